@@ -1,0 +1,66 @@
+"""What can go wrong, and what the command line makes of it.
+
+    LdoError                      exit code 1
+    ├── ConfigError               2   bad arguments or configuration
+    │   └── LosslessCycle             a graph of actors that could wait for itself
+    ├── DataError                 3   nothing readable, broken calibration, too many bad frames
+    │   └── FrameError                one frame cannot be read: skipped, counted, warned about once
+    ├── StageError                4   a part of the service gave up
+    │   ├── RestartsExhausted
+    │   └── StageStalled
+    └── ReplayDiverged            5   a replay produced something else than the recording
+
+Every message is one paragraph: what, where, and what to do next. Outcomes that an algorithm
+expects (tracking lost, a loop refused) are values in messages, not errors.
+"""
+
+
+class LdoError(Exception):
+    exit_code = 1
+
+
+class ConfigError(LdoError):
+    exit_code = 2
+
+
+class LosslessCycle(ConfigError):
+    def __init__(self, path: list[str]) -> None:
+        super().__init__(
+            f"lossless cycle {' -> '.join(path)}: each would wait for room at the next, for ever. "
+            "Make one of these inputs Latest."
+        )
+        self.path = path
+
+
+class DataError(LdoError):
+    exit_code = 3
+
+
+class FrameError(DataError):
+    pass
+
+
+class StageError(LdoError):
+    exit_code = 4
+
+
+class RestartsExhausted(StageError):
+    def __init__(self, actor: str, restarts: int, window_s: float) -> None:
+        super().__init__(
+            f"{actor} failed {restarts} times within {window_s:g} s and was given up. "
+            "The log above has each failure; fix its cause, or raise restart.max_restarts."
+        )
+        self.actor, self.restarts, self.window_s = actor, restarts, window_s
+
+
+class StageStalled(StageError):
+    def __init__(self, actor: str, age_s: float) -> None:
+        super().__init__(
+            f"{actor} has been busy with one message for {age_s:.0f} s and cannot be interrupted. "
+            "Give it less work per message, or raise stall_after_s."
+        )
+        self.actor, self.age_s = actor, age_s
+
+
+class ReplayDiverged(LdoError):
+    exit_code = 5

@@ -1,0 +1,84 @@
+"""Pinhole camera: intrinsics, projection, lens distortion. Conventions: `ldo_service.geometry`."""
+
+from dataclasses import dataclass
+from math import isfinite
+
+import numpy as np
+
+from ldo_service.errors import DataError
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Intrinsics in pixels; pixel centres at integer coordinates.
+
+    `distortion` holds OpenCV's coefficients (k1, k2, p1, p2[, k3[, k4, k5, k6]]); a rectified
+    camera has none. Raises DataError for values that no camera has.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if self.width < 1 or self.height < 1:
+            raise DataError(f"camera of {self.width}x{self.height} pixels: both must be positive.")
+        if not all(isfinite(n) for n in numbers):
+            raise DataError(f"camera intrinsics {numbers} hold NaN or infinity: recalibrate.")
+        if self.fx <= 0 or self.fy <= 0:
+            raise DataError(f"focal lengths fx={self.fx:g}, fy={self.fy:g} px must be positive.")
+        if not (-self.width < self.cx < 2 * self.width):
+            raise DataError(f"cx={self.cx:g} px is far outside an image {self.width} px wide.")
+        if not (-self.height < self.cy < 2 * self.height):
+            raise DataError(f"cy={self.cy:g} px is far outside an image {self.height} px high.")
+        if len(self.distortion) not in (0, 4, 5, 8):
+            raise DataError(
+                f"{len(self.distortion)} distortion coefficients: OpenCV's models have 4, 5 or 8."
+            )
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """K [3, 3]."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def halved(self) -> "Camera":
+        """The camera of the image whose pixels are means of 2x2 blocks of this one's."""
+        return Camera(
+            self.width // 2,
+            self.height // 2,
+            self.fx / 2,
+            self.fy / 2,
+            (self.cx + 0.5) / 2 - 0.5,
+            (self.cy + 0.5) / 2 - 0.5,
+        )
+
+    def rectified(self) -> "Camera":
+        """The same camera without lens distortion."""
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+
+    def rays(self) -> np.ndarray:
+        """Viewing rays [H, W, 3] with z = 1, float64; `rays * depth_m` are camera points."""
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
+        return np.stack(
+            [(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u, float)], axis=-1
+        )
+
+    def backproject(self, depth_m: np.ndarray) -> np.ndarray:
+        """Camera points [H, W, 3] of a depth image [H, W]; the origin where depth is missing."""
+        return (self.rays() * depth_m[..., None]).astype(np.float32)
+
+    def project(self, points_camera: np.ndarray) -> np.ndarray:
+        """Pixel coordinates [..., 2] of camera points [..., 3] with z > 0."""
+        z = points_camera[..., 2]
+        return np.stack(
+            [
+                self.fx * points_camera[..., 0] / z + self.cx,
+                self.fy * points_camera[..., 1] / z + self.cy,
+            ],
+            axis=-1,
+        )

@@ -1,0 +1,134 @@
+"""Rigid transforms as 4x4 float64 arrays. Conventions: `ldo_service.geometry`."""
+
+import numpy as np
+
+Array = np.ndarray
+
+
+def skew(v: Array) -> Array:
+    """Matrix [3, 3] of the cross product: `skew(v) @ w == cross(v, w)`."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp(xi: Array) -> Array:
+    """Transform [4, 4] of the tangent vector xi [6] (rotation rad, translation m)."""
+    omega, v = np.asarray(xi[:3], float), np.asarray(xi[3:], float)
+    theta = float(np.linalg.norm(omega))
+    W = skew(omega)
+    if theta < 1e-6:  # second-order series: error below 1e-18
+        a, b, c = 1.0 - theta**2 / 6, 0.5 - theta**2 / 24, 1.0 / 6 - theta**2 / 120
+    else:
+        a = np.sin(theta) / theta
+        b = (1.0 - np.cos(theta)) / theta**2
+        c = (1.0 - a) / theta**2
+    T = np.eye(4)
+    T[:3, :3] += a * W + b * W @ W
+    T[:3, 3] = (np.eye(3) + b * W + c * W @ W) @ v
+    return T
+
+
+def log(T: Array) -> Array:
+    """Tangent vector [6] of T [4, 4]; the inverse of `exp` for rotations below pi."""
+    q = quaternion(T[:3, :3])
+    q = q if q[0] >= 0 else -q
+    sin_half = float(np.linalg.norm(q[1:]))
+    theta = 2.0 * np.arctan2(sin_half, q[0])
+    omega = q[1:] * (2.0 if sin_half < 1e-9 else theta / sin_half)
+    W = skew(omega)
+    if theta < 1e-4:  # the closed form loses digits here; the series is exact to 1e-17
+        d = 1.0 / 12 + theta**2 / 720
+    else:
+        d = (1.0 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta**2
+    return np.r_[omega, (np.eye(3) - 0.5 * W + d * W @ W) @ T[:3, 3]]
+
+
+def inverse(T: Array) -> Array:
+    """T_b_a of T_a_b; `T` [..., 4, 4] must hold proper rotations."""
+    out = np.zeros_like(T, dtype=float)
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    out[..., :3, :3] = R_t
+    out[..., :3, 3] = -(R_t @ T[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def orthonormalised(T: Array) -> Array:
+    """T [4, 4] with the nearest rotation; chains of products leave the group without it."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    out = np.eye(4)
+    out[:3, :3] = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    out[:3, 3] = T[:3, 3]
+    return out
+
+
+def adjoint(T: Array) -> Array:
+    """Adj [6, 6] with `T * exp(xi) == exp(Adj @ xi) * T`."""
+    R, t = T[:3, :3], T[:3, 3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = R
+    out[3:, :3] = skew(t) @ R
+    return out
+
+
+def rotation_angle(T: Array) -> float:
+    """Angle of the rotation of T [4, 4] in radians, 0..pi."""
+    R = T[:3, :3]
+    sin = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(sin, 0.5 * (np.trace(R) - 1.0)))
+
+
+def transform(T: Array, points: Array) -> Array:
+    """`points` [..., 3] in frame b, mapped by T_a_b [4, 4] to frame a."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def quaternion(R: Array) -> Array:
+    """Unit quaternion wxyz [4] of the rotation R [3, 3], w >= 0."""
+    # The largest of the four squared components is divided by, so no case loses digits.
+    squares = np.array(
+        [
+            1 + R[0, 0] + R[1, 1] + R[2, 2],
+            1 + R[0, 0] - R[1, 1] - R[2, 2],
+            1 - R[0, 0] + R[1, 1] - R[2, 2],
+            1 - R[0, 0] - R[1, 1] + R[2, 2],
+        ]
+    )
+    wx, wy, wz = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    rows = np.array(
+        [
+            [squares[0], wx, wy, wz],
+            [wx, squares[1], xy, xz],
+            [wy, xy, squares[2], yz],
+            [wz, xz, yz, squares[3]],
+        ]
+    )
+    q = rows[int(np.argmax(squares))]
+    q = q / np.linalg.norm(q)
+    return q if q[0] >= 0 else -q
+
+
+def rotation(q: Array) -> Array:
+    """Rotation [..., 3, 3] of the quaternions q [..., 4] wxyz, which need not be normalised."""
+    q = np.asarray(q)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    out = np.empty((*q.shape[:-1], 3, 3), q.dtype)
+    out[..., 0, 0] = 1 - 2 * (y * y + z * z)
+    out[..., 0, 1] = 2 * (x * y - w * z)
+    out[..., 0, 2] = 2 * (x * z + w * y)
+    out[..., 1, 0] = 2 * (x * y + w * z)
+    out[..., 1, 1] = 1 - 2 * (x * x + z * z)
+    out[..., 1, 2] = 2 * (y * z - w * x)
+    out[..., 2, 0] = 2 * (x * z - w * y)
+    out[..., 2, 1] = 2 * (y * z + w * x)
+    out[..., 2, 2] = 1 - 2 * (x * x + y * y)
+    return out
+
+
+def from_quaternion(translation: Array, q: Array) -> Array:
+    """T [4, 4] of a translation [3] in metres and a quaternion wxyz [4]."""
+    T = np.eye(4)
+    T[:3, :3] = rotation(np.asarray(q, float))
+    T[:3, 3] = translation
+    return T
