@@ -1,1 +1,38 @@
-"""What travels."""
+"""What travels between the actors and to other programs. Imports msgspec and numpy only.
+
+A message is one frozen, tagged struct; its body is MessagePack, a map with the struct's field
+names and `type`, so any MessagePack library reads it. Fields are added at the end and with a
+default; what a field means never changes. Conventions of frames and units are those of
+`ldo_service.geometry`.
+"""
+
+from .array import Array
+from .frames import CameraModel, CameraRgbd, FrameRgbd, Image
+from .graph import Correction
+from .health import Health, InputCount, OutputCount
+from .keyframe import Keyframe
+from .map import AnchorMotion, Gaussians, MapDelta, MapSnapshot, ModelView
+from .message import Message
+from .pose import Pose, TrackedPose, TrackingStatus
+
+__all__ = [
+    "AnchorMotion",
+    "Array",
+    "CameraModel",
+    "CameraRgbd",
+    "Correction",
+    "FrameRgbd",
+    "Gaussians",
+    "Health",
+    "Image",
+    "InputCount",
+    "Keyframe",
+    "MapDelta",
+    "MapSnapshot",
+    "Message",
+    "ModelView",
+    "OutputCount",
+    "Pose",
+    "TrackedPose",
+    "TrackingStatus",
+]

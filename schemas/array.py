@@ -1,0 +1,52 @@
+"""An array on the wire: its bytes, shape and dtype."""
+
+from math import prod
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+DType = Literal["u1", "u2", "u4", "i4", "i8", "f4", "f8"]
+
+
+class Array(msgspec.Struct, frozen=True):
+    """Little-endian, C-ordered. With NumPy: `np.frombuffer(data, dtype).reshape(shape)`."""
+
+    dtype: DType
+    shape: tuple[int, ...]
+    data: memoryview
+
+    def __post_init__(self) -> None:
+        if any(n < 0 for n in self.shape):
+            raise ValueError(f"array shape {self.shape} has a negative length")
+        expected = prod(self.shape) * int(self.dtype[1])
+        if self.data.nbytes != expected:
+            raise ValueError(
+                f"array {self.dtype}{list(self.shape)} needs {expected} bytes, "
+                f"has {self.data.nbytes}"
+            )
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> "Array":
+        """A copy of `values`, so that later changes to them do not reach the message."""
+        little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
+        return cls(little.dtype.str[1:], values.shape, memoryview(little.tobytes()))  # type: ignore[arg-type]
+
+    def numpy(self) -> np.ndarray:
+        """A read-only view, without a copy."""
+        view = np.frombuffer(self.data, "<" + self.dtype).reshape(self.shape)
+        view.flags.writeable = False
+        return view
+
+    def require(self, name: str, dtype: DType, shape: tuple[int | None, ...]) -> None:
+        """Raise ValueError unless dtype and shape are these; None stands for any length."""
+        fits = len(shape) == len(self.shape) and all(
+            want is None or want == have for want, have in zip(shape, self.shape, strict=True)
+        )
+        if self.dtype != dtype or not fits:
+            want = ["any" if n is None else n for n in shape]
+            raise ValueError(f"{name} is {self.dtype}{list(self.shape)}, must be {dtype}{want}")
+
+    def require_finite(self, name: str) -> None:
+        if not np.isfinite(self.numpy()).all():
+            raise ValueError(f"{name} holds NaN or infinity")

@@ -1,0 +1,27 @@
+"""What the optimizer says: where the keyframes are in the map."""
+
+import numpy as np
+
+from .array import Array
+from .message import Message, require_count
+from .pose import QUATERNION_TOLERANCE
+
+
+class Correction(Message, frozen=True, kw_only=True):
+    """graph/correction: absolute, so the newest one says it all. 56 bytes a keyframe."""
+
+    graph_version: int  # ascending
+    keyframes: Array  # i8 [K] ids, ascending
+    T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
+
+    def check(self) -> None:
+        require_count("graph_version", self.graph_version)
+        self.keyframes.require("keyframes", "i8", (None,))
+        count = self.keyframes.shape[0]
+        self.T_map_keyframe.require("T_map_keyframe", "f8", (count, 7))
+        self.T_map_keyframe.require_finite("T_map_keyframe")
+        if (np.diff(self.keyframes.numpy()) <= 0).any():
+            raise ValueError("keyframes must be ascending")
+        norms = np.linalg.norm(self.T_map_keyframe.numpy()[:, 3:], axis=1)
+        if (abs(norms - 1.0) > QUATERNION_TOLERANCE).any():
+            raise ValueError("T_map_keyframe holds a quaternion that is not of unit norm")

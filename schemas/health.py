@@ -1,0 +1,51 @@
+"""How a stage is: sent twice a second, whether it works or waits."""
+
+from typing import Literal
+
+import msgspec
+
+from .message import Message, require_count
+
+
+class InputCount(msgspec.Struct, frozen=True, kw_only=True):
+    """Counted since the stage started."""
+
+    topic: str
+    delivered: int  # handled by the actor
+    dropped: int  # displaced by newer ones, by the input's policy
+    rejected: int  # did not decode or did not pass the checks
+    gaps: int  # lossless only: came out of order and was asked for again
+    waiting: int  # in the mailbox now
+    peak: int  # most that ever waited
+
+
+class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
+    topic: str
+    sent: int
+    waited: int  # times the stage waited for a consumer's window
+    evicted: int  # consumers whose window stayed shut
+
+
+class Health(Message, frozen=True, kw_only=True):
+    """health/<actor>. stamp_ns is that of the last message handled."""
+
+    actor: str
+    state: Literal["starting", "ready", "busy", "draining"]
+    pid: int
+    epoch: int  # of the stage: changes when its process was restarted
+    steps: int  # messages handled
+    failures: int  # exceptions in the handler
+    restarts: int  # times the actor was rebuilt from its last state
+    set_aside: int  # messages that made it fail twice
+    step_age_s: float  # since the last step finished
+    busy_s: float  # age of the step under way, 0 when waiting
+    step_ms_p50: float  # over the last steps
+    step_ms_p95: float
+    rss_mb: float  # of the process
+    inputs: tuple[InputCount, ...]
+    outputs: tuple[OutputCount, ...]
+    facts: dict[str, float] = {}  # what the actor counts itself
+
+    def check(self) -> None:
+        for name in ("pid", "epoch", "steps", "failures", "restarts", "set_aside"):
+            require_count(name, getattr(self, name))

@@ -1,0 +1,28 @@
+"""JSON Schema of every message, for programs that are not written in Python."""
+
+import msgspec
+
+from .message import Message
+from .topics import TOPICS
+
+
+def message_types() -> tuple[type[Message], ...]:
+    return tuple(topic.message for topic in TOPICS if topic.message is not None)
+
+
+def json_schema() -> dict[str, object]:
+    """One document: `$defs` has each message by name, `topics` says which travels where.
+
+    Binary fields, base64 strings in JSON Schema's terms, are MessagePack's `bin` on the wire.
+    """
+    _, definitions = msgspec.json.schema_components(message_types())
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "LDO-SLAM messages",
+        "$defs": definitions,
+        "topics": {
+            topic.name: {"$ref": f"#/$defs/{topic.message.__name__}"}
+            for topic in TOPICS
+            if topic.message is not None
+        },
+    }

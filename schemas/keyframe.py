@@ -1,0 +1,36 @@
+"""Keyframes, as the tracker makes them."""
+
+from .array import Array
+from .frames import CameraModel, require_rgbd
+from .message import Message, require_count, require_finite
+from .pose import Matrix6, Pose, require_matrix6
+
+
+class Keyframe(Message, frozen=True, kw_only=True):
+    """keyframe/new: a frame that the map is made from, placed relative to its reference keyframe.
+
+    The optimizer alone owns poses in the map; a receiver chains this one to the pose it knows of
+    `reference`. `T_odom_keyframe` lets a receiver that missed the reference chain to any other.
+    """
+
+    keyframe: int  # id, ascending
+    frame: int  # as in camera/rgbd
+    camera: CameraModel  # without distortion
+    color: Array  # u1 [H, W, 3] RGB
+    depth_m: Array  # f4 [H, W], z in metres, 0 = not measured
+    reference: int | None  # id of the reference keyframe; None for the first
+    T_reference_keyframe: Pose
+    information: Matrix6  # of T_reference_keyframe, perturbed on the right
+    T_odom_keyframe: Pose
+    overlap: float = 1.0  # share of the reference's surface that this keyframe sees
+
+    def check(self) -> None:
+        require_count("keyframe", self.keyframe)
+        require_count("frame", self.frame)
+        require_rgbd(self.camera, self.color, self.depth_m)
+        require_matrix6("information", self.information)
+        require_finite("overlap", (self.overlap,))
+        if self.reference is not None and not 0 <= self.reference < self.keyframe:
+            raise ValueError(
+                f"keyframe {self.keyframe} refers to {self.reference}, not an older one"
+            )

@@ -1,0 +1,99 @@
+"""The map of Gaussians: what it looks like, what changed in it, and the whole of it.
+
+A follower keeps arrays equal to the mapper's like this: take a snapshot of version v (all its
+parts), then apply every delta with `since >= v` in order: first `motions`, then `removed`, then
+`changed`, then `added` at the end. A delta whose `since` is not the version held means one was
+missed: take a snapshot again.
+"""
+
+import msgspec
+
+from .array import Array
+from .frames import CameraModel
+from .message import Message, require_count
+from .pose import Pose
+
+
+class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
+    """N Gaussians. A row of `params` is
+
+    mean xyz (map, metres), log of the scales (metres), quaternion wxyz, logit of the opacity,
+    RGB 0..1, two unused numbers.
+    """
+
+    ids: Array  # i8 [N], unique, ascending
+    params: Array  # f4 [N, 16]
+    anchors: Array  # i4 [N], the keyframe that moves it
+
+    def __post_init__(self) -> None:
+        self.ids.require("ids", "i8", (None,))
+        count = self.ids.shape[0]
+        self.params.require("params", "f4", (count, 16))
+        self.params.require_finite("params")
+        self.anchors.require("anchors", "i4", (count,))
+
+
+class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
+    """Every Gaussian anchored at `keyframe` moved by T_new_old: mean and rotation."""
+
+    keyframe: int
+    T_new_old: Pose
+
+
+class MapDelta(Message, frozen=True, kw_only=True):
+    """map/delta: how version `since` becomes version `version`."""
+
+    since: int
+    version: int
+    graph_version: int  # of the keyframe poses that the means are expressed through
+    motions: tuple[AnchorMotion, ...]
+    removed: Array  # i8 [R] ids
+    changed: Gaussians
+    added: Gaussians
+
+    def check(self) -> None:
+        require_version(self.version, self.graph_version)
+        self.removed.require("removed", "i8", (None,))
+        if not 0 <= self.since < self.version:
+            raise ValueError(f"delta from version {self.since} to {self.version} goes back")
+
+
+class MapSnapshot(Message, frozen=True, kw_only=True):
+    """map/snapshot: one part of the whole map at `version`; parts 0 .. parts-1 make it complete."""
+
+    version: int
+    graph_version: int
+    part: int
+    parts: int
+    gaussians: Gaussians
+
+    def check(self) -> None:
+        require_version(self.version, self.graph_version)
+        if not 0 <= self.part < self.parts:
+            raise ValueError(f"part {self.part} of {self.parts} does not exist")
+
+
+class ModelView(Message, frozen=True, kw_only=True):
+    """map/view: the map as rendered at the pose of `keyframe`."""
+
+    keyframe: int
+    version: int  # of the map
+    graph_version: int
+    camera: CameraModel
+    T_map_camera: Pose
+    color: Array  # u1 [H, W, 3] RGB on black
+    depth_m: Array  # f4 [H, W], where half the light is absorbed; 0 = nothing there
+    opacity: Array  # u1 [H, W], 255 = opaque
+
+    def check(self) -> None:
+        require_version(self.version, self.graph_version)
+        size = (self.camera.height, self.camera.width)
+        self.color.require("color", "u1", (*size, 3))
+        self.depth_m.require("depth_m", "f4", size)
+        self.depth_m.require_finite("depth_m")
+        self.opacity.require("opacity", "u1", size)
+
+
+def require_version(version: int, graph_version: int) -> None:
+    require_count("version", version)
+    require_count("graph_version", graph_version)

@@ -1,0 +1,70 @@
+"""Every topic, written once: `ldo/<robot>/<name>` on the network.
+
+One producer each. A state topic also answers a query with its last value, for late joiners. A
+topic without a message type is declared, and has neither producer nor format yet.
+"""
+
+from dataclasses import dataclass
+
+from .frames import CameraRgbd, FrameRgbd
+from .graph import Correction
+from .health import Health
+from .keyframe import Keyframe
+from .map import MapDelta, MapSnapshot, ModelView
+from .message import Message
+from .pose import TrackedPose
+
+ROBOT_PREFIX = "ldo"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    name: str
+    message: type[Message] | None
+    says: str
+    is_state: bool = False
+    key: str | None = None  # field by which `Latest(per_key=True)` tells messages apart
+
+    def expression(self, robot: str) -> str:
+        """The Zenoh key expression."""
+        return f"{ROBOT_PREFIX}/{robot}/{self.name}"
+
+
+CAMERA_RGBD = Topic("camera/rgbd", CameraRgbd, "one exposure, as the camera sends it")
+FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "the frame, rectified, depth in metres")
+POSE_TRACKED = Topic("pose/tracked", TrackedPose, "where the camera is", is_state=True)
+KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "a frame that the map is made from")
+MAP_VIEW = Topic("map/view", ModelView, "the map rendered at the newest keyframe")
+MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last version")
+MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
+GRAPH_CORRECTION = Topic("graph/correction", Correction, "all keyframe poses", is_state=True)
+HEALTH = Topic("health", Health, "counters and latency of an actor (health/<actor>)")
+
+DETECTION_BOXES = Topic("detection/boxes", None, "boxes with class and score, per keyframe")
+LABEL_REQUEST = Topic("label/request", None, "image crops of a region to be named", key="region")
+LABEL_OPEN = Topic("label/open", None, "the name of a region, late by design", key="region")
+MAP_OBJECTS = Topic("map/objects", None, "the named objects", is_state=True)
+OBJECT_OBSERVATION = Topic("object/observation", None, "an object seen from a keyframe")
+KEYFRAME_REFINEMENT = Topic("keyframe/refinement", None, "a better pose between two keyframes")
+LOOP_CLOSURE = Topic("loop/closure", None, "a verified pose between two distant keyframes")
+LOOP_CANDIDATE = Topic("loop/candidate", None, "every candidate, and why it was refused")
+
+TOPICS: tuple[Topic, ...] = (
+    CAMERA_RGBD,
+    FRAME_RGBD,
+    POSE_TRACKED,
+    KEYFRAME_NEW,
+    DETECTION_BOXES,
+    LABEL_REQUEST,
+    LABEL_OPEN,
+    MAP_VIEW,
+    MAP_DELTA,
+    MAP_SNAPSHOT,
+    MAP_OBJECTS,
+    OBJECT_OBSERVATION,
+    KEYFRAME_REFINEMENT,
+    LOOP_CLOSURE,
+    LOOP_CANDIDATE,
+    GRAPH_CORRECTION,
+    HEALTH,
+)
