@@ -1,1 +1,22 @@
-"""TBD."""
+"""Actors, the links between them, and what keeps them alive.
+
+    Topic       name + message type, one producer (`ldo_service.schemas.topics`)
+    In, Out     ports as class data; the policy belongs to the input: Lossless or Latest
+    Actor       inputs, outputs, handle(message) -> messages, snapshot, restore
+    Transport   publish, subscribe, announce, watch, answer; Zenoh or memory
+    Outlet      sending half of a topic: numbers messages, waits for lossless consumers
+    Mailbox     all inputs of an actor, merged and bounded; every drop is counted
+    Stage       take -> handle in the actor's own thread -> send in order; restarts its actor
+    supervise   one task group; an exhausted restart budget ends the process
+    check_graph refuses a cycle of lossless inputs before anything starts
+    run_on_logical_clock   the whole graph over a file, independent of the machine's load
+
+A handler is an ordinary generator: it opens no socket, reads no clock, starts no task. The stage
+around it is the only asynchronous code.
+"""
+
+from .actor import Actor
+from .graph import check_graph
+from .ports import In, Latest, Lossless, Out
+
+__all__ = ["Actor", "In", "Latest", "Lossless", "Out", "check_graph"]

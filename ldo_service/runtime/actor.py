@@ -1,0 +1,51 @@
+"""What an actor is: ports, a handler, and state that can be put away and taken up again."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any, ClassVar
+
+from ldo_service.schemas import Message
+from ldo_service.schemas.topics import Topic
+
+from .ports import In, Out
+
+UNLIMITED = 1 << 30
+
+# Named parts of an actor's state, each of plain values, bytes and NumPy arrays. A part that did not
+# change since the last step is the same object: only new objects are written.
+State = Mapping[str, Any]
+
+
+class Actor:
+    """One box of the design card.
+
+    `room` says, for each output that never waits, how many messages may be sent now; it is set
+    before each step and is, with the message, all that a step depends on.
+    """
+
+    name: ClassVar[str]
+    inputs: ClassVar[tuple[In, ...]] = ()
+    outputs: ClassVar[tuple[Out, ...]] = ()
+
+    def __init__(self) -> None:
+        self.room: Mapping[Topic, int] = {}
+
+    def has_room(self, topic: Topic) -> bool:
+        return self.room.get(topic, UNLIMITED) > 0
+
+    def handle(self, message: Message) -> Iterator[Message]:
+        raise NotImplementedError
+
+    def finish(self) -> Iterator[Message]:
+        """Last words before a soft stop."""
+        return iter(())
+
+    def snapshot(self) -> State:
+        """What a successor needs to go on; called after every step, so it must be cheap."""
+        return {}
+
+    def restore(self, state: State) -> None:
+        """Go on from a predecessor's snapshot."""
+
+    def facts(self) -> dict[str, float]:
+        """What the actor counts itself, for its health message."""
+        return {}

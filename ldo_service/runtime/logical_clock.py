@@ -1,0 +1,119 @@
+"""The whole graph over a file, on a clock that ticks once per frame.
+
+What an actor makes of a message becomes visible a declared number of ticks after it took the
+message, however long it really took. Actors compute side by side, each in its own thread; a thread
+is waited for when the clock reaches the tick at which its answer is due. So the result depends on
+the input and the latencies alone, not on the machine or its load, and nothing is dropped.
+"""
+
+import heapq
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+from ldo_service.schemas import Message
+
+from .actor import Actor
+from .graph import check_graph
+
+Observer = Callable[[str, Message], None]  # the actor's name and what it made
+
+
+@dataclass(order=True)
+class Due:
+    """An answer under way; equal ticks are settled in the order of the graph, then of starting."""
+
+    tick: int
+    rank: int
+    order: int
+    answer: Future[list[Message]] = field(compare=False)
+
+
+@dataclass
+class ActorThread:
+    actor: Actor
+    rank: int
+    latency_ticks: int
+    thread: ThreadPoolExecutor
+    step_ms: list[float] = field(default_factory=list)
+
+    def start(self, message: Message) -> Future[list[Message]]:
+        return self.thread.submit(self._step, message)
+
+    def finish(self) -> Future[list[Message]]:
+        return self.thread.submit(lambda: list(self.actor.finish()))
+
+    def _step(self, message: Message) -> list[Message]:
+        started_s = time.perf_counter()
+        produced = list(self.actor.handle(message))
+        self.step_ms.append(1e3 * (time.perf_counter() - started_s))
+        return produced
+
+
+class LogicalClock:
+    """Feeds a graph of actors from one source; see the module."""
+
+    def __init__(
+        self,
+        actors: Sequence[Actor],
+        latency_ticks: Mapping[str, int],
+        observe: Observer = lambda _actor, _message: None,
+    ) -> None:
+        check_graph(type(actor) for actor in actors)
+        self._threads = [
+            ActorThread(
+                actor, rank, latency_ticks.get(actor.name, 0), ThreadPoolExecutor(1, actor.name)
+            )
+            for rank, actor in enumerate(actors)
+        ]
+        self._takers: dict[type[Message], list[ActorThread]] = {}
+        for thread in self._threads:
+            for port in thread.actor.inputs:
+                if port.topic.message is not None:
+                    self._takers.setdefault(port.topic.message, []).append(thread)
+        self._observe = observe
+        self._due: list[Due] = []
+        self._started = 0
+
+    def run(self, source: Iterable[Message]) -> Iterator[int]:
+        """Yield the tick after each message of the source; then everything due is settled."""
+        tick = -1
+        try:
+            for tick, message in enumerate(source):
+                self._deliver(message, tick)
+                self._settle(tick)
+                yield tick
+            self._finish(tick)
+        finally:
+            for thread in self._threads:
+                thread.thread.shutdown(cancel_futures=True)
+
+    def step_ms(self) -> dict[str, list[float]]:
+        """Wall time of every step so far, by actor."""
+        return {thread.actor.name: thread.step_ms for thread in self._threads}
+
+    def _deliver(self, message: Message, tick: int) -> None:
+        for thread in self._takers.get(type(message), ()):
+            self._expect(thread, tick + thread.latency_ticks, thread.start(message))
+
+    def _expect(self, thread: ActorThread, tick: int, answer: Future[list[Message]]) -> None:
+        self._started += 1
+        heapq.heappush(self._due, Due(tick, thread.rank, self._started, answer))
+
+    def _settle(self, tick: int) -> None:
+        """Wait for every answer that is due by now and pass it on."""
+        while self._due and self._due[0].tick <= tick:
+            due = heapq.heappop(self._due)
+            for message in due.answer.result():
+                self._observe(self._threads[due.rank].actor.name, message)
+                self._deliver(message, due.tick)
+
+    def _finish(self, tick: int) -> None:
+        """Settle what is under way, then let each actor say its last words, producers first."""
+        while self._due:
+            self._settle(self._due[0].tick)
+        for thread in self._threads:
+            self._expect(thread, tick, thread.finish())
+            while self._due:
+                self._settle(self._due[0].tick)

@@ -1,0 +1,172 @@
+"""The runtime's network in production: Zenoh.
+
+Facts of zenoh-python 1.x that shape this file:
+- Callbacks with `indirect=False` run on Zenoh's own thread; they store and wake, nothing else. A
+  plain `callback=` hides a queue of 256 messages and a thread that keeps the interpreter alive.
+- `put` may block, so it runs in a thread of the publisher. Everything is sent with congestion
+  control DROP: with BLOCK one stalled subscriber stalls the sender for seconds and then loses
+  messages all the same. What must arrive is sent again by the links above.
+- The default configuration listens on every interface: scouting, gossip and shared memory are
+  switched off here, and the service listens on loopback.
+"""
+
+import asyncio
+import json
+import logging
+from collections.abc import Awaitable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Lock
+from typing import Any
+
+import zenoh
+
+from ldo_service.errors import ConfigError
+from ldo_service.schemas.topics import ROBOT_PREFIX
+
+from .transport import LastValues, OnMessage, OnPresence
+
+log = logging.getLogger(__name__)
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+ALIVE = "link/alive"
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """Where the robot's topics are."""
+
+    robot: str = "robot"
+    endpoint: str = DEFAULT_ENDPOINT
+
+    def __post_init__(self) -> None:
+        if not self.robot or any(c in self.robot for c in "/*$?#@ "):
+            raise ConfigError(
+                f"robot name {self.robot!r}: it becomes a part of every topic, so it must not be "
+                "empty nor hold any of / * $ ? # @ or a space."
+            )
+
+    def expression(self, key: str) -> str:
+        return f"{ROBOT_PREFIX}/{self.robot}/{key}"
+
+
+def open_session(network: Network, router: bool = False) -> zenoh.Session:
+    """Open the service's router, or a client of it. Use it in a `with` block.
+
+    Raises ConfigError when the port is taken or nobody answers there.
+    """
+    settings = {
+        "mode": "router" if router else "client",
+        "listen/endpoints" if router else "connect/endpoints": [network.endpoint],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "adminspace/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "connect/timeout_ms": 3000,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        advice = (
+            f"cannot listen on {network.endpoint}: is another `ldo serve` running there? "
+            "Stop it, or choose another port with --endpoint."
+            if router
+            else f"nobody answers on {network.endpoint}: start `ldo serve`, "
+            "or name its address with --endpoint."
+        )
+        raise ConfigError(f"{advice} (zenoh: {error})") from error
+
+
+class ZenohTransport:
+    """Made inside a running event loop, on an open session that outlives it."""
+
+    def __init__(self, session: zenoh.Session, network: Network) -> None:
+        self._session, self._network = session, network
+        self._loop = asyncio.get_running_loop()
+        self._declared: list[Any] = []
+
+    def publisher(self, key: str) -> "ZenohPublisher":
+        return ZenohPublisher(self._session, self._network.expression(key), self._loop)
+
+    def subscribe(self, key: str, on_message: OnMessage) -> None:
+        def store(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment
+            header = attachment.to_bytes() if attachment is not None else b""
+            on_message(header, memoryview(sample.payload.to_bytes()))
+
+        handler = zenoh.handlers.Callback(store, indirect=False)
+        expression = self._network.expression(key)
+        self._declared.append(self._session.declare_subscriber(expression, handler))
+
+    def announce(self, name: str) -> None:
+        expression = self._network.expression(f"{ALIVE}/{name}")
+        self._declared.append(self._session.liveliness().declare_token(expression))
+
+    def watch(self, on_presence: OnPresence) -> None:
+        def changed(sample: zenoh.Sample) -> None:
+            name = str(sample.key_expr).rsplit("/", 1)[1]
+            alive = sample.kind == zenoh.SampleKind.PUT
+            self._loop.call_soon_threadsafe(on_presence, name, alive)
+
+        handler = zenoh.handlers.Callback(changed, indirect=False)
+        expression = self._network.expression(f"{ALIVE}/*")
+        liveliness = self._session.liveliness()
+        self._declared.append(liveliness.declare_subscriber(expression, handler, history=True))
+
+    def answer(self, key: str, last_values: LastValues) -> None:
+        expression = self._network.expression(key)
+
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                for header, body in last_values():
+                    query.reply(expression, body, attachment=header)
+
+        handler = zenoh.handlers.Callback(reply, indirect=False)
+        self._declared.append(self._session.declare_queryable(expression, handler))
+
+    def close(self) -> None:
+        for declared in self._declared:
+            declared.undeclare()
+        self._declared.clear()
+
+
+class ZenohPublisher:
+    """One key, one thread: messages of a key stay in order, and no key waits for another."""
+
+    def __init__(
+        self, session: zenoh.Session, expression: str, loop: asyncio.AbstractEventLoop
+    ) -> None:
+        self._publisher = session.declare_publisher(
+            expression, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._loop = loop
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"put {expression}")
+        self._lock = Lock()
+        self._posted: tuple[bytes, bytes] | None = None
+
+    def send(self, header: bytes, body: bytes) -> Awaitable[None]:
+        return self._loop.run_in_executor(self._thread, self._put, header, body)
+
+    def post(self, header: bytes, body: bytes) -> None:
+        with self._lock:
+            is_under_way, self._posted = self._posted is not None, (header, body)
+        if not is_under_way:
+            self._thread.submit(self._put_posted)
+
+    def _put_posted(self) -> None:
+        with self._lock:
+            posted, self._posted = self._posted, None
+        if posted is not None:
+            self._put(*posted)
+
+    def _put(self, header: bytes, body: bytes) -> None:
+        try:
+            self._publisher.put(body, attachment=header)
+        except zenoh.ZError as error:
+            log.warning("%s: put failed: %s", self._publisher.key_expr, error)
+
+    def close(self) -> None:
+        self._thread.shutdown(wait=False, cancel_futures=True)
