@@ -39,7 +39,7 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     """pose/tracked: where the camera was at `stamp_ns` (REP-105 frames).
 
     WEAK: the pose is a best effort, nothing is mapped from it. LOST: the pose is the last that was
-    trusted, and `keyframe_reference` the keyframe it hangs on.
+    trusted.
     """
 
     frame: int  # as in camera/rgbd
@@ -47,20 +47,20 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     T_odom_camera: Pose  # continuous, never jumps
     T_map_odom: Pose  # moves with corrections: T_map_camera = T_map_odom @ T_odom_camera
     graph_version: int  # of the correction that T_map_odom is built on; 0 before the first
-    reference: int  # the keyframe that the frame was aligned to
+    reference: int | None  # the keyframe it was aligned to; None before there is one
     T_reference_camera: Pose
     keyframe: int | None = None  # the id it was given, when this frame became a keyframe
     covariance: Matrix6 = (0.0,) * 36  # of T_reference_camera, perturbed on the right
     inlier_fraction: float = 0.0  # of the residuals
-    residual_color: float = 0.0  # robust RMS, grey levels of 0..255
-    residual_depth: float = 0.0  # robust RMS over its expected value
+    residual_color: float = 0.0  # robust sigma, grey levels of 0..255
+    residual_depth: float = 0.0  # robust sigma over that of the sensor model
     overlap: float = 0.0  # share of the reference's surface that this frame sees
     iterations: int = 0
 
     def check(self) -> None:
         require_count("frame", self.frame)
         require_count("graph_version", self.graph_version)
-        require_count("reference", self.reference)
+        require_count("reference", self.reference or 0)
         require_matrix6("covariance", self.covariance)
         require_finite(
             "tracking quality",

@@ -1,0 +1,77 @@
+"""Images as bytes: raw, JPEG, PNG, and depth compressed with zstd."""
+
+import cv2
+import numpy as np
+import zstandard
+
+from ldo_service.errors import FrameError
+
+ZSTD_LEVEL = 1  # 0.8 ms for a VGA depth image; 16-bit PNG takes 17 times that (measured)
+
+
+def decode_color(encoding: str, width: int, height: int, data: memoryview) -> np.ndarray:
+    """[H, W, 3] uint8 RGB. Raises FrameError for bytes that are no such image."""
+    if encoding == "rgb8":
+        return _pixels(data, np.uint8, (height, width, 3))
+    if encoding == "bgr8":
+        return np.ascontiguousarray(_pixels(data, np.uint8, (height, width, 3))[..., ::-1])
+    bgr = _decompress(data, cv2.IMREAD_COLOR, encoding)
+    _require_size(bgr, width, height, encoding)
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def decode_depth(encoding: str, width: int, height: int, data: memoryview) -> np.ndarray:
+    """[H, W] uint16 or float32, as stored. Raises FrameError for bytes that are no such image."""
+    if encoding == "png":
+        depth = _decompress(data, cv2.IMREAD_UNCHANGED, encoding)
+        _require_size(depth, width, height, encoding)
+        if depth.dtype != np.uint16 or depth.ndim != 2:
+            raise FrameError(f"depth PNG holds {depth.dtype}{depth.shape}, must be 16-bit grey.")
+        return depth
+    dtype = np.uint16 if encoding.startswith("z16") else np.float32
+    size = width * height * np.dtype(dtype).itemsize
+    raw = _expand(data, size) if encoding.endswith("+zstd") else data
+    return _pixels(raw, dtype, (height, width))
+
+
+def encode_depth(depth: np.ndarray) -> tuple[str, bytes]:
+    """Encoding name and bytes of a depth image [H, W], uint16 or float32."""
+    name = {"uint16": "z16+zstd", "float32": "f32+zstd"}[depth.dtype.name]
+    return name, zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(np.ascontiguousarray(depth))
+
+
+def encode_jpeg(color: np.ndarray, quality: int = 95) -> bytes:
+    """JPEG of [H, W, 3] uint8 RGB."""
+    bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+    _, data = cv2.imencode(".jpg", bgr, (cv2.IMWRITE_JPEG_QUALITY, quality))
+    return data.tobytes()
+
+
+def _pixels(data: memoryview | bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
+    if len(data) != np.prod(shape) * np.dtype(dtype).itemsize:
+        raise FrameError(
+            f"image has {len(data)} bytes, {np.dtype(dtype)}{shape} needs another count."
+        )
+    return np.frombuffer(data, dtype).reshape(shape)
+
+
+def _expand(data: memoryview, size: int) -> bytes:
+    """Decompress at most `size` bytes: a small message must not unpack to gigabytes."""
+    try:
+        return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
+    except zstandard.ZstdError as error:
+        raise FrameError(f"depth cannot be decompressed: {error}.") from error
+
+
+def _decompress(data: memoryview, flags: int, encoding: str) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
+        raise FrameError(f"{len(data)} bytes are no readable {encoding} image.")
+    return image
+
+
+def _require_size(image: np.ndarray, width: int, height: int, encoding: str) -> None:
+    if image.shape[:2] != (height, width):
+        raise FrameError(
+            f"{encoding} image is {image.shape[1]}x{image.shape[0]}, announced as {width}x{height}."
+        )
