@@ -1,0 +1,150 @@
+"""Keyframe poses from relative measurements, by incremental smoothing (iSAM2)."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from ldo_service.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeGraphConfig:
+    first_sigma: float = 1e-6  # rad and m: the first keyframe is the origin of the map
+    sigma_rotation_max_rad: float = 0.2  # a degenerate direction is believed no worse than this,
+    sigma_translation_max_m: float = 0.5  # or the linear system becomes singular
+    sigma_odometry_rad: float = 0.05  # of odometry over a missed keyframe
+    sigma_odometry_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        if min(getattr(self, name) for name in self.__slots__) <= 0:
+            raise ConfigError(f"{self}: every sigma must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePose:
+    """Measured T_a_b with its information [6, 6]: rotation, then translation, perturbed at b."""
+
+    a: int
+    b: int
+    T_a_b: np.ndarray
+    information: np.ndarray
+
+
+class KeyframeGraph:
+    """min over T_map_k of  sum |log(T_a_b^-1 T_map_a^-1 T_map_b)|^2_information.
+
+    iSAM2 relinearises what moved. An update that throws has already changed the object, so the
+    graph is rebuilt from the kept measurements. Deterministic: the same measurements in the same
+    order give the same bits.
+    """
+
+    def __init__(self, config: KeyframeGraphConfig = KeyframeGraphConfig()) -> None:
+        self._config = config
+        self._floor = np.diag(
+            [config.sigma_rotation_max_rad**-2] * 3 + [config.sigma_translation_max_m**-2] * 3
+        )
+        self._initial: dict[int, np.ndarray] = {}  # the value each keyframe was inserted with
+        self._measured: list[RelativePose] = []
+        self._isam = self._new_isam()
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._initial
+
+    def __len__(self) -> int:
+        return len(self._initial)
+
+    @property
+    def newest(self) -> int | None:
+        return max(self._initial, default=None)
+
+    def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
+        """The keyframe that fixes the map's frame."""
+        self._initial[keyframe] = T_map_keyframe
+        self._update(self._first_factor(keyframe), [keyframe])
+
+    def add(self, measured: RelativePose) -> None:
+        """A new keyframe `b`, measured from a known one. Raises KeyError when `a` is not known."""
+        T_map_a = self._initial[measured.a] if len(self) == 1 else self.pose(measured.a)
+        self._initial[measured.b] = T_map_a @ measured.T_a_b
+        self._measured.append(measured)
+        self._update([self._factor(measured)], [measured.b])
+
+    def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
+        """Odometry between keyframes of which those between were missed: believed less."""
+        sigmas = [self._config.sigma_odometry_rad] * 3 + [self._config.sigma_odometry_m] * 3
+        return RelativePose(a, b, T_a_b, np.diag(np.array(sigmas) ** -2))
+
+    def pose(self, keyframe: int) -> np.ndarray:
+        """T_map_keyframe [4, 4], as estimated now."""
+        return self._isam.calculateEstimatePose3(keyframe).matrix()
+
+    def poses(self) -> dict[int, np.ndarray]:
+        """T_map_keyframe of every keyframe, ascending by id."""
+        estimate = self._isam.calculateEstimate()
+        return {k: estimate.atPose3(k).matrix() for k in sorted(self._initial)}
+
+    # --- iSAM2 ------------------------------------------------------------------------------------
+    def _new_isam(self) -> gtsam.ISAM2:
+        parameters = gtsam.ISAM2Params()
+        parameters.setRelinearizeThreshold(0.01)  # rad and m, gtsam's advice for poses
+        parameters.relinearizeSkip = 1
+        return gtsam.ISAM2(parameters)
+
+    def _update(self, factors: list[gtsam.NonlinearFactor], keyframes: list[int]) -> None:
+        try:
+            self._apply(factors, keyframes)
+        except RuntimeError:
+            self._rebuild()
+
+    def _apply(self, factors: list[gtsam.NonlinearFactor], keyframes: list[int]) -> None:
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for factor in factors:
+            graph.add(factor)
+        for keyframe in keyframes:
+            values.insert(keyframe, gtsam.Pose3(self._initial[keyframe]))
+        self._isam.update(graph, values)
+
+    def _rebuild(self) -> None:
+        """All measurements into a new object. Raises RuntimeError when they cannot be solved."""
+        self._isam = self._new_isam()
+        keyframes = sorted(self._initial)
+        factors = [self._factor(measured) for measured in self._measured]
+        self._apply(self._first_factor(keyframes[0]) + factors, keyframes)
+
+    def _first_factor(self, keyframe: int) -> list[gtsam.NonlinearFactor]:
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._config.first_sigma)
+        return [gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(self._initial[keyframe]), noise)]
+
+    def _factor(self, measured: RelativePose) -> gtsam.NonlinearFactor:
+        information = 0.5 * (measured.information + measured.information.T) + self._floor
+        return gtsam.BetweenFactorPose3(
+            measured.a,
+            measured.b,
+            gtsam.Pose3(measured.T_a_b),
+            gtsam.noiseModel.Gaussian.Information(information),
+        )
+
+    # --- state --------------------------------------------------------------------------------------
+    def snapshot(self) -> dict[str, np.ndarray]:
+        keyframes = sorted(self._initial)
+        measured = self._measured
+        return {
+            "keyframes": np.array(keyframes, np.int64),
+            "initial": np.array([self._initial[k] for k in keyframes]).reshape(-1, 4, 4),
+            "pairs": np.array([(m.a, m.b) for m in measured], np.int64).reshape(-1, 2),
+            "T_a_b": np.array([m.T_a_b for m in measured]).reshape(-1, 4, 4),
+            "information": np.array([m.information for m in measured]).reshape(-1, 6, 6),
+        }
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        keyframes = [int(k) for k in state["keyframes"]]
+        self._initial = dict(zip(keyframes, state["initial"], strict=True))
+        self._measured = [
+            RelativePose(int(a), int(b), T_a_b, information)
+            for (a, b), T_a_b, information in zip(
+                state["pairs"], state["T_a_b"], state["information"], strict=True
+            )
+        ]
+        if keyframes:
+            self._rebuild()
