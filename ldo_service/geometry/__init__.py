@@ -16,8 +16,19 @@ Tangents    6-vectors and 6x6 matrices are ordered rotation (rad), then translat
 Shapes      batches lead. N Gaussians or points, K keyframes, H W image, C classes, M matches.
 """
 
+from .association import associate
 from .camera import Camera
+from .rectify import RawFrame, Rectifier, rectify, undistortion_maps
 from .rgbd import RgbdFrame
 from .trajectory import Trajectory
 
-__all__ = ["Camera", "RgbdFrame", "Trajectory"]
+__all__ = [
+    "Camera",
+    "RawFrame",
+    "Rectifier",
+    "RgbdFrame",
+    "Trajectory",
+    "associate",
+    "rectify",
+    "undistortion_maps",
+]

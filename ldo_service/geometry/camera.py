@@ -47,7 +47,10 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def halved(self) -> "Camera":
-        """The camera of the image whose pixels are means of 2x2 blocks of this one's."""
+        """The camera of the image whose pixels are means of 2x2 blocks of this one's.
+
+        Distortion acts on normalised coordinates, so its coefficients stay.
+        """
         return Camera(
             self.width // 2,
             self.height // 2,
@@ -55,6 +58,7 @@ class Camera:
             self.fy / 2,
             (self.cx + 0.5) / 2 - 0.5,
             (self.cy + 0.5) / 2 - 0.5,
+            self.distortion,
         )
 
     def rectified(self) -> "Camera":

@@ -20,7 +20,7 @@ def exp(xi: Array) -> Array:
         a, b, c = 1.0 - theta**2 / 6, 0.5 - theta**2 / 24, 1.0 / 6 - theta**2 / 120
     else:
         a = np.sin(theta) / theta
-        b = (1.0 - np.cos(theta)) / theta**2
+        b = 2.0 * (np.sin(theta / 2) / theta) ** 2  # 1 - cos would lose digits near zero
         c = (1.0 - a) / theta**2
     T = np.eye(4)
     T[:3, :3] += a * W + b * W @ W
@@ -112,8 +112,9 @@ def quaternion(R: Array) -> Array:
 def rotation(q: Array) -> Array:
     """Rotation [..., 3, 3] of the quaternions q [..., 4] wxyz, which need not be normalised."""
     q = np.asarray(q)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    out = np.empty((*q.shape[:-1], 3, 3), q.dtype)
+    unit = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    w, x, y, z = np.moveaxis(unit, -1, 0)
+    out = np.empty((*q.shape[:-1], 3, 3), unit.dtype)
     out[..., 0, 0] = 1 - 2 * (y * y + z * z)
     out[..., 0, 1] = 2 * (x * y - w * z)
     out[..., 0, 2] = 2 * (x * z + w * y)

@@ -12,10 +12,22 @@ from . import se3
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """stamps_s [K] float64, ascending; T_world_camera [K, 4, 4] float64."""
+    """stamps_s [K] float64, ascending; T_world_camera [K, 4, 4] float64.
+
+    Raises DataError when the shapes disagree or the stamps descend.
+    """
 
     stamps_s: np.ndarray
     T_world_camera: np.ndarray
+
+    def __post_init__(self) -> None:
+        if self.T_world_camera.shape != (*self.stamps_s.shape, 4, 4):
+            raise DataError(
+                f"trajectory of {self.stamps_s.shape} stamps and {self.T_world_camera.shape} "
+                "transforms: expected [K] and [K, 4, 4]."
+            )
+        if np.any(np.diff(self.stamps_s) < 0):
+            raise DataError("the stamps of a trajectory must ascend: sort its poses by stamp.")
 
     def __len__(self) -> int:
         return len(self.stamps_s)
@@ -30,21 +42,30 @@ class Trajectory:
 
     @staticmethod
     def load(path: Path) -> "Trajectory":
-        """Read a TUM trajectory. Raises DataError with the line that does not read."""
-        rows = []
-        for number, line in enumerate(path.read_text().splitlines(), 1):
-            if not line.strip() or line.startswith("#"):
-                continue
-            try:
-                row = [float(word) for word in line.split()]
-            except ValueError:
-                row = []
-            if len(row) != 8 or not np.all(np.isfinite(row)):
-                raise DataError(
-                    f"{path}, line {number}: expected `stamp tx ty tz qx qy qz qw` "
-                    f"in finite numbers, found {line[:80]!r}."
-                )
-            rows.append(row)
+        """Read a TUM trajectory, sorted by stamp. Raises DataError with the line at fault."""
+        try:
+            lines = path.read_text().splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise DataError(f"{path} cannot be read as a TUM trajectory: {error}.") from error
+        rows = [
+            _row(path, number, line)
+            for number, line in enumerate(lines, 1)
+            if line.strip() and not line.lstrip().startswith("#")
+        ]
         table = np.array(rows, float).reshape(-1, 8)
+        table = table[np.argsort(table[:, 0], kind="stable")]
         poses = [se3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
         return Trajectory(table[:, 0], np.array(poses).reshape(-1, 4, 4))
+
+
+def _row(path: Path, number: int, line: str) -> list[float]:
+    try:
+        row = [float(word) for word in line.split()]
+    except ValueError:
+        row = []
+    if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
+        raise DataError(
+            f"{path}, line {number}: expected `stamp tx ty tz qx qy qz qw` in finite numbers "
+            f"and a quaternion that is not zero, found {line[:80]!r}."
+        )
+    return row

@@ -1,0 +1,57 @@
+"""Image files, read so that a damaged one is an error and never a half-grey picture."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import FrameError
+
+# The last bytes of a complete file. OpenCV decodes what is there of a cut one without complaint.
+_ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
+_TRAILING_BYTES = 64  # some writers pad their files
+
+
+def read_color(path: Path) -> np.ndarray:
+    """Colour image [H, W, 3] uint8 RGB. Raises FrameError with the path."""
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_depth(path: Path) -> np.ndarray:
+    """Depth image [H, W] uint16 as stored. Raises FrameError with the path."""
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise FrameError(
+            f"{path} is {image.dtype}{image.shape}: a depth image has one channel of 16 bits. "
+            "Export the depth again as 16-bit grey PNG."
+        )
+    return image
+
+
+def _decode(path: Path, flags: int) -> np.ndarray:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise FrameError(
+            f"{path} cannot be read ({error.strerror}): restore the file or drop its line."
+        ) from error
+    if not _is_complete(data):
+        raise FrameError(f"{path} is cut short at {len(data)} bytes: copy or download it again.")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FrameError(f"{path} is not a readable image: copy or download it again.")
+    return image
+
+
+def _is_complete(data: bytes) -> bool:
+    """Whether a PNG or JPEG has its end; other formats are left to their decoder."""
+    if len(data) < 16:
+        return False
+    for start, end in _ENDS.items():
+        if data.startswith(start):
+            return end in data[-_TRAILING_BYTES:]
+    return True

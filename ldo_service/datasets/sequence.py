@@ -1,0 +1,50 @@
+"""What every source of frames offers."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+
+import numpy as np
+
+from ldo_service.geometry import Camera, RawFrame, Rectifier, RgbdFrame, Trajectory
+
+
+class Sequence(ABC):
+    """RGB-D frames in order of their stamps, from one camera.
+
+    `read(i)` gives what the camera delivered, for a publisher; `sequence[i]` the rectified frame,
+    for the numerics. Both raise FrameError for a frame that cannot be read: skip and count it.
+
+    name        what to call it in tables
+    raw_camera  intrinsics with lens distortion
+    stamps_ns   [len] int64, ascending
+    """
+
+    def __init__(self, name: str, raw_camera: Camera, stamps_ns: np.ndarray) -> None:
+        self.name = name
+        self.raw_camera = raw_camera
+        self.stamps_ns = stamps_ns
+        self._rectifier = Rectifier()
+
+    @abstractmethod
+    def read(self, index: int) -> RawFrame:
+        """Frame `index` in 0..len-1 as the camera delivered it. Raises FrameError."""
+
+    @abstractmethod
+    def truth(self) -> Trajectory | None:
+        """True `T_world_camera`, in a world of the data set's choice; None where unknown."""
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the rectified frames."""
+        return self.raw_camera.rectified()
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __getitem__(self, index: int) -> RgbdFrame:
+        if not 0 <= index < len(self):
+            raise IndexError(f"frame {index} of {len(self)} in {self.name}")
+        return self._rectifier(self.read(index))
+
+    def __iter__(self) -> Iterator[RgbdFrame]:
+        return (self[index] for index in range(len(self)))

@@ -1,0 +1,108 @@
+"""A hand-held camera's way through the room."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """Closed way through eyes_m [M, 3], looking at targets_m [M, 3]; world z is up."""
+
+    eyes_m: np.ndarray
+    targets_m: np.ndarray
+
+
+# Out over the room and back another way: every wall part is seen twice.
+LOOK_AROUND = Path(
+    eyes_m=np.array(
+        [
+            [-0.2, -1.1, 1.35],
+            [-0.1, -1.15, 1.4],
+            [0.1, -1.1, 1.5],
+            [0.1, -0.85, 1.45],
+            [-0.1, -0.7, 1.3],
+            [-0.3, -0.8, 1.25],
+            [-0.4, -1.0, 1.3],
+        ]
+    ),
+    targets_m=np.array(
+        [
+            [-0.9, 1.6, 0.65],
+            [0.0, 1.6, 0.7],
+            [1.4, 1.2, 0.8],
+            [2.3, 0.4, 0.75],
+            [1.5, 1.2, 0.7],
+            [0.0, 1.4, 0.6],
+            [-1.0, 1.3, 0.55],
+        ]
+    ),
+)
+
+# Once around: all four walls, and the start again from close by.
+TOUR = Path(
+    eyes_m=np.array(
+        [
+            [-0.2, -1.0, 1.35],
+            [0.3, -0.9, 1.45],
+            [0.7, -0.4, 1.5],
+            [0.7, 0.3, 1.5],
+            [0.3, 0.9, 1.4],
+            [-0.4, 1.0, 1.35],
+            [-0.9, 0.5, 1.4],
+            [-0.8, -0.4, 1.35],
+        ]
+    ),
+    targets_m=np.array(
+        [
+            [-0.6, 1.8, 0.7],
+            [1.3, 1.6, 0.8],
+            [2.6, 0.6, 0.8],
+            [2.4, -1.3, 0.8],
+            [0.9, -2.0, 0.9],
+            [-1.2, -2.0, 0.8],
+            [-2.6, -0.9, 1.0],
+            [-2.3, 1.2, 0.9],
+        ]
+    ),
+)
+
+SWAY_FRAMES = 8  # a hand moves in fractions of a second
+SWAY_EYE_M = 0.008
+SWAY_TARGET_M = 0.03
+
+
+def poses(path: Path, count: int, seed: int) -> np.ndarray:
+    """T_world_camera [count, 4, 4]: cubic splines through the path, and the sway of a hand."""
+    rng = np.random.default_rng(seed)
+    along = np.arange(count) * (len(path.eyes_m) / count)
+    eyes = _closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)
+    targets = _closed_spline(path.targets_m, along) + _sway(rng, count, SWAY_TARGET_M)
+    return np.array([look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)])
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """T_world_camera [4, 4] at `eye` with z towards `target` and the horizon level."""
+    z = _unit(target - eye)
+    x = _unit(np.array([z[1], -z[0], 0.0]))
+    y = np.array([z[1] * x[2] - z[2] * x[1], z[2] * x[0] - z[0] * x[2], z[0] * x[1] - z[1] * x[0]])
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, y, z, eye
+    return T
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+
+
+def _sway(rng: np.random.Generator, count: int, amplitude_m: float) -> np.ndarray:
+    knots = rng.random((max(4, count // SWAY_FRAMES), 3)) * 2 - 1
+    return amplitude_m * _closed_spline(knots, np.arange(count) * (len(knots) / count))
+
+
+def _closed_spline(knots: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Catmull-Rom spline [P, 3] through `knots` [M, 3] at `along` [P] in 0..M."""
+    cell = along.astype(np.int64)
+    t = (along - cell)[:, None]
+    a, b, c, d = (knots[(cell + i) % len(knots)] for i in (-1, 0, 1, 2))
+    return b + 0.5 * t * (c - a + t * (2 * a - 5 * b + 4 * c - d + t * (3 * (b - c) + d - a)))

@@ -1,0 +1,81 @@
+"""The synthetic room as a sequence."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ldo_service.datasets.sequence import Sequence
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import Camera, RawFrame, Trajectory
+
+from . import path
+from .furniture import furnished_room
+from .kinect import kinect_depth
+from .render import Renderer
+
+RATE_HZ = 30
+FOCAL_PER_WIDTH = 0.8125  # 63 degrees wide, as a Kinect's colour camera
+
+
+@dataclass(frozen=True, slots=True)
+class SyntheticConfig:
+    """What is rendered. The same values give the same bytes."""
+
+    frames: int = 120
+    width_px: int = 320
+    height_px: int = 240
+    path: Literal["look_around", "tour"] = "look_around"
+    noise: bool = False  # Kinect-like depth; exact otherwise
+    seed: int = 0  # of textures, of the hand's sway and of the noise
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.width_px < 8 or self.height_px < 8:
+            raise ConfigError(
+                f"synthetic sequence of {self.frames} frames of {self.width_px}x{self.height_px} "
+                "pixels: at least 1 frame of 8x8 is needed."
+            )
+        if self.path not in PATHS:
+            raise ConfigError(f"path {self.path!r} is not one of {', '.join(PATHS)}.")
+
+
+PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR}
+
+NAMED = {
+    "room": SyntheticConfig(),
+    "room-noisy": SyntheticConfig(noise=True),
+    "tour": SyntheticConfig(frames=360, path="tour"),
+    "tour-noisy": SyntheticConfig(frames=360, path="tour", noise=True),
+}
+
+
+class SyntheticSequence(Sequence):
+    """Frames of the furnished room, rendered when they are read; depth is float32 in metres."""
+
+    def __init__(self, config: SyntheticConfig | None = None, name: str = "synthetic") -> None:
+        self.config = config = config or SyntheticConfig()
+        focal_px = FOCAL_PER_WIDTH * config.width_px
+        center_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
+        camera = Camera(config.width_px, config.height_px, focal_px, focal_px, *center_px)
+        stamps_ns = np.arange(config.frames, dtype=np.int64) * 10**9 // RATE_HZ
+        super().__init__(name, camera, stamps_ns)
+        self._T_world_camera = path.poses(PATHS[config.path], config.frames, config.seed)
+        self._renderer = Renderer(furnished_room(config.seed))
+
+    @staticmethod
+    def named(name: str, **changes: int | bool) -> "SyntheticSequence":
+        """The sequence `synthetic:name`, its config changed by keywords. Raises DataError."""
+        if name not in NAMED:
+            known = ", ".join(f"synthetic:{known}" for known in NAMED)
+            raise DataError(f"there is no synthetic:{name}. There is {known}.")
+        return SyntheticSequence(replace(NAMED[name], **changes), f"synthetic:{name}")
+
+    def read(self, index: int) -> RawFrame:
+        color, depth_m = self._renderer.render(self.raw_camera, self._T_world_camera[index])
+        if self.config.noise:
+            depth_m = kinect_depth(depth_m, np.random.default_rng([self.config.seed, index]))
+        depth = depth_m.astype(np.float32)
+        return RawFrame(index, int(self.stamps_ns[index]), color, depth, 1.0, self.raw_camera)
+
+    def truth(self) -> Trajectory:
+        return Trajectory(self.stamps_ns / 1e9, self._T_world_camera.copy())

@@ -1,0 +1,112 @@
+"""Rays against boxes, ellipsoids and cylinders: three shapes of the cube -1..1, stretched."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Vector = tuple[np.ndarray, np.ndarray, np.ndarray]  # x, y, z, each [P], or [] for one point
+Shape = Literal["box", "ball", "cylinder"]
+
+
+def vector(components: Iterable[np.ndarray | float]) -> Vector:
+    """Three components as arrays."""
+    x, y, z = (np.asarray(component, float) for component in components)
+    return x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class Solid:
+    """A convex solid standing upright in the world, z up.
+
+    size_m   full extents along its own axes
+    heading  direction (x, y) of its own x axis, of length 1
+    """
+
+    shape: Shape
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    texture: str
+    heading: tuple[float, float] = (1.0, 0.0)
+
+    def point_to_local(self, p: Vector) -> Vector:
+        """World point in the frame where the solid fills the cube -1..1."""
+        return self.direction_to_local(
+            (p[0] - self.center_m[0], p[1] - self.center_m[1], p[2] - self.center_m[2])
+        )
+
+    def direction_to_local(self, d: Vector) -> Vector:
+        (c, s), (sx, sy, sz) = self.heading, self.size_m
+        return (
+            (c * d[0] + s * d[1]) * (2 / sx),
+            (c * d[1] - s * d[0]) * (2 / sy),
+            d[2] * (2 / sz),
+        )
+
+    def normal(self, q: Vector) -> tuple[Vector, np.ndarray]:
+        """Unit normals on the surface at local points q, in the world, and their own main axis."""
+        n = _NORMALS[self.shape](q)
+        n = tuple(component * (2 / size) for component, size in zip(n, self.size_m, strict=True))
+        length = np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        x, y, z = (component / length for component in n)
+        axis = np.argmax(np.abs(np.stack([x, y, z])), axis=0)
+        c, s = self.heading
+        return (c * x - s * y, s * x + c * y, z), axis
+
+    def corners_m(self) -> np.ndarray:
+        """The 8 corners [8, 3] of its bounding box in the world."""
+        (c, s), half = self.heading, np.array(self.size_m) / 2
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        x, y, z = (signs * half).T
+        return np.array(self.center_m) + np.stack([c * x - s * y, s * x + c * y, z], axis=1)
+
+
+def interval(shape: Shape, o: Vector, d: Vector) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays o + t d enter and leave the unit shape; enter >= leave where they miss."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if shape == "ball":
+            return _round(o, d, 3)
+        bounds = [_slab(o[2], d[2])]
+        bounds += (
+            [_round(o, d, 2)] if shape == "cylinder" else [_slab(o[0], d[0]), _slab(o[1], d[1])]
+        )
+        enter, leave = bounds[0]
+        for near, far in bounds[1:]:
+            enter, leave = np.maximum(enter, near), np.minimum(leave, far)
+        return enter, leave
+
+
+def _slab(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    a, b = (-1 - o) / d, (1 - o) / d
+    return np.minimum(a, b), np.maximum(a, b)
+
+
+def _round(o: Vector, d: Vector, dimensions: int) -> tuple[np.ndarray, np.ndarray]:
+    """The unit sphere (3) or the endless upright cylinder (2)."""
+    a = d[0] * d[0] + d[1] * d[1]
+    b = o[0] * d[0] + o[1] * d[1]
+    c = o[0] * o[0] + o[1] * o[1] - 1
+    if dimensions == 3:
+        a, b, c = a + d[2] * d[2], b + o[2] * d[2], c + o[2] * o[2]
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))  # a miss makes an empty interval
+    return (-b - root) / a, (-b + root) / a
+
+
+def _box_normal(q: Vector) -> Vector:
+    stacked = np.stack(q)
+    main = np.abs(stacked) == np.max(np.abs(stacked), axis=0)
+    x, y, z = np.where(main, np.sign(stacked), 0.0)
+    return x, y * (x == 0), z * (x == 0) * (y == 0)
+
+
+def _ball_normal(q: Vector) -> Vector:
+    return q
+
+
+def _cylinder_normal(q: Vector) -> Vector:
+    cap = q[2] * q[2] > q[0] * q[0] + q[1] * q[1]
+    return np.where(cap, 0.0, q[0]), np.where(cap, 0.0, q[1]), np.where(cap, np.sign(q[2]), 0.0)
+
+
+_NORMALS = {"box": _box_normal, "ball": _ball_normal, "cylinder": _cylinder_normal}

@@ -1,0 +1,128 @@
+"""Sequences in the layout of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
+
+rgb.txt depth.txt        lines of `stamp file`, stamps in seconds, `#` starts a comment
+groundtruth.txt          optional: lines of `stamp tx ty tz qx qy qz qw`, camera to world
+camera.json              optional for the original recordings, see CAMERA_JSON
+"""
+
+import logging
+import re
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera, RawFrame, Trajectory, associate
+
+from .calibration import Calibration, number, pinhole, read_json
+from .images import read_color, read_depth
+from .sequence import Sequence
+
+log = logging.getLogger(__name__)
+
+CAMERA_JSON = (
+    '{"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, '
+    '"distortion": [k1, k2, p1, p2, k3], "depth_scale": 5000}, the last two optional'
+)
+ASSOCIATION_TOLERANCE_NS = 20_000_000  # as TUM's associate.py
+DEPTH_SCALE = 5000.0  # units per metre in every recording of the benchmark
+
+# The calibration of the colour cameras published with the benchmark. fr3 is rectified already.
+PUBLISHED_CAMERAS = {
+    "freiburg1": Camera(
+        *(640, 480, 517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
+    ),
+    "freiburg2": Camera(
+        *(640, 480, 520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)
+    ),
+    "freiburg3": Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class _Listing:
+    """A file list: stamps_ns [N] int64 ascending, and the files."""
+
+    stamps_ns: np.ndarray
+    files: list[str]
+
+
+class TumSequence(Sequence):
+    """Colour and depth paired by nearest stamp within 20 ms, each used once; stamped by colour."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        color, depth = _listing(folder / "rgb.txt"), _listing(folder / "depth.txt")
+        pairs = associate(color.stamps_ns, depth.stamps_ns, ASSOCIATION_TOLERANCE_NS)
+        if len(pairs) == 0:
+            raise DataError(
+                f"{folder}: none of {len(color.files)} colour and {len(depth.files)} depth images "
+                "are within 20 ms of each other. Check the stamps in rgb.txt and depth.txt."
+            )
+        if len(pairs) < len(color.files):
+            log.info(
+                "%s: %d of %d colour images have no depth within 20 ms and are left out",
+                *(folder, len(color.files) - len(pairs), len(color.files)),
+            )
+        self._files = [(color.files[i], depth.files[j]) for i, j in pairs]
+        calibration = _calibration(folder)
+        self.depth_scale = calibration.depth_scale
+        super().__init__(folder.resolve().name, calibration.camera, color.stamps_ns[pairs[:, 0]])
+
+    def read(self, index: int) -> RawFrame:
+        color_file, depth_file = self._files[index]
+        return RawFrame(
+            index,
+            int(self.stamps_ns[index]),
+            read_color(self._folder / color_file),
+            read_depth(self._folder / depth_file),
+            self.depth_scale,
+            self.raw_camera,
+        )
+
+    def truth(self) -> Trajectory | None:
+        path = self._folder / "groundtruth.txt"
+        return Trajectory.load(path) if path.is_file() else None
+
+
+def _listing(path: Path) -> _Listing:
+    """Read `stamp file` lines, sorted by stamp. Raises DataError with the line at fault."""
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as a list of images: {error}.") from error
+    rows = [
+        _row(path, line_number, line)
+        for line_number, line in enumerate(lines, 1)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
+    rows.sort()
+    return _Listing(np.array([stamp for stamp, _ in rows], np.int64), [file for _, file in rows])
+
+
+def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
+    words = line.split(maxsplit=1)
+    try:
+        stamp_ns = int(Decimal(words[0]) * 10**9)  # a float has no room for nanoseconds since 1970
+        return stamp_ns, words[1].strip()
+    except (InvalidOperation, ValueError, OverflowError, IndexError):
+        raise DataError(
+            f"{path}, line {line_number}: expected `stamp file`, found {line[:80]!r}."
+        ) from None
+
+
+def _calibration(folder: Path) -> Calibration:
+    path = folder / "camera.json"
+    if path.is_file():
+        fields = read_json(path)
+        scale = number(fields, "depth_scale", path) if "depth_scale" in fields else DEPTH_SCALE
+        return Calibration(pinhole(fields, "width", "height", path), scale)
+    recording = re.search(r"freiburg[123]", folder.resolve().name)
+    if recording is None:
+        raise DataError(
+            f"{folder} has no camera.json, and its name does not say freiburg1, 2 or 3, whose "
+            f"intrinsics are published. Write {path} such as {CAMERA_JSON}."
+        )
+    return Calibration(PUBLISHED_CAMERAS[recording[0]], DEPTH_SCALE)
