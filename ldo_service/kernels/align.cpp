@@ -1,0 +1,312 @@
+// One thread, fixed order: points are taken in blocks, each block passes four vectorised steps
+// (project, sample, weigh, accumulate), and block sums are added in double precision.
+#include "align.hpp"
+
+#include <cmath>
+#include <cstring>
+
+namespace ldo::align {
+namespace {
+
+constexpr int kBlock = 256;
+constexpr int kLanes = 16;
+constexpr float kDegrees = 5.0f;  // of freedom of the t-distribution (Kerl et al. 2013, III.B)
+constexpr float kInlierSigma = 3.0f;
+constexpr float kNearest = 1e-3f;  // metres: closer points do not project
+
+float smaller(float a, float b) { return a < b ? a : b; }
+float larger(float a, float b) { return a > b ? a : b; }
+
+void halve_depth(const float* depth, int width, int height, float tolerance, float* out) {
+  const int w = width / 2, h = height / 2;
+  const float missing = 1e30f, reach = 1.0f + tolerance;
+  for (int y = 0; y < h; ++y) {
+    const float* upper = depth + static_cast<std::int64_t>(2 * y) * width;
+    const float* lower = upper + width;
+    float* row = out + static_cast<std::int64_t>(y) * w;
+    for (int x = 0; x < w; ++x) {
+      const float a = upper[2 * x], b = upper[2 * x + 1], c = lower[2 * x], d = lower[2 * x + 1];
+      const float nearest = smaller(smaller(a > 0 ? a : missing, b > 0 ? b : missing),
+                                    smaller(c > 0 ? c : missing, d > 0 ? d : missing));
+      const float limit = nearest * reach;
+      const float wa = (a > 0) & (a <= limit) ? 1.0f : 0.0f;
+      const float wb = (b > 0) & (b <= limit) ? 1.0f : 0.0f;
+      const float wc = (c > 0) & (c <= limit) ? 1.0f : 0.0f;
+      const float wd = (d > 0) & (d <= limit) ? 1.0f : 0.0f;
+      row[x] = (wa * a + wb * b + wc * c + wd * d) / larger(wa + wb + wc + wd, 1.0f);
+    }
+  }
+}
+
+void pack(const float* image, const float* depth, int width, int height, float* out) {
+  std::memset(out, 0, sizeof(float) * kTexelSize * width * height);
+  for (int y = 0; y < height; ++y) {
+    const std::int64_t start = static_cast<std::int64_t>(y) * width;
+    const bool inside = y > 0 && y + 1 < height;
+    for (int x = 0; x < width; ++x) {
+      const std::int64_t i = start + x;
+      float* texel = out + kTexelSize * i;
+      texel[kIntensity] = image[i];
+      texel[kDepth] = depth[i];
+      if (inside && x > 0 && x + 1 < width) {
+        texel[kGradientU] = 0.5f * (image[i + 1] - image[i - 1]);
+        texel[kGradientV] = 0.5f * (image[i + width] - image[i - width]);
+      }
+    }
+  }
+}
+
+// The neighbours of a pixel lie on its surface when their depth differs by less than this.
+float surface_step(float depth, int radius) { return 0.015f * radius * depth + 0.01f; }
+
+bool on_surface(float depth, float neighbour, float step) {
+  return neighbour > 0 && std::fabs(neighbour - depth) <= step;
+}
+
+void normals(const float* depth, int width, int height, const Pinhole& camera, int radius,
+             float* out) {
+  std::memset(out, 0, sizeof(float) * 3 * width * height);
+  const float ifx = 1.0f / camera.fx, ify = 1.0f / camera.fy;
+  for (int y = radius; y < height - radius; ++y) {
+    for (int x = radius; x < width - radius; ++x) {
+      const std::int64_t i = static_cast<std::int64_t>(y) * width + x;
+      const float z = depth[i], left = depth[i - radius], right = depth[i + radius];
+      const float up = depth[i - static_cast<std::int64_t>(radius) * width];
+      const float down = depth[i + static_cast<std::int64_t>(radius) * width];
+      const float step = surface_step(z, radius);
+      if (z <= 0 || !on_surface(z, left, step) || !on_surface(z, right, step) ||
+          !on_surface(z, up, step) || !on_surface(z, down, step))
+        continue;
+      const float rx = (x - camera.cx) * ifx, ry = (y - camera.cy) * ify;
+      const float az = right - left, bz = down - up;  // a: along u, b: along v
+      const float ax = rx * az + radius * ifx * (right + left), ay = ry * az;
+      const float bx = rx * bz, by = ry * bz + radius * ify * (down + up);
+      const float nx = ay * bz - az * by, ny = az * bx - ax * bz, nz = ax * by - ay * bx;
+      const float length = std::sqrt(nx * nx + ny * ny + nz * nz);
+      if (!(length > 0)) continue;
+      const float scale = (nx * rx + ny * ry + nz > 0 ? -1.0f : 1.0f) / length;
+      out[3 * i] = nx * scale, out[3 * i + 1] = ny * scale, out[3 * i + 2] = nz * scale;
+    }
+  }
+}
+
+std::int64_t points(const float* texels, const float* normals, int width, int height,
+                    const Pinhole& camera, float max_depth, std::int64_t capacity, float* points) {
+  const float ifx = 1.0f / camera.fx, ify = 1.0f / camera.fy;
+  std::int64_t n = 0;
+  for (int y = 1; y < height - 1; ++y) {
+    for (int x = 1; x < width - 1; ++x) {
+      const std::int64_t i = static_cast<std::int64_t>(y) * width + x;
+      const float z = texels[kTexelSize * i + kDepth];
+      if (!(z > kNearest && z <= max_depth)) continue;
+      points[kX * capacity + n] = (x - camera.cx) * ifx * z;
+      points[kY * capacity + n] = (y - camera.cy) * ify * z;
+      points[kZ * capacity + n] = z;
+      points[kShade * capacity + n] = texels[kTexelSize * i + kIntensity];
+      for (int k = 0; k < 3; ++k) points[(kNormalX + k) * capacity + n] = normals[3 * i + k];
+      ++n;
+    }
+  }
+  return n;
+}
+
+// What one block of points needs between the steps; rows of kBlock floats.
+struct alignas(64) Block {
+  float point[kPointRows][kBlock];        // reference frame, as stored
+  float x[kBlock], y[kBlock], z[kBlock];  // target camera frame
+  float du[kBlock], dv[kBlock];           // fractions of the bilinear sample
+  int corner[kBlock], nearest[kBlock];    // texel indices
+  float column[kBlock], row[kBlock];      // the nearest pixel
+  float visible[kBlock];
+  float intensity[kBlock], gradient_u[kBlock], gradient_v[kBlock], depth[kBlock];
+  // sqrt(w) [J | r] of the photometric observations, then of the geometric ones.
+  float rows[kUnknowns + 1][2 * kBlock];
+  float photometric[3][kBlock], geometric[3][kBlock];  // used, inlier, w (r/sigma)^2
+};
+
+void load(const Problem& p, std::int64_t first, Block& b) {
+  const std::int64_t left = p.count - first;
+  const int n = left < kBlock ? static_cast<int>(left) : kBlock;
+  for (int k = 0; k < kPointRows; ++k) {
+    std::memcpy(b.point[k], p.points + k * p.count + first, sizeof(float) * n);
+    if (n < kBlock) std::memset(b.point[k] + n, 0, sizeof(float) * (kBlock - n));
+  }
+}
+
+void project(const Problem& p, Block& b) {
+  const float* T = p.T_camera_reference;
+  const float right = p.width - 2.0f, bottom = p.height - 2.0f;
+  for (int i = 0; i < kBlock; ++i) {
+    const float X = b.point[kX][i], Y = b.point[kY][i], Z = b.point[kZ][i];
+    const float x = T[0] * X + T[1] * Y + T[2] * Z + T[3];
+    const float y = T[4] * X + T[5] * Y + T[6] * Z + T[7];
+    const float z = T[8] * X + T[9] * Y + T[10] * Z + T[11];
+    const bool in_front = (Z > 0) & (z > kNearest);
+    const float inverse = 1.0f / (in_front ? z : 1.0f);
+    const float u = p.camera.fx * x * inverse + p.camera.cx;
+    const float v = p.camera.fy * y * inverse + p.camera.cy;
+    const bool inside = in_front & (u >= 1.0f) & (v >= 1.0f) & (u < right) & (v < bottom);
+    const float su = inside ? u : 1.0f, sv = inside ? v : 1.0f;
+    const int iu = static_cast<int>(su), iv = static_cast<int>(sv);
+    const int nu = static_cast<int>(su + 0.5f), nv = static_cast<int>(sv + 0.5f);
+    b.x[i] = x, b.y[i] = y, b.z[i] = in_front ? z : 1.0f;
+    b.du[i] = su - iu, b.dv[i] = sv - iv;
+    b.corner[i] = iv * p.width + iu, b.nearest[i] = nv * p.width + nu;
+    b.column[i] = static_cast<float>(nu), b.row[i] = static_cast<float>(nv);
+    b.visible[i] = inside ? 1.0f : 0.0f;
+  }
+}
+
+void sample(const Problem& p, Block& b) {
+  const std::int64_t below = static_cast<std::int64_t>(kTexelSize) * p.width;
+  for (int i = 0; i < kBlock; ++i) {
+    const float* a = p.target + static_cast<std::int64_t>(kTexelSize) * b.corner[i];
+    const float* c = a + below;
+    const float du = b.du[i], dv = b.dv[i];
+    float mixed[kTexelSize];
+    for (int k = 0; k < kTexelSize; ++k) {
+      const float upper = a[k] + du * (a[k + kTexelSize] - a[k]);
+      const float lower = c[k] + du * (c[k + kTexelSize] - c[k]);
+      mixed[k] = upper + dv * (lower - upper);
+    }
+    b.intensity[i] = mixed[kIntensity];
+    b.gradient_u[i] = mixed[kGradientU];
+    b.gradient_v[i] = mixed[kGradientV];
+    b.depth[i] = p.target[static_cast<std::int64_t>(kTexelSize) * b.nearest[i] + kDepth];
+  }
+}
+
+float robust_weight(float square) { return (kDegrees + 1.0f) / (kDegrees + square); }
+
+// r = I(project(p)) - gain * shade - bias;  dp = skew(p) omega - v under T_reference_camera exp(xi)
+void weigh_photometric(const Problem& p, Block& b) {
+  const float inverse_sigma = 1.0f / p.intensity_sigma;
+  for (int i = 0; i < kBlock; ++i) {
+    const float x = b.x[i], y = b.y[i], z = b.z[i], inverse = 1.0f / z, seen = b.depth[i];
+    const bool hidden = (seen > 0) & (z > seen * (1.0f + p.occlusion));
+    const float used = hidden ? 0.0f : b.visible[i];
+    b.visible[i] = used;
+    const float gx = b.gradient_u[i] * p.camera.fx * inverse;
+    const float gy = b.gradient_v[i] * p.camera.fy * inverse;
+    const float gz = -(gx * x + gy * y) * inverse;
+    const float shade = b.point[kShade][i];
+    const float r = b.intensity[i] - p.gain * shade - p.bias;
+    const float normalised = r * inverse_sigma, square = normalised * normalised;
+    const float weight = robust_weight(square);
+    const float s = used * std::sqrt(weight) * inverse_sigma;
+    b.rows[0][i] = s * (gy * z - gz * y);
+    b.rows[1][i] = s * (gz * x - gx * z);
+    b.rows[2][i] = s * (gx * y - gy * x);
+    b.rows[3][i] = -s * gx;
+    b.rows[4][i] = -s * gy;
+    b.rows[5][i] = -s * gz;
+    b.rows[6][i] = -s * shade;
+    b.rows[7][i] = -s;
+    b.rows[8][i] = s * r;
+    b.photometric[0][i] = used;
+    b.photometric[1][i] = square < kInlierSigma * kInlierSigma ? used : 0.0f;
+    b.photometric[2][i] = used * weight * square;
+  }
+}
+
+// r = n . (p - q), n = R n_reference, q the target's surface at the nearest pixel.
+void weigh_geometric(const Problem& p, Block& b) {
+  const float* T = p.T_camera_reference;
+  const float ifx = 1.0f / p.camera.fx, ify = 1.0f / p.camera.fy;
+  for (int i = 0; i < kBlock; ++i) {
+    const float mx = b.point[kNormalX][i], my = b.point[kNormalY][i], mz = b.point[kNormalZ][i];
+    const float nx = T[0] * mx + T[1] * my + T[2] * mz;
+    const float ny = T[4] * mx + T[5] * my + T[6] * mz;
+    const float nz = T[8] * mx + T[9] * my + T[10] * mz;
+    const float z = b.depth[i];
+    const float qx = (b.column[i] - p.camera.cx) * ifx * z;
+    const float qy = (b.row[i] - p.camera.cy) * ify * z;
+    const float r = nx * (b.x[i] - qx) + ny * (b.y[i] - qy) + nz * (b.z[i] - z);
+    const bool has_normal = nx * nx + ny * ny + nz * nz > 0.5f;
+    const bool paired = (z > 0) & has_normal & (std::fabs(b.z[i] - z) < p.gate * b.z[i]);
+    const float used = paired ? b.visible[i] : 0.0f;
+    const float beyond = b.z[i] - p.noise.nearest;
+    const float sigma = p.depth_noise_scale * (p.noise.floor + p.noise.growth * beyond * beyond);
+    const float inverse_sigma = 1.0f / sigma;
+    const float normalised = r * inverse_sigma, square = normalised * normalised;
+    const float weight = robust_weight(square);
+    const float s = used * std::sqrt(weight) * inverse_sigma;
+    const int j = kBlock + i;
+    b.rows[0][j] = s * (ny * z - nz * qy);
+    b.rows[1][j] = s * (nz * qx - nx * z);
+    b.rows[2][j] = s * (nx * qy - ny * qx);
+    b.rows[3][j] = -s * nx;
+    b.rows[4][j] = -s * ny;
+    b.rows[5][j] = -s * nz;
+    b.rows[8][j] = s * r;
+    b.geometric[0][i] = used;
+    b.geometric[1][i] = square < kInlierSigma * kInlierSigma ? used : 0.0f;
+    b.geometric[2][i] = used * weight * square;
+  }
+}
+
+// Lanes are added pairwise in a fixed order, whatever the width of the machine's vectors.
+float folded(float* lanes) {
+  for (int half = kLanes / 2; half > 0; half /= 2)
+    for (int l = 0; l < half; ++l) lanes[l] += lanes[l + half];
+  return lanes[0];
+}
+
+double dot(const float* a, const float* b, int n) {
+  float lanes[kLanes] = {};
+  for (int i = 0; i < n; i += kLanes)
+    for (int l = 0; l < kLanes; ++l) lanes[l] += a[i + l] * b[i + l];
+  return folded(lanes);
+}
+
+double sum(const float* a) {
+  float lanes[kLanes] = {};
+  for (int i = 0; i < kBlock; i += kLanes)
+    for (int l = 0; l < kLanes; ++l) lanes[l] += a[i + l];
+  return folded(lanes);
+}
+
+void accumulate(const Block& b, Equations& e) {
+  for (int r = 0; r < kUnknowns; ++r) {
+    for (int c = r; c <= kUnknowns; ++c) {
+      const bool affine = r >= 6 || c == 6 || c == 7;  // gain and bias: photometric only
+      const double value = dot(b.rows[r], b.rows[c], affine ? kBlock : 2 * kBlock);
+      if (c == kUnknowns)
+        e.gradient[r] += value;
+      else
+        e.hessian[r * kUnknowns + c] += value;
+    }
+  }
+  e.visible += sum(b.visible);
+  e.photometric_count += sum(b.photometric[0]);
+  e.photometric_inliers += sum(b.photometric[1]);
+  e.photometric_square += sum(b.photometric[2]);
+  e.geometric_count += sum(b.geometric[0]);
+  e.geometric_inliers += sum(b.geometric[1]);
+  e.geometric_square += sum(b.geometric[2]);
+}
+
+Equations normal_equations(const Problem& problem) {
+  Equations e{};
+  Block block;
+  for (std::int64_t first = 0; first < problem.count; first += kBlock) {
+    load(problem, first, block);
+    project(problem, block);
+    sample(problem, block);
+    weigh_photometric(problem, block);
+    weigh_geometric(problem, block);
+    accumulate(block, e);
+  }
+  for (int r = 0; r < kUnknowns; ++r)
+    for (int c = 0; c < r; ++c) e.hessian[r * kUnknowns + c] = e.hessian[c * kUnknowns + r];
+  return e;
+}
+
+}  // namespace
+
+const Kernels& LDO_ISA() {
+  static const Kernels kernels{halve_depth, pack, normals, points, normal_equations};
+  return kernels;
+}
+
+}  // namespace ldo::align

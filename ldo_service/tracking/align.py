@@ -1,0 +1,171 @@
+"""Coarse-to-fine direct alignment of an RGB-D frame to a reference. `ldo_service.geometry`."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+
+from .equations import Appearance, Equations, ResidualConfig, Term, normal_equations
+from .pyramid import Level, Pyramid
+from .reference import Reference
+
+POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
+BRIGHTNESS_PRIOR = np.array([1e3, 0.1])  # inverse variances: gain within 3 %, bias within 3 levels
+
+
+@dataclass(frozen=True, slots=True)
+class AlignConfig:
+    residuals: ResidualConfig = ResidualConfig()
+    start: Appearance = Appearance()
+    iterations: tuple[int, ...] = (8, 8, 10, 10)  # at most, per level, the finest first
+    stop_px: float = 0.02  # image motion of the last step, at the level's resolution
+    largest_step: float = 0.15  # rad, and fraction of the median depth: one step's limit
+    damping: float = 1e-6  # of the diagonal: directions that nothing observes stay put
+    least_intensity_sigma: float = 1.0  # grey levels: rounding and interpolation
+    least_depth_noise_scale: float = 0.2  # 0.24 mm at the noise floor: rounding to millimetres
+    independent_fraction: float = 2e-3  # neighbouring residuals share their errors; see README
+
+    def __post_init__(self) -> None:
+        if not self.iterations or min(self.iterations) < 1:
+            raise ConfigError(f"iterations={self.iterations}: at least 1 for each level.")
+        if min(self.stop_px, self.largest_step, self.independent_fraction) <= 0:
+            raise ConfigError("stop_px, largest_step and independent_fraction must be positive.")
+        if min(self.least_intensity_sigma, self.least_depth_noise_scale) <= 0:
+            raise ConfigError("the least noise of intensity and depth must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Pose of a camera in its reference, and how far to trust it.
+
+    information is [6, 6] of T_reference_camera * exp(xi), rotation rad then translation m.
+    """
+
+    T_reference_camera: np.ndarray  # [4, 4]
+    information: np.ndarray
+    photometric_inliers: float  # fraction of the visible points within 3 sigma
+    geometric_inliers: float  # fraction of the paired points within 3 sigma
+    intensity_sigma: float  # grey levels
+    depth_noise_scale: float  # times the sensor model
+    overlap: float  # visible fraction of the reference points
+    paired: float  # fraction of the reference points that have a depth to compare with
+    gain: float
+    bias: float  # grey levels
+    iterations: int  # over all levels
+    converged: bool  # the last step on the finest level was below stop_px
+    condition: float  # of the information, translation in median depths; inf if singular
+
+    @property
+    def appearance(self) -> Appearance:
+        return Appearance(self.gain, self.bias, self.intensity_sigma, self.depth_noise_scale)
+
+
+def align(
+    reference: Reference,
+    frame: Pyramid,
+    T_camera_reference: np.ndarray,
+    config: AlignConfig,
+) -> Alignment:
+    """Minimise the residuals of `equations` by Gauss-Newton, from a guess [4, 4].
+
+    Noise of intensity and depth is estimated along the way (Kerl et al. 2013, equation 13), and
+    weighs colour against geometry. Deterministic: bitwise equal for equal input.
+    """
+    T, appearance = se3.orthonormalised(T_camera_reference), config.start
+    count, converged = 0, False
+    levels = min(len(reference.points), len(frame.levels))
+    for level in reversed(range(levels)):
+        points, target = reference.points[level], frame.levels[level]
+        for _ in range(config.iterations[min(level, len(config.iterations) - 1)]):
+            equations = normal_equations(points, target, T, appearance, config.residuals)
+            step = _step(equations, reference.median_depth_m, config)
+            T = se3.exp(-step[POSE]) @ T
+            appearance = _improved(appearance, step, equations, config)
+            count += 1
+            converged = _image_motion_px(step, target, reference) < config.stop_px
+            if converged:
+                break
+    return evaluate(reference, frame, T, appearance, config, count, converged)
+
+
+def evaluate(
+    reference: Reference,
+    frame: Pyramid,
+    T_camera_reference: np.ndarray,
+    appearance: Appearance,
+    config: AlignConfig,
+    iterations: int = 0,
+    converged: bool = True,
+) -> Alignment:
+    """The alignment that a pose [4, 4] and an appearance make, measured on the finest level."""
+    T = se3.orthonormalised(T_camera_reference)
+    points = reference.points[0]
+    e = normal_equations(points, frame.levels[0], T, appearance, config.residuals)
+    information = _pose_information(e) * config.independent_fraction
+    total = max(points.shape[1], 1)
+    return Alignment(
+        T_reference_camera=se3.inverse(T),
+        information=information,
+        photometric_inliers=e.photometric.inlier_fraction,
+        geometric_inliers=e.geometric.inlier_fraction,
+        intensity_sigma=appearance.intensity_sigma,
+        depth_noise_scale=appearance.depth_noise_scale,
+        overlap=e.visible / total,
+        paired=e.geometric.count / total,
+        gain=appearance.gain,
+        bias=appearance.bias,
+        iterations=iterations,
+        converged=converged,
+        condition=_condition(information, reference.median_depth_m),
+    )
+
+
+def _step(equations: Equations, median_depth_m: float, config: AlignConfig) -> np.ndarray:
+    hessian = equations.hessian.copy()
+    hessian[BRIGHTNESS, BRIGHTNESS] += np.diag(BRIGHTNESS_PRIOR)
+    hessian[np.diag_indices(8)] += config.damping * np.diag(hessian) + 1e-9
+    step = -np.linalg.solve(hessian, equations.gradient)
+    size = max(np.linalg.norm(step[:3]), np.linalg.norm(step[3:6]) / median_depth_m)
+    if size > config.largest_step:
+        step[POSE] *= config.largest_step / size
+    return step
+
+
+def _improved(
+    appearance: Appearance, step: np.ndarray, equations: Equations, config: AlignConfig
+) -> Appearance:
+    sigma = _rescaled(appearance.intensity_sigma, equations.photometric)
+    scale = _rescaled(appearance.depth_noise_scale, equations.geometric)
+    return replace(
+        appearance,
+        gain=appearance.gain + float(step[6]),
+        bias=appearance.bias + float(step[7]),
+        intensity_sigma=max(sigma, config.least_intensity_sigma),
+        depth_noise_scale=max(scale, config.least_depth_noise_scale),
+    )
+
+
+def _rescaled(sigma: float, term: Term) -> float:
+    return sigma * (term.square / term.count) ** 0.5 if term.count else sigma
+
+
+def _image_motion_px(step: np.ndarray, target: Level, reference: Reference) -> float:
+    angle = np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / reference.median_depth_m
+    return float(angle * target.camera.fx)
+
+
+def _pose_information(equations: Equations) -> np.ndarray:
+    """The pose's part, gain and bias marginalised (Schur complement)."""
+    hessian = equations.hessian
+    brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
+    cross = hessian[POSE, BRIGHTNESS]
+    return hessian[POSE, POSE] - cross @ np.linalg.solve(brightness, cross.T)
+
+
+def _condition(information: np.ndarray, median_depth_m: float) -> float:
+    units = np.repeat([1.0, median_depth_m], 3)
+    eigenvalues = np.linalg.eigvalsh(information * np.outer(units, units))
+    smallest, largest = eigenvalues[0], eigenvalues[-1]
+    return float(largest / smallest) if smallest > 1e-12 * largest > 0 else float("inf")

@@ -1,0 +1,102 @@
+"""Whether an alignment is right: independent signs, compared with the recent past.
+
+Inlier fractions do not see a wrong local minimum, whose inflated noise estimate makes everything
+an inlier. So an alignment is judged by what it cannot fake: how much of the surface it shows
+again, its noise against the running median, the condition of its information, and whether
+features found the same pose.
+"""
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from statistics import median
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+
+from .align import Alignment
+
+
+class Status(StrEnum):
+    OK = "OK"
+    WEAK = "WEAK"  # a pose, but nothing to build a map on
+    LOST = "LOST"  # no pose
+
+
+@dataclass(frozen=True, slots=True)
+class JudgementConfig:
+    min_overlap: float = 0.25  # visible reference points; below, less than half is lost: WEAK
+    min_paired: float = 0.1  # of the reference points met by a depth: below, colour is alone
+    max_condition: float = 1e5  # of the information in median depths
+    max_gain: float = 2.0  # exposure changes more slowly than this
+    weak_residual: float = 2.5  # times the running median
+    lost_residual: float = 5.0  # times the running median: never accepted
+    lost_overlap: float = 0.1
+    least_intensity_sigma: float = 2.0  # grey levels: what any camera has, for the comparison
+    least_depth_noise_scale: float = 0.5
+    recovery_margin: float = 0.8  # limits are this much stricter until a frame is OK again
+    history: int = 30  # frames of the running median: a second
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lost_overlap <= self.min_overlap <= 1:
+            raise ConfigError("overlaps must be ordered 0 <= lost_overlap <= min_overlap <= 1.")
+        if not 1 < self.weak_residual <= self.lost_residual:
+            raise ConfigError("residual limits must be ordered 1 < weak <= lost.")
+        if not 0 < self.recovery_margin <= 1 or self.history < 1:
+            raise ConfigError("recovery_margin must be within 0..1 and history at least 1.")
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """Noise of the last trusted frames."""
+
+    intensity_sigmas: tuple[float, ...] = ()
+    depth_noise_scales: tuple[float, ...] = ()
+
+    def extended(self, alignment: Alignment, config: JudgementConfig) -> "History":
+        keep = config.history - 1
+        return History(
+            (*self.intensity_sigmas[-keep:], alignment.intensity_sigma),
+            (*self.depth_noise_scales[-keep:], alignment.depth_noise_scale),
+        )
+
+    def residual_ratio(self, alignment: Alignment, config: JudgementConfig) -> float:
+        """The alignment's noise over its running median, the larger of colour and depth; 1 if
+        there is no past."""
+        if not self.intensity_sigmas:
+            return 1.0
+        intensity = max(median(self.intensity_sigmas), config.least_intensity_sigma)
+        depth = max(median(self.depth_noise_scales), config.least_depth_noise_scale)
+        return max(alignment.intensity_sigma / intensity, alignment.depth_noise_scale / depth)
+
+
+def judge(
+    alignment: Alignment,
+    features_agree: bool | None,
+    history: History,
+    previous: Status,
+    config: JudgementConfig,
+) -> Status:
+    """The status of an alignment; `features_agree` is None where features were not asked."""
+    ratio = history.residual_ratio(alignment, config)
+    if ratio > config.lost_residual or alignment.overlap < config.lost_overlap:
+        return Status.LOST
+    margin = 1.0 if previous is Status.OK else config.recovery_margin
+    plausible = (
+        alignment.overlap * margin >= config.min_overlap
+        and alignment.paired * margin >= config.min_paired
+        and alignment.condition <= config.max_condition * margin
+        and abs(np.log(max(alignment.gain, 1e-6))) <= np.log(config.max_gain) * margin
+        and ratio <= config.weak_residual * margin
+        and features_agree is not False
+    )
+    return Status.OK if plausible else Status.WEAK
+
+
+def strict(config: JudgementConfig) -> JudgementConfig:
+    """The limits for a relocalisation, which has no prediction to speak for it."""
+    return replace(
+        config,
+        min_overlap=max(config.min_overlap, 0.35),
+        weak_residual=min(config.weak_residual, 1.6),
+    )

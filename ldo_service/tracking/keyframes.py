@@ -1,0 +1,70 @@
+"""When a frame becomes a keyframe, and what is kept of it. Conventions: `ldo_service.geometry`."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import radians
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+
+from .features import FeatureConfig, Features, detect
+from .pyramid import Pyramid
+from .reference import Reference, build_reference
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeConfig:
+    min_overlap: float = 0.85  # of the visible surface: below, new surface is worth mapping
+    max_rotation_rad: float = radians(15.0)
+    max_translation: float = 0.08  # of the median depth
+    min_frames: int = 2  # at most every 2nd frame
+    max_frames: int = 30  # at least every 30th
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_overlap <= 1:
+            raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
+        if not 1 <= self.min_frames <= self.max_frames:
+            raise ConfigError(
+                f"min_frames={self.min_frames} must be at least 1 and at most "
+                f"max_frames={self.max_frames}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """A frame that others are aligned to."""
+
+    view: Pyramid
+    T_odom_keyframe: np.ndarray  # [4, 4]
+    index: int  # `RgbdFrame.index`
+
+    @cached_property
+    def reference(self) -> Reference:
+        return build_reference(self.view)
+
+    def features(self, config: FeatureConfig) -> Features:
+        """Detected when first asked for: most keyframes never are."""
+        if "_features" not in self.__dict__:
+            self.__dict__["_features"] = detect(self.view, config)
+        return self.__dict__["_features"]
+
+
+def is_due(
+    T_keyframe_camera: np.ndarray,
+    overlap: float,
+    median_depth_m: float,
+    frames: int,
+    config: KeyframeConfig,
+) -> bool:
+    """Whether a view has left its keyframe far enough, `frames` frames after it."""
+    if frames < config.min_frames:
+        return False
+    translation = np.linalg.norm(T_keyframe_camera[:3, 3]) / median_depth_m
+    return bool(
+        frames >= config.max_frames
+        or overlap < config.min_overlap
+        or translation > config.max_translation
+        or se3.rotation_angle(T_keyframe_camera) > config.max_rotation_rad
+    )

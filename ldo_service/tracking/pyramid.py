@@ -1,0 +1,102 @@
+"""Image and depth pyramids with one definition of pixel centres: `Camera.halved`.
+
+Colour and depth are halved by averaging 2x2 blocks, so a pixel of the coarse image is centred on
+the corner that its four parents share. (`cv2.pyrDown` centres it on one of them; that half pixel
+doubles the trajectory's error.)
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, RgbdFrame
+from ldo_service.kernels import _align
+
+Intrinsics = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PyramidConfig:
+    working_width_px: int = 320  # finest level: halved until below 1.5 times this
+    levels: int = 4  # 320, 160, 80, 40 pixels wide
+    smallest_side_px: int = 12  # coarser images hold too few pixels to align
+    depth_tolerance: float = 0.03  # relative; blocks across an edge keep the nearer surface
+
+    def __post_init__(self) -> None:
+        if min(self.working_width_px, self.levels, self.smallest_side_px) < 1:
+            raise ConfigError("working_width_px, levels and smallest_side_px must be at least 1.")
+        if not 0 < self.depth_tolerance < 1:
+            raise ConfigError(f"depth_tolerance={self.depth_tolerance:g} must be within 0..1.")
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """texels [H, W, 4] float32: grey level, its gradients along u and v per pixel, depth in m."""
+
+    texels: np.ndarray
+    camera: Camera
+
+    @property
+    def depth_m(self) -> np.ndarray:
+        return self.texels[..., 3]
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        return intrinsics(self.camera)
+
+
+@dataclass(frozen=True, slots=True)
+class Pyramid:
+    """A frame ready for alignment: its grey image and depth, and `levels`, the finest first.
+
+    gray [H, W] uint8; depth_m [H, W] float32.
+    """
+
+    gray: np.ndarray
+    depth_m: np.ndarray
+    camera: Camera
+    levels: tuple[Level, ...]
+
+
+def intrinsics(camera: Camera) -> Intrinsics:
+    return camera.fx, camera.fy, camera.cx, camera.cy
+
+
+def halved_image(image: np.ndarray) -> np.ndarray:
+    """Means [H//2, W//2] float32 of the 2x2 blocks of an image [H, W] float32."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    even = image[: 2 * height, : 2 * width]
+    return cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
+    """Means [H//2, W//2] of 2x2 blocks, over the pixels within `tolerance` of the nearest one."""
+    return _align.halve_depth(depth_m, tolerance)
+
+
+def build_pyramid(
+    gray: np.ndarray, depth_m: np.ndarray, camera: Camera, config: PyramidConfig
+) -> Pyramid:
+    """The pyramid of an image [H, W] uint8 and its depth [H, W] float32."""
+    image, depth, scaled = gray.astype(np.float32), np.ascontiguousarray(depth_m), camera
+    levels: list[Level] = []
+    while True:
+        if scaled.width < 1.5 * config.working_width_px:
+            levels.append(Level(_align.pack(image, depth), scaled))
+        smallest = min(scaled.width, scaled.height) // 2
+        if len(levels) == config.levels or smallest < config.smallest_side_px:
+            break
+        image, depth = halved_image(image), halved_depth(depth, config.depth_tolerance)
+        scaled = scaled.halved()
+    if not levels:  # a strip: wide, and too low to be halved
+        levels.append(Level(_align.pack(image, depth), scaled))
+    return Pyramid(gray, depth_m, camera, tuple(levels))
+
+
+def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
+    """The pyramid of a frame's luminance and depth."""
+    return build_pyramid(
+        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m, frame.camera, config
+    )

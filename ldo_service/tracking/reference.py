@@ -1,0 +1,41 @@
+"""What a frame is aligned to: the surface points of a keyframe. `ldo_service.geometry`."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ldo_service.kernels import _align
+
+from .pyramid import Level, Pyramid
+
+MAX_DEPTH_M = 30.0  # beyond, no depth camera measures; a stray 65 m must not set the scale
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Points [7, N] float32 of each level, the finest first.
+
+    Rows: x y z in m in the reference camera, grey level, and a normal (0 0 0 where none).
+    `median_depth_m` is the scale of the scene, 1 where nothing was measured.
+    """
+
+    points: tuple[np.ndarray, ...]
+    median_depth_m: float
+
+    @property
+    def is_empty(self) -> bool:
+        return self.points[0].shape[1] == 0
+
+
+def build_reference(pyramid: Pyramid) -> Reference:
+    points = tuple(_level_points(level, i) for i, level in enumerate(pyramid.levels))
+    depth_m = points[0][2]
+    return Reference(points, float(np.median(depth_m)) if depth_m.size else 1.0)
+
+
+def _level_points(level: Level, index: int) -> np.ndarray:
+    smooth = cv2.medianBlur(np.ascontiguousarray(level.depth_m), 3)
+    radius_px = max(1, 3 - index)  # about the same angle on every level
+    normals = _align.normals(smooth, level.intrinsics, radius_px)
+    return _align.points(level.texels, normals, level.intrinsics, MAX_DEPTH_M)
