@@ -5,17 +5,31 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
 from .align import AlignConfig, Alignment, align, evaluate
+from .features import FeaturePose
 from .keyframes import Keyframe
 from .motion import extent
 from .pyramid import Pyramid
 
+COLOUR_ALONE = 0.05  # weight of points without a depth to compare with, against points with one
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateConfig:
+    agreement_rad: float = 0.06  # features against direct: 3 x the median error of ORB-PnP poses
+    rival_support: float = 0.5  # of the best: a feature pose with less is refuted by the images
+
+    def __post_init__(self) -> None:
+        if not (self.agreement_rad > 0 and 0 < self.rival_support <= 1):
+            raise ConfigError("agreement_rad must be positive, rival_support within 0..1.")
+
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """`features_agree` is None where no feature pose was there to compare with."""
+    """`features_agree` is None where no feature pose spoke, or the images refute it."""
 
     alignment: Alignment
     method: str  # "direct" from a motion guess, "features" from ORB
@@ -34,34 +48,55 @@ def attempt(
     return Candidate(align(keyframe.reference, view, guess, config), method)
 
 
-def best(
-    candidates: Sequence[Candidate], keyframe: Keyframe, view: Pyramid, config: AlignConfig
-) -> Candidate:
-    """The candidate that explains most of the reference at the least noise among them all.
+def support(
+    candidate: Candidate,
+    others: Sequence[Candidate],
+    keyframe: Keyframe,
+    view: Pyramid,
+    config: AlignConfig,
+) -> float:
+    """How much of the reference a candidate explains at the least noise among the others, 0..1.
 
     Each estimated its own noise, and a wrong pose excuses itself with a large one: so all are
-    measured again with the smallest. The first wins a tie.
+    measured again with the smallest. Depth counts; colour alone counts little.
     """
-    if len(candidates) == 1:
-        return candidates[0]
-    intensity_sigma = min(c.alignment.intensity_sigma for c in candidates)
-    depth_noise_scale = min(c.alignment.depth_noise_scale for c in candidates)
-
-    def support(candidate: Candidate) -> float:
-        own = candidate.alignment
-        common = replace(
-            own.appearance, intensity_sigma=intensity_sigma, depth_noise_scale=depth_noise_scale
-        )
-        T_camera_keyframe = se3.inverse(own.T_reference_camera)
-        seen = evaluate(keyframe.reference, view, T_camera_keyframe, common, config)
-        return seen.photometric_inliers * (0.05 * seen.overlap + seen.geometric_inliers * seen.paired)
-
-    return max(candidates, key=support)
+    own = candidate.alignment
+    common = replace(
+        own.appearance,
+        intensity_sigma=min(c.alignment.intensity_sigma for c in others),
+        depth_noise_scale=min(c.alignment.depth_noise_scale for c in others),
+    )
+    T_camera_keyframe = se3.inverse(own.T_reference_camera)
+    seen = evaluate(keyframe.reference, view, T_camera_keyframe, common, config)
+    return seen.photometric_inliers * (
+        COLOUR_ALONE * seen.overlap + seen.geometric_inliers * seen.paired
+    )
 
 
-def compared(
-    candidate: Candidate, T_keyframe_camera: np.ndarray, median_depth_m: float, tolerance: float
+def best(
+    candidates: Sequence[Candidate],
+    features: FeaturePose | None,
+    keyframe: Keyframe,
+    view: Pyramid,
+    config: CandidateConfig,
+    align_config: AlignConfig,
 ) -> Candidate:
-    """The candidate with the verdict of a feature pose: within `tolerance` (rad) or not."""
-    difference = se3.inverse(candidate.alignment.T_reference_camera) @ T_keyframe_camera
-    return replace(candidate, features_agree=extent(difference, median_depth_m) < tolerance)
+    """The candidate with the most support, told whether the features are with it.
+
+    `candidates` holds the one that started at `features`, if any, last.
+    """
+    supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
+    chosen = candidates[int(np.argmax(supports))]
+    if features is None:
+        return chosen
+    median_depth_m = keyframe.reference.median_depth_m
+
+    def is_near(T_keyframe_camera: np.ndarray) -> bool:
+        difference = se3.inverse(chosen.alignment.T_reference_camera) @ T_keyframe_camera
+        return extent(difference, median_depth_m) < config.agreement_rad
+
+    refined = candidates[-1].alignment.T_reference_camera
+    if is_near(se3.inverse(features.T_camera_reference)) or is_near(refined):
+        return replace(chosen, features_agree=True)
+    rivals = supports[-1] > config.rival_support * max(supports)
+    return replace(chosen, features_agree=False if rivals else None)

@@ -10,7 +10,7 @@ weighted by a t-distribution with 5 degrees of freedom, w = 6 / (5 + (r / sigma)
 rotation and translation of T_reference_camera * exp(xi), then gain and bias.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -26,7 +26,7 @@ INLIER_SIGMA = 3.0
 
 @dataclass(frozen=True, slots=True)
 class ResidualConfig:
-    noise: DepthNoise = DepthNoise()
+    noise: DepthNoise = field(default_factory=DepthNoise)
     gate: float = 0.1  # relative depth difference beyond which points are no pair
     occlusion: float = 0.08  # relative; a point this far behind the surface is hidden
 

@@ -25,15 +25,17 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class JudgementConfig:
-    min_overlap: float = 0.25  # visible reference points; below, less than half is lost: WEAK
-    min_paired: float = 0.1  # of the reference points met by a depth: below, colour is alone
+    min_overlap: float = 0.15  # visible reference points; smaller overlaps were right, but few
+    min_paired: float = 0.05  # of the reference points met by a depth: below, colour is alone
     max_condition: float = 1e5  # of the information in median depths
     max_gain: float = 2.0  # exposure changes more slowly than this
     weak_residual: float = 2.5  # times the running median
     lost_residual: float = 5.0  # times the running median: never accepted
-    lost_overlap: float = 0.1
+    lost_overlap: float = 0.08
     least_intensity_sigma: float = 2.0  # grey levels: what any camera has, for the comparison
     least_depth_noise_scale: float = 0.5
+    relocalised_overlap: float = 0.35  # a place recognised without a prediction must show more,
+    relocalised_residual: float = 1.6  # and fit better: 23 of 23 accepted by these were right
     recovery_margin: float = 0.8  # limits are this much stricter until a frame is OK again
     history: int = 30  # frames of the running median: a second
 
@@ -97,6 +99,6 @@ def strict(config: JudgementConfig) -> JudgementConfig:
     """The limits for a relocalisation, which has no prediction to speak for it."""
     return replace(
         config,
-        min_overlap=max(config.min_overlap, 0.35),
-        weak_residual=min(config.weak_residual, 1.6),
+        min_overlap=max(config.min_overlap, config.relocalised_overlap),
+        weak_residual=min(config.weak_residual, config.relocalised_residual),
     )

@@ -20,33 +20,31 @@ from ldo_service.geometry import RgbdFrame, se3
 
 from . import snapshot
 from .align import AlignConfig, Alignment
-from .candidates import Candidate, attempt, best, compared
-from .features import FeatureConfig, FeaturePose, Features, detect, estimate_pose
-from .judgement import History, JudgementConfig, Status, judge, strict
+from .candidates import Candidate, CandidateConfig, attempt, best
+from .features import FeatureConfig, detect, estimate_pose
+from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due
 from .motion import Motion, extent
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
+from .relocalisation import RelocalisationConfig, relocalise
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryConfig:
-    pyramid: PyramidConfig = PyramidConfig()
-    align: AlignConfig = AlignConfig()
-    features: FeatureConfig = FeatureConfig()
-    keyframes: KeyframeConfig = KeyframeConfig()
-    judgement: JudgementConfig = JudgementConfig()
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
+    judgement: JudgementConfig = field(default_factory=JudgementConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
-    agreement_rad: float = 0.06  # features against direct: 3 x the median error of ORB-PnP poses
-    memory: int = 8  # keyframes kept for relocalisation; older places are the loop closer's
-    relocalisation_attempts: int = 2  # direct alignments per lost frame, the best PnP poses first
 
     def __post_init__(self) -> None:
-        if self.memory < 1 or self.relocalisation_attempts < 1:
-            raise ConfigError("memory and relocalisation_attempts must be at least 1.")
-        if not (self.large_motion > 0 and self.agreement_rad > 0):
-            raise ConfigError("large_motion and agreement_rad must be positive.")
+        if not self.large_motion > 0:
+            raise ConfigError(f"large_motion={self.large_motion:g} must be positive.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +100,7 @@ class Odometry:
     def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> None:
         """Track against this frame, the one just tracked, from now on."""
         self._keyframe = Keyframe(self._viewed(frame), tracked.T_odom_camera, frame.index)
-        self._memory = (*self._memory, self._keyframe)[-self.config.memory :]
+        self._memory = (*self._memory, self._keyframe)[-self.config.relocalisation.memory :]
         self._frames_since_keyframe = 0
 
     def state(self) -> dict[str, Any]:
@@ -146,25 +144,11 @@ class Odometry:
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
         predicted = T_keyframe_odom @ self._motion.predicted(frame.stamp_ns)
         resting = T_keyframe_odom @ self._motion.T_odom_camera
-        candidate = attempt(keyframe, view, predicted, "direct", self.config.align)
+        candidate = self._attempted(view, predicted)
         status = self._judged(candidate)
         if status is Status.OK and not self._is_large(candidate, resting, view):
             return candidate, status
-        candidates = [candidate, attempt(keyframe, view, resting, "direct", self.config.align)]
-        pose = self._feature_pose(keyframe, detect(view, self.config.features), view)
-        if pose is None:
-            candidate = self._best(candidates, view)
-            return candidate, self._judged(candidate)
-        T_keyframe_camera = se3.inverse(pose.T_camera_reference)
-        candidates.append(
-            attempt(keyframe, view, T_keyframe_camera, "features", self.config.align)
-        )
-        candidate = compared(
-            self._best(candidates, view),
-            T_keyframe_camera,
-            keyframe.reference.median_depth_m,
-            self.config.agreement_rad,
-        )
+        candidate = self._best([candidate, self._attempted(view, resting)], view)
         return candidate, self._judged(candidate)
 
     @property
@@ -181,8 +165,21 @@ class Odometry:
             self.config.judgement,
         )
 
+    def _attempted(
+        self, view: Pyramid, T_keyframe_camera: np.ndarray, method: str = "direct"
+    ) -> Candidate:
+        return attempt(self._current, view, T_keyframe_camera, method, self.config.align)
+
     def _best(self, candidates: list[Candidate], view: Pyramid) -> Candidate:
-        return best(candidates, self._current, view, self.config.align)
+        """The best of these and of what features suggest."""
+        config, keyframe = self.config, self._current
+        seen = detect(view, config.features)
+        kept = keyframe.features(config.features)
+        pose = estimate_pose(kept, seen, view.camera, config.features)
+        if pose is not None:
+            guess = se3.inverse(pose.T_camera_reference)
+            candidates = [*candidates, self._attempted(view, guess, "features")]
+        return best(candidates, pose, keyframe, view, config.candidates, config.align)
 
     def _is_large(self, candidate: Candidate, resting: np.ndarray, view: Pyramid) -> bool:
         """Whether the image moved so far since the last frame that a minimum may be a wrong one."""
@@ -190,33 +187,17 @@ class Odometry:
         shift_rad = extent(moved, self._current.reference.median_depth_m)
         return shift_rad * view.camera.fx > self.config.large_motion * view.camera.width
 
-    def _feature_pose(
-        self, keyframe: Keyframe, features: Features, view: Pyramid
-    ) -> FeaturePose | None:
-        config = self.config.features
-        return estimate_pose(keyframe.features(config), features, view.camera, config)
-
     def _relocalised(self, view: Pyramid) -> tuple[Keyframe, Candidate] | None:
-        """The remembered keyframe that this view surely shows, and the alignment to it."""
-        features = detect(view, self.config.features)
-        poses = [(k, self._feature_pose(k, features, view)) for k in reversed(self._memory)]
-        found = [(k, pose) for k, pose in poses if pose is not None]
-        found.sort(key=lambda pair: -pair[1].inliers)  # stable: of equals, the newest
-        for keyframe, pose in found[: self.config.relocalisation_attempts]:
-            T_keyframe_camera = se3.inverse(pose.T_camera_reference)
-            candidate = compared(
-                attempt(keyframe, view, T_keyframe_camera, "relocalised", self.config.align),
-                T_keyframe_camera,
-                keyframe.reference.median_depth_m,
-                self.config.agreement_rad,
-            )
-            limits = strict(self.config.judgement)
-            verdict = judge(
-                candidate.alignment, candidate.features_agree, self._history, Status.LOST, limits
-            )
-            if verdict is Status.OK:
-                return keyframe, candidate
-        return None
+        config = self.config
+        return relocalise(
+            self._memory,
+            view,
+            self._history,
+            config.judgement,
+            config.features,
+            config.align,
+            config.relocalisation,
+        )
 
     def _lost(self, alignment: Alignment) -> Tracked:
         self._report(Status.LOST)
@@ -237,9 +218,7 @@ class Odometry:
 
     def _accepted(self, frame: RgbdFrame, candidate: Candidate, status: Status) -> Tracked:
         alignment, keyframe = candidate.alignment, self._current
-        T_odom_camera = se3.orthonormalised(
-            keyframe.T_odom_keyframe @ alignment.T_reference_camera
-        )
+        T_odom_camera = se3.orthonormalised(keyframe.T_odom_keyframe @ alignment.T_reference_camera)
         was_lost = self._status is Status.LOST
         self._report(status)
         self._motion = self._motion.moved_to(T_odom_camera, frame.stamp_ns)
