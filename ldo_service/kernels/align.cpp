@@ -38,7 +38,8 @@ void halve_depth(const float* depth, int width, int height, float tolerance, flo
   }
 }
 
-void pack(const float* image, const float* depth, int width, int height, float* out) {
+void pack(const float* image, const float* depth, int width, int height, float max_depth,
+          float* out) {
   std::memset(out, 0, sizeof(float) * kTexelSize * width * height);
   for (int y = 0; y < height; ++y) {
     const std::int64_t start = static_cast<std::int64_t>(y) * width;
@@ -47,7 +48,7 @@ void pack(const float* image, const float* depth, int width, int height, float* 
       const std::int64_t i = start + x;
       float* texel = out + kTexelSize * i;
       texel[kIntensity] = image[i];
-      texel[kDepth] = depth[i];
+      texel[kDepth] = depth[i] <= max_depth ? depth[i] : 0.0f;
       if (inside && x > 0 && x + 1 < width) {
         texel[kGradientU] = 0.5f * (image[i + 1] - image[i - 1]);
         texel[kGradientV] = 0.5f * (image[i + width] - image[i - width]);
@@ -91,14 +92,14 @@ void normals(const float* depth, int width, int height, const Pinhole& camera, i
 }
 
 std::int64_t points(const float* texels, const float* normals, int width, int height,
-                    const Pinhole& camera, float max_depth, std::int64_t capacity, float* points) {
+                    const Pinhole& camera, std::int64_t capacity, float* points) {
   const float ifx = 1.0f / camera.fx, ify = 1.0f / camera.fy;
   std::int64_t n = 0;
   for (int y = 1; y < height - 1; ++y) {
     for (int x = 1; x < width - 1; ++x) {
       const std::int64_t i = static_cast<std::int64_t>(y) * width + x;
       const float z = texels[kTexelSize * i + kDepth];
-      if (!(z > kNearest && z <= max_depth)) continue;
+      if (!(z > kNearest)) continue;
       points[kX * capacity + n] = (x - camera.cx) * ifx * z;
       points[kY * capacity + n] = (y - camera.cy) * ify * z;
       points[kZ * capacity + n] = z;
@@ -146,7 +147,7 @@ void project(const Problem& p, Block& b) {
     const float u = p.camera.fx * x * inverse + p.camera.cx;
     const float v = p.camera.fy * y * inverse + p.camera.cy;
     const bool inside = in_front & (u >= 1.0f) & (v >= 1.0f) & (u < right) & (v < bottom);
-    const float su = inside ? u : 1.0f, sv = inside ? v : 1.0f;
+    const float su = inside ? u : 0.0f, sv = inside ? v : 0.0f;
     const int iu = static_cast<int>(su), iv = static_cast<int>(sv);
     const int nu = static_cast<int>(su + 0.5f), nv = static_cast<int>(sv + 0.5f);
     b.x[i] = x, b.y[i] = y, b.z[i] = in_front ? z : 1.0f;

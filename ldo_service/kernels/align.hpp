@@ -49,15 +49,16 @@ struct Equations {
 struct Kernels {
   // Mean of those of each 2x2 block that are within `tolerance` (relative) of the nearest.
   void (*halve_depth)(const float* depth, int width, int height, float tolerance, float* out);
-  // Texels of an image and its depth; gradients are central differences, 0 on the border.
-  void (*pack)(const float* image, const float* depth, int width, int height, float* out);
+  // Texels of an image and its depth, which is dropped beyond `max_depth`; gradients are central
+  // differences, 0 on the border.
+  void (*pack)(const float* image, const float* depth, int width, int height, float max_depth,
+               float* out);
   // Normals [height, width, 3] towards the camera from differences over `radius` pixels.
   void (*normals)(const float* depth, int width, int height, const Pinhole& camera, int radius,
                   float* out);
   // Fills `points` [kPointRows, capacity] with the pixels that have depth; returns how many.
   std::int64_t (*points)(const float* texels, const float* normals, int width, int height,
-                         const Pinhole& camera, float max_depth, std::int64_t capacity,
-                         float* points);
+                         const Pinhole& camera, std::int64_t capacity, float* points);
   Equations (*normal_equations)(const Problem& problem);
 };
 

@@ -101,14 +101,16 @@ Output halve_depth(Input<2> depth, double tolerance) {
   return owned(std::move(out), {h / 2, w / 2});
 }
 
-Output pack(Input<2> image, Input<2> depth) {
+Output pack(Input<2> image, Input<2> depth, double max_depth_m) {
   const std::size_t h = image.shape(0), w = image.shape(1);
   require_image(h, w);
   require_same_size(image, depth);
+  const float max_depth = positive(max_depth_m, "max_depth_m");
   auto out = floats(h * w * kTexelSize);
   {
     nb::gil_scoped_release release;
-    chosen->pack(image.data(), depth.data(), static_cast<int>(w), static_cast<int>(h), out.get());
+    chosen->pack(image.data(), depth.data(), static_cast<int>(w), static_cast<int>(h), max_depth,
+                 out.get());
   }
   return owned(std::move(out), {h, w, kTexelSize});
 }
@@ -132,20 +134,19 @@ void require_texels(const Input<3>& texels) {
   require(texels.shape(2) == kTexelSize, "texels must be [H, W, 4], as pack() returns them");
 }
 
-Output points(Input<3> texels, Input<3> normals, const Intrinsics& intrinsics, double max_depth_m) {
+Output points(Input<3> texels, Input<3> normals, const Intrinsics& intrinsics) {
   require_texels(texels);
   require_same_size(texels, normals);
   require(normals.shape(2) == 3, "normals must be [H, W, 3]");
   const std::size_t h = texels.shape(0), w = texels.shape(1), capacity = h * w;
   const Pinhole camera = pinhole(intrinsics);
-  const float max_depth = positive(max_depth_m, "max_depth_m");
   std::unique_ptr<float[]> out;
   std::size_t n;
   {
     nb::gil_scoped_release release;
     auto all = floats(kPointRows * capacity);
     n = static_cast<std::size_t>(chosen->points(texels.data(), normals.data(), static_cast<int>(w),
-                                                static_cast<int>(h), camera, max_depth,
+                                                static_cast<int>(h), camera,
                                                 static_cast<std::int64_t>(capacity), all.get()));
     out = floats(kPointRows * n);
     for (std::size_t k = 0; k < kPointRows; ++k)
@@ -217,10 +218,9 @@ NB_MODULE(_align, m) {
   chosen = &kernels(isa);
   m.attr("isa") = ldo::name(isa);
   m.def("halve_depth", &halve_depth, "depth_m"_a.noconvert(), "tolerance"_a);
-  m.def("pack", &pack, "image"_a.noconvert(), "depth_m"_a.noconvert());
+  m.def("pack", &pack, "image"_a.noconvert(), "depth_m"_a.noconvert(), "max_depth_m"_a);
   m.def("normals", &normals, "depth_m"_a.noconvert(), "intrinsics"_a, "radius"_a);
-  m.def("points", &points, "texels"_a.noconvert(), "normals"_a.noconvert(), "intrinsics"_a,
-        "max_depth_m"_a);
+  m.def("points", &points, "texels"_a.noconvert(), "normals"_a.noconvert(), "intrinsics"_a);
   m.def("normal_equations", &normal_equations, "points"_a.noconvert(), "texels"_a.noconvert(),
         "intrinsics"_a, "T_camera_reference"_a.noconvert(), "gain"_a, "bias"_a, "intensity_sigma"_a,
         "depth_noise_scale"_a, "noise"_a, "gate"_a, "occlusion"_a);

@@ -33,6 +33,7 @@ class Candidate:
 
     alignment: Alignment
     method: str  # "direct" from a motion guess, "features" from ORB
+    median_depth_m: float  # of the keyframe
     features_agree: bool | None = None
 
 
@@ -45,7 +46,8 @@ def attempt(
 ) -> Candidate:
     """Direct alignment from a guessed pose."""
     guess = se3.inverse(T_keyframe_camera)
-    return Candidate(align(keyframe.reference, view, guess, config), method)
+    reference = keyframe.reference
+    return Candidate(align(reference, view, guess, config), method, reference.median_depth_m)
 
 
 def support(
@@ -89,14 +91,14 @@ def best(
     chosen = candidates[int(np.argmax(supports))]
     if features is None:
         return chosen
-    median_depth_m = keyframe.reference.median_depth_m
 
     def is_near(T_keyframe_camera: np.ndarray) -> bool:
         difference = se3.inverse(chosen.alignment.T_reference_camera) @ T_keyframe_camera
-        return extent(difference, median_depth_m) < config.agreement_rad
+        return extent(difference, chosen.median_depth_m) < config.agreement_rad
 
-    refined = candidates[-1].alignment.T_reference_camera
-    if is_near(se3.inverse(features.T_camera_reference)) or is_near(refined):
+    led = candidates[-1]
+    met = chosen is not led and is_near(led.alignment.T_reference_camera)
+    if met or is_near(se3.inverse(features.T_camera_reference)):
         return replace(chosen, features_agree=True)
     rivals = supports[-1] > config.rival_support * max(supports)
     return replace(chosen, features_agree=False if rivals else None)

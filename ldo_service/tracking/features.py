@@ -44,7 +44,7 @@ class FeaturePose:
 
 def detect(view: Pyramid, config: FeatureConfig) -> Features:
     """ORB features of the full-resolution image, with the depth under each."""
-    orb = cv2.ORB_create(nfeatures=config.count)
+    orb = cv2.ORB.create(nfeatures=config.count)
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:
         keypoints, descriptors = (), np.zeros((0, 32), np.uint8)

@@ -79,26 +79,41 @@ def judge(
     previous: Status,
     config: JudgementConfig,
 ) -> Status:
-    """The status of an alignment; `features_agree` is None where features were not asked."""
+    """The status of an alignment; `features_agree` is None where features had no say.
+
+    Hysteresis: limits are stricter after a frame that was not OK, and strictest after a loss,
+    from which only OK leads back.
+    """
+    limits = _limits(previous, config)
     ratio = history.residual_ratio(alignment, config)
     if ratio > config.lost_residual or alignment.overlap < config.lost_overlap:
         return Status.LOST
-    margin = 1.0 if previous is Status.OK else config.recovery_margin
     plausible = (
-        alignment.overlap * margin >= config.min_overlap
-        and alignment.paired * margin >= config.min_paired
-        and alignment.condition <= config.max_condition * margin
-        and abs(np.log(max(alignment.gain, 1e-6))) <= np.log(config.max_gain) * margin
-        and ratio <= config.weak_residual * margin
+        alignment.overlap >= limits.min_overlap
+        and alignment.paired >= limits.min_paired
+        and alignment.condition <= limits.max_condition
+        and abs(np.log(max(alignment.gain, 1e-6))) <= np.log(limits.max_gain)
+        and ratio <= limits.weak_residual
         and features_agree is not False
     )
-    return Status.OK if plausible else Status.WEAK
+    if plausible:
+        return Status.OK
+    return Status.LOST if previous is Status.LOST else Status.WEAK
 
 
-def strict(config: JudgementConfig) -> JudgementConfig:
-    """The limits for a relocalisation, which has no prediction to speak for it."""
+def _limits(previous: Status, config: JudgementConfig) -> JudgementConfig:
+    if previous is Status.OK:
+        return config
+    if previous is Status.LOST:
+        return replace(
+            config,
+            min_overlap=max(config.min_overlap, config.relocalised_overlap),
+            weak_residual=min(config.weak_residual, config.relocalised_residual),
+        )
     return replace(
         config,
-        min_overlap=max(config.min_overlap, config.relocalised_overlap),
-        weak_residual=min(config.weak_residual, config.relocalised_residual),
+        min_overlap=config.min_overlap / config.recovery_margin,
+        min_paired=config.min_paired / config.recovery_margin,
+        max_condition=config.max_condition * config.recovery_margin,
+        weak_residual=max(config.weak_residual * config.recovery_margin, 1.0),
     )

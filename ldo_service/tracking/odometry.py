@@ -10,7 +10,7 @@ last. Conventions: `ldo_service.geometry`.
 """
 
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,6 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 
-from . import snapshot
 from .align import AlignConfig, Alignment
 from .candidates import Candidate, CandidateConfig, attempt, best
 from .features import FeatureConfig, detect, estimate_pose
@@ -27,6 +26,7 @@ from .keyframes import Keyframe, KeyframeConfig, is_due
 from .motion import Motion, extent
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, relocalise
+from .state import State, packed, unpacked
 
 log = logging.getLogger(__name__)
 
@@ -74,181 +74,163 @@ class Odometry:
 
     def __init__(self, config: OdometryConfig | None = None) -> None:
         self.config = config or OdometryConfig()
-        self._memory: tuple[Keyframe, ...] = ()  # oldest first
-        self._keyframe: Keyframe | None = None  # the one tracked against, usually the newest
-        self._motion = Motion()
-        self._history = History()
-        self._status = Status.OK
-        self._frames_since_keyframe = 0
-        self._view: tuple[RgbdFrame, Pyramid] | None = None  # of the last frame
+        self._state = State()
+        self._viewed: tuple[RgbdFrame, Pyramid] | None = None  # the last frame, made ready
 
     def track(self, frame: RgbdFrame) -> Tracked:
-        """The pose of a frame. Never raises for what the frame shows: it may be blank."""
-        view = self._viewed(frame)
-        if self._keyframe is None:
+        """The pose of a frame. Never raises for what a frame shows: it may be blank."""
+        view, keyframe = self._view(frame), self._state.keyframe
+        if keyframe is None:
             return self._first(frame, view)
-        self._frames_since_keyframe += 1
-        candidate, status = self._followed(frame, view)
+        candidate = self._followed(keyframe, view, frame.stamp_ns)
+        status = self._judged(candidate)
         if status is Status.LOST:
             found = self._relocalised(view)
             if found is None:
-                return self._lost(candidate.alignment)
-            self._keyframe, candidate = found
-            status = Status.OK
-        return self._accepted(frame, candidate, status)
+                return self._lost(keyframe, candidate.alignment)
+            (keyframe, candidate), status = found, Status.OK
+        return self._accepted(frame, keyframe, candidate, status)
 
     def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> None:
-        """Track against this frame, the one just tracked, from now on."""
-        self._keyframe = Keyframe(self._viewed(frame), tracked.T_odom_camera, frame.index)
-        self._memory = (*self._memory, self._keyframe)[-self.config.relocalisation.memory :]
-        self._frames_since_keyframe = 0
+        """Track against this frame, the one just tracked, from now on.
+
+        Raises ValueError for a LOST frame, whose pose is unknown.
+        """
+        if tracked.status is Status.LOST:
+            raise ValueError(f"frame {frame.index} is LOST and cannot be a keyframe.")
+        view = self._view(frame)
+        view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
+        keyframe = Keyframe(view, tracked.T_odom_camera, frame.index)
+        memory = (*self._state.memory, keyframe)[-self.config.relocalisation.memory :]
+        self._state = replace(
+            self._state, memory=memory, keyframe=keyframe, frames_since_keyframe=0
+        )
 
     def state(self) -> dict[str, Any]:
-        """All that the next frames depend on, in arrays and plain values; see `restore`."""
-        return snapshot.taken(
-            self._memory,
-            self._keyframe,
-            self._motion,
-            self._history,
-            self._status,
-            self._frames_since_keyframe,
-        )
+        """All that the next frames depend on, in arrays and plain values: 1.5 MB a keyframe."""
+        return packed(self._state)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue where `state` was taken: the next frames give bitwise equal results."""
-        (
-            self._memory,
-            self._keyframe,
-            self._motion,
-            self._history,
-            self._status,
-            self._frames_since_keyframe,
-        ) = snapshot.opened(state, self.config.pyramid)
-        self._view = None
+        self._state = unpacked(state, self.config.pyramid)
+        self._viewed = None
 
-    def _viewed(self, frame: RgbdFrame) -> Pyramid:
-        if self._view is None or self._view[0] is not frame:
-            self._view = (frame, pyramid_of(frame, self.config.pyramid))
-        return self._view[1]
+    def _view(self, frame: RgbdFrame) -> Pyramid:
+        if self._viewed is None or self._viewed[0] is not frame:
+            self._viewed = (frame, pyramid_of(frame, self.config.pyramid))
+        return self._viewed[1]
 
     def _first(self, frame: RgbdFrame, view: Pyramid) -> Tracked:
         measured = float(np.mean(view.levels[0].depth_m > 0))
         usable = measured >= self.config.judgement.min_paired
-        self._motion = Motion(stamp_ns=frame.stamp_ns)
+        self._state = replace(self._state, motion=Motion(stamp_ns=frame.stamp_ns))
         status, method = (Status.OK, "first") if usable else (Status.LOST, "none")
-        return Tracked(np.eye(4), np.eye(4), frame.index, status, method, usable)
+        return Tracked(np.eye(4), np.eye(4), frame.index, status, method, wants_keyframe=usable)
 
-    def _followed(self, frame: RgbdFrame, view: Pyramid) -> tuple[Candidate, Status]:
-        """Alignment to the current keyframe: by prediction, and by all means if that is poor."""
-        keyframe = self._current
+    def _followed(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
+        """Alignment from the predicted pose; from every other guess too, where that is not sure."""
+        motion, config = self._state.motion, self.config
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
-        predicted = T_keyframe_odom @ self._motion.predicted(frame.stamp_ns)
-        resting = T_keyframe_odom @ self._motion.T_odom_camera
-        candidate = self._attempted(view, predicted)
-        status = self._judged(candidate)
-        if status is Status.OK and not self._is_large(candidate, resting, view):
-            return candidate, status
-        candidate = self._best([candidate, self._attempted(view, resting)], view)
-        return candidate, self._judged(candidate)
-
-    @property
-    def _current(self) -> Keyframe:
-        assert self._keyframe is not None
-        return self._keyframe
-
-    def _judged(self, candidate: Candidate) -> Status:
-        return judge(
-            candidate.alignment,
-            candidate.features_agree,
-            self._history,
-            self._status,
-            self.config.judgement,
-        )
-
-    def _attempted(
-        self, view: Pyramid, T_keyframe_camera: np.ndarray, method: str = "direct"
-    ) -> Candidate:
-        return attempt(self._current, view, T_keyframe_camera, method, self.config.align)
-
-    def _best(self, candidates: list[Candidate], view: Pyramid) -> Candidate:
-        """The best of these and of what features suggest."""
-        config, keyframe = self.config, self._current
+        predicted = T_keyframe_odom @ motion.predicted(stamp_ns)
+        resting = T_keyframe_odom @ motion.T_odom_camera
+        candidate = attempt(keyframe, view, predicted, "direct", config.align)
+        if self._judged(candidate) is Status.OK and not self._is_large(candidate, resting, view):
+            return candidate
+        again = attempt(keyframe, view, resting, "direct", config.align)
+        features = keyframe.features(config.features)
         seen = detect(view, config.features)
-        kept = keyframe.features(config.features)
-        pose = estimate_pose(kept, seen, view.camera, config.features)
+        pose = estimate_pose(features, seen, view.camera, config.features)
+        candidates = [candidate, again]
         if pose is not None:
             guess = se3.inverse(pose.T_camera_reference)
-            candidates = [*candidates, self._attempted(view, guess, "features")]
+            candidates.append(attempt(keyframe, view, guess, "features", config.align))
         return best(candidates, pose, keyframe, view, config.candidates, config.align)
 
     def _is_large(self, candidate: Candidate, resting: np.ndarray, view: Pyramid) -> bool:
         """Whether the image moved so far since the last frame that a minimum may be a wrong one."""
         moved = se3.inverse(resting) @ candidate.alignment.T_reference_camera
-        shift_rad = extent(moved, self._current.reference.median_depth_m)
+        shift_rad = extent(moved, candidate.median_depth_m)
         return shift_rad * view.camera.fx > self.config.large_motion * view.camera.width
 
+    def _judged(self, candidate: Candidate) -> Status:
+        state, limits = self._state, self.config.judgement
+        agree = candidate.features_agree
+        return judge(candidate.alignment, agree, state.history, state.status, limits)
+
     def _relocalised(self, view: Pyramid) -> tuple[Keyframe, Candidate] | None:
-        config = self.config
+        state, config = self._state, self.config
         return relocalise(
-            self._memory,
+            state.memory,
             view,
-            self._history,
+            state.history,
             config.judgement,
             config.features,
             config.align,
             config.relocalisation,
         )
 
-    def _lost(self, alignment: Alignment) -> Tracked:
-        self._report(Status.LOST)
-        self._motion = self._motion.stopped()
-        T_odom_camera = self._motion.T_odom_camera
-        return Tracked(
-            T_odom_camera,
-            se3.inverse(self._current.T_odom_keyframe) @ T_odom_camera,
-            self._current.index,
+    def _lost(self, keyframe: Keyframe, alignment: Alignment) -> Tracked:
+        motion = self._state.motion.stopped()
+        self._remember(keyframe, motion, self._state.history, Status.LOST)
+        T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
+        return _report(
+            replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
+            motion.T_odom_camera,
+            keyframe,
             Status.LOST,
             "none",
             wants_keyframe=False,
-            intensity_sigma=alignment.intensity_sigma,
-            depth_noise_scale=alignment.depth_noise_scale,
-            overlap=alignment.overlap,
-            iterations=alignment.iterations,
         )
 
-    def _accepted(self, frame: RgbdFrame, candidate: Candidate, status: Status) -> Tracked:
-        alignment, keyframe = candidate.alignment, self._current
+    def _accepted(
+        self, frame: RgbdFrame, keyframe: Keyframe, candidate: Candidate, status: Status
+    ) -> Tracked:
+        alignment, history = candidate.alignment, self._state.history
         T_odom_camera = se3.orthonormalised(keyframe.T_odom_keyframe @ alignment.T_reference_camera)
-        was_lost = self._status is Status.LOST
-        self._report(status)
-        self._motion = self._motion.moved_to(T_odom_camera, frame.stamp_ns)
-        if was_lost or status is not Status.OK:
-            self._motion = self._motion.stopped()
+        motion = self._state.motion.moved_to(T_odom_camera, frame.stamp_ns)
+        is_steady = status is Status.OK and self._state.status is Status.OK
         if status is Status.OK:
-            self._history = self._history.extended(alignment, self.config.judgement)
-        return Tracked(
-            T_odom_camera,
+            history = history.extended(alignment, self.config.judgement)
+        self._remember(keyframe, motion if is_steady else motion.stopped(), history, status)
+        due = is_due(
             alignment.T_reference_camera,
-            keyframe.index,
-            status,
-            candidate.method,
-            wants_keyframe=status is Status.OK
-            and is_due(
-                alignment.T_reference_camera,
-                alignment.overlap,
-                keyframe.reference.median_depth_m,
-                self._frames_since_keyframe,
-                self.config.keyframes,
-            ),
-            information=alignment.information,
-            inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
-            intensity_sigma=alignment.intensity_sigma,
-            depth_noise_scale=alignment.depth_noise_scale,
-            overlap=alignment.overlap,
-            iterations=alignment.iterations,
+            alignment.overlap,
+            candidate.median_depth_m,
+            self._state.frames_since_keyframe,
+            self.config.keyframes,
         )
+        wanted = due and status is Status.OK
+        return _report(alignment, T_odom_camera, keyframe, status, candidate.method, wanted)
 
-    def _report(self, status: Status) -> None:
-        if status is not self._status:
-            log.info("tracking %s, was %s (keyframe %d)", status, self._status, self._current.index)
-        self._status = status
+    def _remember(
+        self, keyframe: Keyframe, motion: Motion, history: History, status: Status
+    ) -> None:
+        before = self._state
+        if status is not before.status:
+            log.info("tracking %s, was %s; keyframe %d", status, before.status, keyframe.index)
+        frames = before.frames_since_keyframe + 1
+        self._state = State(before.memory, keyframe, motion, history, status, frames)
+
+
+def _report(
+    alignment: Alignment,
+    T_odom_camera: np.ndarray,
+    keyframe: Keyframe,
+    status: Status,
+    method: str,
+    wants_keyframe: bool,
+) -> Tracked:
+    return Tracked(
+        T_odom_camera,
+        alignment.T_reference_camera,
+        keyframe.index,
+        status,
+        method,
+        wants_keyframe,
+        information=alignment.information,
+        inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
+        intensity_sigma=alignment.intensity_sigma,
+        depth_noise_scale=alignment.depth_noise_scale,
+        overlap=alignment.overlap,
+        iterations=alignment.iterations,
+    )

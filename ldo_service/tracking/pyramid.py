@@ -23,10 +23,13 @@ class PyramidConfig:
     levels: int = 4  # 320, 160, 80, 40 pixels wide
     smallest_side_px: int = 12  # coarser images hold too few pixels to align
     depth_tolerance: float = 0.03  # relative; blocks across an edge keep the nearer surface
+    max_depth_m: float = 30.0  # no depth camera measures beyond; a stray 65 m must not count
 
     def __post_init__(self) -> None:
         if min(self.working_width_px, self.levels, self.smallest_side_px) < 1:
             raise ConfigError("working_width_px, levels and smallest_side_px must be at least 1.")
+        if not self.max_depth_m > 0:
+            raise ConfigError(f"max_depth_m={self.max_depth_m:g} must be positive.")
         if not 0 < self.depth_tolerance < 1:
             raise ConfigError(f"depth_tolerance={self.depth_tolerance:g} must be within 0..1.")
 
@@ -68,7 +71,7 @@ def halved_image(image: np.ndarray) -> np.ndarray:
     """Means [H//2, W//2] float32 of the 2x2 blocks of an image [H, W] float32."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     even = image[: 2 * height, : 2 * width]
-    return cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
@@ -84,14 +87,14 @@ def build_pyramid(
     levels: list[Level] = []
     while True:
         if scaled.width < 1.5 * config.working_width_px:
-            levels.append(Level(_align.pack(image, depth), scaled))
+            levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
         smallest = min(scaled.width, scaled.height) // 2
         if len(levels) == config.levels or smallest < config.smallest_side_px:
             break
         image, depth = halved_image(image), halved_depth(depth, config.depth_tolerance)
         scaled = scaled.halved()
     if not levels:  # a strip: wide, and too low to be halved
-        levels.append(Level(_align.pack(image, depth), scaled))
+        levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
     return Pyramid(gray, depth_m, camera, tuple(levels))
 
 

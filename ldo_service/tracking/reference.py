@@ -9,8 +9,6 @@ from ldo_service.kernels import _align
 
 from .pyramid import Level, Pyramid
 
-MAX_DEPTH_M = 30.0  # beyond, no depth camera measures; a stray 65 m must not set the scale
-
 
 @dataclass(frozen=True, slots=True)
 class Reference:
@@ -23,10 +21,6 @@ class Reference:
     points: tuple[np.ndarray, ...]
     median_depth_m: float
 
-    @property
-    def is_empty(self) -> bool:
-        return self.points[0].shape[1] == 0
-
 
 def build_reference(pyramid: Pyramid) -> Reference:
     points = tuple(_level_points(level, i) for i, level in enumerate(pyramid.levels))
@@ -35,7 +29,7 @@ def build_reference(pyramid: Pyramid) -> Reference:
 
 
 def _level_points(level: Level, index: int) -> np.ndarray:
-    smooth = cv2.medianBlur(np.ascontiguousarray(level.depth_m), 3)
+    smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(level.depth_m), 3), np.float32)
     radius_px = max(1, 3 - index)  # about the same angle on every level
     normals = _align.normals(smooth, level.intrinsics, radius_px)
-    return _align.points(level.texels, normals, level.intrinsics, MAX_DEPTH_M)
+    return _align.points(level.texels, normals, level.intrinsics)

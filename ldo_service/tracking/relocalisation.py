@@ -9,7 +9,7 @@ from ldo_service.geometry import se3
 from .align import AlignConfig
 from .candidates import Candidate, attempt
 from .features import FeatureConfig, FeaturePose, detect, estimate_pose
-from .judgement import History, JudgementConfig, Status, judge, strict
+from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe
 from .pyramid import Pyramid
 
@@ -40,7 +40,7 @@ def relocalise(
     for keyframe, pose in _places(memory, view, features)[: config.attempts]:
         guess = se3.inverse(pose.T_camera_reference)
         candidate = attempt(keyframe, view, guess, "relocalised", align)
-        verdict = judge(candidate.alignment, None, history, Status.LOST, strict(judgement))
+        verdict = judge(candidate.alignment, None, history, Status.LOST, judgement)
         if verdict is Status.OK:
             return keyframe, candidate
     return None
