@@ -1,0 +1,145 @@
+// Front-to-back blending of one tile: C = sum c_i alpha_i T_i, T_i = prod_{j < i} (1 - alpha_j).
+#pragma once
+#include "tiles.hpp"
+
+namespace ldo::LDO_ISA {
+
+constexpr float kLog2MaxAlpha = -0.0144995697f;  // log2(0.99)
+constexpr float kStop = 1e-4f;                   // a pixel with less transmittance takes no more
+constexpr int kBlocks = 16;                      // of 4x4 pixels in a tile
+constexpr int kBatch = 256;                      // splats looked at before the blocks are blended
+
+struct Block {  // sixteen pixels
+  Floats transmittance = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
+  Floats median_depth = 1e30f;
+};
+
+struct Lanes {  // column and row of each lane in its 4x4 block
+  Lanes() {
+    alignas(64) float column[kLanes], row[kLanes];
+    for (int i = 0; i < kLanes; ++i) {
+      column[i] = static_cast<float>(i % 4);
+      row[i] = static_cast<float>(i / 4);
+    }
+    x = Floats::load(column);
+    y = Floats::load(row);
+  }
+  Floats x, y;
+};
+
+// Bit i is set where the ellipse alpha >= 1/255 reaches block i of the tile at (x, y): on the two
+// sides of the block nearest to the centre, the ridge line finds the point of largest alpha.
+inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, float y) {
+  const Floats x0 = lanes.x * 4.0f + (x - s.u), x1 = x0 + 3.0f;
+  const Floats y0 = lanes.y * 4.0f + (y - s.v), y1 = y0 + 3.0f;
+  const Floats side_x = clamp(0.0f, x0, x1), side_y = clamp(0.0f, y0, y1);
+  const Floats best_y = clamp(side_x * s.y_slope, y0, y1);
+  const Floats best_x = clamp(side_y * s.x_slope, x0, x1);
+  const auto exponent = [&](Floats dx, Floats dy) {
+    return dx * (dx * s.a + dy * s.b) + dy * dy * s.c;
+  };
+  // The slack keeps rounding from dropping a pixel that the blending would count.
+  const float least = kLog2MinAlpha - s.log2_opacity - 1e-3f;
+  return bits(max(exponent(side_x, best_y), exponent(best_x, side_y)) >= least);
+}
+
+// Adds one splat to sixteen pixels at (px, py).
+[[gnu::always_inline]] inline void blend_splat(const Splat& s, Floats px, Floats py, Block& block) {
+  const Floats dx = px - s.u, dy = py - s.v;
+  const Floats log2_alpha = dx * (dx * s.a + dy * s.b) + (dy * dy * s.c + s.log2_opacity);
+  const Mask counts = log2_alpha >= kLog2MinAlpha;
+  const Floats alpha = select(counts, exp2(min(log2_alpha, kLog2MaxAlpha)), 0.0f);
+  const Floats weight = alpha * block.transmittance;
+  block.red = block.red + weight * s.color[0];
+  block.green = block.green + weight * s.color[1];
+  block.blue = block.blue + weight * s.color[2];
+  block.depth = block.depth + weight * s.z;
+  block.transmittance = block.transmittance - weight;
+  // Splats come by increasing z: the least behind which less than half is left is the first.
+  block.median_depth =
+      select(block.transmittance < 0.5f, min(block.median_depth, s.z), block.median_depth);
+}
+
+class Tile {
+ public:
+  Tile(int column, int row, const View& view) : x_(column * kTile), y_(row * kTile), view_(view) {
+    for (int b = 0; b < kBlocks; ++b)
+      if (x_ + b % 4 * 4 < view.width && y_ + b / 4 * 4 < view.height) open_ |= 1u << b;
+  }
+
+  void blend(const Splat* splats, const uint32_t* list, int64_t n) {
+    for (int64_t first = 0; first < n && open_ != 0; first += kBatch) {
+      gather(splats, list + first, static_cast<int>(std::min<int64_t>(kBatch, n - first)));
+      for (int b = 0; b < kBlocks; ++b)
+        if (open_ >> b & 1) blend_block(b);
+    }
+  }
+
+  void store(const Images& out) const {
+    alignas(64) float planes[6][kTile][kTile];
+    for (int b = 0; b < kBlocks; ++b) unpack(b, planes);
+    const int width = std::min(kTile, view_.width - x_),
+              height = std::min(kTile, view_.height - y_);
+    for (int y = 0; y < height; ++y) {
+      const int64_t pixel = static_cast<int64_t>(y_ + y) * view_.width + x_;
+      for (int x = 0; x < width; ++x)
+        for (int c = 0; c < 3; ++c) out.color[(pixel + x) * 3 + c] = planes[c][y][x];
+      std::copy(planes[3][y], planes[3][y] + width, out.depth + pixel);
+      std::copy(planes[4][y], planes[4][y] + width, out.median_depth + pixel);
+      std::copy(planes[5][y], planes[5][y] + width, out.opacity + pixel);
+    }
+  }
+
+ private:
+  void gather(const Splat* splats, const uint32_t* list, int n) {
+    batch_size_ = n;
+    const float x = static_cast<float>(x_), y = static_cast<float>(y_);
+    for (int i = 0; i < n; ++i) {
+      if (i + 16 < n) __builtin_prefetch(&splats[list[i + 16]]);
+      batch_[i] = splats[list[i]];
+      touched_[i] = touched_blocks(batch_[i], lanes_, x, y);
+    }
+  }
+
+  void blend_block(int b) {
+    const Floats px = lanes_.x + static_cast<float>(x_ + b % 4 * 4);
+    const Floats py = lanes_.y + static_cast<float>(y_ + b / 4 * 4);
+    alignas(64) uint32_t list[kBatch + kLanes];
+    const int n = indices_with_bit(touched_, batch_size_, b, list);
+    Block block = blocks_[b];
+    for (int i = 0; i < n; ++i) {
+      blend_splat(batch_[list[i]], px, py, block);
+      if (i % 4 == 3 && !any(block.transmittance >= kStop)) break;
+    }
+    blocks_[b] = block;
+    if (!any(block.transmittance >= kStop)) open_ &= ~(1u << b);
+  }
+
+  void unpack(int b, float (&planes)[6][kTile][kTile]) const {
+    const Block& block = blocks_[b];
+    const Mask never = block.transmittance >= 0.5f;
+    const Floats values[6] = {block.red,
+                              block.green,
+                              block.blue,
+                              block.depth,
+                              select(never, 0.0f, block.median_depth),
+                              Floats(1.0f) - block.transmittance};
+    for (int k = 0; k < 6; ++k) {
+      alignas(64) float pixels[kLanes];
+      values[k].store(pixels);
+      for (int row = 0; row < 4; ++row)
+        std::memcpy(&planes[k][b / 4 * 4 + row][b % 4 * 4], pixels + 4 * row, 4 * sizeof(float));
+    }
+  }
+
+  const int x_, y_;
+  const View& view_;
+  const Lanes lanes_;
+  uint32_t open_ = 0;  // blocks in the image with a pixel that light still passes
+  Block blocks_[kBlocks];
+  Splat batch_[kBatch];
+  alignas(64) uint32_t touched_[kBatch + kLanes];  // bit b: this splat of the batch reaches block b
+  int batch_size_ = 0;
+};
+
+}  // namespace ldo::LDO_ISA

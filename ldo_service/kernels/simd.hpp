@@ -1,0 +1,212 @@
+// Sixteen float lanes: one 4x4 block of pixels, or sixteen Gaussians.
+//
+// Written with the vector extensions of GCC and Clang. A value is an array of native registers
+// (1 of 64, 2 of 32 or 4 of 16 bytes), because one 64-byte vector on a narrower machine has its
+// compares and selects lowered to scalar code. Everything lives in a namespace named after the
+// instruction set, so that the linker never merges an inline function of one translation unit
+// with that of another, compiled for a different machine.
+#pragma once
+#include <cstdint>
+#include <cstring>
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace ldo::LDO_ISA {
+
+constexpr int kLanes = 16;
+#if defined(__AVX512F__)
+constexpr int kRegisterBytes = 64;
+#elif defined(__AVX2__)
+constexpr int kRegisterBytes = 32;
+#else
+constexpr int kRegisterBytes = 16;
+#endif
+constexpr int kRegisters = kLanes * 4 / kRegisterBytes;
+
+typedef float FloatRegister __attribute__((vector_size(kRegisterBytes)));
+typedef int32_t IntRegister __attribute__((vector_size(kRegisterBytes)));
+static_assert(sizeof(FloatRegister) == kRegisterBytes);
+
+// Applies f to every register index; unrolled, so that the arrays live in registers.
+template <class F>
+[[gnu::always_inline]] inline void each_register(F f) {
+#pragma GCC unroll 4
+  for (int k = 0; k < kRegisters; ++k) f(k);
+}
+
+struct Mask {  // per lane: all bits set, or none
+  IntRegister v[kRegisters];
+};
+
+struct Floats {
+  FloatRegister v[kRegisters];
+
+  Floats() = default;
+  Floats(float x) {  // implicit: a scalar stands for sixteen equal lanes
+    each_register([&](int k) { v[k] = x - FloatRegister{}; });  // x - 0 folds, 0 + x does not
+  }
+  static Floats load(const float* p) {
+    Floats out;
+    std::memcpy(out.v, p, sizeof out.v);
+    return out;
+  }
+  void store(float* p) const { std::memcpy(p, v, sizeof v); }
+};
+
+#define LDO_OPERATOR(Result, op)                                \
+  inline Result operator op(Floats a, Floats b) {               \
+    Result out;                                                 \
+    each_register([&](int k) { out.v[k] = a.v[k] op b.v[k]; }); \
+    return out;                                                 \
+  }
+LDO_OPERATOR(Floats, +)
+LDO_OPERATOR(Floats, -)
+LDO_OPERATOR(Floats, *)
+LDO_OPERATOR(Floats, /)
+LDO_OPERATOR(Mask, <)
+LDO_OPERATOR(Mask, >=)
+#undef LDO_OPERATOR
+
+inline Mask operator&(Mask a, Mask b) {
+  Mask out;
+  each_register([&](int k) { out.v[k] = a.v[k] & b.v[k]; });
+  return out;
+}
+
+inline Floats select(Mask m, Floats yes, Floats no) {
+  Floats out;
+  each_register([&](int k) { out.v[k] = m.v[k] ? yes.v[k] : no.v[k]; });
+  return out;
+}
+
+// From `a < b ? a : b` the compilers make two instructions where the machine has one.
+inline FloatRegister least(FloatRegister a, FloatRegister b) {
+#if defined(__AVX512F__)
+  return _mm512_min_ps(a, b);
+#elif defined(__AVX2__)
+  return _mm256_min_ps(a, b);
+#elif defined(__SSE2__)
+  return _mm_min_ps(a, b);
+#else
+  return a < b ? a : b;
+#endif
+}
+
+inline FloatRegister greatest(FloatRegister a, FloatRegister b) {
+#if defined(__AVX512F__)
+  return _mm512_max_ps(a, b);
+#elif defined(__AVX2__)
+  return _mm256_max_ps(a, b);
+#elif defined(__SSE2__)
+  return _mm_max_ps(a, b);
+#else
+  return a > b ? a : b;
+#endif
+}
+
+inline Floats min(Floats a, Floats b) {
+  Floats out;
+  each_register([&](int k) { out.v[k] = least(a.v[k], b.v[k]); });
+  return out;
+}
+
+inline Floats max(Floats a, Floats b) {
+  Floats out;
+  each_register([&](int k) { out.v[k] = greatest(a.v[k], b.v[k]); });
+  return out;
+}
+
+inline Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
+
+// Bit i of the result is lane i of the mask.
+inline uint32_t bits(Mask m) {
+#if defined(__AVX512DQ__)
+  return _mm512_movepi32_mask(reinterpret_cast<__m512i>(m.v[0]));
+#elif defined(__AVX2__)
+  const auto half = [&](int k) { return _mm256_movemask_ps(reinterpret_cast<__m256>(m.v[k])); };
+  return static_cast<uint32_t>(half(0) | half(1) << 8);
+#elif defined(__SSE2__)
+  uint32_t out = 0;
+  each_register([&](int k) {
+    out |= static_cast<uint32_t>(_mm_movemask_ps(reinterpret_cast<__m128>(m.v[k]))) << 4 * k;
+  });
+  return out;
+#else
+  uint32_t out = 0;
+  each_register([&](int k) {
+    const IntRegister bit = m.v[k] & IntRegister{1, 2, 4, 8};
+    out |= static_cast<uint32_t>(bit[0] | bit[1] | bit[2] | bit[3]) << 4 * k;
+  });
+  return out;
+#endif
+}
+
+inline bool any(Mask m) { return bits(m) != 0; }
+
+// 2^x for x in [-126, 126], relative error below 4e-7. Adding 1.5 * 2^23 leaves the nearest integer
+// in the low bits; a minimax polynomial does the fraction in [-0.5, 0.5].
+inline Floats exp2(Floats x) {
+  Floats out;
+  each_register([&](int k) {
+    const FloatRegister shifted = x.v[k] + 12582912.0f;
+    const FloatRegister f = x.v[k] - (shifted - 12582912.0f);
+    FloatRegister p = f * 1.326472725e-03f + 9.671512688e-03f;
+    p = p * f + 5.550733744e-02f;
+    p = p * f + 2.402224208e-01f;
+    p = p * f + 6.931469776e-01f;
+    p = p * f + 1.0f;
+    const IntRegister exponent = reinterpret_cast<IntRegister>(shifted) << 23;
+    out.v[k] = reinterpret_cast<FloatRegister>(reinterpret_cast<IntRegister>(p) + exponent);
+  });
+  return out;
+}
+
+// log2 of normal x > 0, absolute error below 1e-6: exponent plus the series of atanh.
+inline Floats log2(Floats x) {
+  Floats out;
+  each_register([&](int k) {
+    const IntRegister i = reinterpret_cast<IntRegister>(x.v[k]);
+    const IntRegister e = (i - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
+    const FloatRegister m = reinterpret_cast<FloatRegister>(i - (e << 23));
+    const FloatRegister s = (m - 1.0f) / (m + 1.0f), s2 = s * s;
+    FloatRegister p = s2 * 0.41219858f + 0.57707801f;
+    p = p * s2 + 0.96179669f;
+    p = p * s2 + 2.88539008f;
+    out.v[k] = __builtin_convertvector(e, FloatRegister) + p * s;
+  });
+  return out;
+}
+
+inline Floats sqrt(Floats x) {
+  Floats out;
+  each_register([&](int k) {
+    for (int i = 0; i < kLanes / kRegisters; ++i) out.v[k][i] = __builtin_sqrtf(x.v[k][i]);
+  });
+  return out;
+}
+
+// Writes the i in [0, n) whose words[i] has the bit set, in order; returns how many. Without
+// branches, as the bits follow no pattern. `words` and `out` have room for kLanes beyond n.
+inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out) {
+  int count = 0;
+#if defined(__AVX512F__)
+  const __m512i wanted = _mm512_set1_epi32(1 << bit);
+  __m512i index = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  for (int i = 0; i < n; i += kLanes, index = _mm512_add_epi32(index, _mm512_set1_epi32(kLanes))) {
+    const __mmask16 inside = n - i < kLanes ? (1u << (n - i)) - 1 : 0xffff;
+    const __mmask16 set =
+        _mm512_mask_test_epi32_mask(inside, _mm512_loadu_si512(words + i), wanted);
+    _mm512_storeu_si512(out + count, _mm512_maskz_compress_epi32(set, index));
+    count += __builtin_popcount(set);
+  }
+#else
+  for (int i = 0; i < n; ++i) {
+    out[count] = static_cast<uint32_t>(i);
+    count += words[i] >> bit & 1;
+  }
+#endif
+  return count;
+}
+
+}  // namespace ldo::LDO_ISA
