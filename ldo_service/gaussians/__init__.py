@@ -1,1 +1,6 @@
-"""TBD."""
+"""The map of 3D Gaussians: what it holds, how it is seen, and how it grows."""
+
+from .model import GaussianMap
+from .render import Rendering, render
+
+__all__ = ["GaussianMap", "Rendering", "render"]

@@ -1,0 +1,187 @@
+"""The map: Gaussians in rows of one cache line, with stable ids and the keyframes they hang on."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ldo_service.geometry import se3
+
+ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused
+_CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache
+
+
+class GaussianMap:
+    """Gaussians in the map frame, in order of insertion.
+
+    `rows`, its columns (`means`, ...), `ids` and `anchors` are views without a copy, valid until
+    the next `add` or `remove`. Who writes through them calls `touch`. `version` grows with every
+    change.
+    """
+
+    def __init__(self, capacity: int = 4096) -> None:
+        self._rows = _aligned_rows(capacity)
+        self._ids = np.zeros(capacity, np.int64)
+        self._anchors = np.zeros(capacity, np.int32)
+        self._size = 0
+        self._next_id = 0
+        self.version = 0
+
+    def __len__(self) -> int:
+        return self._size
+
+    @property
+    def rows(self) -> np.ndarray:
+        """[N, 16] float32, as `render` takes them."""
+        return self._rows[: self._size]
+
+    @property
+    def means(self) -> np.ndarray:
+        """[N, 3] metres, map frame."""
+        return self.rows[:, 0:3]
+
+    @property
+    def log_scales(self) -> np.ndarray:
+        """[N, 3] log of the standard deviations in metres."""
+        return self.rows[:, 3:6]
+
+    @property
+    def quats(self) -> np.ndarray:
+        """[N, 4] wxyz, rotate the Gaussians' axes to the map frame."""
+        return self.rows[:, 6:10]
+
+    @property
+    def opacity_logits(self) -> np.ndarray:
+        """[N]"""
+        return self.rows[:, 10]
+
+    @property
+    def colors(self) -> np.ndarray:
+        """[N, 3] RGB, 0..1."""
+        return self.rows[:, 11:14]
+
+    @property
+    def ids(self) -> np.ndarray:
+        """[N] int64, ascending, never used twice."""
+        return self._ids[: self._size]
+
+    @property
+    def anchors(self) -> np.ndarray:
+        """[N] int32, id of the keyframe that each Gaussian moves with."""
+        return self._anchors[: self._size]
+
+    def touch(self) -> None:
+        """Say that something was written through a view."""
+        self.version += 1
+
+    def add(self, rows: np.ndarray, anchor: int) -> np.ndarray:
+        """Append rows [M, 16] that hang on keyframe `anchor`; returns their ids [M].
+
+        Raises ValueError for another shape, and for NaN or infinity.
+        """
+        if rows.ndim != 2 or rows.shape[1] != ROW:
+            raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}].")
+        if not np.all(np.isfinite(rows)):
+            raise ValueError("rows hold NaN or infinity.")
+        start, stop = self._size, self._size + len(rows)
+        self._reserve(stop)
+        self._rows[start:stop] = rows
+        self._ids[start:stop] = np.arange(self._next_id, self._next_id + len(rows))
+        self._anchors[start:stop] = anchor
+        self._size = stop
+        self._next_id += len(rows)
+        self.touch()
+        return self._ids[start:stop].copy()
+
+    def remove(self, mask: np.ndarray) -> int:
+        """Drop the Gaussians where mask [N] is true; the others keep their order and ids.
+
+        Returns how many went. Raises ValueError for a mask of another size or type.
+        """
+        if mask.shape != (self._size,) or mask.dtype != np.bool_:
+            raise ValueError(f"mask is {mask.dtype}{mask.shape}, must be bool({self._size},).")
+        keep = ~mask
+        size = int(np.count_nonzero(keep))
+        for array in (self._rows, self._ids, self._anchors):
+            array[:size] = array[: self._size][keep]
+        removed, self._size = self._size - size, size
+        self.touch()
+        return removed
+
+    def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+        """Move what hangs on each keyframe: mean <- T mean, quat <- q(T) quat.
+
+        T_new_old  per keyframe id the transform [4, 4] from the old place in the map to the new
+                   one, T_map_keyframe(new) @ inverse(T_map_keyframe(old)); others stay.
+        Raises ValueError for a transform that is not finite. Linear in N, computed in float64.
+        """
+        keyframes = np.array(sorted(T_new_old), np.int64)
+        if len(keyframes) == 0 or self._size == 0:
+            return
+        T = np.stack([np.asarray(T_new_old[int(k)], float) for k in keyframes])
+        if T.shape[1:] != (4, 4) or not np.all(np.isfinite(T)):
+            raise ValueError("transforms must be [4, 4] and finite.")
+        for start in range(0, self._size, _CHUNK):
+            chunk = slice(start, min(start + _CHUNK, self._size))
+            _move(self._rows[chunk], self._anchors[chunk], keyframes, T)
+        self.touch()
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """A copy of everything, as named arrays."""
+        return {
+            "rows": self.rows.copy(),
+            "ids": self.ids.copy(),
+            "anchors": self.anchors.copy(),
+            "next_id": np.array(self._next_id, np.int64),
+            "version": np.array(self.version, np.int64),
+        }
+
+    @classmethod
+    def restore(cls, state: Mapping[str, np.ndarray]) -> "GaussianMap":
+        """The map of which `state` is the snapshot, exactly."""
+        size = len(state["rows"])
+        out = cls(max(size, 1))
+        out._rows[:size], out._ids[:size] = state["rows"], state["ids"]
+        out._anchors[:size] = state["anchors"]
+        out._size, out._next_id = size, int(state["next_id"])
+        out.version = int(state["version"])
+        return out
+
+    def _reserve(self, size: int) -> None:
+        if size <= len(self._rows):
+            return
+        capacity = max(size, 2 * len(self._rows))
+        grown = _aligned_rows(capacity), np.zeros(capacity, np.int64), np.zeros(capacity, np.int32)
+        for new, old in zip(grown, (self._rows, self._ids, self._anchors), strict=True):
+            new[: self._size] = old[: self._size]
+        self._rows, self._ids, self._anchors = grown
+
+
+def _aligned_rows(capacity: int) -> np.ndarray:
+    """Zeroed rows [capacity, 16], each of which fills one 64-byte cache line."""
+    memory = np.zeros(capacity * ROW + 16, np.float32)
+    skip = (-memory.ctypes.data % 64) // 4
+    return memory[skip : skip + capacity * ROW].reshape(capacity, ROW)
+
+
+def _move(rows: np.ndarray, anchors: np.ndarray, keyframes: np.ndarray, T: np.ndarray) -> None:
+    which = np.minimum(np.searchsorted(keyframes, anchors), len(keyframes) - 1)
+    moved = np.flatnonzero(keyframes[which] == anchors)
+    R, t = T[which[moved], :3, :3], T[which[moved], :3, 3]
+    rows[moved, 0:3] = (R @ rows[moved, 0:3, None])[..., 0] + t
+    q = np.stack([se3.quaternion(one) for one in T[:, :3, :3]])[which[moved]]
+    rows[moved, 6:10] = _product(q, rows[moved, 6:10])
+
+
+def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Hamilton product [M, 4] of quaternions wxyz: the rotation q, then p."""
+    pw, px, py, pz = p.T
+    qw, qx, qy, qz = q.T
+    return np.stack(
+        [
+            pw * qw - px * qx - py * qy - pz * qz,
+            pw * qx + px * qw + py * qz - pz * qy,
+            pw * qy - px * qz + py * qw + pz * qx,
+            pw * qz + px * qy - py * qx + pz * qw,
+        ],
+        axis=-1,
+    )

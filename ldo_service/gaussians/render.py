@@ -1,0 +1,71 @@
+"""Images of the map: EWA splatting of 3D Gaussians, front to back.
+
+The kernel is `ldo_service/kernels/rasterise.cpp`; its plain twin is `render_reference.py`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera
+from ldo_service.kernels import _rasterise
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """What a camera sees of the map. With w_i = alpha_i prod_{j<i} (1 - alpha_j), near to far:
+
+    color            [H, W, 3] float32, sum w_i c_i, background black
+    weighted_depth_m [H, W] float32, sum w_i z_i: not divided by the opacity
+    median_depth_m   [H, W] float32, z where the transmittance first falls below one half, or 0:
+                     a surface that was there, where the mean may lie between two
+    opacity          [H, W] float32, sum w_i = 1 - transmittance
+    """
+
+    color: np.ndarray
+    weighted_depth_m: np.ndarray
+    median_depth_m: np.ndarray
+    opacity: np.ndarray
+
+    @property
+    def depth_m(self) -> np.ndarray:
+        """Mean depth [H, W] where the opacity exceeds one half, else 0 (computed on each call)."""
+        covered = self.opacity > 0.5
+        return np.where(covered, self.weighted_depth_m / np.where(covered, self.opacity, 1), 0)
+
+
+def render(
+    rows: np.ndarray, camera: Camera, T_camera_map: np.ndarray, *, threads: int = 1
+) -> Rendering:
+    """Render Gaussians into a pinhole camera.
+
+    Each pixel blends, by increasing (z, index), alpha = min(0.99, o exp(-d' S^-1 d / 2)) with
+    S = J R Sigma R' J' + 0.3 px^2 I; Gaussians with z < 0.05 m and alpha < 1/255 are left out.
+    A block of 4x4 pixels is finished when all its transmittances are below 1e-4.
+
+    rows          [N, 16] float32, contiguous: mean [3] in metres (map), log scale [3] in
+                  log metres, quaternion wxyz [4] of any length, opacity logit, rgb [3], 2 unused.
+                  Rows that hold NaN or infinity are not drawn.
+    camera        without distortion; raises DataError with it
+    T_camera_map  [4, 4]
+    Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads; the
+    last bits differ between instruction sets (`ldo_service.kernels.isa`).
+    Zwicker et al., EWA splatting, 2002; Kerbl et al., 3D Gaussian splatting, 2023.
+    """
+    if camera.distortion:
+        raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
+    T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
+    return Rendering(
+        *_rasterise.rasterise(
+            rows,
+            T,
+            camera.fx,
+            camera.fy,
+            camera.cx,
+            camera.cy,
+            camera.width,
+            camera.height,
+            threads,
+        )
+    )

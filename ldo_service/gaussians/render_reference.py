@@ -1,0 +1,79 @@
+"""The plain twin of `render`: every Gaussian in every pixel, in one screenful of array code.
+
+Slow and memory hungry (H W N), meant for small scenes in tests. It assigns to no array, and takes
+the array module as `xp`, so that `autograd.numpy` differentiates it.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+
+from .render import Rendering
+
+
+def rotations(quats: Any, xp: Any = np) -> Any:
+    """Rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz of any length."""
+    w, x, y, z = (quats / xp.sqrt(xp.sum(quats**2, axis=1, keepdims=True))).T
+    return xp.stack(
+        [
+            xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
+            xp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)], -1),
+            xp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        1,
+    )
+
+
+def project(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np) -> tuple[Any, Any, Any]:
+    """Image means [N, 2], image covariances [N, 2, 2] in px^2, and depths [N] in metres."""
+    R, t = T_camera_map[:3, :3], T_camera_map[:3, 3]
+    p = rows[:, :3] @ R.T + t
+    z = xp.maximum(p[:, 2], 0.05)
+    x, y = p[:, 0] / z, p[:, 1] / z
+    margin_x, margin_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
+    near_x = xp.clip(
+        x, -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x
+    )
+    near_y = xp.clip(
+        y, -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y
+    )
+    zero = xp.zeros_like(z)
+    J = xp.stack(
+        [
+            xp.stack([camera.fx / z, zero, -camera.fx * near_x / z], -1),
+            xp.stack([zero, camera.fy / z, -camera.fy * near_y / z], -1),
+        ],
+        1,
+    )
+    M = J @ R @ rotations(rows[:, 6:10], xp) * xp.exp(rows[:, None, 3:6])
+    covariances = M @ xp.swapaxes(M, 1, 2) + 0.3 * xp.eye(2)
+    return (
+        xp.stack([camera.fx * x + camera.cx, camera.fy * y + camera.cy], -1),
+        covariances,
+        p[:, 2],
+    )
+
+
+def render_reference(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np) -> Rendering:
+    """As `render`, in the precision of `rows`, and without its early stop at T < 1e-4."""
+    means, covariances, z = project(rows, camera, T_camera_map, xp)
+    order = np.argsort(z, kind="stable")
+    order = order[z[order] >= 0.05]
+    means, covariances, z = means[order], covariances[order], z[order]
+    opacities, colors = 1 / (1 + xp.exp(-rows[order, 10])), rows[order, 11:14]
+
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    d = xp.stack([u, v], -1)[..., None, :] - means  # [H, W, N, 2]
+    q = xp.einsum("hwni,nij,hwnj->hwn", d, xp.linalg.inv(covariances), d)
+    alpha = xp.minimum(opacities * xp.exp(-0.5 * q), 0.99)
+    alpha = xp.where(alpha >= 1 / 255, alpha, 0.0)
+    log_pass = xp.log(1 - alpha)
+    after = xp.cumsum(log_pass, axis=2)  # log transmittance behind each Gaussian
+    weights = alpha * xp.exp(after - log_pass)
+
+    behind_half = np.concatenate([after < np.log(0.5), np.ones_like(u[..., None], bool)], axis=2)
+    median = np.append(z, 0.0)[np.argmax(behind_half, axis=2)]
+    opacity = xp.sum(weights, axis=2)
+    return Rendering(weights @ colors, weights @ z, median, opacity)
