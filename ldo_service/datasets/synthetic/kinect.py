@@ -2,8 +2,8 @@
 
 import numpy as np
 
-# Khoshelham and Elberink, Sensors 2012: depth = 1 / (A - B * disparity), steps of 1/8 disparity,
-# which makes a step of 2.85e-3 z^2 / 8 * 8 m, and half a step of noise in disparity.
+# Khoshelham and Elberink, Sensors 2012: depth is 1 / (step * disparity), with disparity in whole
+# steps, so a step in depth is 2.85e-3 z^2 m; the matching errs by half a step.
 DISPARITY_STEP_PER_M = 2.85e-3
 DISPARITY_SIGMA_STEPS = 0.5
 NEAREST_M, FARTHEST_M = 0.4, 8.0

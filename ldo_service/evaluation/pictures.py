@@ -1,0 +1,182 @@
+"""Pictures of results, as uint8 RGB images."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ldo_service.geometry import Trajectory, associate, se3
+
+from .trajectory import ASSOCIATION_TOLERANCE_S, FEWEST_POSES, align
+
+Color = tuple[int, int, int]
+BACKGROUND, INK, GRID = (255, 255, 255), (60, 60, 60), (232, 232, 232)
+TRUTH, ESTIMATE = (120, 120, 120), (31, 111, 235)
+START, END = (46, 160, 67), (207, 34, 46)
+FONT = cv2.FONT_HERSHEY_SIMPLEX
+PANEL_PX, MARGIN_PX, CAPTION_PX = 480, 44, 26
+SUBPIXEL_BITS = 4
+NAMES = "xyz"
+
+
+def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
+    """Views from above and from the side [H, W, 3] of the estimate (blue) and the truth (grey).
+
+    The estimate is aligned to the truth if at least three poses have a partner. The world's axes
+    are sorted by how far the camera moved along them: the two longest make the view from above.
+    """
+    lines = [] if truth is None else [_Line(truth.T_world_camera[:, :3, 3], TRUTH, "truth")]
+    lines.append(_Line(_aligned_positions(estimate, truth), ESTIMATE, "estimate"))
+    lines = [line for line in lines if len(line.points_m)]
+    points_m = np.concatenate([line.points_m for line in lines] or [np.zeros((1, 3))])
+    short, middle, long = np.argsort(np.ptp(points_m, axis=0), kind="stable")
+    views = [_view(lines, points_m, (long, up)) for up in (middle, short)]
+    picture = np.hstack(views)
+    _legend(picture, lines)
+    return picture
+
+
+def depth_picture(depth_m: np.ndarray, farthest_m: float | None = None) -> np.ndarray:
+    """Depth [H, W] in Turbo colours [H, W, 3], near is red and far is blue; missing is black.
+
+    Scaled to `farthest_m`, by default the 98th percentile of what was measured.
+    """
+    seen = np.isfinite(depth_m) & (depth_m > 0)
+    if not seen.any():
+        return np.zeros((*depth_m.shape, 3), np.uint8)
+    nearest = float(np.percentile(depth_m[seen], 2))
+    farthest = farthest_m or float(np.percentile(depth_m[seen], 98))
+    nearness = (farthest - np.where(seen, depth_m, farthest)) / max(farthest - nearest, 1e-6)
+    gray = np.clip(nearness * 255, 0, 255).astype(np.uint8)
+    image = cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
+    image[~seen] = 0
+    return image
+
+
+def contact_sheet(rows: list[list[np.ndarray]], captions: list[str]) -> np.ndarray:
+    """Images [H, W, 3] uint8 in rows, a caption above each column.
+
+    All are scaled to the height of the first. Raises ValueError for an empty or ragged table.
+    """
+    if not rows or any(len(row) != len(captions) for row in rows) or not captions:
+        raise ValueError("a contact sheet needs rows with one image per caption")
+    height, width = rows[0][0].shape[:2]
+    gap = 6
+    sheet_size = (
+        CAPTION_PX + len(rows) * (height + gap),
+        len(captions) * (width + gap) + gap,
+        3,
+    )
+    sheet = np.full(sheet_size, 255, np.uint8)
+    for column, caption in enumerate(captions):
+        left = gap + column * (width + gap)
+        _text(sheet, caption, (left, CAPTION_PX - 8))
+        for row, images in enumerate(rows):
+            top = CAPTION_PX + row * (height + gap)
+            sheet[top : top + height, left : left + width] = _fitted(images[column], width, height)
+    return sheet
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    points_m: np.ndarray  # [K, 3]
+    color: Color
+    name: str
+
+
+def _aligned_positions(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
+    positions = estimate.T_world_camera[:, :3, 3]
+    if truth is None:
+        return positions
+    pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
+    if len(pairs) < FEWEST_POSES:
+        return positions
+    T = align(positions[pairs[:, 0]], truth.T_world_camera[pairs[:, 1], :3, 3])
+    return se3.transform(T, positions)
+
+
+def _view(lines: list[_Line], points_m: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
+    """One square panel: grid, scale bar, axes and the lines seen along the third axis."""
+    panel = np.full((PANEL_PX, PANEL_PX, 3), BACKGROUND, np.uint8)
+    across, up = axes
+    low, high = points_m.min(axis=0), points_m.max(axis=0)
+    center_m = (low + high)[[across, up]] / 2
+    extent_m = max(float(np.max(high - low)), 0.05) * 1.08
+    px_per_m = (PANEL_PX - 2 * MARGIN_PX) / extent_m
+    step_m = _round_step(extent_m / 4)
+    _grid(panel, center_m, px_per_m, step_m)
+    for line in lines:
+        flat = (line.points_m[:, [across, up]] - center_m) * (px_per_m, -px_per_m) + PANEL_PX / 2
+        _polyline(panel, flat, line.color)
+    _scale_bar(panel, step_m, px_per_m)
+    _axes(panel, NAMES[across], NAMES[up])
+    return panel
+
+
+def _polyline(panel: np.ndarray, points_px: np.ndarray, color: Color) -> None:
+    fixed = np.round(points_px * 2**SUBPIXEL_BITS).astype(np.int32).reshape(-1, 1, 2)
+    cv2.polylines(panel, [fixed], False, color, 2, cv2.LINE_AA, SUBPIXEL_BITS)
+    if color == ESTIMATE:
+        for end, mark in ((points_px[0], START), (points_px[-1], END)):
+            center = (round(float(end[0])), round(float(end[1])))
+            cv2.circle(panel, center, 5, mark, -1, cv2.LINE_AA)
+
+
+def _grid(panel: np.ndarray, center_m: np.ndarray, px_per_m: float, step_m: float) -> None:
+    half_m = PANEL_PX / 2 / px_per_m
+    for axis in (0, 1):
+        first = np.ceil((center_m[axis] - half_m) / step_m)
+        for value_m in np.arange(first * step_m, center_m[axis] + half_m, step_m):
+            at = round(PANEL_PX / 2 + (value_m - center_m[axis]) * px_per_m * (1, -1)[axis])
+            ends = ((at, 0), (at, PANEL_PX)) if axis == 0 else ((0, at), (PANEL_PX, at))
+            cv2.line(panel, *ends, GRID, 1)
+
+
+def _scale_bar(panel: np.ndarray, length_m: float, px_per_m: float) -> None:
+    right, y = PANEL_PX - 16, PANEL_PX - 16
+    left = right - round(length_m * px_per_m)
+    cv2.line(panel, (left, y), (right, y), INK, 2)
+    for x in (left, right):
+        cv2.line(panel, (x, y - 4), (x, y + 4), INK, 2)
+    label = f"{length_m:g} m" if length_m >= 1 else f"{length_m * 100:g} cm"
+    _text(panel, label, (left, y - 9))
+
+
+def _axes(panel: np.ndarray, across: str, up: str) -> None:
+    origin, length = (16, PANEL_PX - 16), 34
+    cv2.arrowedLine(panel, origin, (origin[0] + length, origin[1]), INK, 1, cv2.LINE_AA)
+    cv2.arrowedLine(panel, origin, (origin[0], origin[1] - length), INK, 1, cv2.LINE_AA)
+    _text(panel, across, (origin[0] + length + 4, origin[1] + 4))
+    _text(panel, up, (origin[0] - 4, origin[1] - length - 6))
+
+
+def _legend(picture: np.ndarray, lines: list[_Line]) -> None:
+    x = 14
+    entries = [(line.name, line.color) for line in lines] + [("start", START), ("end", END)]
+    for name, color in entries:
+        cv2.circle(picture, (x, 16), 5, color, -1, cv2.LINE_AA)
+        _text(picture, name, (x + 9, 21))
+        x += 34 + 9 * len(name)
+
+
+def _round_step(length_m: float) -> float:
+    """The largest of 1, 2, 5 times a power of ten that is not above `length_m`."""
+    power = 10.0 ** np.floor(np.log10(length_m))
+    return float(
+        max(factor for factor in (1, 2, 5) if factor * power <= length_m * 1.000001) * power
+    )
+
+
+def _fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """The image scaled into width x height, centred on white."""
+    scale = min(width / image.shape[1], height / image.shape[0])
+    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+    scaled = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    out = np.full((height, width, 3), 255, np.uint8)
+    top, left = (height - size[1]) // 2, (width - size[0]) // 2
+    out[top : top + size[1], left : left + size[0]] = scaled
+    return out
+
+
+def _text(image: np.ndarray, text: str, at: tuple[int, int]) -> None:
+    cv2.putText(image, text, at, FONT, 0.45, INK, 1, cv2.LINE_AA)

@@ -1,0 +1,121 @@
+"""Absolute and relative trajectory error (Sturm et al., IROS 2012), as `evo` computes them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Trajectory, associate, se3
+
+ASSOCIATION_TOLERANCE_S = 0.020
+RPE_INTERVAL_S = 1.0
+FEWEST_POSES = 3  # fewer points do not fix a rotation
+
+PROTOCOL = """\
+Estimate and truth are paired by nearest stamp within 20 ms, each pose used once.
+ATE: positions after SE(3) alignment of the estimate to the truth over all pairs, without scale
+(Umeyama, PAMI 1991). RPE: (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) with truth Q and estimate P, for all
+pairs j = i + n, where n is 1 s in poses at the median rate; its translation and rotation angle.
+`evo_ape tum TRUTH ESTIMATE --align --t_max_diff 0.02` and `evo_rpe tum TRUTH ESTIMATE --delta n
+--delta_unit f --all_pairs --t_max_diff 0.02 [--pose_relation angle_deg]` print the same.
+Some published systems print the mean as RMSE; both are given here."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorStatistics:
+    """Summary of one error over a trajectory, in the unit that its field is named after."""
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+
+    @staticmethod
+    def of(errors: np.ndarray) -> "ErrorStatistics":
+        return ErrorStatistics(
+            float(np.sqrt(np.mean(errors**2))),
+            float(np.mean(errors)),
+            float(np.median(errors)),
+            float(np.max(errors)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TrajectoryErrors:
+    """`PROTOCOL` says how each is computed; the relative errors are None below 1 s of poses."""
+
+    poses: int  # associated
+    ate_m: ErrorStatistics
+    rpe_poses: int  # 1 s in poses
+    rpe_translation_m: ErrorStatistics | None
+    rpe_rotation_deg: ErrorStatistics | None
+    T_truth_estimate: np.ndarray  # [4, 4] the alignment
+
+
+def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
+    """Errors of an estimated trajectory, following `PROTOCOL`.
+
+    Raises DataError when fewer than 3 poses have a partner.
+    """
+    pairs = associated(estimate, truth)
+    T_estimate = estimate.T_world_camera[pairs[:, 0]]
+    T_truth = truth.T_world_camera[pairs[:, 1]]
+    T_truth_estimate = align(T_estimate[:, :3, 3], T_truth[:, :3, 3])
+    aligned = se3.transform(T_truth_estimate, T_estimate[:, :3, 3])
+    interval = _poses_per_interval(estimate.stamps_s[pairs[:, 0]])
+    relative = _relative_errors(T_estimate, T_truth, interval)
+    return TrajectoryErrors(
+        len(pairs),
+        ErrorStatistics.of(np.linalg.norm(aligned - T_truth[:, :3, 3], axis=1)),
+        interval,
+        ErrorStatistics.of(np.linalg.norm(relative[:, :3, 3], axis=1)) if len(relative) else None,
+        ErrorStatistics.of(np.rad2deg(_angles(relative))) if len(relative) else None,
+        T_truth_estimate,
+    )
+
+
+def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
+    """Index pairs [M, 2] by nearest stamp within 20 ms. Raises DataError below 3 pairs."""
+    pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
+    if len(pairs) < FEWEST_POSES:
+        raise DataError(
+            f"{len(pairs)} of {len(estimate)} estimated poses have a true pose within 20 ms (the "
+            f"estimate spans {_span(estimate)}, the truth {_span(truth)}), and at least "
+            f"{FEWEST_POSES} are needed. Check that both use the same clock."
+        )
+    return pairs
+
+
+def align(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """T_target_points [4, 4] minimising sum |T p_k - q_k|^2 over p, q [M, 3], without scale.
+
+    Umeyama, PAMI 1991, eq. 40-42, with the reflection guarded. Points on one line leave the
+    rotation about it free; the residuals are the smallest all the same.
+    """
+    mean_p, mean_q = points.mean(axis=0), target.mean(axis=0)
+    U, _, Vt = np.linalg.svd((target - mean_q).T @ (points - mean_p))
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
+    T[:3, 3] = mean_q - T[:3, :3] @ mean_p
+    return T
+
+
+def _relative_errors(T_estimate: np.ndarray, T_truth: np.ndarray, interval: int) -> np.ndarray:
+    """(Q_i^-1 Q_j)^-1 (P_i^-1 P_j) [M, 4, 4] for all j = i + interval."""
+    motion_estimate = se3.inverse(T_estimate[:-interval]) @ T_estimate[interval:]
+    motion_truth = se3.inverse(T_truth[:-interval]) @ T_truth[interval:]
+    return se3.inverse(motion_truth) @ motion_estimate
+
+
+def _angles(T: np.ndarray) -> np.ndarray:
+    return np.array([se3.rotation_angle(T_k) for T_k in T])
+
+
+def _poses_per_interval(stamps_s: np.ndarray) -> int:
+    return max(1, round(RPE_INTERVAL_S / max(float(np.median(np.diff(stamps_s))), 1e-9)))
+
+
+def _span(trajectory: Trajectory) -> str:
+    if len(trajectory) == 0:
+        return "nothing"
+    return f"{trajectory.stamps_s[0]:.3f} s to {trajectory.stamps_s[-1]:.3f} s"
