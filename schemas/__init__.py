@@ -6,14 +6,14 @@ default; what a field means never changes. Conventions of frames and units are t
 `ldo_service.geometry`.
 """
 
-from .array import Array
-from .frames import CameraModel, CameraRgbd, FrameRgbd, Image
-from .graph import Correction
-from .health import Health, InputCount, OutputCount
-from .keyframe import Keyframe
-from .map import AnchorMotion, Gaussians, MapDelta, MapSnapshot, ModelView
-from .message import Message
-from .pose import Pose, TrackedPose, TrackingStatus
+from ldo_service.schemas.array import Array
+from ldo_service.schemas.frames import CameraModel, CameraRgbd, FrameRgbd, Image
+from ldo_service.schemas.graph import Correction
+from ldo_service.schemas.health import Health, InputCount, OutputCount
+from ldo_service.schemas.keyframe import Keyframe
+from ldo_service.schemas.map import AnchorMotion, Gaussians, MapDelta, MapSnapshot, ModelView
+from ldo_service.schemas.message import Message
+from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 
 __all__ = [
     "AnchorMotion",

@@ -4,8 +4,8 @@ from typing import Literal
 
 import msgspec
 
-from .array import Array
-from .message import Message, require_count, require_finite
+from ldo_service.schemas.array import Array
+from ldo_service.schemas.message import Message, require_count, require_finite
 
 MAX_PIXELS = 1 << 25  # 33 megapixels: no RGB-D camera has more, and a lying header could ask for TB
 

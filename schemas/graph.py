@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from .array import Array
-from .message import Message, require_count
-from .pose import QUATERNION_TOLERANCE
+from ldo_service.schemas.array import Array
+from ldo_service.schemas.message import Message, require_count
+from ldo_service.schemas.pose import QUATERNION_TOLERANCE
 
 
 class Correction(Message, frozen=True, kw_only=True):

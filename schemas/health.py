@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-from .message import Message, require_count
+from ldo_service.schemas.message import Message, require_count
 
 
 class InputCount(msgspec.Struct, frozen=True, kw_only=True):

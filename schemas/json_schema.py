@@ -2,8 +2,8 @@
 
 import msgspec
 
-from .message import Message
-from .topics import TOPICS
+from ldo_service.schemas.message import Message
+from ldo_service.schemas.topics import TOPICS
 
 
 def message_types() -> tuple[type[Message], ...]:

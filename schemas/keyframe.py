@@ -1,9 +1,9 @@
 """Keyframes, as the tracker makes them."""
 
-from .array import Array
-from .frames import CameraModel, require_rgbd
-from .message import Message, require_count, require_finite
-from .pose import Matrix6, Pose, require_matrix6
+from ldo_service.schemas.array import Array
+from ldo_service.schemas.frames import CameraModel, require_rgbd
+from ldo_service.schemas.message import Message, require_count, require_finite
+from ldo_service.schemas.pose import Matrix6, Pose, require_matrix6
 
 
 class Keyframe(Message, frozen=True, kw_only=True):

@@ -8,10 +8,10 @@ missed: take a snapshot again.
 
 import msgspec
 
-from .array import Array
-from .frames import CameraModel
-from .message import Message, require_count
-from .pose import Pose
+from ldo_service.schemas.array import Array
+from ldo_service.schemas.frames import CameraModel
+from ldo_service.schemas.message import Message, require_count
+from ldo_service.schemas.pose import Pose
 
 
 class Gaussians(msgspec.Struct, frozen=True, kw_only=True):

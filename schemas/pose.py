@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-from .message import Message, require_count, require_finite
+from ldo_service.schemas.message import Message, require_count, require_finite
 
 QUATERNION_TOLERANCE = 1e-6  # of the norm: float64 rounding, with room for a client's float32 maths
 

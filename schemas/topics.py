@@ -6,13 +6,13 @@ topic without a message type is declared, and has neither producer nor format ye
 
 from dataclasses import dataclass
 
-from .frames import CameraRgbd, FrameRgbd
-from .graph import Correction
-from .health import Health
-from .keyframe import Keyframe
-from .map import MapDelta, MapSnapshot, ModelView
-from .message import Message
-from .pose import TrackedPose
+from ldo_service.schemas.frames import CameraRgbd, FrameRgbd
+from ldo_service.schemas.graph import Correction
+from ldo_service.schemas.health import Health
+from ldo_service.schemas.keyframe import Keyframe
+from ldo_service.schemas.map import MapDelta, MapSnapshot, ModelView
+from ldo_service.schemas.message import Message
+from ldo_service.schemas.pose import TrackedPose
 
 ROBOT_PREFIX = "ldo"
 

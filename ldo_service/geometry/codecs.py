@@ -1,5 +1,7 @@
 """Images as bytes: raw, JPEG, PNG, and depth compressed with zstd."""
 
+from typing import Literal
+
 import cv2
 import numpy as np
 import zstandard
@@ -34,10 +36,10 @@ def decode_depth(encoding: str, width: int, height: int, data: memoryview) -> np
     return _pixels(raw, dtype, (height, width))
 
 
-def encode_depth(depth: np.ndarray) -> tuple[str, bytes]:
+def encode_depth(depth: np.ndarray) -> tuple[Literal["z16+zstd", "f32+zstd"], bytes]:
     """Encoding name and bytes of a depth image [H, W], uint16 or float32."""
-    name = {"uint16": "z16+zstd", "float32": "f32+zstd"}[depth.dtype.name]
-    return name, zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(np.ascontiguousarray(depth))
+    compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(depth.tobytes())
+    return ("z16+zstd" if depth.dtype == np.uint16 else "f32+zstd"), compressed
 
 
 def encode_jpeg(color: np.ndarray, quality: int = 95) -> bytes:

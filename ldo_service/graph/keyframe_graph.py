@@ -60,13 +60,14 @@ class KeyframeGraph:
 
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
         """The keyframe that fixes the map's frame."""
-        self._initial[keyframe] = T_map_keyframe
+        self._initial[keyframe] = np.array(T_map_keyframe, float)
         self._update(self._first_factor(keyframe), [keyframe])
 
     def add(self, measured: RelativePose) -> None:
         """A new keyframe `b`, measured from a known one. Raises KeyError when `a` is not known."""
-        T_map_a = self._initial[measured.a] if len(self) == 1 else self.pose(measured.a)
-        self._initial[measured.b] = T_map_a @ measured.T_a_b
+        if measured.a not in self:
+            raise KeyError(measured.a)
+        self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
         self._measured.append(measured)
         self._update([self._factor(measured)], [measured.b])
 
@@ -125,7 +126,7 @@ class KeyframeGraph:
             gtsam.noiseModel.Gaussian.Information(information),
         )
 
-    # --- state --------------------------------------------------------------------------------------
+    # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, np.ndarray]:
         keyframes = sorted(self._initial)
         measured = self._measured

@@ -32,7 +32,8 @@ class Actor:
     def has_room(self, topic: Topic) -> bool:
         return self.room.get(topic, UNLIMITED) > 0
 
-    def handle(self, message: Message) -> Iterator[Message]:
+    def handle(self, message: Any) -> Iterator[Message]:
+        """What the actor makes of one message of its inputs."""
         raise NotImplementedError
 
     def finish(self) -> Iterator[Message]:

@@ -1,16 +1,27 @@
 """A wired graph of actors: who makes what, who waits for whom."""
 
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 from ldo_service.errors import ConfigError, LosslessCycle
 
-from .actor import Actor
-from .ports import In, Lossless
-
-ActorType = type[Actor]
+from .ports import In, Lossless, Out
 
 
-def check_graph(actors: Iterable[ActorType]) -> None:
+class HasPorts(Protocol):
+    """An actor's class, or its drawing."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def inputs(self) -> tuple[In, ...]: ...
+
+    @property
+    def outputs(self) -> tuple[Out, ...]: ...
+
+
+def check_graph(actors: Iterable[HasPorts]) -> None:
     """Refuse two producers of one topic, and a cycle of lossless inputs.
 
     Around such a cycle each actor could wait for room at the next, for ever. Raises ConfigError or
@@ -38,7 +49,7 @@ def check_graph(actors: Iterable[ActorType]) -> None:
         visit(name, [])
 
 
-def producers(actors: Iterable[ActorType]) -> dict[str, str]:
+def producers(actors: Iterable[HasPorts]) -> dict[str, str]:
     """Topic name to the name of the actor that makes it."""
     makers: dict[str, str] = {}
     for actor in actors:
@@ -52,7 +63,7 @@ def producers(actors: Iterable[ActorType]) -> dict[str, str]:
     return makers
 
 
-def lossless_consumers(actors: Iterable[ActorType], topic_name: str) -> frozenset[str]:
+def lossless_consumers(actors: Iterable[HasPorts], topic_name: str) -> frozenset[str]:
     """Names of the actors that must get every message of a topic."""
     return frozenset(
         actor.name
@@ -61,5 +72,5 @@ def lossless_consumers(actors: Iterable[ActorType], topic_name: str) -> frozense
     )
 
 
-def lossless(actor: ActorType) -> Sequence[In]:
+def lossless(actor: HasPorts) -> Sequence[In]:
     return [port for port in actor.inputs if isinstance(port.policy, Lossless)]

@@ -106,6 +106,12 @@ class Odometry:
             self._state, memory=memory, keyframe=keyframe, frames_since_keyframe=0
         )
 
+    def keyframe_indices(self) -> frozenset[int]:
+        """`RgbdFrame.index` of the keyframes that a frame may still be aligned to."""
+        current = self._state.keyframe
+        kept = (*self._state.memory, *(() if current is None else (current,)))
+        return frozenset(keyframe.index for keyframe in kept)
+
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values: 1.5 MB a keyframe."""
         return packed(self._state)

@@ -174,7 +174,7 @@ def test_python_picks_the_instruction_set_that_was_forced() -> None:
     assert done.returncode != 0
 
 
-GOOD = dict(fx=20.0, fy=20.0, cx=4.0, cy=4.0, width=9, height=9, threads=1)
+GOOD = {"fx": 20.0, "fy": 20.0, "cx": 4.0, "cy": 4.0, "width": 9, "height": 9, "threads": 1}
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,95 @@
+"""Receivers of keyframes and corrections agree on where keyframes are."""
+
+import numpy as np
+import pytest
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.keyframe_poses import KeyframePoses
+
+
+def random_pose(rng: np.random.Generator, size: float = 0.3) -> np.ndarray:
+    return se3.exp(rng.normal(scale=size, size=6))
+
+
+@pytest.fixture
+def steps() -> list[np.ndarray]:
+    rng = np.random.default_rng(1)
+    return [random_pose(rng) for _ in range(6)]
+
+
+def chained(steps: list[np.ndarray]) -> KeyframePoses:
+    poses = KeyframePoses()
+    T_odom = np.eye(4)
+    for keyframe, T_reference_keyframe in enumerate(steps):
+        T_odom = T_odom @ T_reference_keyframe
+        reference = keyframe - 1 if keyframe else None
+        poses.chain(keyframe, reference, T_reference_keyframe, T_odom)
+    return poses
+
+
+def test_without_corrections_the_map_is_the_odometry(steps) -> None:
+    poses = chained(steps)
+    for keyframe in range(len(steps)):
+        np.testing.assert_allclose(poses.T_map_odom(keyframe), np.eye(4), atol=1e-12)
+
+
+def test_a_missed_reference_is_bridged_by_odometry(steps) -> None:
+    whole = chained(steps)
+    gappy = KeyframePoses()
+    T_odom = np.eye(4)
+    for keyframe, T_reference_keyframe in enumerate(steps):
+        T_odom = T_odom @ T_reference_keyframe
+        if keyframe != 3:
+            gappy.chain(keyframe, keyframe - 1, T_reference_keyframe, T_odom)
+    for keyframe in (0, 1, 2, 4, 5):
+        np.testing.assert_allclose(gappy[keyframe], whole[keyframe], atol=1e-12)
+
+
+def test_a_correction_returns_the_motion_of_every_keyframe(steps) -> None:
+    poses = chained(steps)
+    old = {k: poses[k].copy() for k in poses}
+    rng = np.random.default_rng(2)
+    new = {k: old[k] @ random_pose(rng, 0.05) for k in old}
+    motions = poses.correct(1, new)
+    for keyframe in old:
+        np.testing.assert_allclose(motions[keyframe] @ old[keyframe], new[keyframe], atol=1e-12)
+        np.testing.assert_allclose(poses[keyframe], new[keyframe], atol=1e-12)
+
+
+def test_keyframes_newer_than_a_correction_follow_its_newest(steps) -> None:
+    poses = chained(steps)
+    T_3_5 = se3.inverse(poses[3]) @ poses[5]
+    rng = np.random.default_rng(3)
+    new = {k: poses[k] @ random_pose(rng, 0.05) for k in range(4)}
+    poses.correct(1, new)
+    np.testing.assert_allclose(se3.inverse(poses[3]) @ poses[5], T_3_5, atol=1e-12)
+
+
+def test_order_of_correction_and_keyframe_does_not_matter(steps) -> None:
+    rng = np.random.default_rng(4)
+    before, after = chained(steps[:5]), chained(steps[:5])
+    new = {k: before[k] @ random_pose(rng, 0.05) for k in range(5)}
+    T_odom_5 = before[4] @ steps[5]
+    before.chain(5, 4, steps[5], T_odom_5)
+    before.correct(1, new)
+    after.correct(1, new)
+    after.chain(5, 4, steps[5], T_odom_5)
+    np.testing.assert_allclose(before[5], after[5], atol=1e-12)
+
+
+def test_an_older_correction_changes_nothing(steps) -> None:
+    poses = chained(steps)
+    poses.correct(2, {0: se3.exp(np.full(6, 0.1))})
+    assert poses.correct(1, {0: np.eye(4)}) == {}
+    assert poses.version == 2
+
+
+def test_snapshot_and_restore_are_exact(steps) -> None:
+    poses, twin = chained(steps), KeyframePoses()
+    poses.correct(3, {k: poses[k] @ steps[0] for k in range(4)})
+    twin.restore(poses.snapshot())
+    assert twin.version == 3
+    assert list(twin) == list(poses)
+    for keyframe in poses:
+        np.testing.assert_array_equal(twin[keyframe], poses[keyframe])
+        np.testing.assert_array_equal(twin.T_map_odom(keyframe), poses.T_map_odom(keyframe))

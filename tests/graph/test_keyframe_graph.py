@@ -1,0 +1,103 @@
+"""Incremental poses agree with the chain, with a batch solution, and with themselves."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from ldo_service.geometry import se3
+from ldo_service.graph.keyframe_graph import KeyframeGraph, RelativePose
+
+INFORMATION = np.diag([1e4, 1e4, 1e4, 1e3, 1e3, 1e3])
+
+
+def circle(count: int) -> list[np.ndarray]:
+    """True T_map_keyframe around a circle, looking outwards."""
+    poses = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        T = se3.exp(np.array([0, angle, 0, 0, 0, 0]))
+        T[:3, 3] = 2 * np.sin(angle), 0.1 * np.sin(3 * angle), 2 * np.cos(angle)
+        poses.append(T)
+    return poses
+
+
+def measured(
+    truth: list[np.ndarray], pairs: list[tuple[int, int]], sigma: float
+) -> list[RelativePose]:
+    rng = np.random.default_rng(5)
+    return [
+        RelativePose(
+            a,
+            b,
+            se3.inverse(truth[a]) @ truth[b] @ se3.exp(rng.normal(scale=sigma, size=6)),
+            INFORMATION,
+        )
+        for a, b in pairs
+    ]
+
+
+def built(truth: list[np.ndarray], measurements: list[RelativePose]) -> KeyframeGraph:
+    graph = KeyframeGraph()
+    graph.add_first(0, truth[0])
+    for measurement in measurements:
+        graph.add(measurement)
+    return graph
+
+
+def test_a_chain_of_exact_odometry_gives_the_truth() -> None:
+    truth = circle(20)
+    graph = built(truth, measured(truth, [(i, i + 1) for i in range(19)], 0.0))
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, truth[keyframe], atol=1e-6)
+
+
+def test_incremental_poses_equal_a_batch_solution() -> None:
+    truth = circle(12)
+    measurements = measured(truth, [(i, i + 1) for i in range(11)], 0.02)
+    graph = built(truth, measurements)
+    batch, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    batch.add(
+        gtsam.PriorFactorPose3(0, gtsam.Pose3(truth[0]), gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+    )
+    values.insert(0, gtsam.Pose3(truth[0]))
+    for m in measurements:
+        noise = gtsam.noiseModel.Gaussian.Information(m.information)
+        batch.add(gtsam.BetweenFactorPose3(m.a, m.b, gtsam.Pose3(m.T_a_b), noise))
+        values.insert(m.b, gtsam.Pose3(truth[m.b]))
+    solved = gtsam.LevenbergMarquardtOptimizer(batch, values).optimize()
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, solved.atPose3(keyframe).matrix(), atol=1e-5)
+
+
+def test_a_degenerate_measurement_is_accepted() -> None:
+    graph = KeyframeGraph()
+    graph.add_first(0, np.eye(4))
+    T = se3.exp(np.array([0.1, 0, 0, 0.2, 0, 0]))
+    graph.add(RelativePose(0, 1, T, np.zeros((6, 6))))
+    np.testing.assert_allclose(graph.pose(1), T, atol=1e-9)
+
+
+def test_an_unknown_reference_raises() -> None:
+    graph = KeyframeGraph()
+    graph.add_first(0, np.eye(4))
+    with pytest.raises(KeyError):
+        graph.add(RelativePose(7, 8, np.eye(4), INFORMATION))
+
+
+def test_a_restored_graph_goes_on_with_the_same_poses() -> None:
+    truth = circle(16)
+    measurements = measured(truth, [(i, i + 1) for i in range(15)], 0.02)
+    whole = built(truth, measurements)
+    first, second = built(truth, measurements[:8]), KeyframeGraph()
+    second.restore(first.snapshot())
+    for measurement in measurements[8:]:
+        second.add(measurement)
+    for keyframe, T in whole.poses().items():
+        np.testing.assert_allclose(second.pose(keyframe), T, atol=1e-6)
+
+
+def test_equal_measurements_give_equal_bits() -> None:
+    truth = circle(16)
+    measurements = measured(truth, [(i, i + 1) for i in range(15)], 0.02)
+    one, two = built(truth, measurements).poses(), built(truth, measurements).poses()
+    for keyframe in one:
+        np.testing.assert_array_equal(one[keyframe], two[keyframe])
