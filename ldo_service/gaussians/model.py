@@ -78,19 +78,26 @@ class GaussianMap:
 
         Raises ValueError for another shape, and for NaN or infinity.
         """
-        if rows.ndim != 2 or rows.shape[1] != ROW:
-            raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}].")
+        ids = np.arange(self._next_id, self._next_id + len(rows))
+        self.append(ids, rows, np.full(len(rows), anchor, np.int32))
+        return ids
+
+    def append(self, ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
+        """Append Gaussians that another map gave their ids [M], above all in this one, to follow
+        it. Raises ValueError for other shapes, ids that do not ascend, NaN and infinity."""
+        if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
+            raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids.")
         if not np.all(np.isfinite(rows)):
             raise ValueError("rows hold NaN or infinity.")
+        if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
+            raise ValueError(f"ids must ascend from {self._next_id}.")
         start, stop = self._size, self._size + len(rows)
         self._reserve(stop)
-        self._rows[start:stop] = rows
-        self._ids[start:stop] = np.arange(self._next_id, self._next_id + len(rows))
-        self._anchors[start:stop] = anchor
+        self._rows[start:stop], self._ids[start:stop] = rows, ids
+        self._anchors[start:stop] = anchors
         self._size = stop
-        self._next_id += len(rows)
+        self._next_id = int(ids[-1]) + 1 if len(ids) else self._next_id
         self.touch()
-        return self._ids[start:stop].copy()
 
     def remove(self, mask: np.ndarray) -> int:
         """Drop the Gaussians where mask [N] is true; the others keep their order and ids.

@@ -1,0 +1,128 @@
+"""The design card as data: every actor with its ports, and what it is made from.
+
+The drawing and the table of topics in README are printed from here (`ldo topics --markdown`).
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.optimizer import Optimizer
+from ldo_service.actors.tracker import Tracker
+from ldo_service.config import Config
+from ldo_service.errors import ConfigError
+from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.schemas import topics as t
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """An actor of the design. Without `make` it is drawn and left out of every run."""
+
+    name: str
+    does: str
+    inputs: tuple[In, ...]
+    outputs: tuple[Out, ...]
+    make: Callable[[Config], Actor] | None = None
+
+
+def _built(actor: type[Actor], does: str, make: Callable[[Config], Actor]) -> Box:
+    return Box(actor.name, does, actor.inputs, actor.outputs, make)
+
+
+GRAPH: tuple[Box, ...] = (
+    _built(FrameSource, "checks and rectifies camera frames", lambda _config: FrameSource()),
+    _built(Tracker, "finds the camera's pose", lambda config: Tracker(config.tracker)),
+    Box(
+        "detector",
+        "finds objects of known classes",
+        inputs=(In(t.KEYFRAME_NEW, Lossless(8)),),
+        outputs=(Out(t.DETECTION_BOXES),),
+    ),
+    Box(
+        "vlm_labeller",
+        "names what the detector does not know",
+        inputs=(In(t.LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),),
+        outputs=(Out(t.LABEL_OPEN),),
+    ),
+    _built(Mapper, "keeps the map of Gaussians", lambda config: Mapper(config.mapper)),
+    Box(
+        "loop_closer",
+        "recognises places",
+        inputs=(
+            In(t.KEYFRAME_NEW, Lossless(8)),
+            In(t.DETECTION_BOXES, Lossless(8)),
+            In(t.MAP_OBJECTS, Latest(1)),
+            In(t.GRAPH_CORRECTION, Latest(1)),
+        ),
+        outputs=(Out(t.LOOP_CLOSURE), Out(t.LOOP_CANDIDATE)),
+    ),
+    _built(Optimizer, "makes keyframe poses agree", lambda config: Optimizer(config.optimizer)),
+)
+
+RUNNING: tuple[Box, ...] = tuple(box for box in GRAPH if box.make is not None)
+
+
+def box_named(name: str) -> Box:
+    """Raises ConfigError for a name that is not in the graph, or not in runs yet."""
+    for box in GRAPH:
+        if box.name == name and box.make is not None:
+            return box
+        if box.name == name:
+            raise ConfigError(f"actor {name} is declared and not part of this version.")
+    names = ", ".join(box.name for box in RUNNING)
+    raise ConfigError(f"there is no actor {name!r}. The actors are {names}.")
+
+
+def make_actors(config: Config) -> list[Actor]:
+    """All running actors, producers first."""
+    return [box.make(config) for box in RUNNING if box.make is not None]
+
+
+def producer_of(topic: t.Topic) -> str:
+    for box in GRAPH:
+        if any(out.topic is topic for out in box.outputs):
+            return box.name
+    return "every stage" if topic is t.HEALTH else "outside"
+
+
+def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
+    """Name and policy of each consumer."""
+    return [
+        (box.name, str(port.policy)) for box in GRAPH for port in box.inputs if port.topic is topic
+    ]
+
+
+def topics_table() -> str:
+    """Markdown: who makes each topic, and who takes it with which policy."""
+    lines = ["| topic | says | made by | taken by |", "|---|---|---|---|"]
+    for topic in t.TOPICS:
+        name = "health/<actor>" if topic is t.HEALTH else topic.name
+        state = " *" if topic.is_state else ""
+        planned = "" if topic.message else " (declared)"
+        takers = ", ".join(f"{who} {policy}" for who, policy in consumers_of(topic)) or "outside"
+        lines.append(
+            f"| `{name}`{state}{planned} | {topic.says} | {producer_of(topic)} | {takers} |"
+        )
+    return "\n".join(lines)
+
+
+def drawing(boxes: Iterable[Box] = GRAPH) -> str:
+    """The graph in Mermaid: solid arrows are lossless, dashed ones keep the latest."""
+    lines = ["flowchart LR", "    camera([camera])"]
+    boxes = tuple(boxes)
+    for box in boxes:
+        lines.append(f"    {box.name}{'' if box.make else ':::declared'}")
+    for box in boxes:
+        for port in box.inputs:
+            arrow = "-->" if isinstance(port.policy, Lossless) else "-.->"
+            for maker in _makers(port.topic, boxes):
+                lines.append(f"    {maker} {arrow}|{port.topic.name}| {box.name}")
+    lines.append("    classDef declared stroke-dasharray: 4 4")
+    return "\n".join(lines)
+
+
+def _makers(topic: t.Topic, boxes: tuple[Box, ...]) -> list[str]:
+    makers = [box.name for box in boxes if any(out.topic is topic for out in box.outputs)]
+    return makers or (["camera"] if topic is t.CAMERA_RGBD else [])

@@ -1,0 +1,168 @@
+"""Camera pose of each RGB-D frame.                                          actors/tracker.py
+
+in   frame/rgbd         FrameRgbd     Latest(1)   a late frame is worth less than the next one
+in   graph/correction   Correction    Latest(1)   a versioned absolute state: the newest says it all
+out  pose/tracked       TrackedPose
+out  keyframe/new       Keyframe      made only when every consumer has room: never waited for
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.runtime import Actor, In, Latest, Out
+from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
+from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
+from ldo_service.tracking.judgement import Status
+from ldo_service.tracking.odometry import Odometry, OdometryConfig, Tracked
+from ldo_service.wire import (
+    camera_message,
+    keyframe_poses_of,
+    matrix6_message,
+    pose_message,
+    rgbd_of,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    hold_out: int = 0  # every n-th frame is tracked and never mapped, to judge the map by; 0: none
+
+    def __post_init__(self) -> None:
+        if self.hold_out < 0 or self.hold_out == 1:
+            raise ConfigError(f"tracker.hold_out={self.hold_out}: must be 0, or 2 and more.")
+
+
+class Tracker(Actor):
+    """Odometry against the last keyframe; the map's frame hangs on the optimizer's poses."""
+
+    name = "tracker"
+    inputs = (In(FRAME_RGBD, Latest(1)), In(GRAPH_CORRECTION, Latest(1)))
+    outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, never_wait=True))
+
+    def __init__(self, config: TrackerConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or TrackerConfig()
+        self._odometry = Odometry(self.config.odometry)
+        self._poses = KeyframePoses()  # of the keyframes that the odometry remembers
+        self._id_of_frame: dict[int, int] = {}  # keyframe id by frame index, for the same ones
+        self._next_id = 0
+        self._without_room = 0
+        self._saved: dict[str, Any] = {}  # the remembered keyframes as they were put away
+
+    def handle(self, message: FrameRgbd | Correction) -> Iterator[TrackedPose | Keyframe]:
+        if isinstance(message, Correction):
+            self._poses.correct(message.graph_version, keyframe_poses_of(message))
+        else:
+            yield from self._track(rgbd_of(message))
+
+    def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
+        tracked = self._odometry.track(frame)
+        keyframe = self._keyframe_id(frame, tracked)
+        if tracked.method == "first" and keyframe is None:
+            return  # nobody is there to map it yet: begin with a later frame
+        reference = self._id_of_frame.get(tracked.keyframe_index)
+        if keyframe is not None:
+            yield self._keyframe(frame, tracked, keyframe, reference)
+            self._remember(frame, tracked, keyframe, reference)
+        yield self._tracked_pose(frame, tracked, keyframe, reference)
+
+    # --- keyframes --------------------------------------------------------------------------------
+    def _keyframe_id(self, frame: RgbdFrame, tracked: Tracked) -> int | None:
+        """The id this frame gets as a keyframe; None when it is none."""
+        if not tracked.wants_keyframe or tracked.status is not Status.OK:
+            return None
+        hold_out = self.config.hold_out
+        if hold_out and frame.index % hold_out == hold_out - 1:
+            return None
+        if not self.has_room(KEYFRAME_NEW):
+            self._without_room += 1
+            return None
+        return self._next_id
+
+    def _keyframe(
+        self, frame: RgbdFrame, tracked: Tracked, keyframe: int, reference: int | None
+    ) -> Keyframe:
+        return Keyframe(
+            stamp_ns=frame.stamp_ns,
+            keyframe=keyframe,
+            frame=frame.index,
+            camera=camera_message(frame.camera),
+            color=Array.of(frame.color),
+            depth_m=Array.of(frame.depth_m),
+            reference=reference,
+            T_reference_keyframe=pose_message(tracked.T_keyframe_camera),
+            information=matrix6_message(tracked.information),
+            T_odom_keyframe=pose_message(tracked.T_odom_camera),
+            overlap=tracked.overlap,
+        )
+
+    def _remember(
+        self, frame: RgbdFrame, tracked: Tracked, keyframe: int, reference: int | None
+    ) -> None:
+        self._odometry.make_keyframe(frame, tracked)
+        self._poses.chain(keyframe, reference, tracked.T_keyframe_camera, tracked.T_odom_camera)
+        self._id_of_frame[frame.index] = keyframe
+        self._next_id = keyframe + 1
+        kept = self._odometry.keyframe_indices()
+        self._id_of_frame = {i: k for i, k in self._id_of_frame.items() if i in kept}
+        self._poses.keep_only(self._id_of_frame.values())
+
+    # --- poses ------------------------------------------------------------------------------------
+    def _tracked_pose(
+        self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None, reference: int | None
+    ) -> TrackedPose:
+        hangs_on = keyframe if reference is None else reference
+        T_reference_camera = np.eye(4) if reference is None else tracked.T_keyframe_camera
+        if hangs_on is not None and hangs_on not in self._poses:
+            hangs_on, T_reference_camera = keyframe, np.eye(4)  # its reference was just forgotten
+        T_map_odom = np.eye(4) if hangs_on is None else self._poses.T_map_odom(hangs_on)
+        return TrackedPose(
+            stamp_ns=frame.stamp_ns,
+            frame=frame.index,
+            status=tracked.status.value,
+            T_odom_camera=pose_message(tracked.T_odom_camera),
+            T_map_odom=pose_message(se3.orthonormalised(T_map_odom)),
+            graph_version=self._poses.version,
+            reference=hangs_on,
+            T_reference_camera=pose_message(T_reference_camera),
+            keyframe=keyframe,
+            covariance=matrix6_message(np.linalg.pinv(tracked.information, hermitian=True)),
+            inlier_fraction=tracked.inlier_fraction,
+            residual_color=tracked.intensity_sigma,
+            residual_depth=tracked.depth_noise_scale,
+            overlap=tracked.overlap,
+            iterations=tracked.iterations,
+        )
+
+    # --- state ------------------------------------------------------------------------------------
+    def snapshot(self) -> dict[str, Any]:
+        """A part for each remembered keyframe, written once, and one for what changes."""
+        state = self._odometry.state()
+        kept = {str(k["index"]): k for k in state.pop("keyframes")}
+        self._saved = {name: self._saved.get(name, kept[name]) for name in kept}
+        changing = {
+            "odometry": state,
+            "kept": list(kept),
+            "poses": self._poses.snapshot(),
+            "ids": list(self._id_of_frame.items()),
+            "next_id": self._next_id,
+        }
+        return {**{f"keyframe_{name}": part for name, part in self._saved.items()}, "now": changing}
+
+    def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        now = state["now"]
+        self._saved = {name: state[f"keyframe_{name}"] for name in now["kept"]}
+        self._odometry.restore({**now["odometry"], "keyframes": list(self._saved.values())})
+        self._poses.restore(now["poses"])
+        self._id_of_frame = {int(index): int(keyframe) for index, keyframe in now["ids"]}
+        self._next_id = now["next_id"]
+
+    def facts(self) -> dict[str, float]:
+        return {"keyframes": self._next_id, "keyframes_without_room": self._without_room}

@@ -1,0 +1,66 @@
+"""A copy of the mapper's map, kept from its messages."""
+
+import numpy as np
+
+from ldo_service.gaussians.model import GaussianMap
+from ldo_service.schemas import Gaussians, MapDelta, MapSnapshot
+from ldo_service.wire import transform
+
+
+class MapFollower:
+    """Feed it every map/delta and map/snapshot; `map` is equal to the mapper's at `version`.
+
+    A missed delta is noticed (`is_behind`), and the next complete snapshot puts it right.
+    """
+
+    def __init__(self) -> None:
+        self.map = GaussianMap()
+        self.version = 0
+        self.is_behind = False
+        self._parts: dict[int, MapSnapshot] = {}
+
+    def take(self, message: MapDelta | MapSnapshot) -> bool:
+        """Whether `map` changed."""
+        if isinstance(message, MapSnapshot):
+            return self._take_part(message)
+        if message.version <= self.version:
+            return False
+        if message.since != self.version:
+            self.is_behind = True
+            return False
+        self._apply(message)
+        return True
+
+    def restart(self) -> None:
+        """The mapper was started anew: only a snapshot can be trusted."""
+        self.is_behind, self.version = True, 0
+        self._parts.clear()
+
+    def _apply(self, delta: MapDelta) -> None:
+        if delta.motions:
+            self.map.move_anchors({m.keyframe: transform(m.T_new_old) for m in delta.motions})
+        if delta.removed.shape[0]:
+            self.map.remove(np.isin(self.map.ids, delta.removed.numpy()))
+        if delta.changed.ids.shape[0]:
+            where = np.searchsorted(self.map.ids, delta.changed.ids.numpy())
+            self.map.rows[where] = delta.changed.params.numpy()
+        self._append(delta.added)
+        self.version = delta.version
+
+    def _append(self, gaussians: Gaussians) -> None:
+        self.map.append(gaussians.ids.numpy(), gaussians.params.numpy(), gaussians.anchors.numpy())
+
+    def _take_part(self, part: MapSnapshot) -> bool:
+        if part.version < self.version or (part.version == self.version and not self.is_behind):
+            return False
+        if any(other.version != part.version for other in self._parts.values()):
+            self._parts.clear()
+        self._parts[part.part] = part
+        if len(self._parts) < part.parts:
+            return False
+        self.map = GaussianMap()
+        for number in range(part.parts):
+            self._append(self._parts[number].gaussians)
+        self.version, self.is_behind = part.version, False
+        self._parts.clear()
+        return True

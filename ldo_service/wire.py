@@ -1,0 +1,120 @@
+"""Between messages and numerics: the one place that knows both."""
+
+import time
+
+import msgspec
+import numpy as np
+
+from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
+from ldo_service.schemas import (
+    Array,
+    CameraModel,
+    CameraRgbd,
+    Correction,
+    FrameRgbd,
+    Image,
+    Keyframe,
+    Pose,
+)
+from ldo_service.schemas.frames import ImageEncoding
+
+
+def pose_message(T: np.ndarray) -> Pose:
+    """T [4, 4] for the wire."""
+    x, y, z = (float(v) for v in T[:3, 3])
+    qw, qx, qy, qz = (float(v) for v in se3.quaternion(T[:3, :3]))
+    return Pose((x, y, z), (qw, qx, qy, qz))
+
+
+def transform(pose: Pose) -> np.ndarray:
+    """T [4, 4] of a pose from the wire."""
+    return se3.from_quaternion(np.array(pose.translation), np.array(pose.quaternion))
+
+
+def matrix6_message(matrix: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(v) for v in np.asarray(matrix).ravel())
+
+
+def camera_message(camera: Camera) -> CameraModel:
+    return CameraModel(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        distortion=camera.distortion,
+    )
+
+
+def camera_of(model: CameraModel) -> Camera:
+    return Camera(
+        model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion
+    )
+
+
+def rgbd_message(frame: RgbdFrame) -> FrameRgbd:
+    return FrameRgbd(
+        stamp_ns=frame.stamp_ns,
+        frame=frame.index,
+        camera=camera_message(frame.camera),
+        color=Array.of(frame.color),
+        depth_m=Array.of(frame.depth_m),
+    )
+
+
+def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
+    """The frame of a message; its arrays are read-only views."""
+    return RgbdFrame(
+        color=message.color.numpy(),
+        depth_m=message.depth_m.numpy(),
+        camera=camera_of(message.camera),
+        stamp_ns=message.stamp_ns,
+        index=message.frame,
+    )
+
+
+def correction_message(
+    stamp_ns: int, graph_version: int, T_map_keyframe: dict[int, np.ndarray]
+) -> Correction:
+    rows = [np.r_[T[:3, 3], se3.quaternion(T[:3, :3])] for T in T_map_keyframe.values()]
+    return Correction(
+        stamp_ns=stamp_ns,
+        graph_version=graph_version,
+        keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
+        T_map_keyframe=Array.of(np.array(rows, np.float64).reshape(-1, 7)),
+    )
+
+
+def keyframe_poses_of(correction: Correction) -> dict[int, np.ndarray]:
+    """T_map_keyframe [4, 4] by keyframe id."""
+    rows = correction.T_map_keyframe.numpy()
+    return {
+        int(k): se3.from_quaternion(row[:3], row[3:])
+        for k, row in zip(correction.keyframes.numpy(), rows, strict=True)
+    }
+
+
+def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
+    """A camera's frame for the wire: colour raw, depth raw or compressed with zstd."""
+    height, width = raw.depth.shape
+    depth = np.asarray(raw.depth, np.float32) if raw.depth.dtype == np.float64 else raw.depth
+    encoding: ImageEncoding = "z16" if depth.dtype == np.uint16 else "f32"
+    data = depth.tobytes()
+    if compress_depth:
+        encoding, data = codecs.encode_depth(depth)
+    return CameraRgbd(
+        stamp_ns=raw.stamp_ns,
+        frame=raw.index,
+        camera=camera_message(raw.camera),
+        color=Image(
+            encoding="rgb8", width=width, height=height, data=memoryview(raw.color.tobytes())
+        ),
+        depth=Image(encoding=encoding, width=width, height=height, data=memoryview(data)),
+        depth_scale=raw.depth_scale,
+    )
+
+
+def restamped(message: CameraRgbd) -> CameraRgbd:
+    """The same exposure, stamped with the time of now."""
+    return msgspec.structs.replace(message, stamp_ns=time.time_ns())
