@@ -5,11 +5,11 @@ from pathlib import Path
 from ldo_service.errors import DataError
 
 from .replica import ReplicaSequence
-from .sequence import Sequence
+from .sequence import Cached, Sequence
 from .synthetic import SyntheticSequence
 from .tum import TumSequence
 
-__all__ = ["Sequence", "open_sequence"]
+__all__ = ["Cached", "Sequence", "open_sequence"]
 
 LAYOUTS = (
     "TUM RGB-D (rgb.txt and depth.txt), Replica as NICE-SLAM lays it out (results/frame*.jpg, "

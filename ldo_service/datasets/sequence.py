@@ -48,3 +48,20 @@ class Sequence(ABC):
 
     def __iter__(self) -> Iterator[RgbdFrame]:
         return (self[index] for index in range(len(self)))
+
+
+class Cached(Sequence):
+    """A sequence whose frames are read once and then kept in memory: for short ones."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns)
+        self._sequence = sequence
+        self._frames: dict[int, RawFrame] = {}
+
+    def read(self, index: int) -> RawFrame:
+        if index not in self._frames:
+            self._frames[index] = self._sequence.read(index)
+        return self._frames[index]
+
+    def truth(self) -> Trajectory | None:
+        return self._sequence.truth()

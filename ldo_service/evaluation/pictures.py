@@ -1,6 +1,7 @@
 """Pictures of results, as uint8 RGB images."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -180,3 +181,9 @@ def _fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def _text(image: np.ndarray, text: str, at: tuple[int, int]) -> None:
     cv2.putText(image, text, at, FONT, 0.45, INK, 1, cv2.LINE_AA)
+
+
+def save_picture(path: Path, image: np.ndarray) -> None:
+    """Write an RGB image [H, W, 3] uint8; the format follows the name. Raises OSError."""
+    if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
+        raise OSError(f"{path} cannot be written")

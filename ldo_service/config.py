@@ -1,0 +1,165 @@
+"""Every setting, its default, its unit and its reason.
+
+A configuration file lists only what differs:
+
+    tracker:
+      hold_out: 5
+    service:
+      spawned: [optimizer, mapper]
+
+An unknown key is an error that names the nearest one; `ldo config` prints the whole.
+"""
+
+import dataclasses
+import difflib
+import inspect
+import re
+import typing
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import yaml
+
+from ldo_service.actors.mapper import MapperConfig
+from ldo_service.actors.optimizer import OptimizerConfig
+from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.errors import ConfigError
+from ldo_service.runtime.stage import StageConfig
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceConfig:
+    """How the actors of `ldo serve` are run."""
+
+    spawned: tuple[str, ...] = ("optimizer",)  # in processes of their own: gtsam holds the GIL
+    drain_s: float = 10.0  # a soft stop waits so long for each stage to finish what it has
+    silent_after_s: float = 10.0  # a process without a heartbeat for so long is killed
+
+    def __post_init__(self) -> None:
+        if self.drain_s < 0 or self.silent_after_s <= 0:
+            raise ConfigError(f"{self}: times must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class RunConfig:
+    """How `ldo run` goes over a file."""
+
+    mapper_latency_frames: int = 3  # a keyframe is in the map so many frames later, on any machine
+    optimizer_latency_frames: int = 3
+    max_rejected: float = 0.1  # share of unreadable frames over which the data is called bad
+
+    def __post_init__(self) -> None:
+        if min(self.mapper_latency_frames, self.optimizer_latency_frames) < 0:
+            raise ConfigError(f"{self}: latencies must be at least 0 frames.")
+        if not 0 <= self.max_rejected <= 1:
+            raise ConfigError(f"run.max_rejected={self.max_rejected:g} must be within 0..1.")
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    mapper: MapperConfig = field(default_factory=MapperConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    run: RunConfig = field(default_factory=RunConfig)
+    service: ServiceConfig = field(default_factory=ServiceConfig)
+    stage: StageConfig = field(default_factory=StageConfig)
+
+
+def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
+    """The defaults, changed by a YAML file, changed by `section.field=value` settings.
+
+    Raises ConfigError for what cannot be read, is not known, or makes no sense.
+    """
+    tree = _read(path) if path else {}
+    for setting in settings:
+        _apply(tree, setting)
+    return config_of(tree)
+
+
+def config_of(tree: dict[str, Any]) -> Config:
+    """The defaults, changed by a tree of plain values."""
+    _check_names(tree, Config, "")
+    try:
+        return msgspec.convert(tree, Config)
+    except msgspec.ValidationError as error:
+        raise ConfigError(_without_path_sugar(str(error))) from error
+
+
+def config_yaml(config: Config) -> str:
+    """The whole configuration; reads back as the same."""
+    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False)
+
+
+def explained_yaml(config: Config) -> str:
+    """The whole configuration with the reason for each default beside it."""
+    return "\n".join(_explain(config, 0)) + "\n"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        tree = yaml.safe_load(path.read_text())
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{path} is not valid YAML: {error}") from error
+    if not isinstance(tree or {}, dict):
+        raise ConfigError(f"{path} must hold sections such as `tracker:`, `ldo config` shows them.")
+    return tree or {}
+
+
+def _apply(tree: dict[str, Any], setting: str) -> None:
+    name, equals, value = setting.partition("=")
+    if not equals or "." not in name:
+        raise ConfigError(f"--set {setting}: write it as section.field=value.")
+    *sections, last = name.strip().split(".")
+    for section in sections:
+        tree = tree.setdefault(section, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"--set {setting}: {section} is no section.")
+    try:
+        tree[last] = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
+
+
+def _check_names(tree: Any, schema: type, prefix: str) -> None:
+    if not isinstance(tree, dict):
+        return  # the conversion says what was expected here
+    types = typing.get_type_hints(schema)
+    for name, value in tree.items():
+        if name not in types:
+            near = difflib.get_close_matches(str(name), types, 1)
+            hint = f"Did you mean {prefix}{near[0]}?" if near else f"Known: {', '.join(types)}."
+            raise ConfigError(f"there is no setting {prefix}{name}. {hint}")
+        if dataclasses.is_dataclass(types[name]):
+            _check_names(value, types[name], f"{prefix}{name}.")
+
+
+def _without_path_sugar(message: str) -> str:
+    """msgspec ends with "- at `$.tracker.hold_out`": say it as the user wrote it."""
+    return re.sub(r" - at `\$\.?(.*?)`$", r", in \1.", message)
+
+
+def _explain(config: Any, depth: int) -> list[str]:
+    comments = _comments(type(config))
+    lines = []
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        indent = "  " * depth
+        if dataclasses.is_dataclass(value):
+            lines += [f"{indent}{entry.name}:", *_explain(value, depth + 1)]
+        else:
+            plain = msgspec.to_builtins(value)
+            text = yaml.safe_dump(plain, default_flow_style=True).splitlines()[0]
+            comment = f"  # {comments[entry.name]}" if entry.name in comments else ""
+            lines.append(f"{indent}{entry.name}: {text}{comment}")
+    return lines or ["  " * depth + "{}"]
+
+
+def _comments(schema: type) -> dict[str, str]:
+    """The comment beside each field in the source."""
+    pattern = re.compile(r"^\s+(\w+): .*?#\s*(.*)$", re.MULTILINE)
+    return dict(pattern.findall(inspect.getsource(schema)))

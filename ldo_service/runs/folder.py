@@ -1,0 +1,176 @@
+"""The folder that a run writes.
+
+trajectory_online.txt   what was published at the time, a line per frame that is not LOST
+trajectory.txt          the same frames after the last correction
+frames.csv              every frame: status, residuals, milliseconds
+keyframes.json          id, frame, stamp and pose of every keyframe
+map.ply                 the Gaussians
+config.yaml             the effective configuration
+summary.json            counts, speed, memory, versions
+"""
+
+import csv
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.gaussians.ply import write_ply
+from ldo_service.geometry import Trajectory
+from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.map_follower import MapFollower
+from ldo_service.schemas import (
+    Correction,
+    Keyframe,
+    MapDelta,
+    MapSnapshot,
+    Message,
+    TrackedPose,
+)
+from ldo_service.wire import keyframe_poses_of, transform
+
+COLUMNS = (
+    *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
+    *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
+)
+
+
+def prepare(folder: Path, overwrite: bool) -> None:
+    """An empty folder to write to. Raises ConfigError when it is not empty or not writable."""
+    try:
+        if folder.is_dir() and any(folder.iterdir()):
+            if not overwrite:
+                raise ConfigError(f"{folder} is not empty. Choose another, or add --overwrite.")
+            _require_a_run(folder)
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
+
+
+def _require_a_run(folder: Path) -> None:
+    """Overwriting deletes: only what looks like an earlier run."""
+    if not any((folder / name).exists() for name in ("config.yaml", "summary.json")):
+        raise ConfigError(
+            f"{folder} holds no earlier run, so --overwrite leaves it alone. Choose another."
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedFrame:
+    """What the final trajectory needs of a frame."""
+
+    stamp_ns: int
+    reference: int | None
+    T_reference_camera: np.ndarray
+    T_map_camera_online: np.ndarray
+
+
+class RunFolder:
+    """Observes what the actors make; `close` writes what is only known at the end."""
+
+    def __init__(self, folder: Path, config_text: str, hold_out: int = 0) -> None:
+        self.folder, self._hold_out = folder, hold_out
+        (folder / "config.yaml").write_text(config_text)
+        self._csv_file = (folder / "frames.csv").open("w", newline="")
+        self._csv = csv.writer(self._csv_file)
+        self._csv.writerow(COLUMNS)
+        self._tracked: list[TrackedFrame] = []
+        self._poses = KeyframePoses()
+        self._keyframes: dict[int, dict[str, int]] = {}
+        self.follower = MapFollower()
+        self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
+        self.corrections = 0
+        self.summary: dict[str, Any] = {}
+
+    @property
+    def keyframes(self) -> int:
+        return len(self._keyframes)
+
+    def observe(self, message: Message, step_ms: float) -> None:
+        """Take note of one message; `step_ms` is how long its maker took."""
+        match message:
+            case TrackedPose():
+                self._observe_pose(message, step_ms)
+            case Keyframe():
+                self._observe_keyframe(message)
+            case Correction():
+                self.corrections += 1
+                self._poses.correct(message.graph_version, keyframe_poses_of(message))
+            case MapDelta() | MapSnapshot():
+                self.follower.take(message)
+
+    def _observe_pose(self, pose: TrackedPose, step_ms: float) -> None:
+        self.statuses[pose.status] += 1
+        held_out = bool(self._hold_out) and pose.frame % self._hold_out == self._hold_out - 1
+        quality = (pose.inlier_fraction, pose.residual_color, pose.residual_depth, pose.overlap)
+        self._csv.writerow(
+            (
+                *(pose.frame, pose.stamp_ns, pose.status, pose.reference, pose.keyframe),
+                int(held_out),
+                *(f"{value:.4f}" for value in quality),
+                *(pose.iterations, f"{step_ms:.3f}"),
+            )
+        )
+        if pose.status != "LOST":
+            online = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+            self._tracked.append(
+                TrackedFrame(
+                    pose.stamp_ns, pose.reference, transform(pose.T_reference_camera), online
+                )
+            )
+
+    def _observe_keyframe(self, keyframe: Keyframe) -> None:
+        self._poses.chain(
+            keyframe.keyframe,
+            keyframe.reference,
+            transform(keyframe.T_reference_keyframe),
+            transform(keyframe.T_odom_keyframe),
+        )
+        self._keyframes[keyframe.keyframe] = {
+            "keyframe": keyframe.keyframe,
+            "frame_index": keyframe.frame,
+            "stamp_ns": keyframe.stamp_ns,
+        }
+
+    # --- at the end -------------------------------------------------------------------------------
+    def close(self, summary: dict[str, Any]) -> None:
+        self._csv_file.close()
+        self.summary = summary
+        self.online().save(self.folder / "trajectory_online.txt")
+        self.final().save(self.folder / "trajectory.txt")
+        self._write_json("keyframes.json", self._placed_keyframes())
+        write_ply(self.folder / "map.ply", self.follower.map.rows)
+        self._write_json("summary.json", summary)
+
+    def online(self) -> Trajectory:
+        """T_map_camera as published at the time."""
+        return self._trajectory([frame.T_map_camera_online for frame in self._tracked])
+
+    def final(self) -> Trajectory:
+        """T_map_camera from where the reference keyframes are now."""
+        return self._trajectory(
+            [
+                frame.T_map_camera_online
+                if frame.reference is None
+                else self._poses[frame.reference] @ frame.T_reference_camera
+                for frame in self._tracked
+            ]
+        )
+
+    def _trajectory(self, T_map_camera: list[np.ndarray]) -> Trajectory:
+        stamps_s = np.array([frame.stamp_ns for frame in self._tracked]) * 1e-9
+        return Trajectory(stamps_s, np.array(T_map_camera).reshape(-1, 4, 4))
+
+    def _placed_keyframes(self) -> list[dict[str, Any]]:
+        return [
+            {**facts, "T_map_camera": self._poses[keyframe].tolist()}
+            for keyframe, facts in self._keyframes.items()
+        ]
+
+    def _write_json(self, name: str, value: object) -> None:
+        (self.folder / name).write_text(json.dumps(value, indent=1) + "\n")
