@@ -1,0 +1,75 @@
+"""The command `ldo`: its verbs, and what becomes of an error.
+
+Exit codes: 0 done, 1 other errors, 2 bad arguments or configuration, 3 bad input data, 4 a stage
+gave up, 5 a replay diverged. An error is one paragraph; --debug adds the traceback.
+"""
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+import tyro
+from rich.console import Console
+
+from ldo_service.errors import LdoError
+
+DESCRIPTION = """RGB-D SLAM as a service: poses and a photo-realistic map, live, on a CPU.
+
+First steps:
+  ldo demo                                the main job on a built-in synthetic room
+  ldo run SOURCE --out DIR                track and map a data set
+  ldo eval DIR SOURCE                     compare with ground truth
+  ldo serve                               the live service; `ldo publish SOURCE` feeds it
+
+Every verb explains itself with --help. --debug shows the traceback of an error."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    logging.basicConfig(
+        level=logging.DEBUG if debug else logging.INFO,
+        format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
+        datefmt="%H:%M:%S",
+    )
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            verbs(), prog="ldo", description=DESCRIPTION, args=words,
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
+        )  # fmt: skip
+    except LdoError as error:
+        if debug:
+            raise
+        Console(stderr=True, highlight=False, markup=False).print(f"ldo: {error}", soft_wrap=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except BrokenPipeError:  # `ldo topics | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def verbs() -> dict[str, Callable[..., None]]:
+    """Each verb's function; its docstring is its help."""
+    from ldo_service.commands import (
+        demo,
+        doctor,
+        evaluate,
+        publish,
+        run,
+        serve,
+        show_config,
+        topics,
+    )
+
+    return {
+        "demo": demo.demo,
+        "run": run.run,
+        "eval": evaluate.evaluate,
+        "serve": serve.serve,
+        "publish": publish.publish,
+        "topics": topics.topics,
+        "config": show_config.show_config,
+        "doctor": doctor.doctor,
+    }

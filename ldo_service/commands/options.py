@@ -1,0 +1,36 @@
+"""Arguments that several verbs share."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+ConfigFile = Annotated[
+    Path | None,
+    tyro.conf.arg(name="config", metavar="FILE", help="YAML with the settings that differ"),
+]
+Settings = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(
+        name="set",
+        metavar="SECTION.FIELD=VALUE",
+        help="change one setting; may be repeated. `ldo config` lists them",
+    ),
+]
+Source = Annotated[
+    str,
+    tyro.conf.Positional,
+    tyro.conf.arg(
+        metavar="SOURCE",
+        help="folder of a data set (TUM RGB-D or Replica/NICE-SLAM, recognised by its files), "
+        "or synthetic:room",
+    ),
+]
+Robot = Annotated[
+    str, tyro.conf.arg(metavar="NAME", help="second part of every topic: ldo/NAME/...")
+]
+Endpoint = Annotated[
+    str, tyro.conf.arg(metavar="ADDRESS", help="where the service's router listens")
+]
+Overwrite = Annotated[bool, tyro.conf.arg(help="replace an earlier run in the folder")]
+Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing else")]

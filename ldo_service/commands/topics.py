@@ -1,0 +1,49 @@
+"""ldo topics"""
+
+import json
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service.actors.graph import consumers_of, drawing, producer_of, topics_table
+from ldo_service.schemas.json_schema import json_schema
+from ldo_service.schemas.topics import HEALTH, TOPICS
+
+from .options import Robot
+
+
+def topics(
+    robot: Robot = "robot",
+    json_schema_: Annotated[
+        bool,
+        tyro.conf.arg(name="json-schema", help="print the JSON Schema of every message"),
+    ] = False,
+    markdown: Annotated[bool, tyro.conf.arg(help="print the table of README")] = False,
+    mermaid: Annotated[bool, tyro.conf.arg(help="print the drawing of README")] = False,
+) -> None:
+    """List every topic: its key, message, producer, consumers and their policies.
+
+    Bodies are MessagePack maps, which any MessagePack library reads; topics marked * also answer a
+    query with their last value.
+    """
+    if json_schema_:
+        print(json.dumps(json_schema(), indent=1))
+    elif markdown:
+        print(topics_table())
+    elif mermaid:
+        print(drawing())
+    else:
+        Console().print(_table(robot))
+
+
+def _table(robot: str) -> Table:
+    table = Table("topic", "message", "made by", "taken by")
+    for topic in TOPICS:
+        expression = topic.expression(robot) + ("/<actor>" if topic is HEALTH else "")
+        message = topic.message.__name__ if topic.message else "declared only"
+        takers = "\n".join(f"{who} {policy}" for who, policy in consumers_of(topic))
+        state = " *" if topic.is_state else ""
+        table.add_row(expression + state, message, producer_of(topic), takers or "outside")
+    return table

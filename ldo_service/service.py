@@ -1,0 +1,163 @@
+"""The live service: every actor as a stage in this process, or in one of its own.
+
+The main process opens the router that all others connect to. An actor in a process of its own is
+`ldo serve --only ACTOR`, started and watched by the main process with the same configuration and
+the same folder for its state.
+"""
+
+import asyncio
+import logging
+import os
+import signal
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+
+from ldo_service.actors.graph import RUNNING, Box, box_named
+from ldo_service.config import Config, config_yaml
+from ldo_service.errors import ConfigError, StageStalled
+from ldo_service.runtime import check_graph
+from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.process import (
+    PARENT_VARIABLE,
+    ChildProcess,
+    leave_with_parent,
+    python_command,
+)
+from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.state_store import FolderStore
+from ldo_service.runtime.supervision import Runner, Stop, supervise
+from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What to serve, and where. `only` names the actors of this process; empty: all of them."""
+
+    config: Config
+    network: Network
+    state: Path
+    only: tuple[str, ...] = ()
+
+    def run(self) -> None:
+        """Serve until SIGINT or SIGTERM; a second one stops at once.
+
+        Raises ConfigError when the port cannot be had, StageError when an actor was given up.
+        """
+        check_graph(RUNNING)
+        self._require_known(self.only)
+        self._require_known(self.config.service.spawned)
+        with open_session(self.network, router=not self.only) as session:
+            try:
+                asyncio.run(self._serve(session))
+            except StageStalled as error:
+                _leave(error)  # its thread cannot be stopped, and would keep the process alive
+
+    async def _serve(self, session: zenoh.Session) -> None:
+        transport = ZenohTransport(session, self.network)
+        stop = Stop()
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.ask)
+        watch = asyncio.create_task(self._stop_with_parent(stop))
+        runners = self._runners(transport)
+        log.info("serving %s on %s", ", ".join(r.name for r in runners), self.network.endpoint)
+        try:
+            await supervise(runners, stop, self.config.service.drain_s)
+        finally:
+            watch.cancel()
+            transport.close()
+
+    # --- who runs where ---------------------------------------------------------------------------
+    def _runners(self, transport: ZenohTransport) -> list[Runner]:
+        """Stages and child processes, producers first."""
+        children: dict[str, ChildProcess] = {}
+        runners: list[Runner] = []
+        for box in RUNNING:
+            if self.only and box.name not in self.only:
+                continue
+            if not self.only and box.name in self.config.service.spawned:
+                children[box.name] = self._child(box, transport)
+                runners.append(children[box.name])
+            else:
+                runners.append(self._stage(box, transport, children))
+        return runners
+
+    def _stage(
+        self, box: Box, transport: ZenohTransport, children: dict[str, ChildProcess]
+    ) -> Stage:
+        def evicted(consumer: str) -> None:
+            if consumer in children:
+                children[consumer].kill()
+
+        make = box.make
+        assert make is not None
+        return Stage(
+            lambda: make(self.config),
+            transport,
+            config=self.config.stage,
+            store=FolderStore(self.state / "state"),
+            expected={
+                out.topic.name: lossless_consumers(RUNNING, out.topic.name) for out in box.outputs
+            },
+            on_evicted=evicted,
+        )
+
+    def _child(self, box: Box, transport: ZenohTransport) -> ChildProcess:
+        config = self.state / "config.yaml"
+        config.write_text(config_yaml(self.config))
+        command = python_command(
+            *("serve", "--only", box.name, "--robot", self.network.robot),
+            *("--endpoint", self.network.endpoint),
+            *("--config", str(config), "--state", str(self.state)),
+        )
+        stage = self.config.stage
+        return ChildProcess(
+            box.name,
+            command,
+            transport,
+            max_restarts=stage.max_restarts,
+            restart_window_s=stage.restart_window_s,
+            restart_delay_s=stage.restart_delay_s,
+            silent_after_s=self.config.service.silent_after_s,
+        )
+
+    async def _stop_with_parent(self, stop: Stop) -> None:
+        if self.only:
+            await leave_with_parent()
+            stop.ask()
+            stop.ask()
+
+    def _require_known(self, names: Sequence[str]) -> None:
+        for name in names:
+            box_named(name)
+
+
+def state_folder(folder: Path | None, stack: ExitStack) -> Path:
+    """The given folder, or a temporary one that goes with the process."""
+    if folder is None:
+        return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise ConfigError(f"{folder} cannot be written: choose another with --state.")
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be used for state: {error.strerror}.") from error
+    return folder
+
+
+def is_child() -> bool:
+    """Whether this process was started by a service for one of its actors."""
+    return PARENT_VARIABLE in os.environ
+
+
+def _leave(error: StageStalled) -> None:
+    log.error("%s", error)
+    logging.shutdown()
+    os._exit(error.exit_code)
