@@ -12,7 +12,7 @@ from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import Keyframe
 from ldo_service.schemas.map import AnchorMotion, Gaussians, MapDelta, MapSnapshot, ModelView
-from ldo_service.schemas.message import Message
+from ldo_service.schemas.message import Message, decode, encode
 from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 
 __all__ = [
@@ -35,4 +35,6 @@ __all__ = [
     "Pose",
     "TrackedPose",
     "TrackingStatus",
+    "decode",
+    "encode",
 ]

@@ -1,12 +1,15 @@
 """An array on the wire: its bytes, shape and dtype."""
 
 from math import prod
-from typing import Literal
+from typing import Literal, get_args
 
 import msgspec
 import numpy as np
 
 DType = Literal["u1", "u2", "u4", "i4", "i8", "f4", "f8"]
+DTYPES = get_args(DType)
+MAX_DIMENSIONS = 8
+MAX_LENGTH = 1 << 32  # of one dimension: an empty array may not claim an absurd one either
 
 
 class Array(msgspec.Struct, frozen=True):
@@ -17,8 +20,8 @@ class Array(msgspec.Struct, frozen=True):
     data: memoryview
 
     def __post_init__(self) -> None:
-        if any(n < 0 for n in self.shape):
-            raise ValueError(f"array shape {self.shape} has a negative length")
+        if len(self.shape) > MAX_DIMENSIONS or any(not 0 <= n < MAX_LENGTH for n in self.shape):
+            raise ValueError(f"array shape {self.shape[:8]} is impossible")
         expected = prod(self.shape) * int(self.dtype[1])
         if self.data.nbytes != expected:
             raise ValueError(
@@ -29,11 +32,14 @@ class Array(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, values: np.ndarray) -> "Array":
         """A copy of `values`, so that later changes to them do not reach the message."""
-        little = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
-        return cls(little.dtype.str[1:], values.shape, memoryview(little.tobytes()))  # type: ignore[arg-type]
+        dtype = values.dtype.str[1:]
+        if dtype not in DTYPES:
+            raise ValueError(f"arrays of {values.dtype} do not travel: use one of {DTYPES}")
+        little = values.astype("<" + dtype, copy=False)
+        return cls(dtype, values.shape, memoryview(little.tobytes()))
 
     def numpy(self) -> np.ndarray:
-        """A read-only view, without a copy."""
+        """A read-only view, without a copy; of a received message it need not be aligned."""
         view = np.frombuffer(self.data, "<" + self.dtype).reshape(self.shape)
         view.flags.writeable = False
         return view
@@ -50,3 +56,9 @@ class Array(msgspec.Struct, frozen=True):
     def require_finite(self, name: str) -> None:
         if not np.isfinite(self.numpy()).all():
             raise ValueError(f"{name} holds NaN or infinity")
+
+    def require_ascending(self, name: str) -> None:
+        """Raise ValueError unless this one-dimensional array of identifiers is 0 <= a < b < ..."""
+        ids = self.numpy()
+        if (ids.size and ids[0] < 0) or (ids[1:] <= ids[:-1]).any():
+            raise ValueError(f"{name} must be ascending and at least 0")

@@ -79,6 +79,11 @@ class CameraRgbd(Message, frozen=True, kw_only=True):
         require_finite("depth_scale", (self.depth_scale,))
         if self.depth_scale <= 0:
             raise ValueError(f"depth_scale {self.depth_scale:g} must be positive")
+        size = (self.camera.width, self.camera.height)
+        if (self.color.width, self.color.height) != size:
+            raise ValueError("colour and camera differ in size")
+        if (self.depth.width, self.depth.height) != size:
+            raise ValueError("depth and camera differ in size: it must be registered to colour")
         if self.color.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
             raise ValueError(f"colour cannot be encoded as {self.color.encoding}")
         if self.depth.encoding not in ("png", "z16", "z16+zstd", "f32", "f32+zstd"):

@@ -11,7 +11,7 @@ class Correction(Message, frozen=True, kw_only=True):
     """graph/correction: absolute, so the newest one says it all. 56 bytes a keyframe."""
 
     graph_version: int  # ascending
-    keyframes: Array  # i8 [K] ids, ascending
+    keyframes: Array  # i8 [K], ids, ascending
     T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
 
     def check(self) -> None:
@@ -20,8 +20,9 @@ class Correction(Message, frozen=True, kw_only=True):
         count = self.keyframes.shape[0]
         self.T_map_keyframe.require("T_map_keyframe", "f8", (count, 7))
         self.T_map_keyframe.require_finite("T_map_keyframe")
-        if (np.diff(self.keyframes.numpy()) <= 0).any():
-            raise ValueError("keyframes must be ascending")
-        norms = np.linalg.norm(self.T_map_keyframe.numpy()[:, 3:], axis=1)
+        self.keyframes.require_ascending("keyframes")
+        quaternions = self.T_map_keyframe.numpy()[:, 3:]
+        with np.errstate(over="ignore"):  # an absurd number is as wrong as any other
+            norms = np.sqrt((quaternions**2).sum(axis=1))
         if (abs(norms - 1.0) > QUATERNION_TOLERANCE).any():
             raise ValueError("T_map_keyframe holds a quaternion that is not of unit norm")

@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-from ldo_service.schemas.message import Message, require_count
+from ldo_service.schemas.message import Message, require_count, require_finite
 
 
 class InputCount(msgspec.Struct, frozen=True, kw_only=True):
@@ -49,3 +49,5 @@ class Health(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         for name in ("pid", "epoch", "steps", "failures", "restarts", "set_aside"):
             require_count(name, getattr(self, name))
+        times = (self.step_age_s, self.busy_s, self.step_ms_p50, self.step_ms_p95)
+        require_finite("health", (*times, self.rss_mb, *self.facts.values()))

@@ -27,6 +27,7 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
 
     def __post_init__(self) -> None:
         self.ids.require("ids", "i8", (None,))
+        self.ids.require_ascending("ids")
         count = self.ids.shape[0]
         self.params.require("params", "f4", (count, 16))
         self.params.require_finite("params")
@@ -39,6 +40,9 @@ class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
     keyframe: int
     T_new_old: Pose
 
+    def __post_init__(self) -> None:
+        require_count("keyframe", self.keyframe)
+
 
 class MapDelta(Message, frozen=True, kw_only=True):
     """map/delta: how version `since` becomes version `version`."""
@@ -47,13 +51,14 @@ class MapDelta(Message, frozen=True, kw_only=True):
     version: int
     graph_version: int  # of the keyframe poses that the means are expressed through
     motions: tuple[AnchorMotion, ...]
-    removed: Array  # i8 [R] ids
+    removed: Array  # i8 [R], ids, ascending
     changed: Gaussians
     added: Gaussians
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
         self.removed.require("removed", "i8", (None,))
+        self.removed.require_ascending("removed")
         if not 0 <= self.since < self.version:
             raise ValueError(f"delta from version {self.since} to {self.version} goes back")
 
@@ -86,6 +91,7 @@ class ModelView(Message, frozen=True, kw_only=True):
     opacity: Array  # u1 [H, W], 255 = opaque
 
     def check(self) -> None:
+        require_count("keyframe", self.keyframe)
         require_version(self.version, self.graph_version)
         size = (self.camera.height, self.camera.width)
         self.color.require("color", "u1", (*size, 3))

@@ -8,10 +8,11 @@ when decoded.
 
 from collections.abc import Iterable
 from math import isfinite
+from typing import TypeVar
 
 import msgspec
 
-LAST_STAMP_NS = 2**63 - 1
+LAST_INTEGER = 2**63 - 1  # what an int64 holds: most languages and array dtypes have no more
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
@@ -20,12 +21,29 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
     stamp_ns: int  # since the epoch of the camera's clock
 
     def __post_init__(self) -> None:
-        if not 0 <= self.stamp_ns <= LAST_STAMP_NS:
-            raise ValueError(f"stamp_ns {self.stamp_ns} is outside 0 .. 2^63 - 1")
+        require_count("stamp_ns", self.stamp_ns)
         self.check()
 
     def check(self) -> None:
         """Raise ValueError when a field is impossible or fields contradict each other."""
+
+
+AnyMessage = TypeVar("AnyMessage", bound=Message)
+
+
+def decode(body: bytes | memoryview, message: type[AnyMessage]) -> AnyMessage:
+    """The message in a MessagePack body. Raises msgspec.DecodeError, whatever the bytes are."""
+    try:
+        return msgspec.msgpack.decode(body, type=message)
+    except msgspec.DecodeError:
+        raise
+    except (RecursionError, ValueError) as error:  # nested too deeply; text that is not UTF-8
+        raise msgspec.DecodeError(f"not a {message.__name__}: {error}") from None
+
+
+def encode(message: Message) -> bytes:
+    """The MessagePack body of a message."""
+    return msgspec.msgpack.encode(message)
 
 
 def require_finite(name: str, numbers: Iterable[float]) -> None:
@@ -35,6 +53,6 @@ def require_finite(name: str, numbers: Iterable[float]) -> None:
 
 
 def require_count(name: str, value: int) -> None:
-    """Identifiers, versions and counters are never negative."""
-    if value < 0:
-        raise ValueError(f"{name} is {value}, must be at least 0")
+    """Identifiers, versions and counters are never negative, and fit an int64."""
+    if not 0 <= value <= LAST_INTEGER:
+        raise ValueError(f"{name} is {value}, must be in 0 .. 2^63 - 1")

@@ -61,6 +61,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
         require_count("frame", self.frame)
         require_count("graph_version", self.graph_version)
         require_count("reference", self.reference or 0)
+        require_count("keyframe", self.keyframe or 0)
+        require_count("iterations", self.iterations)
         require_matrix6("covariance", self.covariance)
         require_finite(
             "tracking quality",

@@ -1,0 +1,165 @@
+"""One message of every type, small and with every field set.
+
+A new type gets a golden file with
+
+    python tests/schemas/examples.py
+
+which writes the files that are missing and never touches one that is there: a golden file is what
+an earlier version has sent, and every later one must still read it.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.schemas import (
+    AnchorMotion,
+    Array,
+    CameraModel,
+    CameraRgbd,
+    Correction,
+    FrameRgbd,
+    Gaussians,
+    Health,
+    Image,
+    InputCount,
+    Keyframe,
+    MapDelta,
+    MapSnapshot,
+    Message,
+    ModelView,
+    OutputCount,
+    Pose,
+    TrackedPose,
+    encode,
+)
+
+GOLDEN = Path(__file__).parent / "golden"
+
+CAMERA = CameraModel(width=3, height=2, fx=2.5, fy=2.25, cx=1.0, cy=0.5)
+COLOR = Array.of(np.arange(18, dtype=np.uint8).reshape(2, 3, 3))
+DEPTH = Array.of(np.array([[0.0, 1.5, 2.0], [0.25, 4.0, 0.0]], np.float32))
+POSE = Pose((1.0, -2.0, 0.5), (0.5, -0.5, 0.5, 0.5))
+OTHER_POSE = Pose((0.0, 0.125, 0.0), (0.6, 0.0, 0.8, 0.0))
+INFORMATION = tuple(float(10 * (i // 6) + i % 6) for i in range(36))
+
+
+def gaussians(ids: list[int]) -> Gaussians:
+    params = np.arange(16 * len(ids), dtype=np.float32).reshape(-1, 16)
+    return Gaussians(
+        ids=Array.of(np.array(ids, np.int64)),
+        params=Array.of(params),
+        anchors=Array.of(np.arange(len(ids), dtype=np.int32)),
+    )
+
+
+EXAMPLES: dict[str, Message] = {
+    "camera_rgbd": CameraRgbd(
+        stamp_ns=1_700_000_000_000_000_001,
+        frame=7,
+        camera=CameraModel(
+            width=2, height=1, fx=2.5, fy=2.25, cx=1.0, cy=0.5, distortion=(0.1, -0.2, 0.01, 0.02)
+        ),
+        color=Image(encoding="bgr8", width=2, height=1, data=memoryview(b"\1\2\3\4\5\6")),
+        depth=Image(encoding="z16", width=2, height=1, data=memoryview(b"\x88\x13\0\0")),
+        depth_scale=5000.0,
+    ),
+    "frame_rgbd": FrameRgbd(stamp_ns=2, frame=8, camera=CAMERA, color=COLOR, depth_m=DEPTH),
+    "keyframe": Keyframe(
+        stamp_ns=3,
+        keyframe=4,
+        frame=9,
+        camera=CAMERA,
+        color=COLOR,
+        depth_m=DEPTH,
+        reference=3,
+        T_reference_keyframe=POSE,
+        information=INFORMATION,
+        T_odom_keyframe=OTHER_POSE,
+        overlap=0.75,
+    ),
+    "tracked_pose": TrackedPose(
+        stamp_ns=4,
+        frame=10,
+        status="WEAK",
+        T_odom_camera=POSE,
+        T_map_odom=OTHER_POSE,
+        graph_version=2,
+        reference=3,
+        T_reference_camera=POSE,
+        keyframe=4,
+        covariance=INFORMATION,
+        inlier_fraction=0.5,
+        residual_color=3.25,
+        residual_depth=1.125,
+        overlap=0.625,
+        iterations=12,
+    ),
+    "correction": Correction(
+        stamp_ns=5,
+        graph_version=3,
+        keyframes=Array.of(np.array([0, 4], np.int64)),
+        T_map_keyframe=Array.of(
+            np.array([[0, 0, 0, 1, 0, 0, 0], [1, -2, 0.5, 0.5, -0.5, 0.5, 0.5]], np.float64)
+        ),
+    ),
+    "model_view": ModelView(
+        stamp_ns=6,
+        keyframe=4,
+        version=5,
+        graph_version=3,
+        camera=CAMERA,
+        T_map_camera=POSE,
+        color=COLOR,
+        depth_m=DEPTH,
+        opacity=Array.of(np.array([[0, 255, 128], [1, 2, 3]], np.uint8)),
+    ),
+    "map_delta": MapDelta(
+        stamp_ns=7,
+        since=4,
+        version=5,
+        graph_version=3,
+        motions=(AnchorMotion(keyframe=1, T_new_old=POSE),),
+        removed=Array.of(np.array([2, 3], np.int64)),
+        changed=gaussians([1]),
+        added=gaussians([8, 9]),
+    ),
+    "map_snapshot": MapSnapshot(
+        stamp_ns=8, version=5, graph_version=3, part=1, parts=2, gaussians=gaussians([1, 8])
+    ),
+    "health": Health(
+        stamp_ns=9,
+        actor="mapper",
+        state="busy",
+        pid=4242,
+        epoch=17,
+        steps=100,
+        failures=2,
+        restarts=2,
+        set_aside=1,
+        step_age_s=0.25,
+        busy_s=0.125,
+        step_ms_p50=20.0,
+        step_ms_p95=31.5,
+        rss_mb=512.5,
+        inputs=(
+            InputCount(
+                topic="keyframe/new", delivered=90, dropped=0, rejected=1, gaps=2, waiting=3, peak=8
+            ),
+        ),
+        outputs=(OutputCount(topic="map/view", sent=90, waited=4, evicted=1),),
+        facts={"gaussians": 1000.0},
+    ),
+}
+
+
+def write_missing() -> None:
+    for name, message in EXAMPLES.items():
+        path = GOLDEN / f"{name}.msgpack"
+        if not path.exists():
+            path.write_bytes(encode(message))
+            print(f"wrote {path}")
+
+
+if __name__ == "__main__":
+    write_missing()

@@ -1,0 +1,30 @@
+"""The JSON Schema, for programs that are not written in Python."""
+
+import json
+
+from ldo_service.schemas.json_schema import json_schema
+from ldo_service.schemas.topics import TOPICS
+
+
+def test_the_schema_is_json_and_names_every_topic_with_a_format() -> None:
+    schema = json.loads(json.dumps(json_schema()))
+    with_format = {topic.name for topic in TOPICS if topic.message is not None}
+    assert set(schema["topics"]) == with_format
+    for reference in schema["topics"].values():
+        name = reference["$ref"].removeprefix("#/$defs/")
+        assert "stamp_ns" in schema["$defs"][name]["properties"]
+
+
+def test_every_reference_in_the_schema_leads_somewhere() -> None:
+    schema = json_schema()
+    text = json.dumps(schema)
+    names = {part.split('"')[0] for part in text.split('"#/$defs/')[1:]}
+    assert names <= set(schema["$defs"])  # type: ignore[call-overload]
+
+
+def test_topic_names_are_unique_and_fit_a_key_expression() -> None:
+    names = [topic.name for topic in TOPICS]
+    assert len(set(names)) == len(names)
+    for topic in TOPICS:
+        assert topic.expression("robot-1") == f"ldo/robot-1/{topic.name}"
+        assert not set(topic.name) & set("*$?# ")

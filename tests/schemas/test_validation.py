@@ -1,0 +1,305 @@
+"""A message that exists is a valid one, whether built or received."""
+
+from typing import Any
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+
+from ldo_service.schemas import (
+    Array,
+    CameraModel,
+    CameraRgbd,
+    Correction,
+    FrameRgbd,
+    Gaussians,
+    Image,
+    Keyframe,
+    MapDelta,
+    MapSnapshot,
+    Message,
+    Pose,
+    decode,
+    encode,
+)
+
+from .examples import CAMERA, EXAMPLES
+
+NAN, INF = float("nan"), float("inf")
+
+
+def array(values: Any, dtype: Any) -> Array:
+    return Array.of(np.array(values, dtype))
+
+
+def image(encoding: Any = "rgb8", width: int = 2, height: int = 1, data: bytes = bytes(6)) -> Image:
+    return Image(encoding=encoding, width=width, height=height, data=memoryview(data))
+
+
+def changed(name: str, **fields: Any) -> Message:
+    return msgspec.structs.replace(EXAMPLES[name], **fields)
+
+
+def received(message: Message, **fields: Any) -> Message:
+    """The message with raw fields replaced behind the back of its checks."""
+    body = msgpack.packb({**msgpack.unpackb(encode(message)), **fields})
+    return decode(body, type(message))
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_a_negative_stamp_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="stamp_ns is -1"):
+        changed(name, stamp_ns=-1)
+    with pytest.raises(msgspec.ValidationError, match="stamp_ns is -1"):
+        received(EXAMPLES[name], stamp_ns=-1)
+    with pytest.raises(msgspec.ValidationError, match="stamp_ns"):
+        received(EXAMPLES[name], stamp_ns=2**63)
+
+
+@pytest.mark.parametrize(
+    ("translation", "quaternion", "complaint"),
+    [
+        ((NAN, 0, 0), (1, 0, 0, 0), "NaN"),
+        ((0, INF, 0), (1, 0, 0, 0), "infinity"),
+        ((0, 0, 0), (1, 0, NAN, 0), "NaN"),
+        ((0, 0, 0), (0, 0, 0, 0), "norm 0"),
+        ((0, 0, 0), (1, 0.1, 0, 0), "norm 1.00"),
+        ((0, 0, 0), (1e200, 0, 0, 0), "norm inf"),
+    ],
+)
+def test_an_impossible_pose_is_refused(translation: Any, quaternion: Any, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Pose(translation, quaternion)
+    with pytest.raises(msgspec.ValidationError, match=complaint):
+        received(
+            EXAMPLES["tracked_pose"],
+            T_map_odom={"translation": translation, "quaternion": quaternion},
+        )
+
+
+def test_a_quaternion_normalised_in_float32_is_taken() -> None:
+    q = np.array([0.1, 0.7, -0.3, 0.2], np.float32)
+    q /= np.linalg.norm(q)
+    assert Pose((0, 0, 0), tuple(q.tolist())).quaternion[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"width": 0}, "image size"),
+        ({"height": -2}, "image size"),
+        ({"width": 1 << 20, "height": 1 << 20}, "image size"),
+        ({"fx": 0.0}, "focal"),
+        ({"fy": -1.0}, "focal"),
+        ({"cx": NAN}, "NaN"),
+        ({"fx": INF}, "infinity"),
+        ({"distortion": (0.1,)}, "distortion"),
+        ({"distortion": (0.1, 0.1, NAN, 0.1)}, "NaN"),
+    ],
+)
+def test_impossible_intrinsics_are_refused(fields: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        msgspec.structs.replace(CAMERA, **fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"shape": [2, 2]}, "needs 16 bytes, has 24"),
+        ({"shape": [3, 4]}, "needs 48 bytes, has 24"),
+        ({"shape": [1 << 31, 1 << 31, 4]}, "bytes"),
+        ({"shape": [-2, -3]}, "impossible"),
+        ({"shape": [0, 1 << 62]}, "impossible"),
+        ({"shape": [1] * 40}, "impossible"),
+        ({"dtype": "f8"}, "needs 48 bytes"),
+        ({"dtype": "O8"}, "dtype"),
+        ({"data": b""}, "has 0"),
+    ],
+)
+def test_an_array_whose_buffer_does_not_fit_is_refused(
+    fields: dict[str, Any], complaint: str
+) -> None:
+    depth = {**msgpack.unpackb(encode(EXAMPLES["frame_rgbd"]))["depth_m"], **fields}
+    with pytest.raises(msgspec.ValidationError, match=complaint):
+        received(EXAMPLES["frame_rgbd"], depth_m=depth)
+
+
+@pytest.mark.parametrize("dtype", [bool, np.float16, np.uint64, object, "U3"])
+def test_an_array_of_a_type_that_does_not_travel_cannot_be_made(dtype: Any) -> None:
+    with pytest.raises(ValueError, match="do not travel"):
+        Array.of(np.zeros(2, dtype))
+
+
+def test_a_big_endian_transposed_array_travels_as_what_it_holds() -> None:
+    values = np.arange(6, dtype=">f4").reshape(2, 3).T
+    np.testing.assert_array_equal(Array.of(values).numpy(), values)
+
+
+@pytest.mark.parametrize("name", ["frame_rgbd", "keyframe"])
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"depth_m": array([[1.0, 2, 3]], np.float32)}, "must be f4"),
+        ({"depth_m": array(np.zeros((2, 3)), np.float64)}, "must be f4"),
+        ({"depth_m": array([[0, 0, 0], [0, NAN, 0]], np.float32)}, "finite"),
+        ({"depth_m": array([[0, 0, 0], [0, INF, 0]], np.float32)}, "finite"),
+        ({"depth_m": array([[0, 0, 0], [0, -1, 0]], np.float32)}, "at least 0"),
+        ({"color": array(np.zeros((2, 3, 4)), np.uint8)}, "must be u1"),
+        ({"color": array(np.zeros((3, 2, 3)), np.uint8)}, "must be u1"),
+        ({"camera": msgspec.structs.replace(CAMERA, distortion=(0.1, 0, 0, 0))}, "distortion"),
+        ({"frame": -1}, "frame is -1"),
+    ],
+)
+def test_a_frame_that_contradicts_its_camera_is_refused(
+    name: str, fields: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        changed(name, **fields)
+
+
+@pytest.mark.parametrize("reference", [4, 5, -1])
+def test_a_keyframe_refers_to_an_older_one(reference: int) -> None:
+    with pytest.raises(ValueError, match="not an older one"):
+        changed("keyframe", reference=reference)
+
+
+@pytest.mark.parametrize("information", [(1.0,) * 35, (*(1.0,) * 35, NAN)])
+def test_a_matrix_of_the_wrong_size_or_with_nan_is_refused(information: Any) -> None:
+    with pytest.raises(ValueError, match="information"):
+        changed("keyframe", information=information)
+    with pytest.raises(ValueError, match="covariance"):
+        changed("tracked_pose", covariance=information)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: image(data=bytes(5)),
+        lambda: image("z16", data=bytes(3)),
+        lambda: image("f32", data=bytes(9)),
+        lambda: image("jpeg", data=b""),
+        lambda: image(width=0, data=b""),
+        lambda: image(width=1 << 20, height=1 << 20),
+    ],
+)
+def test_an_image_whose_bytes_do_not_fit_its_size_is_refused(make: Any) -> None:
+    with pytest.raises(ValueError, match="image"):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"depth_scale": 0.0}, "depth_scale"),
+        ({"depth_scale": NAN}, "depth_scale"),
+        ({"color": image("z16", data=bytes(4))}, "colour cannot"),
+        ({"depth": image("jpeg", data=b"x")}, "depth cannot"),
+        ({"depth": image("z16", width=1, data=bytes(2))}, "registered"),
+        ({"color": image(width=1, data=bytes(3))}, "differ in size"),
+    ],
+)
+def test_an_exposure_that_contradicts_itself_is_refused(
+    fields: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        changed("camera_rgbd", **fields)
+
+
+IDENTITIES = [[0, 0, 0, 1, 0, 0, 0], [1, 0, 0, 1, 0, 0, 0]]
+
+
+@pytest.mark.parametrize(
+    ("keyframes", "poses", "complaint"),
+    [
+        ([4, 0], IDENTITIES, "ascending"),
+        ([4, 4], IDENTITIES, "ascending"),
+        ([-1, 4], IDENTITIES, "at least 0"),
+        ([-(2**63), 2**63 - 1], IDENTITIES, "at least 0"),
+        ([0, 4, 5], IDENTITIES, "T_map_keyframe"),
+        ([0], [[0, 0, 0, 1, 1, 0, 0]], "unit norm"),
+        ([0], [[0, 0, 0, 1e200, 0, 0, 0]], "unit norm"),
+        ([0], [[NAN, 0, 0, 1, 0, 0, 0]], "NaN"),
+    ],
+)
+def test_a_correction_out_of_order_or_with_impossible_poses_is_refused(
+    keyframes: list[int], poses: Any, complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Correction(
+            stamp_ns=0,
+            graph_version=1,
+            keyframes=array(keyframes, np.int64),
+            T_map_keyframe=array(poses, np.float64),
+        )
+
+
+def test_a_correction_of_no_keyframes_is_a_correction() -> None:
+    empty = Correction(
+        stamp_ns=0,
+        graph_version=0,
+        keyframes=array([], np.int64),
+        T_map_keyframe=Array.of(np.zeros((0, 7))),
+    )
+    assert decode(encode(empty), Correction) == empty
+
+
+@pytest.mark.parametrize(
+    ("ids", "params", "anchors", "complaint"),
+    [
+        ([2, 1], np.zeros((2, 16)), [0, 0], "ascending"),
+        ([1, 2], np.zeros((3, 16)), [0, 0], "params"),
+        ([1, 2], np.zeros((2, 15)), [0, 0], "params"),
+        ([1, 2], np.full((2, 16), NAN), [0, 0], "NaN"),
+        ([1, 2], np.zeros((2, 16)), [0], "anchors"),
+    ],
+)
+def test_gaussians_whose_arrays_do_not_fit_are_refused(
+    ids: Any, params: Any, anchors: Any, complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Gaussians(
+            ids=array(ids, np.int64),
+            params=array(params, np.float32),
+            anchors=array(anchors, np.int32),
+        )
+
+
+@pytest.mark.parametrize("since", [5, 6, -1])
+def test_a_delta_leads_to_a_newer_version(since: int) -> None:
+    with pytest.raises(ValueError, match="goes back"):
+        changed("map_delta", since=since)
+
+
+@pytest.mark.parametrize(("part", "parts"), [(2, 2), (-1, 2), (0, 0)])
+def test_a_part_of_a_snapshot_is_one_of_its_parts(part: int, parts: int) -> None:
+    with pytest.raises(ValueError, match="does not exist"):
+        changed("map_snapshot", part=part, parts=parts)
+
+
+def test_a_health_message_with_nan_is_refused() -> None:
+    with pytest.raises(ValueError, match="NaN"):
+        changed("health", facts={"loss": NAN})
+
+
+def test_every_type_above_is_checked_on_the_way_in_as_well() -> None:
+    for name, kind in [
+        ("camera_rgbd", CameraRgbd),
+        ("keyframe", Keyframe),
+        ("frame_rgbd", FrameRgbd),
+    ]:
+        with pytest.raises(msgspec.ValidationError, match="frame is -1"):
+            received(EXAMPLES[name], frame=-1)
+        assert isinstance(EXAMPLES[name], kind)
+    with pytest.raises(msgspec.ValidationError, match="goes back"):
+        received(EXAMPLES["map_delta"], since=5)
+    with pytest.raises(msgspec.ValidationError, match="does not exist"):
+        received(EXAMPLES["map_snapshot"], part=2)
+    assert isinstance(EXAMPLES["map_delta"], MapDelta)
+    assert isinstance(EXAMPLES["map_snapshot"], MapSnapshot)
+
+
+def test_a_camera_with_a_distortion_model_of_opencv_is_taken() -> None:
+    for count in (4, 5, 8):
+        camera = CameraModel(width=3, height=2, fx=1, fy=1, cx=0, cy=0, distortion=(0.1,) * count)
+        assert len(camera.distortion) == count
