@@ -16,12 +16,13 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 import zenoh
 
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.links import Header, decode_header, encode
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
-from ldo_service.schemas import CameraRgbd, Message, TrackedPose
+from ldo_service.schemas import CameraModel, CameraRgbd, Image, Message, TrackedPose
 from ldo_service.schemas.topics import CAMERA_RGBD, POSE_TRACKED, Topic
 
 M = TypeVar("M", bound=Message)
@@ -38,8 +39,35 @@ class Client:
             network.expression(CAMERA_RGBD.name), congestion_control=zenoh.CongestionControl.DROP
         )
 
-    def publish(self, frame: CameraRgbd) -> None:
-        """Send one camera frame. May block for some milliseconds; drops under congestion."""
+    def publish(
+        self,
+        color: np.ndarray,
+        depth: np.ndarray,
+        camera: CameraModel,
+        depth_scale: float,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Send one exposure.
+
+        color        [H, W, 3] uint8 RGB
+        depth        [H, W] uint16 or float32, registered to colour; 0 or NaN: not measured
+        depth_scale  units of `depth` per metre
+        stamp_ns     of the exposure; default: now
+        Raises ValueError for arrays that do not fit the camera.
+        """
+        message = CameraRgbd(
+            stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
+            frame=self._sent,
+            camera=camera,
+            color=Image.raw("rgb8", color),
+            depth=Image.raw("z16" if depth.dtype == np.uint16 else "f32", depth),
+            depth_scale=depth_scale,
+        )
+        self.send(message)
+
+    def send(self, frame: CameraRgbd) -> None:
+        """Send a frame, which may be compressed. May block for some milliseconds, and is dropped
+        when the network is congested."""
         header = Header("camera", self._epoch, self._sent, frame.stamp_ns)
         self._camera.put(msgspec.msgpack.encode(frame), attachment=encode(header))
         self._sent += 1

@@ -3,6 +3,7 @@
 from typing import Literal
 
 import msgspec
+import numpy as np
 
 from ldo_service.schemas.array import Array
 from ldo_service.schemas.message import Message, require_count, require_finite
@@ -63,6 +64,13 @@ class Image(msgspec.Struct, frozen=True, kw_only=True):
             )
         if self.data.nbytes == 0:
             raise ValueError(f"{self.encoding} image has no data")
+
+    @classmethod
+    def raw(cls, encoding: ImageEncoding, pixels: np.ndarray) -> "Image":
+        """A copy of uncompressed pixels [H, W] or [H, W, 3]."""
+        height, width = pixels.shape[:2]
+        data = memoryview(np.ascontiguousarray(pixels).tobytes())
+        return cls(encoding=encoding, width=width, height=height, data=data)
 
 
 class CameraRgbd(Message, frozen=True, kw_only=True):

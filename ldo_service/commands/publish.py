@@ -58,7 +58,7 @@ def publish(
                 console.print(f"{error} It is left out.")
                 continue
             message = camera_rgbd_message(raw)
-            service.publish(restamped(message) if restamp else message)
+            service.send(restamped(message) if restamp else message)
             sent += 1
             advance(done)
     console.print(f"{sent} frames published")
