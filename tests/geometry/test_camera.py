@@ -1,0 +1,55 @@
+import numpy as np
+import pytest
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera
+
+CAMERA = Camera(64, 48, 50.0, 52.0, 31.2, 22.9)
+
+
+def test_projection_returns_to_the_pixel_that_was_backprojected() -> None:
+    depth_m = np.random.default_rng(0).uniform(0.5, 4, (48, 64)).astype(np.float32)
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    pixels = CAMERA.project(CAMERA.backproject(depth_m))
+    np.testing.assert_allclose(pixels, np.stack([u, v], -1), atol=1e-4)
+
+
+def test_projection_is_the_product_with_the_intrinsic_matrix() -> None:
+    points = np.random.default_rng(1).uniform([-1, -1, 1], [1, 1, 3], (10, 3))
+    homogeneous = points @ CAMERA.matrix.T
+    np.testing.assert_allclose(CAMERA.project(points), homogeneous[:, :2] / homogeneous[:, 2:])
+
+
+def test_missing_depth_backprojects_to_the_origin() -> None:
+    assert not CAMERA.backproject(np.zeros((48, 64), np.float32)).any()
+
+
+def test_halved_camera_sees_the_mean_of_four_pixels_between_them() -> None:
+    points = np.array([[0.1, -0.2, 1.5], [-0.4, 0.3, 2.0]])
+    fine, coarse = CAMERA.project(points), CAMERA.halved().project(points)
+    np.testing.assert_allclose(coarse, (fine + 0.5) / 2 - 0.5)
+    assert (CAMERA.halved().width, CAMERA.halved().height) == (32, 24)
+
+
+def test_halving_keeps_the_lens_and_rectifying_removes_it() -> None:
+    camera = Camera(64, 48, 50, 50, 32, 24, (0.1, 0.01, 0, 0))
+    assert camera.halved().distortion == camera.distortion
+    assert camera.rectified().distortion == ()
+    assert camera.rectified().matrix.tolist() == camera.matrix.tolist()
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ((0, 48, 50, 50, 32, 24), "0x48"),
+        ((64, 48, -50, 50, 32, 24), "focal"),
+        ((64, 48, float("nan"), 50, 32, 24), "NaN"),
+        ((64, 48, 50, 50, 640, 24), "cx=640"),
+        ((64, 48, 50, 50, 32, -480), "cy=-480"),
+        ((64, 48, 50, 50, 32, 24, (0.1,)), "1 distortion"),
+        ((64, 48, 50, 50, 32, 24, (0.1, float("inf"), 0, 0)), "infinity"),
+    ],
+)
+def test_impossible_intrinsics_are_named(values: tuple, word: str) -> None:
+    with pytest.raises(DataError, match=word):
+        Camera(*values)
