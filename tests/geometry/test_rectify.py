@@ -20,7 +20,9 @@ def seen_through_the_lens(image: np.ndarray) -> np.ndarray:
     seen = np.stack([u, v], -1).reshape(-1, 2)
     zero, ideal = np.zeros(3), seen.copy()
     for _ in range(12):  # p = distort(ideal), solved for ideal by fixed-point steps
-        rays = np.c_[(ideal - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(len(u.flat))]
+        rays = np.c_[
+            (ideal - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(len(u.flat))
+        ]
         bent = cv2.projectPoints(rays, zero, zero, CAMERA.matrix, np.array(LENS))[0][:, 0]
         ideal += seen - bent
     maps = ideal.reshape(480, 640, 2).astype(np.float32)

@@ -23,8 +23,9 @@ class Texture:
     def sample(self, u_m: np.ndarray, v_m: np.ndarray, footprint_m: np.ndarray) -> np.ndarray:
         """Colours [P, 3] at surface coordinates [P], averaged over `footprint_m` [P]."""
         level = _log2(footprint_m * (TILE_TEXELS / self.size_m))
-        level = np.clip(level, 0.0, TILE_TEXELS.bit_length() - 2.0)
-        lower = level.astype(np.int64)
+        top = TILE_TEXELS.bit_length() - 1
+        level = np.clip(level, 0.0, top)
+        lower = np.minimum(level.astype(np.int64), top - 1)
         weight = (level - lower)[:, None]
         u, v = u_m / self.size_m, v_m / self.size_m
         return (1 - weight) * self._at(u, v, lower) + weight * self._at(u, v, lower + 1)

@@ -1,0 +1,42 @@
+from pathlib import Path
+
+import pytest
+
+from ldo_service.datasets import open_sequence
+from ldo_service.errors import DataError
+
+
+def test_synthetic_is_the_room() -> None:
+    assert open_sequence("synthetic").name == open_sequence("synthetic:room").name
+
+
+def test_unknown_synthetic_name_lists_the_known_ones() -> None:
+    with pytest.raises(DataError, match=r"synthetic:castle.*synthetic:room"):
+        open_sequence("synthetic:castle")
+
+
+def test_folder_of_no_known_layout_says_what_was_looked_for(tmp_path: Path) -> None:
+    (tmp_path / "rgb.txt").write_text("")
+    with pytest.raises(DataError, match=r"rgb\.txt with depth\.txt.*results/.*TUM.*Replica"):
+        open_sequence(str(tmp_path))
+
+
+def test_missing_folder_and_file_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"does not exist.*TUM"):
+        open_sequence(str(tmp_path / "nowhere"))
+    (tmp_path / "a.mcap").touch()
+    with pytest.raises(DataError, match="is a file"):
+        open_sequence(str(tmp_path / "a.mcap"))
+
+
+def test_every_message_is_one_paragraph(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        open_sequence(str(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+def test_indices_outside_the_sequence_are_refused() -> None:
+    room = open_sequence("synthetic")
+    for index in (-1, len(room)):
+        with pytest.raises(IndexError, match="of 120"):
+            room[index]

@@ -1,0 +1,149 @@
+"""The judge is evo."""
+
+import copy
+import os
+
+import numpy as np
+import pytest
+from evo.core import metrics, sync
+from evo.core.trajectory import PoseTrajectory3D
+
+from ldo_service.datasets import open_sequence
+from ldo_service.errors import DataError
+from ldo_service.evaluation import ErrorStatistics, align, evaluate_trajectory
+from ldo_service.geometry import Trajectory, se3
+
+
+def random_trajectory(seed: int, count: int = 150) -> Trajectory:
+    rng = np.random.default_rng(seed)
+    T, poses = se3.exp(rng.normal(0, 1, 6)), []
+    for _ in range(count):
+        T = T @ se3.exp(rng.normal(0, 0.03, 6))
+        poses.append(T)
+    return Trajectory(100 + np.arange(count) / 30, np.array(poses))
+
+
+def disturbed(truth: Trajectory, seed: int, sigma: float = 0.01) -> Trajectory:
+    """Another world frame, drift, and stamps off by milliseconds."""
+    rng = np.random.default_rng(seed)
+    T_other_world = se3.exp(rng.normal(0, 1, 6))
+    errors = np.cumsum(rng.normal(0, sigma, (len(truth), 6)), axis=0)
+    poses = [
+        T_other_world @ T @ se3.exp(xi) for T, xi in zip(truth.T_world_camera, errors, strict=True)
+    ]
+    return Trajectory(truth.stamps_s + rng.uniform(-0.004, 0.004, len(truth)), np.array(poses))
+
+
+def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
+    return PoseTrajectory3D(
+        poses_se3=list(trajectory.T_world_camera), timestamps=trajectory.stamps_s
+    )
+
+
+def evo_errors(estimate: Trajectory, truth: Trajectory, delta: int) -> list[dict[str, float]]:
+    reference, other = sync.associate_trajectories(as_evo(truth), as_evo(estimate), max_diff=0.02)
+    aligned = copy.deepcopy(other)
+    aligned.align(reference)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, aligned))
+    results = [ape.get_all_statistics()]
+    for relation in (
+        metrics.PoseRelation.translation_part,
+        metrics.PoseRelation.rotation_angle_deg,
+    ):
+        rpe = metrics.RPE(relation, delta, metrics.Unit.frames, all_pairs=True)
+        rpe.process_data((reference, other))
+        results.append(rpe.get_all_statistics())
+    return results
+
+
+def assert_evo_agrees(estimate: Trajectory, truth: Trajectory) -> None:
+    ours = evaluate_trajectory(estimate, truth)
+    theirs = evo_errors(estimate, truth, ours.rpe_poses)
+    for mine, judge in zip(
+        (ours.ate_m, ours.rpe_translation_m, ours.rpe_rotation_deg), theirs, strict=True
+    ):
+        assert mine is not None
+        for name in ("rmse", "mean", "median", "max"):
+            assert getattr(mine, name) == pytest.approx(judge[name], abs=1e-6), name
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_agree_with_evo(seed: int) -> None:
+    truth = random_trajectory(seed)
+    assert_evo_agrees(disturbed(truth, seed), truth)
+
+
+def test_errors_agree_with_evo_when_poses_are_missing() -> None:
+    truth = random_trajectory(7)
+    estimate = disturbed(truth, 7)
+    kept = np.random.default_rng(7).random(len(truth)) > 0.3
+    assert_evo_agrees(Trajectory(estimate.stamps_s[kept], estimate.T_world_camera[kept]), truth)
+
+
+@pytest.mark.skipif("LDO_DATA" not in os.environ, reason="set LDO_DATA to the shared data")
+def test_errors_agree_with_evo_on_a_real_trajectory() -> None:
+    truth = open_sequence(os.environ["LDO_DATA"] + "/tum/kitchen").truth()
+    assert truth is not None
+    assert_evo_agrees(disturbed(truth, 1, sigma=0.002), truth)
+
+
+def test_another_world_frame_costs_nothing() -> None:
+    truth = random_trajectory(1)
+    T_other_world = se3.exp(np.array([1.0, -2, 0.5, 3, 2, 1]))
+    errors = evaluate_trajectory(
+        Trajectory(truth.stamps_s, T_other_world @ truth.T_world_camera), truth
+    )
+    assert errors.ate_m.max < 1e-12
+    assert errors.rpe_translation_m is not None
+    assert errors.rpe_translation_m.max < 1e-12
+    np.testing.assert_allclose(errors.T_truth_estimate @ T_other_world, np.eye(4), atol=1e-12)
+
+
+def test_scale_is_not_aligned_away() -> None:
+    truth = random_trajectory(2)
+    doubled = truth.T_world_camera.copy()
+    doubled[:, :3, 3] *= 2
+    assert evaluate_trajectory(Trajectory(truth.stamps_s, doubled), truth).ate_m.rmse > 0.05
+
+
+def test_mirrored_points_are_not_aligned_by_a_reflection() -> None:
+    points = np.random.default_rng(3).normal(size=(30, 3))
+    T = align(points, points * [1, 1, -1])
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
+
+
+def test_points_on_a_line_still_align() -> None:
+    points = np.outer(np.arange(10.0), [1, 2, 3])
+    target = se3.transform(se3.exp(np.array([0.3, 0.2, 0.1, 1, 2, 3])), points)
+    np.testing.assert_allclose(se3.transform(align(points, target), points), target, atol=1e-12)
+
+
+def test_a_camera_that_stands_still_has_errors_too() -> None:
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    still = Trajectory(np.arange(50) / 30, poses)
+    assert evaluate_trajectory(still, still).ate_m.max == 0
+
+
+def test_short_trajectories_have_no_relative_error() -> None:
+    truth = random_trajectory(4, count=20)
+    errors = evaluate_trajectory(truth, truth)
+    assert (errors.poses, errors.rpe_poses) == (20, 30)
+    assert errors.rpe_translation_m is None
+    assert errors.rpe_rotation_deg is None
+
+
+def test_too_few_pairs_are_a_data_error_that_shows_both_clocks() -> None:
+    truth = random_trajectory(5)
+    late = Trajectory(truth.stamps_s + 1000, truth.T_world_camera)
+    with pytest.raises(DataError, match=r"0 of 150.*1100\.000 s.*100\.000 s.*same clock"):
+        evaluate_trajectory(late, truth)
+    nothing = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    with pytest.raises(DataError, match="spans nothing"):
+        evaluate_trajectory(nothing, truth)
+
+
+def test_statistics_are_the_textbook_ones() -> None:
+    assert ErrorStatistics.of(np.array([3.0, 4, 0, 1])) == ErrorStatistics(
+        np.sqrt(26 / 4), 2.0, 2.0, 4.0
+    )
