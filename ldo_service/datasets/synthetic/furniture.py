@@ -3,7 +3,7 @@
 import numpy as np
 
 from . import textures
-from .render import Room
+from .room import Room
 from .solids import Solid
 from .textures import Texture, mipmapped
 

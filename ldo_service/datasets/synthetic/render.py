@@ -6,30 +6,13 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 
+from .light import interpolated, light_on_face, plane_axes, shade
+from .room import Room
 from .solids import Solid, Vector, interval, vector
-from .textures import Texture
 
 NEAR_M = 0.05
-LAMP_GRID = 4  # the ceiling lamp is an area of 4x4 points: its shadows are soft
-LIGHT_CELL_M = 0.06
-AMBIENT = 0.42  # share of light that comes from everywhere
 # Four rays for a pixel on an outline, each in the middle of a quarter of it.
 QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
-
-
-@dataclass(frozen=True, slots=True)
-class Room:
-    """A box seen from within, what stands in it, and one square lamp under the ceiling.
-
-    faces    texture names of the sides -x, +x, -y, +y, -z, +z
-    """
-
-    shell: Solid
-    faces: tuple[str, ...]
-    furniture: tuple[Solid, ...]
-    textures: dict[str, Texture]
-    lamp_center_m: tuple[float, float, float]
-    lamp_side_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +28,7 @@ class Renderer:
 
     def __init__(self, room: Room) -> None:
         self._room = room
-        self._light = [_light_on_face(room, face) for face in range(6)]
+        self._light = [light_on_face(room, face) for face in range(6)]
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Colour [H, W, 3] uint8 and depth [H, W] float64 in metres (z, exact at pixel centres).
@@ -83,11 +66,12 @@ class Renderer:
         return np.clip(color, 0.0, 1.0)
 
     def _wall_color(self, face: int, point: Vector, footprint_m: np.ndarray) -> np.ndarray:
-        a, b = _plane_axes(face // 2)
-        corner = [c - s / 2 for c, s in zip(*_frame(self._room.shell), strict=True)]
+        a, b = plane_axes(face // 2)
+        shell = self._room.shell
+        corner = [c - s / 2 for c, s in zip(shell.center_m, shell.size_m, strict=True)]
         u_m, v_m = point[a] - corner[a], point[b] - corner[b]
         albedo = self._room.textures[self._room.faces[face]].sample(u_m, v_m, footprint_m)
-        return albedo * _interpolated(self._light[face], u_m, v_m)[:, None]
+        return albedo * interpolated(self._light[face], u_m, v_m)[:, None]
 
     def _solid_color(self, index: int, point: Vector, footprint_m: np.ndarray) -> np.ndarray:
         solid = self._room.furniture[index]
@@ -97,7 +81,7 @@ class Renderer:
         rays = np.arange(len(axis))
         u_m, v_m = own[np.where(axis == 0, 1, 0), rays], own[np.where(axis == 2, 1, 2), rays]
         albedo = self._room.textures[solid.texture].sample(u_m, v_m, footprint_m)
-        return albedo * _shade(vector(self._room.lamp_center_m), point, normal, 1.0)[:, None]
+        return albedo * shade(vector(self._room.lamp_center_m), point, normal, 1.0)[:, None]
 
 
 class _View:
@@ -190,73 +174,3 @@ def _outline(surface: np.ndarray) -> np.ndarray:
     edge[1:] |= down
     edge[:-1] |= down
     return edge
-
-
-def _shade(lamp_m: Vector, point: Vector, normal: Vector, lit: np.ndarray | float) -> np.ndarray:
-    """Light [P] on a surface: from everywhere, more from above, and from a lamp of share `lit`."""
-    x, y, z = (a - b for a, b in zip(lamp_m, point, strict=True))
-    distance_sq = x * x + y * y + z * z
-    cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / np.sqrt(distance_sq)
-    falloff = 1.35 / (1.0 + 0.1 * distance_sq)
-    return AMBIENT * (1.0 + 0.18 * normal[2] + 0.06 * normal[0]) + (
-        0.55 * falloff * lit * np.maximum(cosine, 0.0)
-    )
-
-
-def _frame(shell: Solid) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return shell.center_m, shell.size_m
-
-
-def _plane_axes(axis: int) -> tuple[int, int]:
-    """The two axes that span a face across `axis`; the second is up on walls."""
-    return ((1, 2), (0, 2), (0, 1))[axis]
-
-
-def _light_on_face(room: Room, face: int) -> np.ndarray:
-    """Light [rows, columns] on a grid over a face of the room, with the shadows of furniture."""
-    axis, sign = face // 2, 2 * (face % 2) - 1
-    a, b = _plane_axes(axis)
-    center, size = _frame(room.shell)
-    columns, rows = (int(size[i] / LIGHT_CELL_M) + 2 for i in (a, b))
-    grid_b, grid_a = np.divmod(np.arange(rows * columns), columns)
-    p = [np.zeros(rows * columns)] * 3
-    p[a] = center[a] - size[a] / 2 + np.minimum(grid_a * LIGHT_CELL_M, size[a])
-    p[b] = center[b] - size[b] / 2 + np.minimum(grid_b * LIGHT_CELL_M, size[b])
-    p[axis] = np.full(rows * columns, center[axis] + sign * size[axis] / 2)
-    point = vector(p)
-    normal = vector(-sign if i == axis else 0.0 for i in range(3))
-    light = _shade(vector(room.lamp_center_m), point, normal, _lit(room, point))
-    return light.reshape(rows, columns)
-
-
-def _lit(room: Room, point: Vector) -> np.ndarray:
-    """The share [P] of the lamp that is seen from each point."""
-    total = np.zeros(len(point[0]))
-    x, y, z = room.lamp_center_m
-    for k in range(LAMP_GRID**2):
-        row, column = divmod(k, LAMP_GRID)
-        dx, dy = (((i + 0.5) / LAMP_GRID - 0.5) * room.lamp_side_m for i in (column, row))
-        to_lamp = (x + dx - point[0], y + dy - point[1], z - point[2])
-        total += ~_is_blocked(room, point, to_lamp)
-    return total / LAMP_GRID**2
-
-
-def _is_blocked(room: Room, point: Vector, way: Vector) -> np.ndarray:
-    blocked = np.zeros(len(point[0]), bool)
-    for solid in room.furniture:
-        enter, leave = interval(
-            solid.shape, solid.point_to_local(point), solid.direction_to_local(way)
-        )
-        blocked |= (enter < leave) & (leave > 1e-4) & (enter < 0.999)
-    return blocked
-
-
-def _interpolated(grid: np.ndarray, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
-    """Bilinear value [P] of a grid with cells of LIGHT_CELL_M."""
-    x, y = u_m / LIGHT_CELL_M, v_m / LIGHT_CELL_M
-    column = np.clip(x.astype(np.int64), 0, grid.shape[1] - 2)
-    row = np.clip(y.astype(np.int64), 0, grid.shape[0] - 2)
-    fx, fy = np.clip(x - column, 0, 1), np.clip(y - row, 0, 1)
-    upper = grid[row, column] * (1 - fx) + grid[row, column + 1] * fx
-    lower = grid[row + 1, column] * (1 - fx) + grid[row + 1, column + 1] * fx
-    return upper * (1 - fy) + lower * fy
