@@ -156,17 +156,17 @@ Output points(Input<3> texels, Input<3> normals, const Intrinsics& intrinsics) {
 }
 
 void require_rigid(const Pose& T) {
-  double deviation = 0;
-  for (int a = 0; a < 3; ++a)
-    for (int b = 0; b < 3; ++b) {
-      double product = a == b ? -1.0 : 0.0;
-      for (int k = 0; k < 3; ++k) product += T(a, k) * T(b, k);
-      deviation = std::fmax(deviation, std::fabs(product));
-      if (!std::isfinite(product)) deviation = INFINITY;
-    }
-  const bool translates =
-      std::isfinite(T(0, 3)) && std::isfinite(T(1, 3)) && std::isfinite(T(2, 3));
-  require(deviation < 1e-6 && translates, "T_camera_reference must be a rigid transform");
+  bool rigid = std::isfinite(T(0, 3)) && std::isfinite(T(1, 3)) && std::isfinite(T(2, 3)) &&
+               T(3, 0) == 0 && T(3, 1) == 0 && T(3, 2) == 0 && T(3, 3) == 1;
+  for (int a = 0; a < 3; ++a) {  // rows are orthonormal, and the third is the others' product
+    const int b = (a + 1) % 3, c = (a + 2) % 3;
+    const double square = T(a, 0) * T(a, 0) + T(a, 1) * T(a, 1) + T(a, 2) * T(a, 2);
+    const double inner = T(0, a) * T(0, b) + T(1, a) * T(1, b) + T(2, a) * T(2, b);
+    const double third = T(0, b) * T(1, c) - T(0, c) * T(1, b);
+    rigid = rigid && std::fabs(square - 1) < 1e-6 && std::fabs(inner) < 1e-6 &&
+            std::fabs(third - T(2, a)) < 1e-6;
+  }
+  require(rigid, "T_camera_reference must be a rigid transform");
 }
 
 nb::tuple normal_equations(Input<2> points, Input<3> texels, const Intrinsics& intrinsics,

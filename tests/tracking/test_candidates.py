@@ -1,0 +1,44 @@
+import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
+from ldo_service.tracking.candidates import CandidateConfig, attempt, best
+from ldo_service.tracking.features import FeaturePose
+from ldo_service.tracking.keyframes import Keyframe
+
+T_KEYFRAME_CAMERA = se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]))
+T_ASTRAY = se3.exp(np.array([0.0, -0.4, 0.1, -0.6, 0.1, 0.0]))
+
+
+def chosen_from(room, guesses, features_at=None):
+    keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
+    view = pyramid_of(room.view(T_KEYFRAME_CAMERA), PyramidConfig())
+    align = AlignConfig()
+    attempts = [attempt(keyframe, view, T, f"guess {k}", align) for k, T in enumerate(guesses)]
+    pose = None if features_at is None else FeaturePose(se3.inverse(features_at), 20)
+    return attempts, best(attempts, pose, keyframe, view, CandidateConfig(), align)
+
+
+def test_true_pose_wins_over_a_wrong_minimum_that_calls_itself_inliers(room) -> None:
+    (wrong, _), winner = chosen_from(room, [T_ASTRAY, T_KEYFRAME_CAMERA])
+    assert wrong.alignment.photometric_inliers > 0.85  # by its own inflated noise
+    off = se3.inverse(wrong.alignment.T_reference_camera) @ T_KEYFRAME_CAMERA
+    assert np.linalg.norm(off[:3, 3]) > 0.1
+    assert winner.method == "guess 1"
+    assert winner.features_agree is None
+
+
+def test_first_of_equals_wins(room) -> None:
+    _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_KEYFRAME_CAMERA])
+    assert winner.method == "guess 0"
+
+
+def test_features_at_the_same_pose_agree(room) -> None:
+    _, winner = chosen_from(room, [np.eye(4), T_KEYFRAME_CAMERA], T_KEYFRAME_CAMERA)
+    assert winner.features_agree is True
+
+
+def test_features_that_the_images_refute_have_no_say(room) -> None:
+    _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_ASTRAY], T_ASTRAY)
+    assert winner.method == "guess 0"
+    assert winner.features_agree is None

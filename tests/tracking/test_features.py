@@ -1,0 +1,47 @@
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.tracking import PyramidConfig, pyramid_of
+from ldo_service.tracking.features import FeatureConfig, detect, estimate_pose
+
+CONFIG = FeatureConfig()
+T_REFERENCE_CAMERA = se3.exp(np.array([0.05, -0.2, 0.05, 0.2, 0.1, 0.15]))  # 12 degrees, 27 cm
+
+
+def test_large_motion_is_found_within_the_reach_of_direct_alignment(large_room) -> None:
+    reference, frame = (
+        detect(pyramid_of(large_room.view(T), PyramidConfig()), CONFIG)
+        for T in (np.eye(4), T_REFERENCE_CAMERA)
+    )
+    poses = [estimate_pose(reference, frame, large_room.camera, CONFIG) for _ in range(2)]
+    assert poses[0] is not None
+    assert poses[1] is not None
+    assert poses[0].inliers >= CONFIG.min_inliers
+    difference = T_REFERENCE_CAMERA @ poses[0].T_camera_reference
+    assert np.linalg.norm(difference[:3, 3]) < 0.1
+    assert se3.rotation_angle(difference) < np.radians(2)
+    np.testing.assert_array_equal(poses[0].T_camera_reference, poses[1].T_camera_reference)
+
+
+def test_points_are_the_surface_under_the_pixels(large_room) -> None:
+    view = pyramid_of(large_room.view(np.eye(4)), PyramidConfig())
+    features = detect(view, CONFIG)
+    assert len(features.pixels) > 100
+    np.testing.assert_allclose(
+        large_room.camera.project(features.points_camera), features.pixels, atol=1e-6
+    )
+
+
+def test_blank_image_has_no_features_and_no_pose(large_room) -> None:
+    blank = detect(pyramid_of(large_room.blank(), PyramidConfig()), CONFIG)
+    seen = detect(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()), CONFIG)
+    assert len(blank.pixels) == 0
+    assert estimate_pose(seen, blank, large_room.camera, CONFIG) is None
+    assert estimate_pose(blank, seen, large_room.camera, CONFIG) is None
+
+
+def test_ratio_above_one_is_refused() -> None:
+    with pytest.raises(ConfigError, match="ratio"):
+        FeatureConfig(ratio=1.5)

@@ -1,0 +1,92 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.tracking import Alignment, Status
+from ldo_service.tracking.judgement import History, JudgementConfig, judge
+
+CONFIG = JudgementConfig()
+SOUND = Alignment(
+    T_reference_camera=np.eye(4),
+    information=np.eye(6),
+    photometric_inliers=0.95,
+    geometric_inliers=0.95,
+    intensity_sigma=4.0,
+    depth_noise_scale=1.0,
+    overlap=0.9,
+    paired=0.7,
+    gain=1.0,
+    bias=0.0,
+    iterations=10,
+    converged=True,
+    condition=50.0,
+)
+PAST = History((3.0, 4.0, 5.0), (0.8, 1.0, 1.2))
+
+
+def verdict(previous: Status = Status.OK, agree: bool | None = None, **changes: float) -> Status:
+    return judge(replace(SOUND, **changes), agree, PAST, previous, CONFIG)
+
+
+def test_sound_alignment_is_ok_whatever_came_before() -> None:
+    assert [verdict(previous) for previous in Status] == [Status.OK] * 3
+
+
+@pytest.mark.parametrize(
+    "sign",
+    [
+        {"overlap": 0.12},
+        {"paired": 0.0},
+        {"condition": 1e6},
+        {"condition": float("inf")},
+        {"gain": 0.0},
+        {"gain": 3.0},
+        {"intensity_sigma": 11.0},
+        {"depth_noise_scale": 3.0},
+        {"agree": False},
+    ],
+)
+def test_every_single_sign_makes_a_frame_weak(sign: dict) -> None:
+    assert verdict(**sign) is Status.WEAK
+
+
+def test_residual_that_jumps_fivefold_is_never_accepted() -> None:
+    for previous in Status:
+        assert verdict(previous, intensity_sigma=20.4) is Status.LOST
+        assert verdict(previous, depth_noise_scale=5.1) is Status.LOST
+
+
+def test_view_without_overlap_is_lost() -> None:
+    assert verdict(overlap=0.05) is Status.LOST
+
+
+def test_recovery_takes_more_than_staying() -> None:
+    border = {"intensity_sigma": 9.0}
+    assert verdict(Status.OK, **border) is Status.OK
+    assert verdict(Status.WEAK, **border) is Status.WEAK
+    assert verdict(Status.WEAK, intensity_sigma=7.0) is Status.OK
+
+
+def test_only_ok_leads_back_from_a_loss() -> None:
+    assert verdict(Status.LOST, overlap=0.3) is Status.LOST
+    assert verdict(Status.LOST, overlap=0.4) is Status.OK
+
+
+def test_noise_below_that_of_any_camera_may_rise_unpunished() -> None:
+    perfect = History((1.0,) * 5, (0.2,) * 5)
+    textured = replace(SOUND, intensity_sigma=4.5, depth_noise_scale=1.0)
+    assert judge(textured, None, perfect, Status.OK, CONFIG) is Status.OK
+
+
+def test_history_forgets_beyond_its_length() -> None:
+    history = History()
+    for k in range(100):
+        history = history.extended(replace(SOUND, intensity_sigma=float(k)), CONFIG)
+    assert history.intensity_sigmas == tuple(float(k) for k in range(70, 100))
+
+
+def test_limits_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(ConfigError, match="residual"):
+        JudgementConfig(weak_residual=6.0)

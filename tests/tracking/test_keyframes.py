@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.tracking import PyramidConfig, pyramid_of
+from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig, is_due
+
+CONFIG = KeyframeConfig()
+TURNED = se3.exp(np.array([0, np.radians(16), 0, 0, 0, 0]))
+MOVED = se3.exp(np.array([0, 0, 0, 0.2, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("T", "overlap", "median_depth_m", "frames", "expected"),
+    [
+        (np.eye(4), 1.0, 2.0, 5, False),
+        (np.eye(4), 0.84, 2.0, 5, True),
+        (TURNED, 1.0, 2.0, 5, True),
+        (MOVED, 1.0, 2.0, 5, True),
+        (MOVED, 1.0, 3.0, 5, False),  # the same way means less in a larger room
+        (TURNED, 0.2, 2.0, 1, False),  # at most every 2nd frame
+        (np.eye(4), 1.0, 2.0, 30, True),  # at least every 30th
+    ],
+)
+def test_keyframe_is_due_when_the_view_has_changed(
+    T: np.ndarray, overlap: float, median_depth_m: float, frames: int, expected: bool
+) -> None:
+    assert is_due(T, overlap, median_depth_m, frames, CONFIG) is expected
+
+
+def test_features_are_detected_once(room) -> None:
+    keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
+    assert keyframe.features(FeatureConfig()) is keyframe.features(FeatureConfig())
+    assert keyframe.reference is keyframe.reference
+
+
+def test_limits_in_the_wrong_order_are_refused() -> None:
+    with pytest.raises(ConfigError, match="min_frames"):
+        KeyframeConfig(min_frames=31)

@@ -1,0 +1,215 @@
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
+
+T_ELSEWHERE = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+
+
+def track(odometry: Odometry, frames: Sequence[RgbdFrame]) -> list[Tracked]:
+    results = []
+    for frame in frames:
+        results.append(odometry.track(frame))
+        if results[-1].wants_keyframe:
+            odometry.make_keyframe(frame, results[-1])
+    return results
+
+
+def largest_error_m(results: Sequence[Tracked], truth: Sequence[np.ndarray]) -> float:
+    return max(
+        float(np.linalg.norm(r.T_odom_camera[:3, 3] - T[:3, 3]))
+        for r, T in zip(results, truth, strict=True)
+    )
+
+
+def assert_bitwise_equal(a: Sequence[Tracked], b: Sequence[Tracked]) -> None:
+    for x, y in zip(a, b, strict=True):
+        assert x.T_odom_camera.tobytes() == y.T_odom_camera.tobytes()
+        assert x.information.tobytes() == y.information.tobytes()
+        assert (x.status, x.method, x.wants_keyframe) == (y.status, y.method, y.wants_keyframe)
+
+
+def test_walk_is_followed_and_keyframes_are_made(room, make_walk) -> None:
+    truth = make_walk(25)
+    results = track(Odometry(), [room.view(T, index=k) for k, T in enumerate(truth)])
+    assert {r.status for r in results} == {Status.OK}
+    assert largest_error_m(results, truth) < 5e-3
+    assert 2 < len({r.keyframe_index for r in results}) < 14
+    last = results[-1]
+    between = se3.inverse(truth[last.keyframe_index]) @ truth[-1]
+    np.testing.assert_allclose(last.T_keyframe_camera, between, atol=2e-3)
+
+
+def test_tracking_survives_when_there_is_never_room_for_a_keyframe(room, make_walk) -> None:
+    truth = make_walk(16)
+    odometry = Odometry()
+    first = room.view(truth[0])
+    odometry.make_keyframe(first, odometry.track(first))
+    results = [odometry.track(room.view(T)) for T in truth[1:]]
+    assert {r.status for r in results} == {Status.OK}
+    assert largest_error_m(results, truth[1:]) < 5e-3
+    assert all(r.wants_keyframe for r in results[-5:])
+
+
+def test_before_the_first_keyframe_every_usable_frame_is_the_first(room) -> None:
+    odometry = Odometry()
+    assert odometry.track(room.blank()).status is Status.LOST
+    for _ in range(2):
+        tracked = odometry.track(room.view(np.eye(4)))
+        assert (tracked.status, tracked.method) == (Status.OK, "first")
+        assert tracked.wants_keyframe
+
+
+def test_missed_frames_are_bridged(room, make_walk) -> None:
+    truth = [T for k, T in enumerate(make_walk(24)) if not 10 <= k < 14]
+    results = track(Odometry(), [room.view(T, index=k) for k, T in enumerate(truth)])
+    assert largest_error_m(results, truth) < 5e-3
+
+
+def test_steps_beyond_the_reach_of_direct_alignment_are_found_by_features(large_room) -> None:
+    step = se3.exp(np.array([0.0, 0.3, 0.0, 0.25, 0.0, 0.0]))
+    truth = [np.linalg.matrix_power(step, k) for k in range(4)]
+    results = track(Odometry(), [large_room.view(T, index=k) for k, T in enumerate(truth)])
+    assert largest_error_m(results, truth) < 5e-3
+    assert {r.status for r in results} == {Status.OK}
+    assert "features" in {r.method for r in results}
+
+
+def test_repeated_frame_stays_where_it_is(room, make_walk) -> None:
+    frames = [room.view(T, stamp_ns=k * 33_000_000) for k, T in enumerate(make_walk(6))]
+    odometry = Odometry()
+    moving = track(odometry, frames)
+    still = track(odometry, [frames[-1]] * 4)
+    assert {r.status for r in still} == {Status.OK}
+    for r in still:
+        np.testing.assert_allclose(r.T_odom_camera, moving[-1].T_odom_camera, atol=1e-3)
+
+
+def test_frame_without_depth_is_weak_and_does_not_break_the_track(room, make_walk) -> None:
+    truth = make_walk(12)
+    frames = [room.view(T) for T in truth]
+    frames[6] = replace(frames[6], depth_m=np.zeros_like(frames[6].depth_m))
+    results = track(Odometry(), frames)
+    assert results[6].status is Status.WEAK
+    assert not results[6].wants_keyframe
+    assert results[-1].status is Status.OK
+    assert largest_error_m(results, truth) < 5e-3
+
+
+def test_blank_frame_is_not_ok_and_the_next_one_is_found_again(large_room, make_walk) -> None:
+    truth = make_walk(8)
+    frames = [large_room.view(T) for T in truth]
+    frames[5] = large_room.blank()
+    results = track(Odometry(), frames)
+    assert results[5].status is not Status.OK
+    assert results[-1].status is Status.OK
+    assert largest_error_m(results[6:], truth[6:]) < 5e-3
+
+
+def test_kidnapped_camera_knows_it_and_relocalises_on_return(large_room, make_walk) -> None:
+    odometry = Odometry()
+    track(odometry, [large_room.view(T, index=k) for k, T in enumerate(make_walk(8))])
+    before = odometry.track(large_room.view(make_walk(8)[-1]))
+    gone = [odometry.track(large_room.view(T_ELSEWHERE @ T)) for T in make_walk(5)]
+    assert {r.status for r in gone} == {Status.LOST}
+    for r in gone:  # the pose does not jump
+        np.testing.assert_array_equal(r.T_odom_camera, before.T_odom_camera)
+        assert not r.information.any()
+    T_back = make_walk(3)[-1] @ se3.exp(np.array([0.0, -0.1, 0.05, -0.1, 0.0, 0.05]))
+    back = odometry.track(large_room.view(T_back))
+    assert back.status is Status.OK
+    np.testing.assert_allclose(back.T_odom_camera, T_back, atol=5e-3)
+
+
+def test_lost_frame_cannot_become_a_keyframe(room) -> None:
+    odometry = Odometry()
+    blank = room.blank()
+    with pytest.raises(ValueError, match="LOST"):
+        odometry.make_keyframe(blank, odometry.track(blank))
+
+
+def test_two_runs_are_bitwise_equal(large_room, make_walk) -> None:
+    frames = [large_room.view(T) for T in make_walk(8, step_m=0.08, step_rad=0.05)]
+    assert_bitwise_equal(track(Odometry(), frames), track(Odometry(), frames))
+
+
+def test_restored_odometry_continues_bitwise_equal(large_room, make_walk) -> None:
+    frames = [large_room.view(T, index=k) for k, T in enumerate(make_walk(14, 0.05, 0.03))]
+    odometry = Odometry()
+    track(odometry, frames[:7])
+    state = odometry.state()
+    expected = track(odometry, [*frames[7:10], large_room.blank(), *frames[10:]])
+    restored = Odometry()
+    restored.restore(state)
+    assert_bitwise_equal(
+        track(restored, [*frames[7:10], large_room.blank(), *frames[10:]]), expected
+    )
+
+
+def test_state_holds_only_arrays_and_plain_values(room, make_walk) -> None:
+    odometry = Odometry()
+    track(odometry, [room.view(T) for T in make_walk(6)])
+    json.dumps(odometry.state(), default=lambda array: array.tolist())
+
+
+@pytest.mark.parametrize("size", [(161, 121), (80, 60), (128, 128), (97, 200)])
+def test_odd_sizes_are_tracked(make_room, make_walk, size: tuple[int, int]) -> None:
+    room, truth = make_room(*size), make_walk(8)
+    results = track(Odometry(), [room.view(T) for T in truth])
+    assert largest_error_m(results, truth) < 0.02
+    assert {r.status for r in results} == {Status.OK}
+
+
+def test_motion_limit_of_zero_is_refused() -> None:
+    with pytest.raises(ConfigError, match="large_motion"):
+        OdometryConfig(large_motion=0.0)
+
+
+def kitchen(count: int) -> tuple[list[RgbdFrame], np.ndarray]:
+    """The first frames of the sequence and the true positions [N, 3]."""
+    root = Path(os.environ.get("LDO_DATA", "")) / "tum" / "kitchen"
+    if "LDO_DATA" not in os.environ or not root.is_dir():
+        pytest.skip("needs tum/kitchen in the folder that LDO_DATA names")
+    calibration = json.loads((root / "camera.json").read_text())
+    scale = calibration.pop("depth_scale")
+    camera = Camera(**calibration)
+
+    def table(name: str) -> list[list[str]]:
+        lines = (root / name).read_text().splitlines()
+        return [line.split() for line in lines if line and not line.startswith("#")]
+
+    depths, truth = table("depth.txt"), np.array(table("groundtruth.txt"), float)
+    depth_stamps = np.array([float(stamp) for stamp, _ in depths])
+    frames, positions = [], []
+    for stamp, name in table("rgb.txt")[:count]:
+        nearest = int(np.argmin(np.abs(depth_stamps - float(stamp))))
+        color = cv2.cvtColor(cv2.imread(str(root / name)), cv2.COLOR_BGR2RGB)
+        depth = cv2.imread(str(root / depths[nearest][1]), cv2.IMREAD_UNCHANGED)
+        depth_m = (depth / scale).astype(np.float32)
+        frames.append(RgbdFrame(color, depth_m, camera, round(float(stamp) * 1e9), len(frames)))
+        positions.append(truth[np.argmin(np.abs(truth[:, 0] - float(stamp))), 1:4])
+    return frames, np.array(positions)
+
+
+def ate_rmse_m(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """After the best rigid alignment (Horn 1987)."""
+    a, b = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    U, _, Vt = np.linalg.svd(b.T @ a)
+    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+    return float(np.sqrt(np.mean(np.sum((b - a @ R.T) ** 2, axis=1))))
+
+
+def test_forty_real_frames_stay_within_three_centimetres() -> None:
+    frames, truth = kitchen(40)
+    results = track(Odometry(), frames)
+    assert {r.status for r in results} == {Status.OK}
+    assert ate_rmse_m(np.array([r.T_odom_camera[:3, 3] for r in results]), truth) < 0.03
