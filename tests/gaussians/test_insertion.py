@@ -1,0 +1,213 @@
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.gaussians import GaussianMap, InsertionConfig, insert, render
+from ldo_service.gaussians.insertion import with_small_holes_filled
+from ldo_service.geometry import Camera, RgbdFrame, se3
+
+CAMERA = Camera(120, 88, 100.0, 100.0, 59.5, 43.5)
+T_MAP_CAMERA = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, -0.1, 0.2]))
+
+
+def corner_of_a_room(T_room_camera: np.ndarray | None = None) -> RgbdFrame:
+    """A back wall at z = 2 m with a checkerboard, and a floor at y = 0.7 m with a gradient."""
+    T = np.eye(4) if T_room_camera is None else T_room_camera
+    rays = CAMERA.rays() @ T[:3, :3].T
+    to_wall, to_floor = (2 - T[2, 3]) / rays[..., 2], (0.7 - T[1, 3]) / rays[..., 1]
+    on_floor = (to_floor > 0) & (to_floor < to_wall)
+    depth_m = np.where(on_floor, to_floor, to_wall).astype(np.float32)
+    p = T[:3, 3] + rays * depth_m[..., None]
+    checker = (np.floor(p[..., 0] / 0.4) + np.floor(p[..., 1] / 0.4)) % 2
+    wall = np.stack([60 + 130 * checker, 90 + 60 * checker, np.full_like(checker, 120)], -1)
+    floor = np.stack([40 * p[..., 2] + 60, 150 - 30 * p[..., 2], 90 + 20 * p[..., 0]], -1)
+    color = np.where(on_floor[..., None], floor, wall)
+    return RgbdFrame(np.clip(color, 0, 255).astype(np.uint8), depth_m, CAMERA)
+
+
+def view(gaussians: GaussianMap, T_map_camera: np.ndarray):
+    return render(gaussians.rows, CAMERA, se3.inverse(T_map_camera))
+
+
+def psnr(color: np.ndarray, truth: np.ndarray) -> float:
+    return float(-10 * np.log10(np.mean((color - truth / 255) ** 2)))
+
+
+def without_depth(frame: RgbdFrame, missing: np.ndarray) -> RgbdFrame:
+    depth_m = np.where(missing, 0, frame.depth_m).astype(np.float32)
+    return RgbdFrame(frame.color, depth_m, frame.camera)
+
+
+def test_inserted_frame_is_rendered_as_it_was_seen() -> None:
+    frame, gaussians = corner_of_a_room(), GaussianMap()
+    ids = insert(gaussians, frame, T_MAP_CAMERA, keyframe=7)
+    seen = view(gaussians, T_MAP_CAMERA)
+    assert psnr(seen.color, frame.color) > 28
+    assert np.mean(seen.opacity > 0.8) > 0.99
+    error = np.abs(seen.median_depth_m / frame.depth_m - 1)
+    assert np.mean(error < 0.02) > 0.94
+    np.testing.assert_array_equal(gaussians.ids, ids)
+    assert set(gaussians.anchors) == {7}
+
+
+def test_view_from_elsewhere_has_no_cracks() -> None:
+    gaussians = GaussianMap()
+    insert(gaussians, corner_of_a_room(), np.eye(4), 0)
+    T = se3.exp(np.array([0.05, 0.06, 0.02, 0.1, -0.05, 0.3]))
+    seen, truth = view(gaussians, T), corner_of_a_room(T)
+    inside = np.s_[12:-12, 12:-12]
+    assert np.mean(seen.opacity[inside] > 0.8) > 0.97
+    assert psnr(seen.color[inside], truth.color[inside]) > 24
+
+
+def test_edges_get_more_gaussians_than_flats() -> None:
+    frame = corner_of_a_room()
+    flat = RgbdFrame(np.full_like(frame.color, 128), np.full_like(frame.depth_m, 2), CAMERA)
+    sparse, dense = GaussianMap(), GaussianMap()
+    insert(sparse, flat, np.eye(4), 0)
+    insert(dense, frame, np.eye(4), 0)
+    assert len(sparse) == CAMERA.width * CAMERA.height // 16
+    assert len(dense) > 1.5 * len(sparse)
+
+
+def test_frame_that_the_map_explains_adds_almost_nothing() -> None:
+    frame, gaussians = corner_of_a_room(), GaussianMap()
+    first = len(insert(gaussians, frame, T_MAP_CAMERA, 0))
+    again = len(insert(gaussians, frame, T_MAP_CAMERA, 1))
+    assert again < 0.02 * first
+
+
+def test_pixels_without_depth_get_nothing() -> None:
+    frame = corner_of_a_room()
+    missing = np.zeros(frame.depth_m.shape, bool)
+    missing[:, 50:] = True
+    gaussians = GaussianMap()
+    insert(gaussians, without_depth(frame, missing), np.eye(4), 0, InsertionConfig(hole_px=0))
+    u = CAMERA.project(gaussians.means)[:, 0]
+    assert len(gaussians) > 100
+    assert u.max() < 49.6
+    assert len(insert(GaussianMap(), without_depth(frame, ~missing | missing), np.eye(4), 0)) == 0
+
+
+def test_small_holes_are_filled_with_the_depth_behind_and_large_ones_stay() -> None:
+    depth_m = np.full((60, 80), 2.0, np.float32)
+    depth_m[:, :20] = 1.0
+    depth_m[10:50, 20:23] = 0  # the shadow of the near surface
+    depth_m[10:50, 45:75] = 0
+    filled = with_small_holes_filled(depth_m, 4)
+    np.testing.assert_array_equal(filled[10:50, 20:23], 2.0)
+    assert not filled[20:40, 52:68].any()
+    np.testing.assert_array_equal(filled[depth_m > 0], depth_m[depth_m > 0])
+
+
+def test_surface_in_front_of_the_map_is_added() -> None:
+    frame, gaussians = corner_of_a_room(), GaussianMap()
+    insert(gaussians, frame, np.eye(4), 0)
+    depth_m, color = frame.depth_m.copy(), frame.color.copy()
+    depth_m[30:50, 40:70], color[30:50, 40:70] = 1.0, (255, 0, 0)
+    box = RgbdFrame(color, depth_m, CAMERA)
+    ids = insert(gaussians, box, np.eye(4), 1)
+    assert 30 < len(ids) < 1000
+    seen = view(gaussians, np.eye(4))
+    np.testing.assert_allclose(seen.median_depth_m[34:46, 44:66], 1.0, atol=0.02)
+    assert seen.color[34:46, 44:66, 0].min() > 0.85
+    assert seen.color[34:46, 44:66, 1].max() < 0.15
+
+
+def test_gaussians_are_flat_and_lie_in_the_surface() -> None:
+    gaussians = GaussianMap()
+    insert(gaussians, corner_of_a_room(), np.eye(4), 0)
+    R, scales = se3.rotation(gaussians.quats.astype(float)), np.exp(gaussians.log_scales)
+    thinnest = np.take_along_axis(R, scales.argmin(1)[:, None, None], axis=2)[..., 0]
+    _, y, z = gaussians.means.T
+    on_wall = (np.abs(z - 2) < 1e-3) & (y < 0.62)  # not in the corner, where normals are mixed
+    on_floor = (np.abs(y - 0.7) < 1e-3) & (z < 1.85)
+    assert np.all(scales.min(1) < 0.2 * scales.max(1))
+    assert np.mean(np.abs(thinnest[on_wall, 2]) > 0.99) > 0.9
+    assert np.mean(np.abs(thinnest[on_floor, 1]) > 0.99) > 0.9
+    assert on_floor.sum() > 20
+
+
+def test_color_criterion_reinserts_what_changed_its_color() -> None:
+    frame, config = corner_of_a_room(), InsertionConfig(max_color_error=0.1)
+    plain, strict = GaussianMap(), GaussianMap()
+    for gaussians in (plain, strict):
+        insert(gaussians, frame, np.eye(4), 0)
+    repainted = RgbdFrame(255 - frame.color, frame.depth_m, CAMERA)
+    assert len(insert(plain, repainted, np.eye(4), 1)) < 20
+    assert len(insert(strict, repainted, np.eye(4), 1, config)) > 300
+
+
+def test_number_of_threads_changes_no_bit() -> None:
+    maps = [GaussianMap(), GaussianMap()]
+    for gaussians, threads in zip(maps, (1, 3), strict=True):
+        insert(gaussians, corner_of_a_room(), T_MAP_CAMERA, 0, threads=threads)
+    assert maps[0].rows.tobytes() == maps[1].rows.tobytes()
+
+
+def test_image_whose_sides_are_not_multiples_of_a_cell_is_covered() -> None:
+    frame = corner_of_a_room()
+    camera = Camera(117, 86, 100.0, 100.0, 59.5, 43.5)
+    cropped = RgbdFrame(
+        np.ascontiguousarray(frame.color[:86, :117]), frame.depth_m[:86, :117].copy(), camera
+    )
+    gaussians = GaussianMap()
+    insert(gaussians, cropped, np.eye(4), 0)
+    seen = render(gaussians.rows, camera, np.eye(4))
+    assert np.mean(seen.opacity > 0.5) > 0.99
+
+
+def test_image_of_one_pixel_gives_one_gaussian() -> None:
+    camera = Camera(1, 1, 2.0, 2.0, 0.0, 0.0)
+    frame = RgbdFrame(np.full((1, 1, 3), 99, np.uint8), np.ones((1, 1), np.float32), camera)
+    gaussians = GaussianMap()
+    insert(gaussians, frame, np.eye(4), 0)
+    np.testing.assert_allclose(gaussians.means, [[0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"coarsest_px": 3},
+        {"opacity": 1.0},
+        {"max_transmittance": 0.0},
+        {"sigma_per_spacing": 0.4},
+        {"max_stretch": 0.5},
+        {"hole_px": -1},
+        {"max_contrast": float("nan")},
+    ],
+)
+def test_config_refuses_senseless_values(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        InsertionConfig(**wrong)
+
+
+def test_real_room_is_rendered_between_its_keyframes() -> None:
+    folder = Path(os.environ.get("LDO_DATA", "")) / "replica" / "apartment_floor1"
+    if "LDO_DATA" not in os.environ or not folder.is_dir():
+        pytest.skip("set LDO_DATA to a folder with replica/apartment_floor1")
+    T_map_camera = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
+    camera = Camera(512, 512, 256.0, 256.0, 255.5, 255.5)
+
+    def frame_of(i: int) -> RgbdFrame:
+        color = cv2.imread(str(folder / "results" / f"frame{i:06d}.jpg"))
+        depth = cv2.imread(str(folder / "results" / f"depth{i:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert color is not None
+        assert depth is not None
+        color = np.ascontiguousarray(color[..., ::-1])
+        return RgbdFrame(color, depth.astype(np.float32) / 1000, camera)
+
+    gaussians = GaussianMap()
+    for i in (0, 5, 20, 25):
+        insert(gaussians, frame_of(i), T_map_camera[i], i)
+    for i in (2, 22):
+        frame = frame_of(i)
+        seen = render(gaussians.rows, camera, se3.inverse(T_map_camera[i]))
+        covered = seen.opacity > 0.5
+        assert covered.mean() > 0.95
+        assert psnr(seen.color[covered], frame.color[covered]) > 25
+    assert len(gaussians) < 80_000

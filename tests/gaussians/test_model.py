@@ -1,0 +1,151 @@
+import numpy as np
+import pytest
+
+from ldo_service.gaussians import GaussianMap, render
+from ldo_service.geometry import Camera, se3
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+
+
+def rows_of(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((n, 16), np.float32)
+    rows[:, 0:3] = np.array([0, 0, 2.5]) + rng.uniform(-1, 1, (n, 3))
+    rows[:, 3:6] = rng.uniform(-4, -2, (n, 3))
+    rows[:, 6:10] = rng.normal(size=(n, 4))
+    rows[:, 6:10] /= np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
+    rows[:, 10] = rng.uniform(-1, 4, n)
+    rows[:, 11:14] = rng.uniform(0, 1, (n, 3))
+    return rows
+
+
+def map_of(*counts: int) -> GaussianMap:
+    """A map with that many Gaussians on keyframes 0, 1, ..."""
+    out = GaussianMap(capacity=2)
+    for keyframe, n in enumerate(counts):
+        out.add(rows_of(n, keyframe), keyframe)
+    return out
+
+
+def test_added_rows_come_back_bit_for_bit_after_growing() -> None:
+    gaussians = GaussianMap(capacity=1)
+    wanted = [rows_of(n, n) for n in (1, 5, 0, 300)]
+    ids = [gaussians.add(rows, keyframe) for keyframe, rows in enumerate(wanted)]
+    assert gaussians.rows.tobytes() == np.concatenate(wanted).tobytes()
+    np.testing.assert_array_equal(np.concatenate(ids), np.arange(306))
+    np.testing.assert_array_equal(gaussians.ids, np.arange(306))
+    np.testing.assert_array_equal(gaussians.anchors, np.repeat([0, 1, 3], [1, 5, 300]))
+
+
+def test_removal_keeps_order_and_never_gives_an_id_twice() -> None:
+    gaussians = map_of(4, 4)
+    before = gaussians.rows.copy()
+    drop = np.array([1, 0, 0, 1, 0, 0, 0, 1], bool)
+    assert gaussians.remove(drop) == 3
+    np.testing.assert_array_equal(gaussians.ids, [1, 2, 4, 5, 6])
+    np.testing.assert_array_equal(gaussians.rows, before[~drop])
+    np.testing.assert_array_equal(gaussians.anchors, [0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(gaussians.add(rows_of(2), 7), [8, 9])
+
+
+def test_every_row_fills_one_cache_line() -> None:
+    gaussians = map_of(3, 500)
+    assert gaussians.rows.ctypes.data % 64 == 0
+    assert gaussians.rows.strides == (64, 4)
+
+
+def test_columns_are_views_of_the_rows() -> None:
+    gaussians = map_of(5)
+    for column in ("means", "log_scales", "quats", "opacity_logits", "colors"):
+        getattr(gaussians, column)[...] = 0.25
+        assert np.shares_memory(getattr(gaussians, column), gaussians.rows)
+    np.testing.assert_array_equal(gaussians.rows[:, :14], 0.25)
+
+
+def test_version_grows_with_every_change() -> None:
+    gaussians = GaussianMap()
+    seen = [gaussians.version]
+    gaussians.add(rows_of(3), 0)
+    seen.append(gaussians.version)
+    gaussians.remove(np.array([True, False, False]))
+    seen.append(gaussians.version)
+    gaussians.move_anchors({0: se3.exp(np.full(6, 0.1))})
+    seen.append(gaussians.version)
+    gaussians.touch()
+    seen.append(gaussians.version)
+    assert seen == sorted(set(seen))
+
+
+def test_correction_moves_the_gaussians_of_its_keyframe_only() -> None:
+    gaussians = map_of(10, 20, 30)
+    before = gaussians.rows.copy()
+    gaussians.move_anchors({1: se3.exp(np.array([0.1, 0.2, 0.3, 1, 2, 3])), 99: np.eye(4)})
+    moved = np.any(gaussians.rows != before, axis=1)
+    np.testing.assert_array_equal(moved, gaussians.anchors == 1)
+    np.testing.assert_array_equal(gaussians.log_scales, before[:, 3:6])
+
+
+def test_moved_gaussian_has_the_transformed_mean_and_covariance() -> None:
+    gaussians = map_of(7)
+    before = gaussians.rows.astype(float)
+    T = se3.exp(np.array([0.4, -1.1, 0.7, 0.5, -0.6, 0.2]))
+    gaussians.move_anchors({0: T})
+    np.testing.assert_allclose(gaussians.means, se3.transform(T, before[:, :3]), atol=1e-6)
+    R_before, R_after = se3.rotation(before[:, 6:10]), se3.rotation(gaussians.quats.astype(float))
+    np.testing.assert_allclose(R_after, T[:3, :3] @ R_before, atol=1e-6)
+
+
+def test_move_and_inverse_move_restore_the_rows() -> None:
+    gaussians = map_of(70_000, 500)
+    before = gaussians.rows.copy()
+    T = {0: se3.exp(np.full(6, 0.3)), 1: se3.exp(np.array([1, -2, 0.5, -1, 0.4, 0.2]))}
+    gaussians.move_anchors(T)
+    assert np.abs(gaussians.rows - before).max() > 0.1
+    gaussians.move_anchors({k: se3.inverse(one) for k, one in T.items()})
+    np.testing.assert_allclose(gaussians.rows, before, atol=1e-6)
+
+
+def test_camera_that_moves_along_sees_the_same() -> None:
+    gaussians = map_of(300)
+    T_map_camera = se3.exp(np.array([0.05, -0.1, 0.02, 0.1, 0.0, -0.2]))
+    before = render(gaussians.rows, CAMERA, se3.inverse(T_map_camera))
+    T_new_old = se3.exp(np.array([0.5, 0.8, -0.3, 1, -0.5, 0.7]))
+    gaussians.move_anchors({0: T_new_old})
+    after = render(gaussians.rows, CAMERA, se3.inverse(T_new_old @ T_map_camera))
+    assert before.opacity.mean() > 0.2
+    np.testing.assert_allclose(after.color, before.color, atol=2e-4)
+    np.testing.assert_allclose(after.weighted_depth_m, before.weighted_depth_m, atol=5e-4)
+
+
+def test_restored_map_continues_as_the_original() -> None:
+    gaussians = map_of(30, 40)
+    gaussians.remove(np.arange(70) % 3 == 0)
+    copy = GaussianMap.restore(gaussians.snapshot())
+    for one in (gaussians, copy):
+        one.add(rows_of(9, 5), 2)
+        one.move_anchors({1: se3.exp(np.full(6, 0.1))})
+    a, b = gaussians.snapshot(), copy.snapshot()
+    assert a.keys() == b.keys()
+    assert all(a[name].tobytes() == b[name].tobytes() for name in a)
+
+
+def test_snapshot_does_not_follow_the_map() -> None:
+    gaussians = map_of(5)
+    state = gaussians.snapshot()
+    gaussians.means[...] = 0
+    assert np.abs(state["rows"][:, :3]).min() > 0
+
+
+def test_bad_arguments_are_refused_and_change_nothing() -> None:
+    gaussians = map_of(5)
+    before = gaussians.snapshot()
+    with pytest.raises(ValueError, match="shape"):
+        gaussians.add(np.zeros((2, 14), np.float32), 0)
+    with pytest.raises(ValueError, match="NaN"):
+        gaussians.add(np.full((2, 16), np.nan, np.float32), 0)
+    with pytest.raises(ValueError, match="mask"):
+        gaussians.remove(np.zeros(4, bool))
+    with pytest.raises(ValueError, match="finite"):
+        gaussians.move_anchors({0: np.full((4, 4), np.inf)})
+    after = gaussians.snapshot()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
