@@ -46,7 +46,7 @@ def test_stamps_that_go_back_are_rejected(message: CameraRgbd) -> None:
 
 
 def test_a_broken_image_is_rejected_and_the_stream_goes_on(
-    room: Sequence, message: CameraRgbd, caplog: pytest.LogCaptureFixture
+    message: CameraRgbd, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = FrameSource()
     broken = Image(encoding="jpeg", width=320, height=240, data=memoryview(b"not a picture"))
