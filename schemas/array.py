@@ -1,7 +1,7 @@
 """An array on the wire: its bytes, shape and dtype."""
 
 from math import prod
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import msgspec
 import numpy as np
@@ -36,7 +36,7 @@ class Array(msgspec.Struct, frozen=True):
         if dtype not in DTYPES:
             raise ValueError(f"arrays of {values.dtype} do not travel: use one of {DTYPES}")
         little = values.astype("<" + dtype, copy=False)
-        return cls(dtype, values.shape, memoryview(little.tobytes()))
+        return cls(cast(DType, dtype), values.shape, memoryview(little.tobytes()))
 
     def numpy(self) -> np.ndarray:
         """A read-only view, without a copy; of a received message it need not be aligned."""

@@ -24,6 +24,7 @@ class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
     sent: int
     waited: int  # times the stage waited for a consumer's window
     evicted: int  # consumers whose window stayed shut
+    repeated: int = 0  # lossless messages sent again, because they got lost
 
 
 class Health(Message, frozen=True, kw_only=True):

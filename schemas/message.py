@@ -28,17 +28,17 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, tag=True):
         """Raise ValueError when a field is impossible or fields contradict each other."""
 
 
-AnyMessage = TypeVar("AnyMessage", bound=Message)
+T = TypeVar("T")
 
 
-def decode(body: bytes | memoryview, message: type[AnyMessage]) -> AnyMessage:
+def decode(body: bytes | memoryview, kind: type[T]) -> T:
     """The message in a MessagePack body. Raises msgspec.DecodeError, whatever the bytes are."""
     try:
-        return msgspec.msgpack.decode(body, type=message)
+        return msgspec.msgpack.decode(body, type=kind)
     except msgspec.DecodeError:
         raise
     except (RecursionError, ValueError) as error:  # nested too deeply; text that is not UTF-8
-        raise msgspec.DecodeError(f"not a {message.__name__}: {error}") from None
+        raise msgspec.DecodeError(f"cannot be decoded: {error}") from None
 
 
 def encode(message: Message) -> bytes:

@@ -1,16 +1,21 @@
 """A link from a producer to a lossless consumer, over a network that may lose messages.
 
     Join      consumer -> producer   "I am here"; repeated until welcomed
-    Welcome   producer -> consumer   "numbering starts at n, in my epoch e"
+    Welcome   producer -> consumers  "in my epoch e, what you get begins at n", for all of them
     Grant     consumer -> producer   "I have handled all before h, all before a has arrived, and I
-                                     take up to n": absolute, so it may be lost, repeated or
-                                     reordered; sent after each step and twice a second
+                                     take up to n"; after each step and twice a second
+
+All three state what is, not what changed: they may be lost, repeated or replaced by newer ones.
 
 The producer keeps what was not handled, at most one window, and sends it again from `arrived` when
-a grant shows a gap. A consumer that died and joined again is welcomed at what it had not handled.
+a grant shows a gap. A consumer that died and joined again is welcomed at what it had not handled:
+between crashes each message is handled once, and after a crash the one under way once more. What a
+producer had not delivered when its process was killed is gone with it.
 """
 
 import msgspec
+
+from ldo_service.schemas import decode
 
 MAX_SEQ = 1 << 62
 
@@ -29,6 +34,9 @@ class Header(msgspec.Struct, frozen=True, array_like=True):
             raise ValueError(f"header with epoch {self.epoch}, seq {self.seq}")
 
 
+OUTSIDE = Header("outside", 1, 0, 0)  # of a message that a foreign program sends without one
+
+
 class Join(msgspec.Struct, frozen=True, tag="join", array_like=True):
     consumer: str
 
@@ -41,21 +49,30 @@ class Grant(msgspec.Struct, frozen=True, tag="grant", array_like=True):
     limit: int  # the first seq that may not be sent yet
     gap: bool = False  # `arrived` was sent and did not arrive
 
+    def __post_init__(self) -> None:
+        if not 0 <= self.handled <= self.arrived < MAX_SEQ or self.limit < self.handled:
+            raise ValueError(f"impossible grant {self.handled}, {self.arrived}, {self.limit}")
+
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):
-    consumer: str
     epoch: int
-    start: int  # the first seq to come
+    starts: dict[str, int]  # by consumer: the first seq to come
 
 
 encode = msgspec.msgpack.Encoder().encode
-decode_header = msgspec.msgpack.Decoder(Header).decode
-decode_request = msgspec.msgpack.Decoder(Join | Grant).decode
-decode_welcome = msgspec.msgpack.Decoder(Welcome).decode
+
+
+def decode_request(body: memoryview) -> Join | Grant:
+    return decode(body, Join | Grant)  # type: ignore[arg-type]
 
 
 def data_key(topic: str) -> str:
     return topic
+
+
+def again_key(topic: str) -> str:
+    """Repetitions go to lossless consumers only: others see each message once."""
+    return f"link/again/{topic}"
 
 
 def grant_key(topic: str) -> str:

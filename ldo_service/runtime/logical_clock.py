@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
+from ldo_service.errors import StageError
 from ldo_service.schemas import Message
 
 from .actor import Actor
@@ -77,7 +78,10 @@ class LogicalClock:
         self._started = 0
 
     def run(self, source: Iterable[Message]) -> Iterator[int]:
-        """Yield the tick after each message of the source; then everything due is settled."""
+        """Yield the tick after each message of the source; then everything due is settled.
+
+        Raises StageError, naming the actor, when a handler raises.
+        """
         tick = -1
         try:
             for tick, message in enumerate(source):
@@ -105,8 +109,9 @@ class LogicalClock:
         """Wait for every answer that is due by now and pass it on."""
         while self._due and self._due[0].tick <= tick:
             due = heapq.heappop(self._due)
-            for message in due.answer.result():
-                self._observe(self._threads[due.rank].actor.name, message)
+            actor = self._threads[due.rank].actor.name
+            for message in _answer(due, actor):
+                self._observe(actor, message)
                 self._deliver(message, due.tick)
 
     def _finish(self, tick: int) -> None:
@@ -117,3 +122,13 @@ class LogicalClock:
             self._expect(thread, tick, thread.finish())
             while self._due:
                 self._settle(self._due[0].tick)
+
+
+def _answer(due: Due, actor: str) -> list[Message]:
+    try:
+        return due.answer.result()
+    except Exception as error:
+        raise StageError(
+            f"{actor} failed at tick {due.tick}: {type(error).__name__}: {error}. "
+            "Run with --debug to see where."
+        ) from error

@@ -6,8 +6,9 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import msgspec
+
 from ldo_service.schemas import Message, OutputCount
-from ldo_service.schemas.topics import Topic
 
 from .actor import UNLIMITED
 from .links import (
@@ -15,13 +16,15 @@ from .links import (
     Header,
     Join,
     Welcome,
+    again_key,
     data_key,
     decode_request,
     encode,
     grant_key,
     welcome_key,
 )
-from .transport import Transport
+from .ports import Out
+from .transport import Transport, call_soon
 
 log = logging.getLogger(__name__)
 
@@ -34,23 +37,31 @@ class Consumer:
     handled: int = 0
     arrived: int = 0
     limit: int = 0
-    resent_from: int = -1  # where the last repetition began, and when
-    resent_at_s: float = 0.0
+    repeated_from: int = -1  # where the last repetition began, and when
+    repeated_at_s: float = 0.0
     shut_since_s: float | None = None  # when its window was first seen shut
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    seq: int
+    header: bytes
+    body: bytes
 
 
 class Outlet:
     """Numbers messages, waits for room at every lossless consumer, sends again what got lost.
 
     `expected` names consumers that must not miss a message: until each has joined, and again after
-    one died, there is no room. Others hold the producer back only while they live.
+    one died, there is no room. Others hold the producer back only while they live. A port that
+    never waits sends at once: its actor has looked at `room` before.
     """
 
-    RESEND_AFTER_S = 0.25  # half a grant period: sooner would repeat what is still on its way
+    REPEAT_AFTER_S = 0.25  # half a grant period: sooner would repeat what is still on its way
 
     def __init__(
         self,
-        topic: Topic,
+        port: Out,
         source: str,
         epoch: int,
         transport: Transport,
@@ -58,33 +69,43 @@ class Outlet:
         evict_after_s: float = 30.0,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
     ) -> None:
-        self.topic, self._source, self._epoch = topic, source, epoch
+        self.port, self.topic = port, port.topic
+        self._source, self._epoch = source, epoch
         self._evict_after_s, self._on_evicted = evict_after_s, on_evicted
         self._loop = asyncio.get_running_loop()
         self._seq = 0
         self._sent_at_s = self._loop.time()
         self._consumers = {name: Consumer() for name in expected}
-        self._expected = frozenset(expected)
-        self._unhandled: deque[tuple[int, bytes, bytes]] = deque()  # seq, header, body
-        self._last: list[tuple[bytes, bytes]] = []
-        self._opened = asyncio.Event()
-        self._publisher = transport.publisher(data_key(topic.name))
-        self._welcomes = transport.publisher(welcome_key(topic.name))
-        self._repeating: set[asyncio.Task[None]] = set()
-        self.sent = self.waited = self.evicted = 0
-        transport.subscribe(grant_key(topic.name), self._requested)
+        self._expected = frozenset(self._consumers)
+        self._evicted: dict[str, int] = {}  # what each had handled when its patience was over
+        self._unhandled: deque[Sent] = deque()
+        self._changed = asyncio.Event()  # something about a consumer
+        self._repeating: asyncio.Task[None] | None = None
+        self._closed = False
+        self._parts: list[tuple[bytes, bytes]] = []  # of a state that is not complete yet
+        self._last_value: tuple[tuple[bytes, bytes], ...] = ()
+        self.sent = self.waited = self.repeated = self.evicted = 0
+        self._open(transport)
+
+    def _open(self, transport: Transport) -> None:
+        topic = self.topic.name
+        self._publisher = transport.publisher(data_key(topic))
+        self._again = transport.publisher(again_key(topic))
+        self._welcomes = transport.publisher(welcome_key(topic))
+        transport.subscribe(grant_key(topic), self._requested)
         transport.watch(self._presence)
-        if topic.is_state:
-            transport.answer(data_key(topic.name), lambda: tuple(self._last))
+        if self.topic.is_state:
+            transport.answer(data_key(topic), lambda: self._last_value)
 
     # --- sending ----------------------------------------------------------------------------
     def room(self) -> int:
         """How many messages may be sent now without waiting."""
         limits = [c.limit - self._seq if c.alive else 0 for c in self._consumers.values()]
-        return min(limits, default=UNLIMITED)
+        return max(0, min(limits, default=UNLIMITED))
 
     async def send(self, message: Message, body: bytes) -> None:
-        await self._wait_for_room()
+        if not self.port.never_wait:
+            await self._wait_for_room()
         key = str(getattr(message, self.topic.key)) if self.topic.key else ""
         header = encode(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
         self._keep(message, header, body)
@@ -94,120 +115,152 @@ class Outlet:
         await self._publisher.send(header, body)
 
     async def _wait_for_room(self) -> None:
-        if self.room() > 0:
-            return
-        self.waited += 1
-        while self.room() <= 0:
-            self._opened.clear()
-            await self._opened.wait()
+        self.waited += self.room() == 0
+        while self.room() == 0:
+            await self._change()
+
+    async def flush(self) -> None:
+        """Wait until all that was sent has arrived at every lossless consumer."""
+        self._post_welcomes()  # each answers with a grant at once
+        while any(c.arrived < self._seq for c in self._consumers.values()):
+            await self._change()
+
+    async def _change(self) -> None:
+        self._changed.clear()
+        await self._changed.wait()
 
     def _keep(self, message: Message, header: bytes, body: bytes) -> None:
         if self._consumers:
-            self._unhandled.append((self._seq, header, body))
+            self._unhandled.append(Sent(self._seq, header, body))
         if self.topic.is_state:
             if getattr(message, "part", 0) == 0:
-                self._last.clear()
-            self._last.append((header, body))
+                self._parts.clear()
+            self._parts.append((header, body))
+            if len(self._parts) == getattr(message, "parts", 1):
+                self._last_value = tuple(self._parts)
 
     # --- consumers --------------------------------------------------------------------------
     def _requested(self, _header: bytes, body: memoryview) -> None:
         """On any thread: grants are few, the loop does the rest."""
         try:
             request = decode_request(body)
-        except Exception as error:
+        except msgspec.DecodeError as error:
             log.warning("%s: unreadable grant: %s", self.topic.name, error)
             return
-        self._loop.call_soon_threadsafe(self._take_request, request)
+        call_soon(self._loop, self._take_request, request)
 
     def _take_request(self, request: Join | Grant) -> None:
+        name = request.consumer
+        if self._closed:
+            return
         if isinstance(request, Join) or request.epoch != self._epoch:
-            self._welcome(request.consumer)
-        elif request.consumer in self._consumers:
-            self._granted(self._consumers[request.consumer], request)
+            self._welcome(name)
+        elif request.handled <= self._evicted.get(name, -1):
+            pass  # still takes nothing
+        elif name not in self._consumers:
+            self._welcome(name)
+        elif request.arrived <= self._seq:
+            self._granted(self._consumers[name], request)
 
     def _welcome(self, name: str) -> None:
         """A consumer joined, or joined again: it gets what it has not handled."""
+        self._evicted.pop(name, None)
         consumer = self._consumers.setdefault(name, Consumer(handled=self._seq))
-        start = consumer.handled
-        consumer.alive, consumer.arrived, consumer.limit = True, start, start
-        consumer.resent_from = -1
-        self._welcomes.post(b"", encode(Welcome(name, self._epoch, start)))
+        consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
+        consumer.arrived = consumer.limit = consumer.handled
+        self._post_welcomes()
+
+    def _post_welcomes(self) -> None:
+        starts = {name: consumer.handled for name, consumer in self._consumers.items()}
+        self._welcomes.post(b"", encode(Welcome(self._epoch, starts)))
 
     def _granted(self, consumer: Consumer, grant: Grant) -> None:
+        self._evicted.pop(grant.consumer, None)
         consumer.alive = True
         consumer.handled = max(consumer.handled, grant.handled)
-        consumer.arrived = max(consumer.arrived, grant.arrived)
+        consumer.arrived = grant.arrived  # not the most ever: a successor may have less
         if grant.limit > consumer.limit:
             consumer.limit, consumer.shut_since_s = grant.limit, None
         self._forget_handled()
         if consumer.arrived < self._seq:
             self._repeat(consumer, grant.gap)
-        self._opened.set()
+        self._changed.set()
 
     def _forget_handled(self) -> None:
         oldest = min((c.handled for c in self._consumers.values()), default=self._seq)
-        while self._unhandled and self._unhandled[0][0] < oldest:
+        while self._unhandled and self._unhandled[0].seq < oldest:
             self._unhandled.popleft()
 
     def _repeat(self, consumer: Consumer, gap: bool) -> None:
         """Send again what did not arrive: after a gap at once, a lost tail after a while."""
         now = self._loop.time()
-        tail_lost = now - self._sent_at_s > self.RESEND_AFTER_S
-        fresh = now - consumer.resent_at_s < self.RESEND_AFTER_S
-        if not (gap or tail_lost) or (consumer.resent_from == consumer.arrived and fresh):
+        recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
+        if gap:
+            is_on_its_way = recently and consumer.repeated_from == consumer.arrived
+        else:
+            is_on_its_way = recently or now - self._sent_at_s < self.REPEAT_AFTER_S
+        if is_on_its_way or self._repeating is not None:
             return
-        consumer.resent_from, consumer.resent_at_s = consumer.arrived, now
-        lost = [(h, b) for seq, h, b in self._unhandled if seq >= consumer.arrived]
-        task = self._loop.create_task(self._send_all(lost))
-        self._repeating.add(task)
-        task.add_done_callback(self._repeating.discard)
+        consumer.repeated_from, consumer.repeated_at_s = consumer.arrived, now
+        lost = [sent for sent in self._unhandled if sent.seq >= consumer.arrived]
+        self.repeated += len(lost)
+        self._repeating = self._loop.create_task(self._send_again(lost))
 
-    async def _send_all(self, messages: list[tuple[bytes, bytes]]) -> None:
-        for header, body in messages:
-            await self._publisher.send(header, body)
+    async def _send_again(self, lost: list[Sent]) -> None:
+        try:
+            for sent in lost:
+                await self._again.send(sent.header, sent.body)
+        finally:
+            self._repeating = None
 
     def _presence(self, name: str, alive: bool) -> None:
         consumer = self._consumers.get(name)
         if consumer is None or alive:
             return
-        consumer.alive = False
+        self._release(name, consumer)
+        log.warning("%s: consumer %s is gone", self.topic.name, name)
+
+    def _release(self, name: str, consumer: Consumer) -> None:
+        """It holds nothing any more, unless it must not miss a message."""
+        consumer.alive, consumer.shut_since_s = False, None
         if name not in self._expected:
             del self._consumers[name]
             self._forget_handled()
-        log.warning("%s: consumer %s is gone", self.topic.name, name)
-        self._opened.set()
+        self._changed.set()
 
     def check_windows(self) -> None:
         """Evict consumers that live and yet take nothing; called with every heartbeat."""
         now = self._loop.time()
         for name, consumer in list(self._consumers.items()):
             if consumer.alive and consumer.limit <= self._seq:
-                consumer.shut_since_s = consumer.shut_since_s or now
+                if consumer.shut_since_s is None:
+                    consumer.shut_since_s = now
                 if now - consumer.shut_since_s > self._evict_after_s:
                     self._evict(name, consumer)
 
     def _evict(self, name: str, consumer: Consumer) -> None:
         log.error(
             "%s: consumer %s took nothing for %.0f s and is evicted",
-            self.topic.name,
-            name,
-            self._evict_after_s,
-        )
+            self.topic.name, name, self._evict_after_s,
+        )  # fmt: skip
         self.evicted += 1
-        consumer.alive, consumer.shut_since_s = False, None
-        if name not in self._expected:
-            del self._consumers[name]
+        self._evicted[name] = consumer.handled
+        self._release(name, consumer)
         self._on_evicted(name)
-        self._opened.set()
 
     # --- the rest ---------------------------------------------------------------------------
     def statistics(self) -> OutputCount:
         return OutputCount(
-            topic=self.topic.name, sent=self.sent, waited=self.waited, evicted=self.evicted
+            topic=self.topic.name,
+            sent=self.sent,
+            waited=self.waited,
+            evicted=self.evicted,
+            repeated=self.repeated,
         )
 
     def close(self) -> None:
-        for task in self._repeating:
-            task.cancel()
-        self._publisher.close()
-        self._welcomes.close()
+        self._closed = True
+        if self._repeating is not None:
+            self._repeating.cancel()
+        for publisher in (self._publisher, self._again, self._welcomes):
+            publisher.close()

@@ -5,12 +5,10 @@ import logging
 import os
 import resource
 import sys
-from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ldo_service.errors import RestartsExhausted
-
+from .restart import RestartBudget
 from .transport import Transport
 
 log = logging.getLogger(__name__)
@@ -28,7 +26,7 @@ def resident_mb() -> float:
 
 
 async def leave_with_parent(period_s: float = 0.5) -> None:
-    """Return when the process that started this one is gone; at once never, without a parent."""
+    """Return when the process that started this one is gone; never, if no ChildProcess did."""
     parent = int(os.environ.get(PARENT_VARIABLE, "0"))
     while parent == 0 or os.getppid() == parent:
         await asyncio.sleep(period_s)
@@ -38,7 +36,8 @@ async def leave_with_parent(period_s: float = 0.5) -> None:
 class ChildProcess:
     """Starts an actor's process, and starts it again when it dies or is silent.
 
-    `command` must run the stage `name` and end with exit code 0 after SIGTERM.
+    `command` must run the stage `name` and end after SIGTERM. It gets a process group of its own:
+    Ctrl-C at a terminal reaches the parent alone, which ends its children in order.
     """
 
     def __init__(
@@ -52,16 +51,18 @@ class ChildProcess:
         restart_window_s: float = 60.0,
         restart_delay_s: float = 0.05,
         silent_after_s: float = 10.0,
+        start_within_s: float = 60.0,
     ) -> None:
         self.name = name
         self._command, self._transport = command, transport
         self._environment = {**os.environ, **(environment or {}), PARENT_VARIABLE: str(os.getpid())}
-        self._max_restarts, self._window_s = max_restarts, restart_window_s
-        self._delay_s, self._silent_after_s = restart_delay_s, silent_after_s
-        self._died_at_s: deque[float] = deque()
+        self._budget = RestartBudget(
+            name, max_restarts, restart_window_s, restart_delay_s, delay_max_s=5.0
+        )
+        self._silent_after_s, self._start_within_s = silent_after_s, start_within_s
         self._process: asyncio.subprocess.Process | None = None
         self._draining = False
-        self._heard_at_s: float | None = None  # None until the first heartbeat of a process
+        self._heard_until_s = float("inf")  # a heartbeat must come before
         self.restarts = 0
 
     @property
@@ -74,17 +75,25 @@ class ChildProcess:
         watch = asyncio.create_task(self._kill_when_silent(), name=f"{self.name} watch")
         try:
             while not self._draining:
-                self._heard_at_s = None
-                self._process = await asyncio.create_subprocess_exec(
-                    *self._command, env=self._environment
-                )
-                log.info("%s runs in process %d", self.name, self._process.pid)
-                code = await self._process.wait()
+                code = await self._run_once()
                 if not self._draining:
                     await self._back_off(code)
         finally:
             watch.cancel()
-            self._kill()
+            self.kill()
+            if self._process:
+                await self._process.wait()
+
+    async def _run_once(self) -> int:
+        """Exit code of one process; negative: the signal that killed it."""
+        self._process = await asyncio.create_subprocess_exec(
+            *self._command, env=self._environment, process_group=0
+        )
+        log.info("%s runs in process %d", self.name, self._process.pid)
+        self._heard_until_s = self._loop.time() + self._start_within_s
+        if self._draining:  # asked while it was being started
+            self._process.terminate()
+        return await self._process.wait()
 
     def drain(self) -> None:
         """Soft stop."""
@@ -94,38 +103,26 @@ class ChildProcess:
 
     def kill(self) -> None:
         """End the process now; it is started again."""
-        self._kill()
-
-    def _kill(self) -> None:
         if self._process and self._process.returncode is None:
             self._process.kill()
 
     def _heard(self) -> None:
-        self._heard_at_s = self._loop.time()
+        self._heard_until_s = self._loop.time() + self._silent_after_s
 
     async def _kill_when_silent(self) -> None:
         """A stopped process keeps its connection for seconds: only its silence tells."""
         while True:
             await asyncio.sleep(self._silent_after_s / 10)
-            heard_at_s = self._heard_at_s
-            if heard_at_s is not None and self._loop.time() - heard_at_s > self._silent_after_s:
-                log.error("%s has been silent for %.0f s: killed", self.name, self._silent_after_s)
-                self._heard_at_s = None
-                self._kill()
+            if self._loop.time() > self._heard_until_s:
+                log.error("%s is silent: its process %s is killed", self.name, self.pid)
+                self._heard_until_s = float("inf")
+                self.kill()
 
     async def _back_off(self, code: int) -> None:
-        now = self._loop.time()
-        self._died_at_s.append(now)
-        while self._died_at_s[0] < now - self._window_s:
-            self._died_at_s.popleft()
-        recent = len(self._died_at_s)
-        how = f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        if recent > self._max_restarts:
-            log.error("%s: its process was %s", self.name, how)
-            raise RestartsExhausted(self.name, recent, self._window_s)
-        log.error("%s: its process was %s; started again", self.name, how)
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        log.error("%s: its process %s", self.name, how)
+        await asyncio.sleep(self._budget.spend(self._loop.time()))
         self.restarts += 1
-        await asyncio.sleep(self._delay_s * 2 ** (recent - 1))
 
 
 def python_command(*arguments: str) -> list[str]:

@@ -2,31 +2,28 @@
 
 import asyncio
 import logging
-import os
-import time
-from collections import deque
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from typing import Literal
+import secrets
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import msgspec
-import numpy as np
 
-from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
-from ldo_service.schemas import Health, Message
+from ldo_service.errors import ConfigError, StageStalled
+from ldo_service.schemas import Health, Message, decode, encode
 from ldo_service.schemas.topics import HEALTH
 
+from . import links
 from .actor import Actor
-from .links import Header, encode
-from .mailbox import Delivery, Mailbox
+from .inlet import Delivery
+from .mailbox import Mailbox
 from .outlet import Outlet
-from .process import resident_mb
+from .restart import RestartBudget
 from .state_store import MemoryStore, StateStore
 from .transport import Transport
+from .vitals import Vitals
+from .worker import Worker
 
 log = logging.getLogger(__name__)
-_encode_message = msgspec.msgpack.Encoder().encode
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +39,8 @@ class StageConfig:
     evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
 
     def __post_init__(self) -> None:
-        if self.max_restarts < 0 or self.heartbeat_s <= 0 or self.stall_after_s <= 0:
+        times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
+        if min(times) <= 0 or min(self.max_restarts, self.restart_delay_s) < 0:
             raise ConfigError(f"{self}: counts and times must be positive.")
 
 
@@ -50,18 +48,6 @@ class StageConfig:
 class Produced:
     message: Message
     body: bytes
-
-
-@dataclass
-class Counters:
-    steps: int = 0
-    failures: int = 0
-    restarts: int = 0
-    set_aside: int = 0
-    step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
-    last_stamp_ns: int = 0
-    finished_at_s: float = 0.0
-    started_at_s: float | None = None  # of the step under way
 
 
 class Stage:
@@ -88,48 +74,53 @@ class Stage:
         self._on_evicted = on_evicted
         self._actor = self._successor()
         self.name = self._actor.name
-        self._count = Counters()
-        self._failed_at_s: deque[float] = deque()
-        self._state: Literal["starting", "ready", "busy", "draining"] = "starting"
+        self._epoch = 1 + secrets.randbits(62)  # a number no earlier run of this stage had
+        self._vitals = Vitals()
+        self._budget = RestartBudget(
+            self.name,
+            config.max_restarts,
+            config.restart_window_s,
+            config.restart_delay_s,
+            config.restart_delay_max_s,
+        )
         self._drain_requested = False
         self._mailbox: Mailbox | None = None
         self._outlets: dict[type[Message], Outlet] = {}
 
     # --- life -----------------------------------------------------------------------------------
     async def run(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._epoch = time.time_ns()  # a number no earlier run of this stage had
-        self._count.finished_at_s = self._loop.time()
-        self._open_ports()
+        """Once. Raises RestartsExhausted or StageStalled when it gives up."""
+        self._worker = Worker(self.name)
+        self._mailbox = self._open_ports()
         self._transport.announce(self.name)
-        worker = ThreadPoolExecutor(1, thread_name_prefix=self.name)
-        beat = asyncio.create_task(self._beat(), name=f"{self.name} heartbeat")
-        work = asyncio.create_task(self._work(worker), name=f"{self.name} work")
+        tasks = {
+            asyncio.create_task(self._beat(self._mailbox), name=f"{self.name} heartbeat"),
+            asyncio.create_task(self._work(self._mailbox), name=f"{self.name} work"),
+        }
         try:
-            done, _ = await asyncio.wait({beat, work}, return_when=asyncio.FIRST_COMPLETED)
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
             for task in done:
                 task.result()
         finally:
-            for task in (beat, work):
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(beat, work, return_exceptions=True)
-            worker.shutdown(wait=False, cancel_futures=True)
-            self._close_ports()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            self._worker.close()
+            self._close_ports(self._mailbox)
 
     def drain(self) -> None:
         """Soft stop: handle what has arrived, say the last words, end."""
         self._drain_requested = True
-        self._state = "draining"
+        self._vitals.state = "draining"
         if self._mailbox:
             self._mailbox.close()
 
-    def _open_ports(self) -> None:
-        self._mailbox = Mailbox(self.name, self._actor.inputs, self._transport)
+    def _open_ports(self) -> Mailbox:
         for port in self._actor.outputs:
             if port.topic.message is None:
                 continue  # declared for a later version: nothing can be sent on it
             self._outlets[port.topic.message] = Outlet(
-                port.topic,
+                port,
                 self.name,
                 self._epoch,
                 self._transport,
@@ -138,78 +129,118 @@ class Stage:
                 self._on_evicted,
             )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
+        mailbox = Mailbox(self.name, self._actor.inputs, self._transport)
         if self._drain_requested:
-            self._mailbox.close()
+            mailbox.close()
+        else:
+            self._vitals.state = "ready"
+        return mailbox
 
-    def _close_ports(self) -> None:
-        self._health.close()
+    def _close_ports(self, mailbox: Mailbox) -> None:
+        mailbox.close()
+        mailbox.release()
         for outlet in self._outlets.values():
             outlet.close()
-        if self._mailbox:
-            self._mailbox.close()
-            self._mailbox.release()
+        self._health.close()
 
     # --- work -----------------------------------------------------------------------------------
-    async def _work(self, worker: ThreadPoolExecutor) -> None:
-        assert self._mailbox is not None
-        if not self._drain_requested:
-            self._state = "ready"
-        while delivery := await self._mailbox.take():
+    async def _work(self, mailbox: Mailbox) -> None:
+        while delivery := await mailbox.take():
             message = self._decode(delivery)
             if message is not None:
-                await self._step(worker, message)
-            self._mailbox.done(delivery, rejected=message is None)
-        for out in await self._loop.run_in_executor(worker, self._last_words):
-            await self._send(out)
+                await self._step(message)
+            mailbox.done(delivery, rejected=message is None)
+        await self._say_last_words()
+        for outlet in self._outlets.values():
+            await outlet.flush()
 
     def _decode(self, delivery: Delivery) -> Message | None:
-        topic = delivery.port.topic
+        topic, header = delivery.port.topic, delivery.header
         assert topic.message is not None
         try:
-            return msgspec.msgpack.decode(delivery.body, type=topic.message)
-        except (msgspec.DecodeError, ValueError) as error:  # ValidationError is a DecodeError
-            header: Header = delivery.header
+            return decode(delivery.body, topic.message)
+        except msgspec.DecodeError as error:
             log.warning(
                 "%s: %s #%d from %s rejected: %s",
                 self.name, topic.name, header.seq, header.source, error,
             )  # fmt: skip
             return None
 
-    async def _step(self, worker: ThreadPoolExecutor, message: Message) -> None:
-        for attempt in (1, 2):
-            self._actor.room = {o.topic: o.room() for o in self._outlets.values()}
-            self._count.started_at_s = started_s = self._loop.time()
-            try:
-                produced = await self._loop.run_in_executor(worker, self._handle, message)
-            except Exception:
-                log.exception("%s failed on %s", self.name, type(message).__name__)
-                await self._restart()
-                if attempt == 2:
-                    self._set_aside(message)
-                    return
-                continue
-            finally:
-                self._count.started_at_s = None
-            self._count.step_ms.append(1e3 * (self._loop.time() - started_s))
-            for out in produced:
-                await self._send(out)
-            self._store.save(self.name, self._actor.snapshot())
-            self._count.steps += 1
-            self._count.last_stamp_ns = message.stamp_ns
-            self._count.finished_at_s = self._loop.time()
-            return
+    async def _step(self, message: Message) -> None:
+        for _attempt in range(2):
+            if await self._try(message):
+                return
+        self._vitals.set_aside += 1
+        log.error(
+            "%s: %s of stamp %d failed twice and is set aside",
+            self.name, type(message).__name__, message.stamp_ns,
+        )  # fmt: skip
 
-    def _handle(self, message: Message) -> list[Produced]:
-        """In the actor's thread."""
-        return [Produced(out, _encode_message(out)) for out in self._actor.handle(message)]
-
-    def _last_words(self) -> list[Produced]:
-        return [Produced(out, _encode_message(out)) for out in self._actor.finish()]
+    async def _try(self, message: Message) -> bool:
+        """Handle, send, save; False when the handler failed and a successor is in place."""
+        self._look_at_room()
+        try:
+            with self._vitals.step():
+                produced = await self._worker.run(self._handle, message)
+        except Exception:
+            log.exception("%s failed on %s", self.name, type(message).__name__)
+            await self._restart()
+            return False
+        for out in produced:
+            await self._send(out)
+        await self._worker.run(self._save)
+        self._vitals.finished(message)
+        return True
 
     async def _send(self, out: Produced) -> None:
         await self._outlets[type(out.message)].send(out.message, out.body)
 
-    # --- failure --------------------------------------------------------------------------------
+    def _look_at_room(self) -> None:
+        never_wait = [outlet for outlet in self._outlets.values() if outlet.port.never_wait]
+        self._actor.room = {outlet.topic: outlet.room() for outlet in never_wait}
+
+    async def _say_last_words(self) -> None:
+        self._look_at_room()
+        try:
+            last_words = await self._worker.run(self._finish)
+        except Exception:
+            self._vitals.failures += 1
+            log.exception("%s failed on its last words", self.name)
+            return
+        for out in last_words:
+            await self._send(out)
+
+    # --- in the actor's thread ------------------------------------------------------------------
+    def _handle(self, message: Message) -> list[Produced]:
+        return self._collect(self._actor.handle(message))
+
+    def _finish(self) -> list[Produced]:
+        return self._collect(self._actor.finish())
+
+    def _collect(self, messages: Iterable[Message]) -> list[Produced]:
+        """Raises when a message is none of the outputs, or has no room where none may wait."""
+        produced: list[Produced] = []
+        room = dict(self._actor.room)
+        for message in messages:
+            if type(message) not in self._outlets:
+                raise TypeError(f"{type(message).__name__} is none of {self.name}'s outputs")
+            topic = self._outlets[type(message)].topic
+            if topic in room:
+                room[topic] -= 1
+                if room[topic] < 0:
+                    raise RuntimeError(f"{self.name} made {topic.name} without room for it")
+            produced.append(Produced(message, encode(message)))
+        return produced
+
+    def _save(self) -> None:
+        """A full disk must not stop the robot: it goes on, and a restart would lose a few steps."""
+        self._vitals.facts = self._actor.facts()
+        try:
+            self._store.save(self.name, self._actor.snapshot())
+        except Exception:
+            self._vitals.failures += 1
+            log.exception("%s: its state could not be saved", self.name)
+
     def _successor(self) -> Actor:
         actor = self._make()
         state = self._store.load(actor.name)
@@ -220,66 +251,34 @@ class Stage:
 
     async def _restart(self) -> None:
         """Wait, longer with each failure, and put a successor in place."""
-        self._count.failures += 1
-        now = self._loop.time()
-        self._failed_at_s.append(now)
-        while self._failed_at_s[0] < now - self._config.restart_window_s:
-            self._failed_at_s.popleft()
-        recent = len(self._failed_at_s)
-        if recent > self._config.max_restarts:
-            raise RestartsExhausted(self.name, recent, self._config.restart_window_s)
-        delay_s = self._config.restart_delay_s * 2 ** (recent - 1)
-        await asyncio.sleep(min(delay_s, self._config.restart_delay_max_s))
-        self._actor = self._successor()
-        self._count.restarts += 1
-
-    def _set_aside(self, message: Message) -> None:
-        self._count.set_aside += 1
-        log.error(
-            "%s: %s of stamp %d failed twice and is set aside",
-            self.name, type(message).__name__, message.stamp_ns,
-        )  # fmt: skip
+        while True:
+            self._vitals.failures += 1
+            await asyncio.sleep(self._budget.spend(asyncio.get_running_loop().time()))
+            try:
+                self._actor = await self._worker.run(self._successor)
+            except Exception:
+                log.exception("%s cannot go on from its last state", self.name)
+                continue
+            self._vitals.restarts += 1
+            return
 
     # --- health ---------------------------------------------------------------------------------
-    async def _beat(self) -> None:
-        assert self._mailbox is not None
+    async def _beat(self, mailbox: Mailbox) -> None:
         while True:
-            self._mailbox.send_grants()
+            mailbox.send_grants()
             for outlet in self._outlets.values():
                 outlet.check_windows()
-            self._health.post(
-                encode(Header(self.name, self._epoch, 0, self._count.last_stamp_ns)),
-                _encode_message(self.health()),
-            )
-            self._raise_when_stalled()
+            header = links.Header(self.name, self._epoch, 0, self._vitals.last_stamp_ns)
+            self._health.post(links.encode(header), encode(self.health()))
+            if self._vitals.busy_s > self._config.stall_after_s:
+                raise StageStalled(self.name, self._vitals.busy_s)
             await asyncio.sleep(self._config.heartbeat_s)
 
-    def _raise_when_stalled(self) -> None:
-        started_s = self._count.started_at_s
-        if started_s is not None and self._loop.time() - started_s > self._config.stall_after_s:
-            raise StageStalled(self.name, self._loop.time() - started_s)
-
     def health(self) -> Health:
-        assert self._mailbox is not None
-        count, now = self._count, self._loop.time()
-        step_ms = np.array(count.step_ms or [0.0])
-        is_busy = count.started_at_s is not None
-        return Health(
-            stamp_ns=count.last_stamp_ns,
+        """How it is now; also sent with every heartbeat."""
+        return self._vitals.health(
             actor=self.name,
-            state="busy" if is_busy and self._state == "ready" else self._state,
-            pid=os.getpid(),
             epoch=self._epoch,
-            steps=count.steps,
-            failures=count.failures,
-            restarts=count.restarts,
-            set_aside=count.set_aside,
-            step_age_s=now - count.finished_at_s,
-            busy_s=now - count.started_at_s if count.started_at_s is not None else 0.0,
-            step_ms_p50=float(np.percentile(step_ms, 50)),
-            step_ms_p95=float(np.percentile(step_ms, 95)),
-            rss_mb=resident_mb(),
-            inputs=self._mailbox.statistics(),
+            inputs=self._mailbox.statistics() if self._mailbox else (),
             outputs=tuple(outlet.statistics() for outlet in self._outlets.values()),
-            facts=self._actor.facts(),
         )

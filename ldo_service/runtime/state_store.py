@@ -1,7 +1,7 @@
 """Where the last state of each actor is kept, so that a successor goes on.
 
-A state is a few named parts. Only a part that is a new object is written; parts are written to a
-temporary name and renamed, so a reader finds the old or the new one, never half of one.
+A state is a few named parts. Only a part that is a new object is written, so the parts given must
+not be changed afterwards.
 """
 
 import logging
@@ -12,12 +12,11 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 
-from ldo_service.schemas import Array
-
 from .actor import State
 
 log = logging.getLogger(__name__)
 ARRAY_CODE = 1  # MessagePack extension type of a NumPy array
+CONTENTS = "contents.msgpack"
 
 
 class StateStore(Protocol):
@@ -41,33 +40,45 @@ class MemoryStore:
 
 
 class FolderStore:
-    """`<folder>/<actor>/<part>.msgpack`: outlives a killed process.
+    """`<folder>/<actor>/`: outlives a killed process.
 
-    Not synced to the disk at each step: a power cut may cost the last seconds.
+    Each part has a file, and `contents.msgpack` names the files that belong together. A new part
+    goes to a new file and the contents change last, in one rename: a reader finds the whole old
+    state or the whole new one. Not synced to the disk at each step: a power cut may cost the last
+    seconds.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._written: dict[tuple[str, str], Any] = {}
+        self._saved: dict[str, State] = {}
+        self._files: dict[str, dict[str, str]] = {}  # by actor: part to file
 
     def save(self, actor: str, state: State) -> None:
+        if not state:
+            return
+        folder = self._folder / actor
+        folder.mkdir(parents=True, exist_ok=True)
+        saved = self._saved.get(actor, {})
+        old = self._files[actor] if actor in self._files else _read_contents_or_nothing(folder)
+        new = dict(old)
         for part, value in state.items():
-            if self._written.get((actor, part)) is not value:
-                self._write(self._folder / actor / f"{part}.msgpack", value)
-                self._written[actor, part] = value
-
-    def _write(self, path: Path, value: object) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".new")
-        temporary.write_bytes(encode_state(value))
-        temporary.rename(path)
+            if part not in saved or saved[part] is not value:
+                new[part] = f"{part}.b" if old.get(part) == f"{part}.a" else f"{part}.a"
+                (folder / new[part]).write_bytes(encode_state(value))
+        new = {part: new[part] for part in state}
+        if new != old:
+            _write_contents(folder, new)
+        for file in set(old.values()) - set(new.values()):
+            (folder / file).unlink(missing_ok=True)
+        self._saved[actor], self._files[actor] = dict(state), new
 
     def load(self, actor: str) -> State | None:
         """None when nothing was saved, or what was saved cannot be read: said in the log."""
+        folder = self._folder / actor
         try:
+            files = _read_contents(folder)
             parts = {
-                path.stem: decode_state(path.read_bytes())
-                for path in sorted((self._folder / actor).glob("*.msgpack"))
+                part: decode_state((folder / file).read_bytes()) for part, file in files.items()
             }
         except (OSError, msgspec.DecodeError, ValueError) as error:
             log.error("%s: its saved state cannot be read and is left out: %s", actor, error)
@@ -75,12 +86,30 @@ class FolderStore:
         return parts or None
 
 
+def _read_contents(folder: Path) -> dict[str, str]:
+    path = folder / CONTENTS
+    return msgspec.msgpack.decode(path.read_bytes(), type=dict[str, str]) if path.exists() else {}
+
+
+def _read_contents_or_nothing(folder: Path) -> dict[str, str]:
+    try:
+        return _read_contents(folder)
+    except msgspec.DecodeError:
+        return {}
+
+
+def _write_contents(folder: Path, files: Mapping[str, str]) -> None:
+    temporary = folder / f"{CONTENTS}.new"
+    temporary.write_bytes(msgspec.msgpack.encode(files))
+    temporary.rename(folder / CONTENTS)
+
+
 def encode_state(value: object) -> bytes:
     """Plain values, bytes and NumPy arrays as MessagePack."""
     return msgspec.msgpack.encode(value, enc_hook=_array_to_ext)
 
 
-def decode_state(body: bytes) -> Mapping[str, Any]:
+def decode_state(body: bytes) -> Any:
     return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
 
 
@@ -89,10 +118,15 @@ def _array_to_ext(value: object) -> msgspec.msgpack.Ext:
         value = np.asarray(value)
     if not isinstance(value, np.ndarray):
         raise NotImplementedError(f"{type(value).__name__} in an actor's state")
-    return msgspec.msgpack.Ext(ARRAY_CODE, msgspec.msgpack.encode(Array.of(value)))
+    if value.dtype.hasobject:
+        raise NotImplementedError("an array of Python objects in an actor's state")
+    packed = (value.dtype.str, value.shape, value.tobytes())
+    return msgspec.msgpack.Ext(ARRAY_CODE, msgspec.msgpack.encode(packed))
 
 
-def _array_from_ext(code: int, data: memoryview) -> np.ndarray:
+def _array_from_ext(code: int, data: memoryview) -> Any:
     if code != ARRAY_CODE:
         raise ValueError(f"unknown extension {code} in a saved state")
-    return msgspec.msgpack.decode(data, type=Array).numpy().copy()
+    dtype, shape, raw = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...], bytes])
+    array = np.frombuffer(raw, dtype).reshape(shape).copy()
+    return array if shape else array[()]

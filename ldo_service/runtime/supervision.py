@@ -45,13 +45,15 @@ async def supervise(runners: Sequence[Runner], stop: Stop, drain_s: float = 10.0
     """
     try:
         async with asyncio.TaskGroup() as group:
-            tasks = {r.name: group.create_task(r.run(), name=r.name) for r in runners}
+            tasks = [group.create_task(runner.run(), name=runner.name) for runner in runners]
             await stop.wait_soft()
             hard = asyncio.create_task(stop.wait_hard())
-            for runner in runners:
-                await _end(runner, tasks[runner.name], hard, drain_s)
-            hard.cancel()
-    except* Exception as errors:
+            try:
+                for runner, task in zip(runners, tasks, strict=True):
+                    await _end(runner, task, hard, drain_s)
+            finally:
+                hard.cancel()
+    except BaseExceptionGroup as errors:
         raise _first(errors) from None
 
 

@@ -1,15 +1,17 @@
 """What the runtime needs of a network, and the network within one process."""
 
+import asyncio
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Protocol
+from contextlib import suppress
+from typing import Any, Protocol
 
 OnMessage = Callable[[bytes, memoryview], None]  # header, body; may be called on any thread
 OnPresence = Callable[[str, bool], None]  # name, alive; called on the event loop
-LastValues = Callable[[], Sequence[tuple[bytes, bytes]]]  # header and body of each part
+LastValues = Callable[[], Sequence[tuple[bytes, bytes]]]  # on any thread; header, body of each part
 
 
 class Publisher(Protocol):
-    """Sends on one key. Nothing here blocks the event loop."""
+    """Sends on one key. Nothing here blocks the event loop; after `close` nothing is sent."""
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
         """Send; done when the message has left, or was given up to congestion."""
@@ -25,8 +27,8 @@ class Publisher(Protocol):
 class Transport(Protocol):
     """Keys are relative to the robot: `data/...` of topics, and the runtime's own.
 
-    Messages may be lost or repeated, and those of one publisher stay in order: what must arrive is
-    numbered, acknowledged and sent again by `ldo_service.runtime.links`.
+    Messages may be lost, and those of one publisher stay in order: what must arrive is numbered,
+    acknowledged and sent again by `ldo_service.runtime.links`.
     """
 
     def publisher(self, key: str) -> Publisher: ...
@@ -46,6 +48,12 @@ class Transport(Protocol):
         ...
 
     def close(self) -> None: ...
+
+
+def call_soon(loop: asyncio.AbstractEventLoop, callback: Callable[..., None], *args: Any) -> None:
+    """On any thread, even one that outlives the loop: then there is nobody left to tell."""
+    with suppress(RuntimeError):
+        loop.call_soon_threadsafe(callback, *args)
 
 
 class MemoryTransport:
@@ -98,11 +106,14 @@ class MemoryTransport:
 class MemoryPublisher:
     def __init__(self, transport: MemoryTransport, key: str) -> None:
         self._transport, self._key = transport, key
+        self._closed = False
 
     async def send(self, header: bytes, body: bytes) -> None:
-        self._transport.deliver(self._key, header, body)
+        self.post(header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
-        self._transport.deliver(self._key, header, body)
+        if not self._closed:
+            self._transport.deliver(self._key, header, body)
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        self._closed = True

@@ -3,7 +3,7 @@
 Facts of zenoh-python 1.x that shape this file:
 - Callbacks with `indirect=False` run on Zenoh's own thread; they store and wake, nothing else. A
   plain `callback=` hides a queue of 256 messages and a thread that keeps the interpreter alive.
-- `put` may block, so it runs in a thread of the publisher. Everything is sent with congestion
+- `put` and `reply` may block, so they run in threads of ours. Everything is sent with congestion
   control DROP: with BLOCK one stalled subscriber stalls the sender for seconds and then loses
   messages all the same. What must arrive is sent again by the links above.
 - The default configuration listens on every interface: scouting, gossip and shared memory are
@@ -14,9 +14,9 @@ import asyncio
 import json
 import logging
 from collections.abc import Awaitable
-from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
-from threading import Lock
+from threading import BoundedSemaphore, Lock
 from typing import Any
 
 import zenoh
@@ -24,12 +24,14 @@ import zenoh
 from ldo_service.errors import ConfigError
 from ldo_service.schemas.topics import ROBOT_PREFIX
 
-from .transport import LastValues, OnMessage, OnPresence
+from .transport import LastValues, OnMessage, OnPresence, call_soon
+from .worker import Worker
 
 log = logging.getLogger(__name__)
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ALIVE = "link/alive"
+MAX_QUERIES = 16  # that may wait for their answer; who asks more often gets an error
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,9 +89,11 @@ class ZenohTransport:
         self._session, self._network = session, network
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
+        self._answering = Worker("answers")
+        self._query_slots = BoundedSemaphore(MAX_QUERIES)
 
     def publisher(self, key: str) -> "ZenohPublisher":
-        return ZenohPublisher(self._session, self._network.expression(key), self._loop)
+        return ZenohPublisher(self._session, self._network.expression(key))
 
     def subscribe(self, key: str, on_message: OnMessage) -> None:
         def store(sample: zenoh.Sample) -> None:
@@ -109,7 +113,7 @@ class ZenohTransport:
         def changed(sample: zenoh.Sample) -> None:
             name = str(sample.key_expr).rsplit("/", 1)[1]
             alive = sample.kind == zenoh.SampleKind.PUT
-            self._loop.call_soon_threadsafe(on_presence, name, alive)
+            call_soon(self._loop, on_presence, name, alive)
 
         handler = zenoh.handlers.Callback(changed, indirect=False)
         expression = self._network.expression(f"{ALIVE}/*")
@@ -120,35 +124,44 @@ class ZenohTransport:
         expression = self._network.expression(key)
 
         def reply(query: zenoh.Query) -> None:
-            with query:
-                for header, body in last_values():
-                    query.reply(expression, body, attachment=header)
+            try:
+                with query, suppress(zenoh.ZError):  # the asker may be gone
+                    for header, body in last_values():
+                        query.reply(expression, body, attachment=header)
+            finally:
+                self._query_slots.release()
 
-        handler = zenoh.handlers.Callback(reply, indirect=False)
+        def asked(query: zenoh.Query) -> None:
+            if self._query_slots.acquire(blocking=False):
+                self._answering.submit(reply, query)
+            else:
+                with query:
+                    query.reply_err(b"too many queries: ask again later")
+
+        handler = zenoh.handlers.Callback(asked, indirect=False)
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def close(self) -> None:
         for declared in self._declared:
-            declared.undeclare()
+            with suppress(zenoh.ZError):  # the session may be closed already
+                declared.undeclare()
         self._declared.clear()
+        self._answering.close()
 
 
 class ZenohPublisher:
     """One key, one thread: messages of a key stay in order, and no key waits for another."""
 
-    def __init__(
-        self, session: zenoh.Session, expression: str, loop: asyncio.AbstractEventLoop
-    ) -> None:
+    def __init__(self, session: zenoh.Session, expression: str) -> None:
         self._publisher = session.declare_publisher(
             expression, congestion_control=zenoh.CongestionControl.DROP
         )
-        self._loop = loop
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"put {expression}")
+        self._thread = Worker(f"put {expression}")
         self._lock = Lock()
         self._posted: tuple[bytes, bytes] | None = None
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
-        return self._loop.run_in_executor(self._thread, self._put, header, body)
+        return self._thread.run(self._put, header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
         with self._lock:
@@ -169,4 +182,10 @@ class ZenohPublisher:
             log.warning("%s: put failed: %s", self._publisher.key_expr, error)
 
     def close(self) -> None:
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        """What was sent or posted so far still leaves."""
+        self._thread.submit(self._undeclare)
+        self._thread.close()
+
+    def _undeclare(self) -> None:
+        with suppress(zenoh.ZError):
+            self._publisher.undeclare()

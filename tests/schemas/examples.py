@@ -147,7 +147,7 @@ EXAMPLES: dict[str, Message] = {
                 topic="keyframe/new", delivered=90, dropped=0, rejected=1, gaps=2, waiting=3, peak=8
             ),
         ),
-        outputs=(OutputCount(topic="map/view", sent=90, waited=4, evicted=1),),
+        outputs=(OutputCount(topic="map/view", sent=90, waited=4, evicted=1, repeated=3),),
         facts={"gaussians": 1000.0},
     ),
 }

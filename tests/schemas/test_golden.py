@@ -40,12 +40,25 @@ def plain(value: object) -> object:
     return bytes(value) if isinstance(value, memoryview) else value
 
 
+def assert_holds(whole: object, part: object) -> None:
+    """Equal, but for fields that an earlier version did not have."""
+    if isinstance(whole, dict) and isinstance(part, dict):
+        for key, item in part.items():
+            assert_holds(whole[key], item)
+    elif isinstance(whole, list) and isinstance(part, list):
+        assert len(whole) == len(part)
+        for one, other in zip(whole, part, strict=True):
+            assert_holds(one, other)
+    else:
+        assert whole == part
+
+
 def test_golden_file_decodes_to_the_expected_message(golden: Golden) -> None:
     assert decode(golden.body, type(golden.expected)) == golden.expected
 
 
 def test_golden_file_reads_the_same_with_a_plain_messagepack_library(golden: Golden) -> None:
-    assert msgpack.unpackb(golden.body) == plain(golden.expected)
+    assert_holds(plain(golden.expected), msgpack.unpackb(golden.body))
 
 
 def test_what_a_plain_messagepack_library_writes_decodes(golden: Golden) -> None:

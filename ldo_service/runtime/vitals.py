@@ -1,0 +1,72 @@
+"""What a stage counts about itself, for its health message."""
+
+import os
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from ldo_service.schemas import Health, Message
+
+from .process import resident_mb
+
+
+@dataclass
+class Vitals:
+    """Times are of the monotonic clock."""
+
+    state: Literal["starting", "ready", "draining"] = "starting"
+    steps: int = 0
+    failures: int = 0
+    restarts: int = 0
+    set_aside: int = 0
+    step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
+    last_stamp_ns: int = 0
+    finished_at_s: float = field(default_factory=time.monotonic)
+    started_at_s: float | None = None  # of the step under way
+    facts: dict[str, float] = field(default_factory=dict)  # the actor's own, after its last step
+
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Around the handler; only a step that does not raise is timed."""
+        started_s = self.started_at_s = time.monotonic()
+        try:
+            yield
+            self.step_ms.append(1e3 * (time.monotonic() - started_s))
+        finally:
+            self.started_at_s = None
+
+    def finished(self, message: Message) -> None:
+        self.steps += 1
+        self.last_stamp_ns = message.stamp_ns
+        self.finished_at_s = time.monotonic()
+
+    @property
+    def busy_s(self) -> float:
+        """Age of the step under way, 0 when there is none."""
+        started_s = self.started_at_s
+        return 0.0 if started_s is None else time.monotonic() - started_s
+
+    def health(self, **of_the_stage: Any) -> Health:
+        step_ms = np.array(self.step_ms or [0.0])
+        is_busy = self.started_at_s is not None and self.state == "ready"
+        return Health(
+            stamp_ns=self.last_stamp_ns,
+            state="busy" if is_busy else self.state,
+            pid=os.getpid(),
+            steps=self.steps,
+            failures=self.failures,
+            restarts=self.restarts,
+            set_aside=self.set_aside,
+            step_age_s=time.monotonic() - self.finished_at_s,
+            busy_s=self.busy_s,
+            step_ms_p50=float(np.percentile(step_ms, 50)),
+            step_ms_p95=float(np.percentile(step_ms, 95)),
+            rss_mb=resident_mb(),
+            facts=self.facts,
+            **of_the_stage,
+        )

@@ -1,0 +1,66 @@
+"""A thread that works off what it is given, in order."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import SimpleQueue
+from threading import Lock, Thread
+from typing import Any, ParamSpec, TypeVar
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class Worker:
+    """One daemon thread.
+
+    An executor's thread keeps the interpreter from exiting while a job runs, for ever if the job
+    never ends; this one does not. How much may wait is up to who submits.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._jobs: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        self._lock = Lock()
+        self._closed = False
+        Thread(target=self._work, name=name, daemon=True).start()
+
+    def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
+        """Run soon, in the thread. After `close` the future is cancelled at once."""
+        future: Future[R] = Future()
+        with self._lock:
+            if self._closed:
+                future.cancel()
+            else:
+                self._jobs.put((future, lambda: job(*args, **kwargs)))
+        return future
+
+    async def run(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        return await asyncio.wrap_future(self.submit(job, *args, **kwargs))
+
+    def close(self) -> None:
+        """End after what was submitted so far; nobody waits for it."""
+        with self._lock:
+            if not self._closed:
+                self._closed = True
+                self._jobs.put(None)
+
+    def _work(self) -> None:
+        while entry := self._jobs.get():
+            future, job = entry
+            if future.set_running_or_notify_cancel():
+                _settle(future, job)
+            del entry, future, job  # a waiting thread holds on to nothing
+
+
+def _settle(future: Future[Any], job: Callable[[], Any]) -> None:
+    try:
+        result = job()
+    except (StopIteration, GeneratorExit, KeyboardInterrupt, SystemExit) as error:
+        # asyncio cannot hand these on: the job failed, and that is all there is to know
+        failure = RuntimeError(f"{type(error).__name__} was raised")
+        failure.__cause__ = error
+        future.set_exception(failure)
+    except BaseException as error:
+        future.set_exception(error)
+    else:
+        future.set_result(result)

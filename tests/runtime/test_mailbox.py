@@ -1,0 +1,120 @@
+"""Inputs of policy Latest, and what arrives from outside."""
+
+from ldo_service.runtime import In, Latest, Lossless
+from ldo_service.runtime.inlet import Delivery
+from ldo_service.runtime.links import Header, encode
+from ldo_service.runtime.mailbox import Mailbox
+from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.schemas import encode as encode_message
+
+from .cast import DOUBLES, NUMBERS, collector, eventually, number, running
+
+
+class Feed:
+    """A producer without a link: what it sends, it sends."""
+
+    def __init__(self, transport: MemoryTransport, topic: str = NUMBERS.name) -> None:
+        self._transport, self._topic, self._seq = transport, topic, 0
+
+    def send(self, value: int, key: str = "") -> None:
+        header = Header("feed", 1, self._seq, value, key)
+        self._seq += 1
+        body = encode_message(number(value, region=key))
+        self._transport.deliver(self._topic, encode(header), body)
+
+
+async def take_all(mailbox: Mailbox) -> list[tuple[str, int]]:
+    """Key and stamp of all that waits."""
+    mailbox.close()
+    taken: list[Delivery] = []
+    while delivery := await mailbox.take():
+        taken.append(delivery)
+        mailbox.done(delivery)
+    return [(delivery.header.key, delivery.header.stamp_ns) for delivery in taken]
+
+
+async def test_latest_drops_the_oldest_and_counts() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(2)),), transport)
+    feed = Feed(transport)
+    for value in range(10):
+        feed.send(value)
+    assert await take_all(mailbox) == [("", 8), ("", 9)]
+    (counted,) = mailbox.statistics()
+    assert (counted.delivered, counted.dropped, counted.peak, counted.waiting) == (2, 8, 2, 0)
+
+
+async def test_latest_per_key_keeps_the_newest_of_each() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(1, per_key=True)),), transport)
+    feed = Feed(transport)
+    for value, key in enumerate("aabcab"):
+        feed.send(value, key)
+    assert await take_all(mailbox) == [("c", 3), ("a", 4), ("b", 5)]
+    assert mailbox.statistics()[0].dropped == 3
+
+
+async def test_beyond_max_keys_the_key_that_waited_longest_makes_room() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(2, per_key=True, max_keys=2)),), transport)
+    feed = Feed(transport)
+    for value, key in enumerate(["a", "a", "b", "c"]):
+        feed.send(value, key)
+    assert await take_all(mailbox) == [("b", 2), ("c", 3)]
+    assert mailbox.statistics()[0].dropped == 2
+
+
+async def test_inputs_are_merged_in_order_of_arrival() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(8)), In(DOUBLES, Latest(8))), transport)
+    numbers, doubles = Feed(transport), Feed(transport, DOUBLES.name)
+    for value in range(6):
+        (numbers if value % 3 else doubles).send(value)
+    assert await take_all(mailbox) == [("", value) for value in range(6)]
+
+
+async def test_a_message_whose_header_cannot_be_read_is_rejected_and_counted() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(8)), In(DOUBLES, Lossless(2))), transport)
+    for noise in (
+        b"\xff",
+        b"\x96\xa1a\x01\x00\x00\xa0" + b"\x91" * 9999,
+        encode(["feed", 0, 0, 0]),
+        encode(["feed", 1, -1, 0]),
+    ):
+        transport.deliver(NUMBERS.name, noise, b"")
+        transport.deliver(DOUBLES.name, noise, b"")
+    assert await take_all(mailbox) == []
+    assert [counted.rejected for counted in mailbox.statistics()] == [4, 4]
+
+
+async def test_a_foreign_program_may_send_to_a_latest_input_without_a_header() -> None:
+    transport, seen = MemoryTransport(), []
+    async with running(collector(transport, seen, policy=Latest(4))):
+        transport.deliver(NUMBERS.name, b"", encode_message(number(5)))
+        await eventually(lambda: seen == [5])
+
+
+async def test_a_flood_into_a_lossless_input_stays_within_its_window() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Lossless(3)),), transport)
+    transport.deliver("link/welcome/test/number", b"", encode([1, {"me": 0}]))
+    feed = Feed(transport)
+    for value in range(100):
+        feed.send(value)
+    (counted,) = mailbox.statistics()
+    assert (counted.waiting, counted.peak) == (3, 3)
+    assert await take_all(mailbox) == [("", 0), ("", 1), ("", 2)]
+
+
+async def test_a_body_that_does_not_decode_is_rejected_and_the_next_is_handled() -> None:
+    transport, seen = MemoryTransport(), []
+    stage = collector(transport, seen, policy=Latest(8))
+    async with running(stage):
+        transport.deliver(NUMBERS.name, b"", b"\x80")
+        transport.deliver(NUMBERS.name, b"", b"\x81\xa1y" + b"\x91" * 100_000)
+        transport.deliver(NUMBERS.name, b"", encode_message(number(3)))
+        await eventually(lambda: seen == [3])
+        await eventually(lambda: stage.health().inputs[0].delivered == 1)
+        assert stage.health().inputs[0].rejected == 2
+        assert stage.health().failures == 0
