@@ -22,6 +22,11 @@ def test_every_reference_in_the_schema_leads_somewhere() -> None:
     assert names <= set(schema["$defs"])  # type: ignore[call-overload]
 
 
+def test_each_message_type_travels_on_one_topic() -> None:
+    types = [topic.message for topic in TOPICS if topic.message is not None]
+    assert len(set(types)) == len(types)
+
+
 def test_topic_names_are_unique_and_fit_a_key_expression() -> None:
     names = [topic.name for topic in TOPICS]
     assert len(set(names)) == len(names)

@@ -1,0 +1,142 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ldo_service.runtime import state_store
+from ldo_service.runtime.state_store import FolderStore, MemoryStore
+
+RICH: dict[str, Any] = {
+    "counters": {"frames": 3, "names": ["a", "b"], "nothing": None},
+    "means": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "mask": np.array([True, False]),
+    "random": np.array([2**64 - 1], np.uint64),
+    "empty": np.zeros((0, 3)),
+    "scalar": np.float32(1.5),
+    "bytes": b"\0\1",
+    "nothing": None,
+}
+
+
+def assert_same(one: Any, other: Any) -> None:
+    assert one.keys() == other.keys()
+    for part in one:
+        if isinstance(one[part], np.ndarray):
+            assert one[part].dtype == other[part].dtype
+        np.testing.assert_array_equal(one[part], other[part])
+
+
+@pytest.fixture(params=["memory", "folder"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> MemoryStore | FolderStore:
+    return MemoryStore() if request.param == "memory" else FolderStore(tmp_path)
+
+
+def test_what_was_saved_is_loaded(store: MemoryStore | FolderStore) -> None:
+    assert store.load("mapper") is None
+    store.save("mapper", RICH)
+    loaded = store.load("mapper")
+    assert loaded is not None
+    assert_same(loaded, RICH)
+    assert store.load("tracker") is None
+
+
+def test_an_actor_without_state_leaves_nothing(
+    store: MemoryStore | FolderStore, tmp_path: Path
+) -> None:
+    store.save("mapper", {})
+    assert store.load("mapper") is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_loaded_arrays_can_be_changed(tmp_path: Path) -> None:
+    FolderStore(tmp_path).save("mapper", RICH)
+    state = FolderStore(tmp_path).load("mapper")
+    assert state is not None
+    state["means"][0, 0] = 9
+
+
+def test_a_part_that_did_not_change_is_not_written_again(tmp_path: Path) -> None:
+    store, big = FolderStore(tmp_path), np.zeros(10)
+    store.save("mapper", {"big": big, "step": 1000})
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "mapper").glob("big*")}
+    store.save("mapper", {"big": big, "step": 1001})
+    after = {path: path.stat().st_mtime_ns for path in (tmp_path / "mapper").glob("big*")}
+    assert before == after
+    assert FolderStore(tmp_path).load("mapper") == {"big": pytest.approx(big), "step": 1001}
+
+
+def test_a_save_that_breaks_off_leaves_the_whole_old_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = FolderStore(tmp_path)
+    store.save("mapper", {"one": [1], "two": [1]})
+    store.save("mapper", {"one": [2], "two": [2]})
+
+    for fails in ("one", "two", "contents"):
+        monkeypatch.undo()
+        break_off(monkeypatch, fails)
+        with pytest.raises(OSError, match="disk full"):
+            store.save("mapper", {"one": [3], "two": [3]})
+        assert FolderStore(tmp_path).load("mapper") == {"one": [2], "two": [2]}
+    monkeypatch.undo()
+    store.save("mapper", {"one": [4], "two": [4]})
+    assert FolderStore(tmp_path).load("mapper") == {"one": [4], "two": [4]}
+
+
+def break_off(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """Let writing of a file that begins with `name` stop in the middle."""
+    write = Path.write_bytes
+
+    def write_half(path: Path, data: bytes) -> int:
+        if path.name.startswith(name):
+            write(path, data[: len(data) // 2])
+            raise OSError("disk full")
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", write_half)
+
+
+def test_a_part_that_is_gone_is_gone_from_the_folder(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    store.save("mapper", {"one": [1], "two": [1]})
+    store.save("mapper", {"one": [1]})
+    assert FolderStore(tmp_path).load("mapper") == {"one": [1]}
+    assert not list((tmp_path / "mapper").glob("two*"))
+
+
+def test_many_saves_leave_at_most_two_files_a_part(tmp_path: Path) -> None:
+    store = FolderStore(tmp_path)
+    for step in range(50):
+        store.save("mapper", {"step": [step]})
+    assert len(list((tmp_path / "mapper").iterdir())) <= 3
+    assert FolderStore(tmp_path).load("mapper") == {"step": [49]}
+
+
+@pytest.mark.parametrize("file", ["step.a", state_store.CONTENTS])
+@pytest.mark.parametrize("noise", [b"", b"\xc1noise", b"\x93", b"\xc7\x01\x07\x00"])
+def test_a_broken_file_is_left_out_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, file: str, noise: bytes
+) -> None:
+    FolderStore(tmp_path).save("mapper", {"step": [1]})
+    (tmp_path / "mapper" / file).write_bytes(noise)
+    store = FolderStore(tmp_path)
+    assert store.load("mapper") is None
+    assert "cannot be read" in caplog.text
+    store.save("mapper", {"step": [2]})
+    assert FolderStore(tmp_path).load("mapper") == {"step": [2]}
+
+
+def test_a_missing_file_is_left_out_and_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    FolderStore(tmp_path).save("mapper", {"step": [1]})
+    (tmp_path / "mapper" / "step.a").unlink()
+    assert FolderStore(tmp_path).load("mapper") is None
+    assert "cannot be read" in caplog.text
+
+
+@pytest.mark.parametrize("value", [{1, object()}, np.array([object()])])
+def test_what_is_no_plain_value_is_refused(tmp_path: Path, value: Any) -> None:
+    with pytest.raises((NotImplementedError, TypeError)):
+        FolderStore(tmp_path).save("mapper", {"strange": value})

@@ -1,0 +1,147 @@
+"""All stages of a process: errors end them all, stops end them in order."""
+
+import asyncio
+import subprocess
+import sys
+from threading import Event
+
+import pytest
+
+from ldo_service.errors import RestartsExhausted
+from ldo_service.runtime.outlet import Outlet
+from ldo_service.runtime.ports import Out
+from ldo_service.runtime.stage import Stage, StageConfig
+from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.transport import MemoryTransport
+
+from .cast import (
+    DOUBLES,
+    NUMBERS,
+    QUICK,
+    DoubleCollector,
+    Doubler,
+    collector,
+    eventually,
+    number,
+    send,
+)
+
+
+async def test_a_soft_stop_loses_nothing_that_is_under_way() -> None:
+    transport, seen, stop = MemoryTransport(), [], Stop()
+    numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["doubler"])
+    expected = {DOUBLES.name: frozenset({"double_collector"})}
+    doubler = Stage(Doubler, transport, config=QUICK, expected=expected)
+    last = Stage(lambda: DoubleCollector(seen), transport, config=QUICK)
+    service = asyncio.create_task(supervise([doubler, last], stop))
+    for value in range(20):
+        await send(numbers, number(value))
+    await numbers.flush()
+    stop.ask()
+    assert stop.is_asked
+    await service
+    assert seen == [2 * value for value in range(20)]
+
+
+async def test_a_hard_stop_ends_at_once() -> None:
+    transport, stop, stuck = MemoryTransport(), Stop(), Event()
+    stage = collector(transport, [], lambda _value: stuck.wait(10) and None)
+    numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["collector"])
+    service = asyncio.create_task(supervise([stage], stop, drain_s=1000))
+    await send(numbers, number(0))
+    await eventually(lambda: stage.health().state == "busy")
+    stop.ask()
+    await asyncio.sleep(0.01)
+    assert not service.done()
+    stop.ask()
+    await asyncio.wait_for(service, 5)
+    stuck.set()
+
+
+async def test_a_stage_that_does_not_drain_in_time_is_cancelled() -> None:
+    transport, stop = MemoryTransport(), Stop()
+    stage = collector(transport, [])
+    stage.drain = lambda: None  # type: ignore[method-assign]
+    stop.ask()
+    await asyncio.wait_for(supervise([stage], stop, drain_s=0.01), 5)
+
+
+async def test_an_exhausted_restart_budget_ends_all_stages_with_that_error() -> None:
+    def fail(_value: int) -> None:
+        raise RuntimeError("always")
+
+    transport, stop = MemoryTransport(), Stop()
+    config = StageConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=1)
+    bad, good = collector(transport, [], fail, config=config), Stage(Doubler, transport)
+    numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["collector"])
+    service = asyncio.create_task(supervise([good, bad], stop))
+    await send(numbers, number(0))
+    with pytest.raises(RestartsExhausted, match="collector"):
+        await asyncio.wait_for(service, 10)
+    left = [task for task in asyncio.all_tasks() if task is not asyncio.current_task()]
+    assert left == []
+
+
+async def test_a_second_error_during_a_soft_stop_leaves_no_task_behind() -> None:
+    class Failing:
+        name = "failing"
+
+        def __init__(self) -> None:
+            self._asked = asyncio.Event()
+
+        async def run(self) -> None:
+            await self._asked.wait()
+            raise RestartsExhausted("failing", 1, 1.0)
+
+        def drain(self) -> None:
+            self._asked.set()
+
+    stop = Stop()
+    stop.ask()
+    with pytest.raises(RestartsExhausted):
+        await supervise([Failing(), Failing()], stop)
+    await asyncio.sleep(0)
+    assert asyncio.all_tasks() == {asyncio.current_task()}
+
+
+STUCK = """
+import asyncio, time
+from ldo_service.errors import StageStalled
+from ldo_service.runtime import Actor, In, Latest
+from ldo_service.runtime.stage import Stage, StageConfig
+from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.schemas import Health, encode
+from ldo_service.schemas.topics import Topic
+
+ANY = Topic("any", Health, "")
+
+class Stuck(Actor):
+    name, inputs = "stuck", (In(ANY, Latest(1)),)
+
+    def handle(self, message):
+        time.sleep(1e6)
+        yield from ()
+
+async def main():
+    transport = MemoryTransport()
+    stage = Stage(Stuck, transport, config=StageConfig(heartbeat_s=0.02, stall_after_s=0.1))
+    service = asyncio.create_task(supervise([stage], Stop()))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    transport.deliver("any", b"", encode(stage.health()))
+    try:
+        await service
+    except StageStalled as error:
+        print("stalled:", error)
+
+asyncio.run(main())
+"""
+
+
+def test_the_interpreter_exits_while_a_handler_is_stuck() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", STUCK], capture_output=True, text=True, timeout=15, check=False
+    )
+    assert "stalled: stuck has been busy" in done.stdout
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,0 +1,50 @@
+import asyncio
+from concurrent.futures import CancelledError
+from threading import Event
+
+import pytest
+
+from ldo_service.runtime.worker import Worker
+
+
+async def test_jobs_run_in_order_and_hand_back_their_results() -> None:
+    worker, done = Worker("test"), []
+
+    def job(value: int) -> int:
+        done.append(value)
+        return value * value
+
+    assert await asyncio.gather(*(worker.run(job, value) for value in range(20))) == [
+        value * value for value in range(20)
+    ]
+    assert done == list(range(20))
+    worker.close()
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected"),
+    [(KeyError, KeyError), (StopIteration, RuntimeError), (SystemExit, RuntimeError)],
+)
+async def test_what_a_job_raises_comes_back(raised: type, expected: type) -> None:
+    def job() -> None:
+        raise raised
+
+    worker = Worker("test")
+    with pytest.raises(expected):
+        await asyncio.wait_for(worker.run(job), 5)
+    assert await worker.run(int) == 0  # the thread goes on
+    worker.close()
+
+
+def test_after_close_what_was_submitted_still_runs_and_the_rest_is_cancelled() -> None:
+    worker, go = Worker("test"), Event()
+    first, second = worker.submit(go.wait, 10), worker.submit(int)
+    worker.close()
+    worker.close()
+    late = worker.submit(int)
+    assert late.cancelled()
+    go.set()
+    assert first.result(5)
+    assert second.result(5) == 0
+    with pytest.raises(CancelledError):
+        late.result(5)
