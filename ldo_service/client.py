@@ -20,9 +20,9 @@ import numpy as np
 import zenoh
 
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.links import Header, decode_header, encode
+from ldo_service.runtime.links import Header, encode
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
-from ldo_service.schemas import CameraModel, CameraRgbd, Image, Message, TrackedPose
+from ldo_service.schemas import CameraModel, CameraRgbd, Image, Message, TrackedPose, decode
 from ldo_service.schemas.topics import CAMERA_RGBD, POSE_TRACKED, Topic
 
 M = TypeVar("M", bound=Message)
@@ -115,11 +115,11 @@ def _type_of(topic: Topic) -> type[Message]:
 
 
 def _header(sample: Any) -> Header:
-    return decode_header(sample.attachment.to_bytes())
+    return decode(sample.attachment.to_bytes(), Header)
 
 
 def _message(sample: Any, of: type[M]) -> M:
-    return msgspec.msgpack.decode(sample.payload.to_bytes(), type=of)
+    return decode(sample.payload.to_bytes(), of)
 
 
 @contextmanager

@@ -96,7 +96,7 @@ def run_over_file(
             "mapper": config.run.mapper_latency_frames,
             "optimizer": config.run.optimizer_latency_frames,
         },
-        lambda _actor, message, step_ms=0.0: record.observe(message, step_ms),
+        lambda _actor, message, step_ms: record.observe(message, step_ms),
     )
     started = Usage.now()
     for done in clock.run(reader):

@@ -18,7 +18,13 @@ from ldo_service.schemas import Message
 from .actor import Actor
 from .graph import check_graph
 
-Observer = Callable[[str, Message], None]  # the actor's name and what it made
+Observer = Callable[[str, Message, float], None]  # actor, what it made, milliseconds of the step
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    messages: list[Message]
+    step_ms: float  # wall time
 
 
 @dataclass(order=True)
@@ -28,7 +34,7 @@ class Due:
     tick: int
     rank: int
     order: int
-    answer: Future[list[Message]] = field(compare=False)
+    answer: Future[Answer] = field(compare=False)
 
 
 @dataclass
@@ -37,19 +43,24 @@ class ActorThread:
     rank: int
     latency_ticks: int
     thread: ThreadPoolExecutor
-    step_ms: list[float] = field(default_factory=list)
+    step_ms: list[float] = field(default_factory=list)  # of every step so far
 
-    def start(self, message: Message) -> Future[list[Message]]:
+    def start(self, message: Message) -> Future[Answer]:
         return self.thread.submit(self._step, message)
 
-    def finish(self) -> Future[list[Message]]:
-        return self.thread.submit(lambda: list(self.actor.finish()))
+    def finish(self) -> Future[Answer]:
+        return self.thread.submit(lambda: _timed(self.actor.finish()))
 
-    def _step(self, message: Message) -> list[Message]:
-        started_s = time.perf_counter()
-        produced = list(self.actor.handle(message))
-        self.step_ms.append(1e3 * (time.perf_counter() - started_s))
-        return produced
+    def _step(self, message: Message) -> Answer:
+        answer = _timed(self.actor.handle(message))
+        self.step_ms.append(answer.step_ms)
+        return answer
+
+
+def _timed(messages: Iterator[Message]) -> Answer:
+    started_s = time.perf_counter()
+    produced = list(messages)
+    return Answer(produced, 1e3 * (time.perf_counter() - started_s))
 
 
 class LogicalClock:
@@ -59,7 +70,7 @@ class LogicalClock:
         self,
         actors: Sequence[Actor],
         latency_ticks: Mapping[str, int],
-        observe: Observer = lambda _actor, _message: None,
+        observe: Observer = lambda _actor, _message, _step_ms: None,
     ) -> None:
         check_graph(type(actor) for actor in actors)
         self._threads = [
@@ -101,7 +112,7 @@ class LogicalClock:
         for thread in self._takers.get(type(message), ()):
             self._expect(thread, tick + thread.latency_ticks, thread.start(message))
 
-    def _expect(self, thread: ActorThread, tick: int, answer: Future[list[Message]]) -> None:
+    def _expect(self, thread: ActorThread, tick: int, answer: Future[Answer]) -> None:
         self._started += 1
         heapq.heappush(self._due, Due(tick, thread.rank, self._started, answer))
 
@@ -109,9 +120,10 @@ class LogicalClock:
         """Wait for every answer that is due by now and pass it on."""
         while self._due and self._due[0].tick <= tick:
             due = heapq.heappop(self._due)
-            actor = self._threads[due.rank].actor.name
-            for message in _answer(due, actor):
-                self._observe(actor, message)
+            thread = self._threads[due.rank]
+            answer = _answer(due, thread.actor.name)
+            for message in answer.messages:
+                self._observe(thread.actor.name, message, answer.step_ms)
                 self._deliver(message, due.tick)
 
     def _finish(self, tick: int) -> None:
@@ -124,7 +136,7 @@ class LogicalClock:
                 self._settle(self._due[0].tick)
 
 
-def _answer(due: Due, actor: str) -> list[Message]:
+def _answer(due: Due, actor: str) -> Answer:
     try:
         return due.answer.result()
     except Exception as error:

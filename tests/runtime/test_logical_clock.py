@@ -50,7 +50,7 @@ def run(
 ) -> list[tuple[str, Message]]:
     made: list[tuple[str, Message]] = []
     clock = LogicalClock(
-        actors, latency_ticks, lambda actor, message: made.append((actor, message))
+        actors, latency_ticks, lambda actor, message, _step_ms: made.append((actor, message))
     )
     assert list(clock.run(source(count))) == list(range(count))
     return made
