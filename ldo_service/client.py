@@ -100,7 +100,11 @@ class Client:
 
     def last(self, topic: Topic, timeout_s: float = 3.0) -> list[Message]:
         """The last value of a state topic, all its parts; empty when there is none yet."""
-        replies = self._session.get(self._network.expression(topic.name), timeout=timeout_s)
+        replies = self._session.get(
+            self._network.expression(topic.name),
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
+        )
         return [_message(r.ok, _type_of(topic)) for r in replies if r.ok is not None]
 
     def _subscriber(self, name: str, keep: int) -> Any:

@@ -1,0 +1,119 @@
+"""A whole service in processes of its own, as a user starts it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from ldo_service.client import Client, connect
+from ldo_service.errors import ConfigError
+from ldo_service.schemas import Health, TrackedPose
+
+LDO = (sys.executable, "-m", "ldo_service")
+
+
+def free_endpoint() -> str:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
+
+
+def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
+    until_s = time.monotonic() + timeout_s
+    while not true():
+        if time.monotonic() > until_s:
+            pytest.fail(f"{what} within {timeout_s:g} s")
+        time.sleep(0.05)
+
+
+class LiveService:
+    """`ldo serve`, its log, and a client that listens to health and poses."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        self.endpoint = free_endpoint()
+        self.log_path = folder / "serve.log"
+        self._log = self.log_path.open("w")
+        self.process = subprocess.Popen(
+            [*LDO, "serve", "--endpoint", self.endpoint, "--state", str(folder / "s"), *arguments],
+            stderr=self._log,
+        )
+        self._stack = ExitStack()
+        self.client = self._connect()
+        self._health = self._stack.enter_context(self.client.listen("health/*", Health))
+        self._poses = self._stack.enter_context(
+            self.client.listen("pose/tracked", TrackedPose, keep=4096)
+        )
+        self.health: dict[str, Health] = {}
+
+    @property
+    def log(self) -> str:
+        return self.log_path.read_text()
+
+    def _connect(self) -> Client:
+        for _ in range(20):
+            try:
+                return self._stack.enter_context(connect("robot", self.endpoint))
+            except ConfigError:
+                assert self.process.poll() is None, self.log
+                time.sleep(0.2)
+        pytest.fail(f"the service does not answer:\n{self.log}")
+
+    def update_health(self) -> dict[str, Health]:
+        self.health.update({health.actor: health for health in self._health()})
+        return self.health
+
+    def wait_for_actors(self, count: int = 4) -> None:
+        wait_until(lambda: len(self.update_health()) == count, 20, "all actors report")
+
+    def poses(self) -> list[TrackedPose]:
+        """Those that came since the last call."""
+        return self._poses()
+
+    def wait_for_poses(self, count: int, timeout_s: float = 20) -> list[TrackedPose]:
+        poses: list[TrackedPose] = []
+
+        def enough() -> bool:
+            poses.extend(self.poses())
+            return len(poses) >= count
+
+        wait_until(enough, timeout_s, f"{count} poses (log: {self.log})")
+        return poses
+
+    def publisher(self, *arguments: str) -> subprocess.Popen[bytes]:
+        command = [*LDO, "publish", *arguments, "--endpoint", self.endpoint]
+        return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+
+    def stop(self, number: signal.Signals = signal.SIGINT, timeout_s: float = 15) -> int:
+        self.process.send_signal(number)
+        return self.process.wait(timeout_s)
+
+    def close(self) -> None:
+        self._stack.close()
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.wait()
+        self._log.close()
+
+
+@contextmanager
+def live_service(folder: Path, *arguments: str) -> Iterator[LiveService]:
+    service = LiveService(folder, *arguments)
+    try:
+        yield service
+    finally:
+        service.close()
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return not Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] == "Z"

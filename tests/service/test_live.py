@@ -1,0 +1,157 @@
+"""The service as its users see it: processes, sockets, signals."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ldo_service.schemas import MapSnapshot, TrackedPose
+from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
+from tests.service.conftest import LDO, is_running, live_service, wait_until
+
+EXAMPLES = Path(__file__).parent.parent.parent / "examples"
+EVERY_ACTOR = ("frame_source", "tracker", "mapper", "optimizer")
+APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]")
+
+
+@pytest.mark.timeout(60)
+def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "45")
+        poses = service.wait_for_poses(40)
+        assert {pose.status for pose in poses} == {"OK"}
+        assert publisher.wait(20) == 0
+        assert isinstance(service.client.last(POSE_TRACKED)[0], TrackedPose)
+        parts = service.client.last(MAP_SNAPSHOT)
+        assert all(isinstance(part, MapSnapshot) for part in parts)
+        assert sum(part.gaussians.ids.shape[0] for part in parts) > 1000
+        assert service.stop() == 0
+        assert "Traceback" not in service.log
+
+
+@pytest.mark.timeout(60)
+def test_the_examples_run_as_printed(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        camera, ours, plain = (
+            subprocess.Popen(
+                [sys.executable, "-c", _at(service.endpoint, EXAMPLES / name), count],
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+            for name, count in (
+                ("1_publish_a_camera.py", "150"),
+                ("2_follow_the_pose.py", "5"),
+                ("3_without_our_package.py", "5"),
+            )
+        )
+        for subscriber in (ours, plain):
+            printed, _ = subscriber.communicate(timeout=30)
+            lines = printed.splitlines()
+            assert len(lines) == 5
+            assert all(line.split()[1] == "OK" for line in lines)
+        camera.kill()
+        camera.communicate()
+
+
+def _at(endpoint: str, example: Path) -> str:
+    """The example's text with the service's address in place of the default."""
+    text = example.read_text().replace("tcp/127.0.0.1:7447", endpoint)
+    return text.replace('connect("robot")', f'connect("robot", "{endpoint}")')
+
+
+@pytest.mark.timeout(60)
+def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        second = subprocess.run(
+            [*LDO, "serve", "--endpoint", service.endpoint], capture_output=True, text=True
+        )
+        assert second.returncode == 2
+        assert "another `ldo serve`" in second.stderr
+        assert "Traceback" not in second.stderr
+
+
+@pytest.mark.timeout(60)
+def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
+    with live_service(tmp_path, *APART) as service:
+        service.wait_for_actors()
+        pids = [health.pid for health in service.health.values()]
+        assert len(set(pids)) == 4
+        service.process.kill()
+        service.process.wait()
+        wait_until(lambda: not any(map(is_running, pids)), 10, "the children leave")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> None:
+    with live_service(tmp_path, *APART) as service:
+        service.wait_for_actors()
+        publisher = service.publisher("synthetic:tour", "--rate", "10", "--max-frames", "350")
+        service.wait_for_poses(20)
+        for actor in EVERY_ACTOR:
+            old = service.update_health()[actor]
+            os.kill(old.pid, signal.SIGKILL)
+            wait_until(
+                lambda a=actor, pid=old.pid: service.update_health()[a].pid != pid,
+                15,
+                f"{actor} comes back",
+            )
+            service.poses()
+            steps = service.health["optimizer"].steps
+            poses = service.wait_for_poses(40)
+            assert sum(pose.status == "OK" for pose in poses) >= 36, f"after {actor}"
+            assert f"{actor}: its process was killed by signal 9" in service.log
+            wait_until(
+                lambda s=steps: service.update_health()["optimizer"].steps != s, 10, "keyframes"
+            )
+        publisher.kill()
+        publisher.wait()
+        assert service.stop() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(90)
+def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        first = service.publisher("synthetic:room", "--rate", "15", "--restamp")
+        service.wait_for_poses(20)
+        first.kill()
+        first.wait()
+        service.poses()
+        second = service.publisher("synthetic:room", "--rate", "15", "--restamp")
+        poses = service.wait_for_poses(60)
+        assert sum(pose.status == "OK" for pose in poses) >= 50
+        second.kill()
+        second.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(90)
+def test_a_sleeping_subscriber_is_its_own_problem(tmp_path: Path) -> None:
+    sleeper = (
+        "import time, zenoh, json, sys\n"
+        "config = zenoh.Config()\n"
+        "config.insert_json5('mode', json.dumps('client'))\n"
+        "config.insert_json5('connect/endpoints', json.dumps([sys.argv[1]]))\n"
+        "with zenoh.open(config) as session:\n"
+        "    with session.declare_subscriber('ldo/robot/**') as everything:\n"
+        "        for _ in everything:\n"
+        "            time.sleep(1)\n"
+    )
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        slow = subprocess.Popen([sys.executable, "-c", sleeper, service.endpoint])
+        publisher = service.publisher("synthetic:tour", "--rate", "15", "--max-frames", "200")
+        poses = service.wait_for_poses(150, timeout_s=40)
+        assert sum(pose.status == "OK" for pose in poses) >= 145
+        slow.kill()
+        slow.wait()
+        publisher.kill()
+        publisher.wait()
