@@ -96,8 +96,9 @@ def best(
         difference = se3.inverse(chosen.alignment.T_reference_camera) @ T_keyframe_camera
         return extent(difference, chosen.median_depth_m) < config.agreement_rad
 
-    led = candidates[-1]
-    met = chosen is not led and is_near(led.alignment.T_reference_camera)
+    *unled, led = candidates  # two starts that met are two witnesses
+    others = unled if chosen is led else [led]
+    met = any(is_near(c.alignment.T_reference_camera) for c in others)
     if met or is_near(se3.inverse(features.T_camera_reference)):
         return replace(chosen, features_agree=True)
     rivals = supports[-1] > config.rival_support * max(supports)

@@ -13,7 +13,8 @@ from .pyramid import Pyramid
 
 @dataclass(frozen=True, slots=True)
 class FeatureConfig:
-    count: int = 800  # ORB-SLAM3 takes 1000 at 640x480
+    count: int = 1000  # as ORB-SLAM3 at 640x480
+    fast_threshold: int = 7  # grey levels; ORB-SLAM3's lower one: blurred images have no more
     ratio: float = 0.8  # of the best to the second distance (Lowe 2004, 7.1, at 0.8)
     max_distance: int = 64  # bits of 256 (ORB-SLAM3's loose threshold is 100, its tight one 50)
     reprojection_px: float = 3.0  # at 640 pixels wide; scaled with the image
@@ -21,8 +22,10 @@ class FeatureConfig:
     min_inliers: int = 15  # ORB-SLAM3 relocalises from 15 RANSAC inliers
 
     def __post_init__(self) -> None:
-        if min(self.count, self.ransac_iterations) < 1 or self.min_inliers < 6:
-            raise ConfigError("count, ransac_iterations must be positive, min_inliers at least 6.")
+        if min(self.count, self.fast_threshold, self.ransac_iterations) < 1 or self.min_inliers < 6:
+            raise ConfigError(
+                "count, fast_threshold, ransac_iterations must be positive, min_inliers at least 6."
+            )
         if not (0 < self.ratio <= 1 and self.reprojection_px > 0):
             raise ConfigError("ratio must be within 0..1 and reprojection_px positive.")
 
@@ -44,7 +47,7 @@ class FeaturePose:
 
 def detect(view: Pyramid, config: FeatureConfig) -> Features:
     """ORB features of the full-resolution image, with the depth under each."""
-    orb = cv2.ORB.create(nfeatures=config.count)
+    orb = cv2.ORB.create(nfeatures=config.count, fastThreshold=config.fast_threshold)
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:
         keypoints, descriptors = (), np.zeros((0, 32), np.uint8)
@@ -58,18 +61,16 @@ def detect(view: Pyramid, config: FeatureConfig) -> Features:
 
 
 def match(reference: Features, frame: Features, config: FeatureConfig) -> np.ndarray:
-    """Index pairs [M, 2] (reference, frame) that are each other's best and pass the ratio test."""
+    """Index pairs [M, 2] (reference, frame) that pass the ratio test, each feature used once."""
     if min(len(reference.pixels), len(frame.pixels)) < 2:
         return np.zeros((0, 2), int)
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    forward = matcher.knnMatch(reference.descriptors, frame.descriptors, k=2)
-    back = {m.queryIdx: m.trainIdx for m in matcher.match(frame.descriptors, reference.descriptors)}
-    pairs = [
-        (best.queryIdx, best.trainIdx)
-        for best, second in forward
-        if best.distance < min(config.ratio * second.distance, config.max_distance)
-        and back[best.trainIdx] == best.queryIdx
-    ]
+    closest: dict[int, tuple[float, int]] = {}  # of each frame feature: distance, reference
+    for best, second in matcher.knnMatch(reference.descriptors, frame.descriptors, k=2):
+        if best.distance < min(config.ratio * second.distance, config.max_distance):
+            known = closest.get(best.trainIdx, (np.inf, -1))
+            closest[best.trainIdx] = min(known, (best.distance, best.queryIdx))
+    pairs = [(there, here) for here, (_, there) in sorted(closest.items())]
     return np.array(pairs, int).reshape(-1, 2)
 
 

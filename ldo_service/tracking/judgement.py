@@ -81,10 +81,11 @@ def judge(
 ) -> Status:
     """The status of an alignment; `features_agree` is None where features had no say.
 
-    Hysteresis: limits are stricter after a frame that was not OK, and strictest after a loss,
-    from which only OK leads back.
+    Hysteresis: limits are stricter after a WEAK frame, unless features vouch for this one, and
+    strictest after a loss, from which only OK leads back.
     """
-    limits = _limits(previous, config)
+    vouched = features_agree and previous is Status.WEAK
+    limits = config if vouched else _limits(previous, config)
     ratio = history.residual_ratio(alignment, config)
     if ratio > config.lost_residual or alignment.overlap < config.lost_overlap:
         return Status.LOST

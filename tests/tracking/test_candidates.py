@@ -38,6 +38,13 @@ def test_features_at_the_same_pose_agree(room) -> None:
     assert winner.features_agree is True
 
 
+def test_two_starts_that_met_agree_even_where_the_raw_feature_pose_was_rough(room) -> None:
+    rough = T_KEYFRAME_CAMERA @ se3.exp(np.array([0.0, 0.05, 0.0, 0.1, 0.0, 0.0]))
+    for guesses in ([T_KEYFRAME_CAMERA, rough], [rough, T_KEYFRAME_CAMERA]):
+        _, winner = chosen_from(room, guesses, rough)
+        assert winner.features_agree is True
+
+
 def test_features_that_the_images_refute_have_no_say(room) -> None:
     _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_ASTRAY], T_ASTRAY)
     assert winner.method == "guess 0"

@@ -4,7 +4,7 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import PyramidConfig, pyramid_of
-from ldo_service.tracking.features import FeatureConfig, detect, estimate_pose
+from ldo_service.tracking.features import FeatureConfig, detect, estimate_pose, match
 
 CONFIG = FeatureConfig()
 T_REFERENCE_CAMERA = se3.exp(np.array([0.05, -0.2, 0.05, 0.2, 0.1, 0.15]))  # 12 degrees, 27 cm
@@ -32,6 +32,17 @@ def test_points_are_the_surface_under_the_pixels(large_room) -> None:
     np.testing.assert_allclose(
         large_room.camera.project(features.points_camera), features.pixels, atol=1e-6
     )
+
+
+def test_every_feature_is_matched_at_most_once(large_room) -> None:
+    reference, frame = (
+        detect(pyramid_of(large_room.view(T), PyramidConfig()), CONFIG)
+        for T in (np.eye(4), T_REFERENCE_CAMERA)
+    )
+    pairs = match(reference, frame, CONFIG)
+    assert len(pairs) > CONFIG.min_inliers
+    for side in pairs.T:
+        assert len(np.unique(side)) == len(side)
 
 
 def test_blank_image_has_no_features_and_no_pose(large_room) -> None:

@@ -69,6 +69,11 @@ def test_recovery_takes_more_than_staying() -> None:
     assert verdict(Status.WEAK, intensity_sigma=7.0) is Status.OK
 
 
+def test_features_vouch_for_a_weak_frame_but_not_for_a_lost_one() -> None:
+    assert verdict(Status.WEAK, agree=True, intensity_sigma=9.0) is Status.OK
+    assert verdict(Status.LOST, agree=True, intensity_sigma=9.0) is Status.LOST
+
+
 def test_only_ok_leads_back_from_a_loss() -> None:
     assert verdict(Status.LOST, overlap=0.3) is Status.LOST
     assert verdict(Status.LOST, overlap=0.4) is Status.OK
