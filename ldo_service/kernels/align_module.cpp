@@ -7,7 +7,6 @@
 #include <algorithm>
 #include <cmath>
 #include <memory>
-#include <stdexcept>
 #include <string>
 #include <tuple>
 
@@ -22,7 +21,6 @@ namespace {
 template <int Dimensions>
 using Input = nb::ndarray<const float, nb::ndim<Dimensions>, nb::c_contig, nb::device::cpu>;
 using Output = nb::ndarray<nb::numpy, float>;
-using Output64 = nb::ndarray<nb::numpy, double>;
 using Pose = nb::ndarray<const double, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 using Intrinsics = std::tuple<double, double, double, double>;
 
@@ -69,13 +67,15 @@ Pinhole pinhole(const Intrinsics& intrinsics) {
 }
 
 float positive(double value, const char* name) {
-  require(std::isfinite(value) && value > 0, std::string(name) + " must be finite and positive");
-  return static_cast<float>(value);
+  const float single = static_cast<float>(value);
+  require(std::isfinite(single) && single > 0, std::string(name) + " must be finite and positive");
+  return single;
 }
 
 float finite(double value, const char* name) {
-  require(std::isfinite(value), std::string(name) + " must be finite");
-  return static_cast<float>(value);
+  const float single = static_cast<float>(value);
+  require(std::isfinite(single), std::string(name) + " must be finite");
+  return single;
 }
 
 template <typename T>
@@ -178,7 +178,7 @@ nb::tuple normal_equations(Input<2> points, Input<3> texels, const Intrinsics& i
   require_texels(texels);
   require_rigid(T_camera_reference);
   const auto [noise_floor, noise_growth, noise_nearest] = noise;
-  require(std::isfinite(noise_growth) && noise_growth >= 0, "noise growth must be at least 0");
+  require(noise_growth >= 0, "noise growth must be at least 0");
   Problem problem{};
   problem.points = points.data();
   problem.count = static_cast<std::int64_t>(points.shape(1));
@@ -192,7 +192,7 @@ nb::tuple normal_equations(Input<2> points, Input<3> texels, const Intrinsics& i
   problem.bias = finite(bias, "bias");
   problem.intensity_sigma = positive(intensity_sigma, "intensity_sigma");
   problem.depth_noise_scale = positive(depth_noise_scale, "depth_noise_scale");
-  problem.noise = {positive(noise_floor, "noise floor"), static_cast<float>(noise_growth),
+  problem.noise = {positive(noise_floor, "noise floor"), finite(noise_growth, "noise growth"),
                    finite(noise_nearest, "noise nearest")};
   problem.gate = positive(gate, "gate");
   problem.occlusion = positive(occlusion, "occlusion");

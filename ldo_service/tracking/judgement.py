@@ -36,6 +36,8 @@ class JudgementConfig:
     least_depth_noise_scale: float = 0.5
     relocalised_overlap: float = 0.35  # a place recognised without a prediction must show more,
     relocalised_residual: float = 1.6  # and fit better: 23 of 23 accepted by these were right
+    first_intensity_sigma: float = 8.0  # grey levels; expected while there is no past
+    first_depth_noise_scale: float = 2.0
     recovery_margin: float = 0.8  # limits are this much stricter until a frame is OK again
     history: int = 30  # frames of the running median: a second
 
@@ -63,12 +65,11 @@ class History:
         )
 
     def residual_ratio(self, alignment: Alignment, config: JudgementConfig) -> float:
-        """The alignment's noise over its running median, the larger of colour and depth; 1 if
-        there is no past."""
-        if not self.intensity_sigmas:
-            return 1.0
-        intensity = max(median(self.intensity_sigmas), config.least_intensity_sigma)
-        depth = max(median(self.depth_noise_scales), config.least_depth_noise_scale)
+        """The alignment's noise over its running median, the larger of colour and depth."""
+        usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
+        usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
+        intensity = max(usual_sigma, config.least_intensity_sigma)
+        depth = max(usual_scale, config.least_depth_noise_scale)
         return max(alignment.intensity_sigma / intensity, alignment.depth_noise_scale / depth)
 
 

@@ -85,6 +85,15 @@ def test_noise_below_that_of_any_camera_may_rise_unpunished() -> None:
     assert judge(textured, None, perfect, Status.OK, CONFIG) is Status.OK
 
 
+def test_without_a_past_noise_is_compared_with_a_usual_cameras() -> None:
+    def first(**changes: float) -> Status:
+        return judge(replace(SOUND, **changes), None, History(), Status.OK, CONFIG)
+
+    assert first() is Status.OK
+    assert first(intensity_sigma=41.0) is Status.LOST
+    assert first(depth_noise_scale=6.0) is Status.WEAK
+
+
 def test_history_forgets_beyond_its_length() -> None:
     history = History()
     for k in range(100):
