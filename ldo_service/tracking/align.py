@@ -26,7 +26,8 @@ class AlignConfig:
     least_intensity_sigma: float = 1.0  # grey levels: rounding and interpolation
     least_depth_noise_scale: float = 0.2  # 0.24 mm at the noise floor: rounding to millimetres
     # Neighbouring residuals share their errors, so N of them inform less than N: errors fit a
-    # fraction of 0.1 on exact renders, 1e-4 on a Kinect against its KinectFusion ground truth.
+    # fraction of 0.1 on exact renders, and of 1e-4 (next frame) to 3e-5 (half a second) on a
+    # Kinect against KinectFusion, whose own error is in that. The value lies between, unproven.
     independent_fraction: float = 2e-3
 
     def __post_init__(self) -> None:

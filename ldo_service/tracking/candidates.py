@@ -19,7 +19,7 @@ COLOUR_ALONE = 0.05  # weight of points without a depth to compare with, against
 
 @dataclass(frozen=True, slots=True)
 class CandidateConfig:
-    agreement_rad: float = 0.06  # features against direct: 3 x the median error of ORB-PnP poses
+    agreement_rad: float = 0.06  # rotation plus parallax; 9 of 10 ORB-PnP poses erred 3 cm or less
     rival_support: float = 0.5  # of the best: a feature pose with less is refuted by the images
 
     def __post_init__(self) -> None:

@@ -25,7 +25,7 @@ class Status(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class JudgementConfig:
-    min_overlap: float = 0.15  # visible reference points; smaller overlaps were right, but few
+    min_overlap: float = 0.15  # visible reference points; chosen on apartment_floor1, not elsewhere
     min_paired: float = 0.05  # of the reference points met by a depth: below, colour is alone
     max_condition: float = 1e5  # of the information in median depths
     max_gain: float = 2.0  # exposure changes more slowly than this
@@ -35,7 +35,7 @@ class JudgementConfig:
     least_intensity_sigma: float = 2.0  # grey levels: what any camera has, for the comparison
     least_depth_noise_scale: float = 0.5
     relocalised_overlap: float = 0.35  # a place recognised without a prediction must show more,
-    relocalised_residual: float = 1.6  # and fit better: 23 of 23 accepted by these were right
+    relocalised_residual: float = 1.6  # and fit better; both limits are the prototype's
     first_intensity_sigma: float = 8.0  # grey levels; expected while there is no past
     first_depth_noise_scale: float = 2.0
     recovery_margin: float = 0.8  # limits are this much stricter until a frame is OK again
