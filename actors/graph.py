@@ -84,7 +84,9 @@ def producer_of(topic: t.Topic) -> str:
     for box in GRAPH:
         if any(out.topic is topic for out in box.outputs):
             return box.name
-    return "every stage" if topic is t.HEALTH else "outside"
+    if topic is t.HEALTH:
+        return "every stage"
+    return "outside" if topic is t.CAMERA_RGBD else "nobody yet"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:

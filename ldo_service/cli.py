@@ -7,22 +7,28 @@ gave up, 5 a replay diverged. An error is one paragraph; --debug adds the traceb
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import tyro
 from rich.console import Console
 
 from ldo_service.errors import LdoError
 
-DESCRIPTION = """RGB-D SLAM as a service: poses and a photo-realistic map, live, on a CPU.
+HELP = """\
+usage: ldo VERB ...
 
-First steps:
-  ldo demo                                the main job on a built-in synthetic room
-  ldo run SOURCE --out DIR                track and map a data set
-  ldo eval DIR SOURCE                     compare with ground truth
-  ldo serve                               the live service; `ldo publish SOURCE` feeds it
+RGB-D SLAM as a service: poses and a photo-realistic map, live, on a CPU.
 
-Every verb explains itself with --help. --debug shows the traceback of an error."""
+first steps:
+  ldo demo                      the main job on a built-in synthetic room
+  ldo run SOURCE --out DIR      track and map a data set
+  ldo eval DIR SOURCE           compare with its ground truth
+  ldo serve                     the live service; `ldo publish SOURCE` feeds it
+
+verbs:
+{verbs}
+
+`ldo VERB --help` explains a verb. `--debug` shows the traceback of an error."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -34,9 +40,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
+    if not words or words[0] in ("-h", "--help"):
+        print(HELP.format(verbs="\n".join(first_lines())))
+        sys.exit(0 if words else 2)
     try:
         tyro.extras.subcommand_cli_from_dict(
-            verbs(), prog="ldo", description=DESCRIPTION, args=words,
+            verbs(), prog="ldo", args=words,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),
         )  # fmt: skip
     except LdoError as error:
@@ -48,6 +57,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:  # `ldo topics | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def first_lines() -> Iterator[str]:
+    """Each verb with the first line of its help."""
+    for name, verb in verbs().items():
+        yield f"  {name:<10}{(verb.__doc__ or '').strip().splitlines()[0]}"
 
 
 def verbs() -> dict[str, Callable[..., None]]:

@@ -160,6 +160,7 @@ def _explain(config: Any, depth: int) -> list[str]:
 
 
 def _comments(schema: type) -> dict[str, str]:
-    """The comment beside each field in the source."""
-    pattern = re.compile(r"^\s+(\w+): .*?#\s*(.*)$", re.MULTILINE)
-    return dict(pattern.findall(inspect.getsource(schema)))
+    """The comment beside each field in the source, with the lines that continue it."""
+    pattern = re.compile(r"^ {4}(\w+): [^#\n]*#\s*(.*(?:\n {4,}# .*)*)$", re.MULTILINE)
+    found = pattern.findall(inspect.getsource(schema))
+    return {name: re.sub(r"\n\s*# ", " ", comment) for name, comment in found}

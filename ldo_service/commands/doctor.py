@@ -49,7 +49,7 @@ def doctor(robot: Robot = "robot", endpoint: Endpoint = DEFAULT_ENDPOINT) -> Non
 
     Exit code 1 when something is bad.
     """
-    console = Console(highlight=False)
+    console = Console(highlight=False, soft_wrap=True)
     bad = 0
     for finding in (*machine(), *libraries(), *extras(), *service(robot, endpoint)):
         console.print(MARKS[finding.mark] + finding.text)
@@ -84,7 +84,7 @@ def extras() -> Iterator[Finding]:
     for extra, packages in EXTRAS.items():
         missing = [p for p in packages if importlib.util.find_spec(p) is None]
         if missing:
-            advice = f"`pip install 'ldo-slam[{extra}]'` brings it"
+            advice = f"`pip install 'ldo-slam\\[{extra}]'` brings it"  # escaped for rich
             yield Finding("absent", f"extra {extra} ({', '.join(missing)}): {advice}")
         else:
             yield Finding("ok", f"extra {extra}")

@@ -17,6 +17,9 @@ class Lossless:
         if self.window < 1:
             raise ConfigError(f"Lossless(window={self.window}): must be at least 1.")
 
+    def __str__(self) -> str:
+        return f"Lossless({self.window})"
+
 
 @dataclass(frozen=True, slots=True)
 class Latest:
@@ -32,7 +35,12 @@ class Latest:
 
     def __post_init__(self) -> None:
         if self.keep < 1 or self.max_keys < 1:
-            raise ConfigError(f"{self}: keep and max_keys must be at least 1.")
+            raise ConfigError(
+                f"Latest(keep={self.keep}, max_keys={self.max_keys}): both must be at least 1."
+            )
+
+    def __str__(self) -> str:
+        return f"Latest({self.keep} per key)" if self.per_key else f"Latest({self.keep})"
 
 
 Policy = Lossless | Latest

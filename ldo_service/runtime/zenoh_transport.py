@@ -79,7 +79,7 @@ def open_session(network: Network, router: bool = False) -> zenoh.Session:
             else f"nobody answers on {network.endpoint}: start `ldo serve`, "
             "or name its address with --endpoint."
         )
-        raise ConfigError(f"{advice} (zenoh: {error})") from error
+        raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from error
 
 
 class ZenohTransport:

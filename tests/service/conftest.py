@@ -116,4 +116,4 @@ def is_running(pid: int) -> bool:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    return not Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] == "Z"
+    return Path(f"/proc/{pid}/stat").read_text().split(")")[1].split()[0] != "Z"
