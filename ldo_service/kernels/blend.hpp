@@ -11,7 +11,7 @@ constexpr int kBatch = 256;                      // splats looked at before the 
 
 struct Block {  // sixteen pixels
   Floats transmittance = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
-  Floats median_depth = 1e30f;
+  Floats median_depth = 1e30f;  // farther than any
 };
 
 struct Lanes {  // column and row of each lane in its 4x4 block
@@ -95,7 +95,7 @@ class Tile {
     batch_size_ = n;
     const float x = static_cast<float>(x_), y = static_cast<float>(y_);
     for (int i = 0; i < n; ++i) {
-      if (i + 16 < n) __builtin_prefetch(&splats[list[i + 16]]);
+      __builtin_prefetch(&splats[list[i + kPrefetchAhead]]);
       batch_[i] = splats[list[i]];
       touched_[i] = touched_blocks(batch_[i], lanes_, x, y);
     }

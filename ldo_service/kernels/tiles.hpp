@@ -86,10 +86,12 @@ inline VisibleSplats project(const float* rows, int64_t n, const View& view, int
   return visible;
 }
 
+constexpr int kPrefetchAhead = 24;  // splats, while those of a tile are read in list order
+
 struct TileLists {
   int columns, rows;
   Buffer<uint32_t> start;   // [columns * rows + 1] into splats
-  Buffer<uint32_t> splats;  // front to back within a tile
+  Buffer<uint32_t> splats;  // front to back within a tile; kPrefetchAhead zeros at the end
 };
 
 inline int64_t area(const TileRange& r) { return (r.x1 - r.x0 + 1) * (r.y1 - r.y0 + 1); }
@@ -115,12 +117,15 @@ inline void write_pairs(const VisibleSplats& visible, int64_t begin, int64_t end
   for (int64_t i = begin; i < end; ++i) {
     const uint32_t splat = visible.depths[i].value;
     const TileRange& range = visible.tiles[splat];
-    for (uint32_t y = range.y0; y <= range.y1; ++y)
-      for (uint32_t x = range.x0; x <= range.x1; ++x) {
-        const uint32_t tile = y * columns + x;
-        ++counts[tile];
-        *pair++ = {tile, splat};
-      }
+    uint32_t x = range.x0, tile = range.y0 * columns + range.x0;
+    const uint32_t to_next_row = columns - (range.x1 - range.x0);
+    for (int64_t left = area(range); left > 0; --left) {  // one loop: fewer mispredicted branches
+      ++counts[tile];
+      *pair++ = {tile, splat};
+      const bool at_end = x == range.x1;
+      x = at_end ? range.x0 : x + 1;
+      tile += at_end ? to_next_row : 1;
+    }
   }
 }
 
@@ -140,7 +145,9 @@ inline TileLists list_by_tile(const VisibleSplats& visible, const View& view, in
                 counts);
   });
   to_offsets(places.data(), pieces.count(), tiles);
-  TileLists lists{columns, rows, Buffer<uint32_t>(tiles + 1), Buffer<uint32_t>(total)};
+  TileLists lists{columns, rows, Buffer<uint32_t>(tiles + 1),
+                  Buffer<uint32_t>(total + kPrefetchAhead)};
+  std::fill(lists.splats.data() + total, lists.splats.data() + total + kPrefetchAhead, 0u);
   std::fill(lists.start.data(), lists.start.data() + tiles + 1, static_cast<uint32_t>(total));
   if (total > 0) std::copy(places.data(), places.data() + tiles, lists.start.data());
   parallel_for(pieces.count(), threads, [&](int64_t piece) {
