@@ -44,7 +44,10 @@ class Transport(Protocol):
         ...
 
     def answer(self, key: str, last_values: LastValues) -> None:
-        """Answer queries on a key with its last values."""
+        """Answer queries on a key with its last values.
+
+        The parts of a value share the key: over Zenoh, ask with consolidation NONE to get all.
+        """
         ...
 
     def close(self) -> None: ...

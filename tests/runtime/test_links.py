@@ -36,7 +36,7 @@ async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> N
         assert source.sent == 4  # not one more than the window, however long it takes
         let_go.set()
         await producing
-        await eventually(lambda: len(seen) == 50)
+        await eventually(lambda: stage.health().inputs[0].delivered == 50)
         counted = stage.health().inputs[0]
     assert seen == list(range(50))
     assert (counted.delivered, counted.dropped, counted.waiting) == (50, 0, 0)

@@ -1,0 +1,58 @@
+"""A process that collects numbers: arguments endpoint, path of the file that gets them, seconds
+that each takes."""
+
+import asyncio
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from ldo_service.runtime import Actor, In, Lossless
+from ldo_service.runtime.process import leave_with_parent
+from ldo_service.runtime.stage import Stage, StageConfig
+from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
+from ldo_service.schemas import Message
+from ldo_service.schemas.topics import Topic
+
+
+class Number(Message, frozen=True, kw_only=True):
+    value: int
+
+
+class Collector(Actor):
+    name = "collector"
+    inputs = (In(Topic("test/number", Number, ""), Lossless(4)),)
+
+    def __init__(self, path: Path, step_s: float) -> None:
+        super().__init__()
+        self._path, self._step_s = path, step_s
+
+    def handle(self, message: Message) -> Iterator[Message]:
+        assert isinstance(message, Number)
+        with self._path.open("a") as file:
+            file.write(f"{message.value}\n")
+        time.sleep(self._step_s)
+        yield from ()
+
+
+async def main(endpoint: str, path: str, step_s: str) -> None:
+    network, stop = Network("test", endpoint), Stop()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.ask)
+    with open_session(network) as session:
+        transport = ZenohTransport(session, network)
+        stage = Stage(
+            lambda: Collector(Path(path), float(step_s)),
+            transport,
+            config=StageConfig(heartbeat_s=0.1),
+        )
+        leaving = asyncio.create_task(leave_with_parent())
+        leaving.add_done_callback(lambda task: None if task.cancelled() else stop.ask())
+        await supervise([stage], stop, drain_s=2)
+        leaving.cancel()
+        transport.close()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))
