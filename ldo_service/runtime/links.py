@@ -1,7 +1,8 @@
 """A link from a producer to a lossless consumer, over a network that may lose messages.
 
     Join      consumer -> producer   "I am here"; repeated until welcomed
-    Welcome   producer -> consumers  "in my epoch e, what you get begins at n", for all of them
+    Welcome   producer -> consumers  "in my epoch e, what you get begins at n", for all it knows;
+                                     each answers at once, with a Join or a Grant
     Grant     consumer -> producer   "I have handled all before h, all before a has arrived, and I
                                      take up to n"; after each step and twice a second
 

@@ -89,10 +89,8 @@ class Mailbox:
             log.warning("%s: unreadable welcome: %s", inlet.port.topic.name, error)
             return
         start = welcome.starts.get(self._consumer)
-        if start is None:
-            return
         with self._lock:
-            lost = inlet.welcome(welcome.epoch, start)
+            lost = 0 if start is None else inlet.welcome(welcome.epoch, start)
             self._ask_for_grants()
         if lost:
             log.error("%s: %d messages of %s were missed: it was evicted",

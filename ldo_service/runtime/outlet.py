@@ -96,6 +96,7 @@ class Outlet:
         transport.watch(self._presence)
         if self.topic.is_state:
             transport.answer(data_key(topic), lambda: self._last_value)
+        self._post_welcomes()  # consumers that are there already join at once
 
     # --- sending ----------------------------------------------------------------------------
     def room(self) -> int:

@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+from itertools import pairwise
 from threading import Event
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from ldo_service.runtime.links import again_key, data_key, grant_key, welcome_key
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.ports import Out
+from ldo_service.runtime.stage import StageConfig
 from ldo_service.runtime.transport import MemoryTransport
 
 from .cast import NUMBERS, collector, eventually, number, running, send
@@ -61,6 +63,42 @@ async def test_a_network_that_loses_a_third_still_delivers_each_message_once_in_
         await eventually(lambda: len(one) == len(other) == 60)
     assert one == other == list(range(60))
     assert source.statistics().repeated > 0
+
+
+@pytest.mark.parametrize("seed", range(4))
+async def test_a_consumer_that_dies_again_and_again_on_a_bad_network_misses_nothing(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
+    chance = random.Random(seed)
+    transport = MemoryTransport(lose=lambda key: key in KEYS and chance.random() < 0.2)
+    source, lives = outlet(transport, "collector"), []
+
+    async def produce() -> None:
+        for value in range(80):
+            await send(source, number(value))
+
+    producing = asyncio.create_task(produce())
+    while not lives or lives[-1][-1:] != [79]:
+        lives.append([])
+        life, length = lives[-1], chance.randint(1, 30)
+        async with running(collector(transport, life)):
+            await eventually(lambda life=life, n=length: len(life) >= n or life[-1:] == [79])
+        transport.leave("collector")
+    await producing
+    for life in lives:
+        assert life == list(range(life[0], life[0] + len(life)))
+    for before, after in pairwise(lives):
+        assert after[0] <= before[-1] + 1  # nothing is left out between two lives
+
+
+async def test_a_consumer_that_waits_is_found_as_soon_as_the_producer_starts() -> None:
+    transport, seen = MemoryTransport(), []
+    patient = StageConfig(heartbeat_s=1000)
+    async with running(collector(transport, seen, config=patient)):
+        source = outlet(transport, "collector")
+        await send(source, number(0))
+        await eventually(lambda: seen == [0])
 
 
 async def test_everyone_else_sees_a_repeated_message_once(monkeypatch: pytest.MonkeyPatch) -> None:
