@@ -40,10 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
-    if not words or words[0] in ("-h", "--help"):
-        print(HELP.format(verbs="\n".join(first_lines())))
-        sys.exit(0 if words else 2)
     try:
+        if not words or words[0] in ("-h", "--help"):
+            print(HELP.format(verbs="\n".join(first_lines())))
+            sys.exit(0 if words else 2)
         tyro.extras.subcommand_cli_from_dict(
             verbs(), prog="ldo", args=words,
             config=(tyro.conf.OmitArgPrefixes, tyro.conf.FlagCreatePairsOff),

@@ -5,6 +5,13 @@ Each kernel is compiled once per instruction set. The widest that the machine ha
 and differ in the last bits between instruction sets.
 """
 
-from ._rasterise import isa
+from ldo_service.errors import ConfigError
+
+try:
+    from ._rasterise import isa
+except ImportError as error:
+    if "LDO_ISA" in str(error):
+        raise ConfigError(f"{error}.") from error
+    raise
 
 __all__ = ["isa"]

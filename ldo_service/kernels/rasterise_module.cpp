@@ -20,7 +20,7 @@ namespace {
 constexpr int kMaxSide = 32768;             // pixels
 constexpr int64_t kMaxGaussians = 1 << 27;  // splats are counted with 32 bits
 
-const Isa isa = chosen_isa();
+Isa isa = Isa::baseline;  // chosen when the module is imported
 
 auto rasterise_for(Isa isa) {
 #if LDO_X86
@@ -93,6 +93,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
 
 NB_MODULE(_rasterise, m) {
   using namespace nb::literals;
+  isa = chosen_isa();
   m.def("isa", [] { return std::string(name(isa)); });
   m.def("rasterise", &rasterise, "rows"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
         "width"_a, "height"_a, "threads"_a = 1);
