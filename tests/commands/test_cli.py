@@ -1,0 +1,136 @@
+"""The command line: one clear paragraph and the right exit code."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ldo_service import cli
+
+LDO = (sys.executable, "-m", "ldo_service")
+
+
+def ldo(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error of a call in this process."""
+    try:
+        cli.main(arguments)
+        code = 0
+    except SystemExit as leaving:
+        code = int(leaving.code or 0)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def assert_one_paragraph(text: str) -> None:
+    assert text.startswith("ldo: ")
+    assert "Traceback" not in text
+    assert len(text.strip().splitlines()) == 1
+
+
+def test_help_names_every_verb(capsys) -> None:
+    code, out, _ = ldo(capsys, "--help")
+    assert code == 0
+    for verb in cli.verbs():
+        assert f"\n  {verb} " in out
+
+
+@pytest.mark.parametrize("verb", list(cli.verbs()))
+def test_every_verb_explains_itself(capsys, verb: str) -> None:
+    code, out, _ = ldo(capsys, verb, "--help")
+    assert code == 0
+    assert f"usage: ldo {verb}" in out
+
+
+def test_a_missing_source_is_bad_data(capsys, tmp_path: Path) -> None:
+    code, _, err = ldo(capsys, "run", str(tmp_path / "absent"), "--out", str(tmp_path / "out"))
+    assert code == 3
+    assert_one_paragraph(err)
+    assert "does not exist" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_layout_is_bad_data(capsys, tmp_path: Path) -> None:
+    code, _, err = ldo(capsys, "run", str(tmp_path), "--out", str(tmp_path / "out"))
+    assert code == 3
+    assert_one_paragraph(err)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("--stride", "0"),
+        ("--max-frames", "-3"),
+        ("--hold-out", "1"),
+        ("--set", "mapper.nothing=1"),
+        ("--threads", "-1"),
+    ],
+)
+def test_bad_arguments_are_a_configuration_error(capsys, tmp_path: Path, arguments) -> None:
+    out = str(tmp_path / "out")
+    code, _, err = ldo(capsys, "run", "synthetic:room", "--out", out, *arguments)
+    assert code == 2
+    assert_one_paragraph(err)
+
+
+def test_a_full_folder_is_refused_and_left_alone(capsys, tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    for extra in ((), ("--overwrite",)):
+        code, _, err = ldo(capsys, "run", "synthetic:room", "--out", str(tmp_path), *extra)
+        assert code == 2
+        assert_one_paragraph(err)
+    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+
+
+def test_an_unwritable_folder_is_said(capsys) -> None:
+    code, _, err = ldo(capsys, "run", "synthetic:room", "--out", "/proc/nowhere")
+    assert code == 2
+    assert_one_paragraph(err)
+    assert "cannot be written" in err
+
+
+def test_evaluating_something_else_than_a_run_is_said(capsys, tmp_path: Path) -> None:
+    code, _, err = ldo(capsys, "eval", str(tmp_path), "synthetic:room")
+    assert code == 3
+    assert_one_paragraph(err)
+
+
+def test_a_publisher_without_a_service_is_told_to_start_one(capsys) -> None:
+    code, _, err = ldo(
+        capsys, "publish", "synthetic:room", "--endpoint", "tcp/127.0.0.1:1", "--max-frames", "1"
+    )
+    assert code == 2
+    assert_one_paragraph(err)
+    assert "ldo serve" in err
+
+
+def test_a_declared_actor_cannot_be_served(capsys) -> None:
+    code, _, err = ldo(capsys, "serve", "--only", "detector")
+    assert code == 2
+    assert "declared" in err
+
+
+def test_a_robot_name_that_breaks_topics_is_refused(capsys) -> None:
+    code, _, err = ldo(capsys, "serve", "--robot", "a/b")
+    assert code == 2
+    assert_one_paragraph(err)
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [*LDO, "run", str(tmp_path), "--out", str(tmp_path / "o"), "--debug"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode != 0
+    assert "Traceback" in done.stderr
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m ldo_service topics --json-schema | head -1",
+        shell=True,
+        capture_output=True,
+        text=True,
+    )
+    assert done.stderr == ""

@@ -1,0 +1,140 @@
+"""A run over a sequence: what it writes, that it repeats, what it does with bad frames."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.config import load_config
+from ldo_service.datasets import Cached, Sequence
+from ldo_service.errors import DataError, FrameError
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.geometry import RawFrame, Trajectory
+from ldo_service.runs.folder import prepare
+from ldo_service.runs.over_file import Selection, run_over_file
+
+FRAMES = 40
+
+
+class Spoilt(Cached):
+    """A sequence some frames of which cannot be read."""
+
+    def __init__(self, sequence: Sequence, bad: set[int]) -> None:
+        super().__init__(sequence)
+        self._bad = bad
+
+    def read(self, index: int) -> RawFrame:
+        if index in self._bad:
+            raise FrameError(f"frame {index} is truncated. Copy it again.")
+        return super().read(index)
+
+
+def run(sequence: Sequence, folder: Path, *settings: str, frames: int = FRAMES, warn=print):
+    prepare(folder, overwrite=False)
+    config = load_config(settings=settings)
+    return run_over_file(
+        sequence, folder, config, Selection(max_frames=frames), warn, lambda _done: None
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "out"
+    run(room, folder)
+    return folder
+
+
+def test_every_frame_has_a_line_and_the_trajectory_is_right(room: Sequence, finished: Path) -> None:
+    truth = room.truth()
+    assert truth is not None
+    for name in ("trajectory_online.txt", "trajectory.txt"):
+        estimate = Trajectory.load(finished / name)
+        assert len(estimate) == FRAMES
+        assert evaluate_trajectory(estimate, truth).ate_m.rmse < 0.002
+    with (finished / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["frame"]) for row in rows] == list(range(FRAMES))
+    assert {row["status"] for row in rows} == {"OK"}
+
+
+def test_keyframes_are_placed(finished: Path) -> None:
+    keyframes = json.loads((finished / "keyframes.json").read_text())
+    assert [k["keyframe"] for k in keyframes] == list(range(len(keyframes)))
+    assert len(keyframes) > 3
+    for keyframe in keyframes:
+        R = np.array(keyframe["T_map_camera"])[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+
+
+def test_the_summary_has_what_tools_rely_on(finished: Path) -> None:
+    summary = json.loads((finished / "summary.json").read_text())
+    expected = {
+        *("frames", "frames_rejected", "keyframes", "gaussians", "fps", "wall_s", "cpu_s"),
+        *("peak_rss_mb", "stage_ms", "drops", "loops_accepted", "loops_rejected", "vlm_calls"),
+        *("optimizations", "isa", "threads", "versions"),
+    }
+    assert expected <= set(summary)
+    assert summary["frames"] == FRAMES
+    assert summary["gaussians"] > 1000
+    assert summary["optimizations"] == summary["keyframes"]
+    assert set(summary["stage_ms"]["tracker"]) == {"p50", "p95"}
+
+
+def test_the_map_is_a_ply_with_every_gaussian(finished: Path) -> None:
+    header, _, body = (finished / "map.ply").read_bytes().partition(b"end_header\n")
+    count = json.loads((finished / "summary.json").read_text())["gaussians"]
+    assert f"element vertex {count}".encode() in header
+    table = np.frombuffer(body, "<f4").reshape(count, 17)
+    assert np.isfinite(table).all()
+    np.testing.assert_allclose(np.linalg.norm(table[:, 13:17], axis=1), 1, atol=1e-3)
+
+
+def test_two_runs_write_the_same_bytes(room: Sequence, finished: Path, tmp_path: Path) -> None:
+    run(room, tmp_path / "again", "mapper.threads=2")
+    for name in ("trajectory_online.txt", "trajectory.txt", "keyframes.json", "map.ply"):
+        assert (tmp_path / "again" / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def test_a_bad_frame_is_left_out_counted_and_said_once(room: Sequence, tmp_path: Path) -> None:
+    said: list[str] = []
+    record = run(Spoilt(room, {5, 6, 20}), tmp_path / "out", warn=said.append)
+    assert record.summary["frames_rejected"] == 3
+    assert len(record.online()) == FRAMES - 3
+    assert len(said) == 1
+    assert "frame 5" in said[0]
+
+
+def test_too_many_bad_frames_fail_and_keep_what_could_be_done(
+    room: Sequence, tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match="10 of 40 frames"):
+        run(Spoilt(room, set(range(10, 20))), tmp_path / "out", warn=lambda _text: None)
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
+def test_nothing_readable_fails_plainly(room: Sequence, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="could not be used"):
+        run(Spoilt(room, set(range(FRAMES))), tmp_path / "out", warn=lambda _text: None)
+
+
+def test_held_out_frames_are_marked_and_not_mapped(room: Sequence, tmp_path: Path) -> None:
+    run(room, tmp_path / "out", "tracker.hold_out=5")
+    with (tmp_path / "out" / "frames.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    held_out = [row for row in rows if row["held_out"] == "1"]
+    assert [int(row["frame"]) for row in held_out] == list(range(4, FRAMES, 5))
+    assert not any(row["keyframe"] for row in held_out)
+
+
+@pytest.mark.timeout(60)
+def test_forty_real_frames_stay_within_three_centimetres(data: Path, tmp_path: Path) -> None:
+    from ldo_service.datasets import open_sequence
+
+    kitchen = open_sequence(str(data / "tum" / "kitchen"))
+    record = run(kitchen, tmp_path / "out")
+    truth = kitchen.truth()
+    assert truth is not None
+    assert record.statuses["OK"] == FRAMES
+    assert evaluate_trajectory(record.online(), truth).ate_m.rmse < 0.03

@@ -1,0 +1,71 @@
+"""Configuration: defaults, files, settings, and errors that say what to do."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ldo_service.config import Config, config_of, config_yaml, explained_yaml, load_config
+from ldo_service.errors import ConfigError
+
+
+def test_the_printed_configuration_reads_back_as_the_same() -> None:
+    config = load_config(settings=["tracker.hold_out=5", "service.spawned=[mapper, optimizer]"])
+    assert config_of(yaml.safe_load(config_yaml(config))) == config
+    assert config_of(yaml.safe_load(explained_yaml(config))) == config
+
+
+def test_settings_change_what_the_file_left(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text("tracker:\n  hold_out: 5\nmapper:\n  threads: 3\n")
+    config = load_config(path, ["mapper.threads=2"])
+    assert (config.tracker.hold_out, config.mapper.threads) == (5, 2)
+
+
+def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
+    (tmp_path / "empty.yaml").write_text("")
+    assert load_config(tmp_path / "empty.yaml") == Config()
+
+
+@pytest.mark.parametrize(
+    ("setting", "says"),
+    [
+        ("tracker.holdout=5", "Did you mean tracker.hold_out?"),
+        ("traker.hold_out=5", "Did you mean tracker?"),
+        ("tracker.hold_out=1", "must be 0, or 2 and more"),
+        ("tracker.hold_out=many", "tracker.hold_out"),
+        ("tracker.odometry.pyramid.levels=[", "not valid YAML"),
+        ("hold_out=5", "section.field=value"),
+        ("tracker.hold_out", "section.field=value"),
+        ("tracker.hold_out.deeper=5", "Expected `int`"),
+        ("mapper=3", "section.field=value"),
+    ],
+)
+def test_a_wrong_setting_is_said_plainly(setting: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=says.replace("?", r"\?")):
+        load_config(settings=[setting])
+
+
+def test_a_wrong_file_is_said_plainly(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_config(tmp_path / "absent.yaml")
+    for text, says in (("tracker: [", "not valid YAML"), ("- a\n- b\n", "must hold sections")):
+        (tmp_path / "wrong.yaml").write_text(text)
+        with pytest.raises(ConfigError, match=says):
+            load_config(tmp_path / "wrong.yaml")
+
+
+def every_field(config: object) -> Iterator[tuple[str, object]]:
+    for entry in dataclasses.fields(config):  # type: ignore[arg-type]
+        value = getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            yield from every_field(value)
+        else:
+            yield entry.name, value
+
+
+def test_every_setting_is_a_plain_value() -> None:
+    for name, value in every_field(Config()):
+        assert isinstance(value, bool | int | float | str | tuple), name
