@@ -7,6 +7,7 @@
     Outlet      sending half of a topic: numbers messages, waits for lossless consumers
     Mailbox     all inputs of an actor, merged and bounded; every drop is counted
     Stage       take -> handle in the actor's own thread -> send in order; restarts its actor
+    ChildProcess  an actor in a process of its own, seen from the process that started it
     supervise   one task group; an exhausted restart budget ends the process
     check_graph refuses a cycle of lossless inputs before anything starts
     run_on_logical_clock   the whole graph over a file, independent of the machine's load

@@ -10,7 +10,7 @@ import msgspec
 
 from ldo_service.schemas import Message, OutputCount
 
-from .actor import UNLIMITED
+from .consumers import Consumer, Consumers
 from .links import (
     Grant,
     Header,
@@ -27,19 +27,6 @@ from .ports import Out
 from .transport import Transport, call_soon
 
 log = logging.getLogger(__name__)
-
-
-@dataclass
-class Consumer:
-    """A lossless consumer as the producer knows it."""
-
-    alive: bool = False
-    handled: int = 0
-    arrived: int = 0
-    limit: int = 0
-    repeated_from: int = -1  # where the last repetition began, and when
-    repeated_at_s: float = 0.0
-    shut_since_s: float | None = None  # when its window was first seen shut
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +62,7 @@ class Outlet:
         self._loop = asyncio.get_running_loop()
         self._seq = 0
         self._sent_at_s = self._loop.time()
-        self._consumers = {name: Consumer() for name in expected}
-        self._expected = frozenset(self._consumers)
-        self._evicted: dict[str, int] = {}  # what each had handled when its patience was over
+        self._consumers = Consumers(expected)
         self._unhandled: deque[Sent] = deque()
         self._changed = asyncio.Event()  # something about a consumer
         self._repeating: asyncio.Task[None] | None = None
@@ -101,8 +86,7 @@ class Outlet:
     # --- sending ----------------------------------------------------------------------------
     def room(self) -> int:
         """How many messages may be sent now without waiting."""
-        limits = [c.limit - self._seq if c.alive else 0 for c in self._consumers.values()]
-        return max(0, min(limits, default=UNLIMITED))
+        return self._consumers.room(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
         if not self.port.never_wait:
@@ -123,7 +107,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until all that was sent has arrived at every lossless consumer."""
         self._post_welcomes()  # each answers with a grant at once
-        while any(c.arrived < self._seq for c in self._consumers.values()):
+        while not self._consumers.have_all(self._seq):
             await self._change()
 
     async def _change(self) -> None:
@@ -154,41 +138,29 @@ class Outlet:
         name = request.consumer
         if self._closed:
             return
-        if isinstance(request, Join) or request.epoch != self._epoch:
-            self._welcome(name)
-        elif request.handled <= self._evicted.get(name, -1):
-            pass  # still takes nothing
-        elif name not in self._consumers:
-            self._welcome(name)
-        elif request.arrived <= self._seq:
-            self._granted(self._consumers[name], request)
-
-    def _welcome(self, name: str) -> None:
-        """A consumer joined, or joined again: it gets what it has not handled."""
-        self._evicted.pop(name, None)
-        consumer = self._consumers.setdefault(name, Consumer(handled=self._seq))
-        consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
-        consumer.arrived = consumer.limit = consumer.handled
+        if isinstance(request, Grant) and request.epoch == self._epoch:
+            if self._consumers.is_still_stuck(request):
+                return
+            if name in self._consumers:
+                self._granted(request)
+                return
+        self._consumers.join(name, self._seq)
         self._post_welcomes()
 
     def _post_welcomes(self) -> None:
-        starts = {name: consumer.handled for name, consumer in self._consumers.items()}
-        self._welcomes.post(b"", encode(Welcome(self._epoch, starts)))
+        self._welcomes.post(b"", encode(Welcome(self._epoch, self._consumers.starts())))
 
-    def _granted(self, consumer: Consumer, grant: Grant) -> None:
-        self._evicted.pop(grant.consumer, None)
-        consumer.alive = True
-        consumer.handled = max(consumer.handled, grant.handled)
-        consumer.arrived = grant.arrived  # not the most ever: a successor may have less
-        if grant.limit > consumer.limit:
-            consumer.limit, consumer.shut_since_s = grant.limit, None
+    def _granted(self, grant: Grant) -> None:
+        if grant.arrived > self._seq:
+            return  # of messages that were never sent
+        consumer = self._consumers.grant(grant)
         self._forget_handled()
         if consumer.arrived < self._seq:
             self._repeat(consumer, grant.gap)
         self._changed.set()
 
     def _forget_handled(self) -> None:
-        oldest = min((c.handled for c in self._consumers.values()), default=self._seq)
+        oldest = self._consumers.handled(self._seq)
         while self._unhandled and self._unhandled[0].seq < oldest:
             self._unhandled.popleft()
 
@@ -215,39 +187,23 @@ class Outlet:
             self._repeating = None
 
     def _presence(self, name: str, alive: bool) -> None:
-        consumer = self._consumers.get(name)
-        if consumer is None or alive:
-            return
-        self._release(name, consumer)
-        log.warning("%s: consumer %s is gone", self.topic.name, name)
-
-    def _release(self, name: str, consumer: Consumer) -> None:
-        """It holds nothing any more, unless it must not miss a message."""
-        consumer.alive, consumer.shut_since_s = False, None
-        if name not in self._expected:
-            del self._consumers[name]
+        if not alive and name in self._consumers:
+            log.warning("%s: consumer %s is gone", self.topic.name, name)
+            self._consumers.leave(name)
             self._forget_handled()
-        self._changed.set()
+            self._changed.set()
 
     def check_windows(self) -> None:
         """Evict consumers that live and yet take nothing; called with every heartbeat."""
-        now = self._loop.time()
-        for name, consumer in list(self._consumers.items()):
-            if consumer.alive and consumer.limit <= self._seq:
-                if consumer.shut_since_s is None:
-                    consumer.shut_since_s = now
-                if now - consumer.shut_since_s > self._evict_after_s:
-                    self._evict(name, consumer)
-
-    def _evict(self, name: str, consumer: Consumer) -> None:
-        log.error(
-            "%s: consumer %s took nothing for %.0f s and is evicted",
-            self.topic.name, name, self._evict_after_s,
-        )  # fmt: skip
-        self.evicted += 1
-        self._evicted[name] = consumer.handled
-        self._release(name, consumer)
-        self._on_evicted(name)
+        overdue = self._consumers.overdue(self._loop.time(), self._evict_after_s, self._seq)
+        for name in overdue:
+            log.error("%s: consumer %s took nothing for %.0f s and is evicted",
+                      self.topic.name, name, self._evict_after_s)  # fmt: skip
+            self.evicted += 1
+            self._consumers.evict(name)
+            self._forget_handled()
+            self._changed.set()
+            self._on_evicted(name)
 
     # --- the rest ---------------------------------------------------------------------------
     def statistics(self) -> OutputCount:
