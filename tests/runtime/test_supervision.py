@@ -8,6 +8,7 @@ from threading import Event
 import pytest
 
 from ldo_service.errors import RestartsExhausted
+from ldo_service.runtime.links import data_key
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.ports import Out
 from ldo_service.runtime.stage import Stage, StageConfig
@@ -41,6 +42,25 @@ async def test_a_soft_stop_loses_nothing_that_is_under_way() -> None:
     assert stop.is_asked
     await service
     assert seen == [2 * value for value in range(20)]
+
+
+async def test_a_soft_stop_waits_for_what_must_be_sent_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
+    transport = MemoryTransport(lose=lambda key: key == data_key(DOUBLES.name))
+    seen, stop = [], Stop()
+    numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["doubler"])
+    expected = {DOUBLES.name: frozenset({"double_collector"})}
+    doubler = Stage(Doubler, transport, config=QUICK, expected=expected)
+    last = Stage(lambda: DoubleCollector(seen), transport, config=QUICK)
+    service = asyncio.create_task(supervise([doubler, last], stop))
+    for value in range(7):
+        await send(numbers, number(value))
+    await numbers.flush()
+    stop.ask()
+    await service
+    assert seen == [2 * value for value in range(7)]
 
 
 async def test_a_hard_stop_ends_at_once() -> None:
