@@ -1,9 +1,13 @@
 """The runtime over Zenoh, on this machine's loopback."""
 
 import asyncio
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import msgpack
 import pytest
@@ -280,3 +284,41 @@ def test_a_number_decodes_as_a_number() -> None:
     """The process of the kill tests declares the message on its own: the bytes must fit."""
     body = msgpack.packb({"type": "Number", "stamp_ns": 1, "value": 5})
     assert decode(body, Number) == Number(stamp_ns=1, value=5)
+
+
+@pytest.mark.slow
+async def test_a_network_that_hangs_for_seconds_blocks_no_loop_and_loses_nothing() -> None:
+    network, seen = Network("test", f"tcp/127.0.0.1:{free_port()}"), []
+    program = [sys.executable, str(Path(__file__).with_name("router_process.py"))]
+    router = subprocess.Popen([*program, network.endpoint], stdout=subprocess.PIPE)
+    try:
+        assert router.stdout
+        router.stdout.readline()
+        with open_session(network) as one, open_session(network) as other:
+            source = outlet(ZenohTransport(one, network), "collector")
+            async with running(collector(ZenohTransport(other, network), seen)):
+                await send_images(source, range(20))
+                router.send_signal(signal.SIGSTOP)
+                sending = asyncio.create_task(send_images(source, range(20, 60)))
+                pauses = [await pause() for _ in range(300)]
+                assert not sending.done()
+                router.send_signal(signal.SIGCONT)
+                await sending
+                await eventually(lambda: len(seen) == 60)
+        assert seen == list(range(60))
+        assert max(pauses) < 1.0  # a blocked put would take seconds
+    finally:
+        router.kill()
+        router.communicate()
+
+
+async def send_images(source: Outlet, values: range) -> None:
+    for value in values:
+        await send(source, number(value, data=bytes(1_000_000)))
+
+
+async def pause() -> float:
+    """How long the event loop took for a moment's sleep."""
+    started_s = time.perf_counter()
+    await asyncio.sleep(0.01)
+    return time.perf_counter() - started_s
