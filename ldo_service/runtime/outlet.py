@@ -187,7 +187,7 @@ class Outlet:
             self._repeating = None
 
     def _presence(self, name: str, alive: bool) -> None:
-        if not alive and name in self._consumers:
+        if not alive and not self._closed and name in self._consumers:
             log.warning("%s: consumer %s is gone", self.topic.name, name)
             self._consumers.leave(name)
             self._forget_handled()
