@@ -1,5 +1,4 @@
 import json
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -98,9 +97,8 @@ def test_truncated_jpeg_fails_alone(replica_folder: Writer) -> None:
     assert sequence[1].index == 1
 
 
-@pytest.mark.skipif("LDO_DATA" not in os.environ, reason="set LDO_DATA to the shared data")
-def test_real_apartment_reads() -> None:
-    sequence = open_sequence(os.environ["LDO_DATA"] + "/replica/apartment_floor1")
+def test_real_apartment_reads(data: Path) -> None:
+    sequence = open_sequence(str(data / "replica/apartment_floor1"))
     assert len(sequence) == 275
     truth = sequence.truth()
     assert truth is not None

@@ -1,6 +1,5 @@
 import json
 import logging
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -184,9 +183,8 @@ def test_truth_is_optional(tum_folder: Writer) -> None:
     assert truth.T_world_camera[0, :3, 3].tolist() == [1, 2, 3]
 
 
-@pytest.mark.skipif("LDO_DATA" not in os.environ, reason="set LDO_DATA to the shared data")
-def test_real_kitchen_reads() -> None:
-    sequence = open_sequence(os.environ["LDO_DATA"] + "/tum/kitchen")
+def test_real_kitchen_reads(data: Path) -> None:
+    sequence = open_sequence(str(data / "tum/kitchen"))
     assert sequence.camera == Camera(640, 480, 525, 525, 320, 238)
     frame = sequence[299]
     assert 0.5 < np.median(frame.depth_m[frame.depth_m > 0]) < 4

@@ -1,7 +1,7 @@
 """The judge is evo."""
 
 import copy
-import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -81,9 +81,8 @@ def test_errors_agree_with_evo_when_poses_are_missing() -> None:
     assert_evo_agrees(Trajectory(estimate.stamps_s[kept], estimate.T_world_camera[kept]), truth)
 
 
-@pytest.mark.skipif("LDO_DATA" not in os.environ, reason="set LDO_DATA to the shared data")
-def test_errors_agree_with_evo_on_a_real_trajectory() -> None:
-    truth = open_sequence(os.environ["LDO_DATA"] + "/tum/kitchen").truth()
+def test_errors_agree_with_evo_on_a_real_trajectory(data: Path) -> None:
+    truth = open_sequence(str(data / "tum/kitchen")).truth()
     assert truth is not None
     assert_evo_agrees(disturbed(truth, 1, sigma=0.002), truth)
 

@@ -1,11 +1,11 @@
-import os
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
+from ldo_service.evaluation import rendering
 from ldo_service.gaussians import GaussianMap, InsertionConfig, insert, render
 from ldo_service.gaussians.insertion import with_small_holes_filled
 from ldo_service.geometry import Camera, RgbdFrame, se3
@@ -34,7 +34,8 @@ def view(gaussians: GaussianMap, T_map_camera: np.ndarray):
 
 
 def psnr(color: np.ndarray, truth: np.ndarray) -> float:
-    return float(-10 * np.log10(np.mean((color - truth / 255) ** 2)))
+    """Of a rendering in 0..1 against a camera's 0..255."""
+    return rendering.psnr(color, truth / np.float32(255))
 
 
 def without_depth(frame: RgbdFrame, missing: np.ndarray) -> RgbdFrame:
@@ -186,28 +187,17 @@ def test_config_refuses_senseless_values(wrong: dict) -> None:
         InsertionConfig(**wrong)
 
 
-def test_real_room_is_rendered_between_its_keyframes() -> None:
-    folder = Path(os.environ.get("LDO_DATA", "")) / "replica" / "apartment_floor1"
-    if "LDO_DATA" not in os.environ or not folder.is_dir():
-        pytest.skip("set LDO_DATA to a folder with replica/apartment_floor1")
-    T_map_camera = np.loadtxt(folder / "traj.txt").reshape(-1, 4, 4)
-    camera = Camera(512, 512, 256.0, 256.0, 255.5, 255.5)
-
-    def frame_of(i: int) -> RgbdFrame:
-        color = cv2.imread(str(folder / "results" / f"frame{i:06d}.jpg"))
-        depth = cv2.imread(str(folder / "results" / f"depth{i:06d}.png"), cv2.IMREAD_UNCHANGED)
-        assert color is not None
-        assert depth is not None
-        color = np.ascontiguousarray(color[..., ::-1])
-        return RgbdFrame(color, depth.astype(np.float32) / 1000, camera)
-
+def test_real_room_is_rendered_between_its_keyframes(data: Path) -> None:
+    apartment = open_sequence(str(data / "replica" / "apartment_floor1"))
+    truth = apartment.truth()
+    assert truth is not None
+    T_map_camera = truth.T_world_camera
     gaussians = GaussianMap()
     for i in (0, 5, 20, 25):
-        insert(gaussians, frame_of(i), T_map_camera[i], i)
+        insert(gaussians, apartment[i], T_map_camera[i], i)
     for i in (2, 22):
-        frame = frame_of(i)
-        seen = render(gaussians.rows, camera, se3.inverse(T_map_camera[i]))
+        seen = render(gaussians.rows, apartment.camera, se3.inverse(T_map_camera[i]))
         covered = seen.opacity > 0.5
         assert covered.mean() > 0.95
-        assert psnr(seen.color[covered], frame.color[covered]) > 25
+        assert psnr(seen.color[covered], apartment[i].color[covered]) > 25
     assert len(gaussians) < 80_000

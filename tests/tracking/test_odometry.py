@@ -1,15 +1,15 @@
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
 
 T_ELSEWHERE = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
@@ -174,42 +174,12 @@ def test_motion_limit_of_zero_is_refused() -> None:
         OdometryConfig(large_motion=0.0)
 
 
-def kitchen(count: int) -> tuple[list[RgbdFrame], np.ndarray]:
-    """The first frames of the sequence and the true positions [N, 3]."""
-    root = Path(os.environ.get("LDO_DATA", "")) / "tum" / "kitchen"
-    if "LDO_DATA" not in os.environ or not root.is_dir():
-        pytest.skip("needs tum/kitchen in the folder that LDO_DATA names")
-    calibration = json.loads((root / "camera.json").read_text())
-    scale = calibration.pop("depth_scale")
-    camera = Camera(**calibration)
-
-    def table(name: str) -> list[list[str]]:
-        lines = (root / name).read_text().splitlines()
-        return [line.split() for line in lines if line and not line.startswith("#")]
-
-    depths, truth = table("depth.txt"), np.array(table("groundtruth.txt"), float)
-    depth_stamps = np.array([float(stamp) for stamp, _ in depths])
-    frames, positions = [], []
-    for stamp, name in table("rgb.txt")[:count]:
-        nearest = int(np.argmin(np.abs(depth_stamps - float(stamp))))
-        color = cv2.cvtColor(cv2.imread(str(root / name)), cv2.COLOR_BGR2RGB)
-        depth = cv2.imread(str(root / depths[nearest][1]), cv2.IMREAD_UNCHANGED)
-        depth_m = (depth / scale).astype(np.float32)
-        frames.append(RgbdFrame(color, depth_m, camera, round(float(stamp) * 1e9), len(frames)))
-        positions.append(truth[np.argmin(np.abs(truth[:, 0] - float(stamp))), 1:4])
-    return frames, np.array(positions)
-
-
-def ate_rmse_m(estimate: np.ndarray, truth: np.ndarray) -> float:
-    """After the best rigid alignment (Horn 1987)."""
-    a, b = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
-    U, _, Vt = np.linalg.svd(b.T @ a)
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
-    return float(np.sqrt(np.mean(np.sum((b - a @ R.T) ** 2, axis=1))))
-
-
-def test_forty_real_frames_stay_within_three_centimetres() -> None:
-    frames, truth = kitchen(40)
-    results = track(Odometry(), frames)
+def test_forty_real_frames_stay_within_three_centimetres(data: Path) -> None:
+    kitchen = open_sequence(str(data / "tum" / "kitchen"))
+    results = track(Odometry(), [kitchen[index] for index in range(40)])
     assert {r.status for r in results} == {Status.OK}
-    assert ate_rmse_m(np.array([r.T_odom_camera[:3, 3] for r in results]), truth) < 0.03
+    T_odom_camera = np.array([r.T_odom_camera for r in results])
+    truth = kitchen.truth()
+    assert truth is not None
+    estimate = Trajectory(kitchen.stamps_ns[:40] * 1e-9, T_odom_camera)
+    assert evaluate_trajectory(estimate, truth).ate_m.rmse < 0.03
