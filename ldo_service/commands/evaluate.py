@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +24,7 @@ from ldo_service.geometry import Trajectory
 
 from .options import Json, Source
 
+WIDTH = 120  # of the table in a file
 STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond
 
 
@@ -52,7 +54,7 @@ def evaluate(
     if json_:
         print(json.dumps({row.name: plain(row.errors) for row in rows}, indent=1))
         return
-    console = Console(highlight=False)
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
     console.print(PROTOCOL, style="dim")
     console.print(errors_table(rows))
     console.print(f"Picture: {folder / 'trajectory.png'}")
