@@ -23,7 +23,8 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.gaussians.render import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.runs.folder import RunFolder, prepare
-from ldo_service.runs.over_file import Selection, run_over_file
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.source import Selection
 
 from .options import Overwrite
 from .progress import progress

@@ -1,6 +1,7 @@
 """ldo run"""
 
 from dataclasses import replace
+from math import gcd
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +13,9 @@ from ldo_service.config import Config, load_config
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.runs.folder import prepare
-from ldo_service.runs.over_file import Selection, run_over_file
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.realtime import run_in_real_time
+from ldo_service.runs.source import Selection
 
 from .options import ConfigFile, Overwrite, Settings, Source
 from .progress import progress
@@ -34,6 +37,9 @@ def run(
     threads: Annotated[
         int, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
     ] = 0,
+    realtime: Annotated[
+        bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Track and map a sequence; write trajectory, map and figures to a folder.
@@ -47,10 +53,12 @@ def run(
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
     selection = selected(stride, max_frames)
+    require_held_out(stride, settings.tracker.hold_out)
     sequence = open_sequence(source)
     prepare(out, overwrite)
     with progress("run", len(selection.indices(sequence)), console) as advance:
-        record = run_over_file(sequence, out, settings, selection, console.print, advance)
+        go = run_in_real_time if realtime else run_over_file
+        record = go(sequence, out, settings, selection, console.print, advance)
     Console().print(summary_table(record.summary, out))
 
 
@@ -65,6 +73,15 @@ def selected(stride: int, max_frames: int | None) -> Selection:
     if stride < 1 or (max_frames is not None and max_frames < 1):
         raise ConfigError("--stride and --max-frames must be at least 1.")
     return Selection(stride, max_frames)
+
+
+def require_held_out(stride: int, hold_out: int) -> None:
+    """Held-out frames are counted in the sequence: with a common factor some would never come."""
+    if hold_out and gcd(stride, hold_out) > 1:
+        raise ConfigError(
+            f"--stride {stride} and --hold-out {hold_out} share a factor, so other frames would be "
+            "held out than asked for. Choose one without."
+        )
 
 
 def summary_table(summary: dict[str, Any], out: Path) -> Table:

@@ -13,7 +13,8 @@ from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RawFrame, Trajectory
 from ldo_service.runs.folder import prepare
-from ldo_service.runs.over_file import Selection, run_over_file
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.source import Selection
 
 FRAMES = 40
 

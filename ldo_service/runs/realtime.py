@@ -1,0 +1,124 @@
+"""A run over a sequence as if it were live: paced by its stamps, late frames are dropped."""
+
+import asyncio
+import time
+from collections.abc import Sequence as Ordered
+from pathlib import Path
+
+from ldo_service.actors.graph import RUNNING, Box
+from ldo_service.config import Config, config_yaml
+from ldo_service.datasets import Sequence
+from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.links import Header, data_key
+from ldo_service.runtime.links import encode as encode_header
+from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.schemas import Health, decode, encode
+from ldo_service.schemas.topics import CAMERA_RGBD, Topic
+
+from .folder import RunFolder
+from .over_file import Advance, require_usable
+from .source import Reader, Selection, Warn
+from .summary import Usage, summarise
+
+
+def run_in_real_time(
+    sequence: Sequence,
+    folder: Path,
+    config: Config,
+    selection: Selection,
+    warn: Warn,
+    advance: Advance,
+) -> RunFolder:
+    """Like `run_over_file`, with the stages and policies of the service, all in this process.
+
+    A frame that comes before the tracker is done with the last one is dropped and counted, so the
+    result depends on the machine's speed and load. Raises what `run_over_file` raises.
+    """
+    run = _RealTimeRun(sequence, folder, config, selection, warn, advance)
+    return asyncio.run(run.go())
+
+
+class _RealTimeRun:
+    def __init__(
+        self,
+        sequence: Sequence,
+        folder: Path,
+        config: Config,
+        selection: Selection,
+        warn: Warn,
+        advance: Advance,
+    ) -> None:
+        self._sequence, self._config, self._advance = sequence, config, advance
+        self._indices = selection.indices(sequence)
+        self._reader = Reader(sequence, self._indices, warn)
+        self._record = RunFolder(folder, config_yaml(config), config.tracker.hold_out)
+        self._step_ms: dict[str, float] = {}
+
+    async def go(self) -> RunFolder:
+        transport = MemoryTransport()
+        stages = [self._stage(box, transport) for box in RUNNING]
+        for topic in _made_topics():
+            self._observe(topic, transport)
+        stop = Stop()
+        started = Usage.now()
+        async with asyncio.TaskGroup() as group:
+            service = supervise(stages, stop, self._config.service.drain_s)
+            running = group.create_task(service)
+            feeding = group.create_task(self._feed(transport))
+            await asyncio.wait({running, feeding}, return_when=asyncio.FIRST_COMPLETED)
+            feeding.cancel()
+            stop.ask()
+        used = Usage.now().since(started)
+        return self._close(used, [stage.health() for stage in stages])
+
+    def _stage(self, box: Box, transport: MemoryTransport) -> Stage:
+        make = box.make
+        assert make is not None
+        return Stage(
+            lambda: make(self._config),
+            transport,
+            config=self._config.stage,
+            expected={
+                out.topic.name: lossless_consumers(RUNNING, out.topic.name) for out in box.outputs
+            },
+        )
+
+    def _observe(self, topic: Topic, transport: MemoryTransport) -> None:
+        kind = topic.message
+        assert kind is not None
+        transport.subscribe(
+            data_key(topic.name),
+            lambda _header, body: self._record.observe(decode(body, kind), 0.0),
+        )
+
+    async def _feed(self, transport: MemoryTransport) -> None:
+        """Each frame at its time."""
+        camera = transport.publisher(data_key(CAMERA_RGBD.name))
+        first_ns = int(self._sequence.stamps_ns[self._indices[0]])
+        started_s = time.monotonic()
+        frames = iter(self._reader)
+        number = 0
+        while (frame := await asyncio.to_thread(next, frames, None)) is not None:
+            due_s = started_s + (frame.stamp_ns - first_ns) * 1e-9
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+            header = Header("camera", 1, number, frame.stamp_ns)
+            await camera.send(encode_header(header), encode(frame))
+            number += 1
+            self._advance(number + self._reader.rejected)
+
+    def _close(self, used: Usage, healths: Ordered[Health]) -> RunFolder:
+        rejected = self._reader.rejected + sum(
+            int(health.facts.get("frames_rejected", 0)) for health in healths
+        )
+        stage_ms = {h.actor: {"p50": h.step_ms_p50, "p95": h.step_ms_p95} for h in healths}
+        drops = {f"{h.actor} {i.topic}": i.dropped for h in healths for i in h.inputs if i.dropped}
+        frames = len(self._indices)
+        self._record.close(summarise(self._record, used, frames, rejected, stage_ms, drops))
+        require_usable(self._record, self._config.run.max_rejected)
+        return self._record
+
+
+def _made_topics() -> list[Topic]:
+    return [out.topic for box in RUNNING for out in box.outputs if out.topic.message is not None]

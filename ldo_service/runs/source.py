@@ -1,0 +1,57 @@
+"""Which frames of a sequence a run takes, and reading them ahead."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+from ldo_service.datasets import Sequence
+from ldo_service.errors import DataError, FrameError
+from ldo_service.schemas import CameraRgbd
+from ldo_service.wire import camera_rgbd_message
+
+READ_AHEAD = 3  # frames decoded before they are needed: one decoding, one waiting, one to spare
+
+Warn = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which frames of a sequence."""
+
+    stride: int = 1
+    max_frames: int | None = None
+
+    def indices(self, sequence: Sequence) -> range:
+        """Raises DataError when nothing is left."""
+        chosen = range(0, len(sequence), self.stride)[: self.max_frames]
+        if not chosen:
+            raise DataError(f"{sequence.name}: the selection leaves no frame to run on.")
+        return chosen
+
+
+class Reader:
+    """Frames as camera messages, read ahead in a thread; bad ones are counted and left out."""
+
+    def __init__(self, sequence: Sequence, indices: range, warn: Warn) -> None:
+        self._sequence, self._indices, self._warn = sequence, indices, warn
+        self.rejected = 0
+
+    def __iter__(self) -> Iterator[CameraRgbd]:
+        with ThreadPoolExecutor(1, "reader") as thread:
+            ahead = [thread.submit(self._read, i) for i in self._indices[:READ_AHEAD]]
+            for position in range(len(self._indices)):
+                message = ahead.pop(0).result()
+                following = position + READ_AHEAD
+                if following < len(self._indices):
+                    ahead.append(thread.submit(self._read, self._indices[following]))
+                if message is not None:
+                    yield message
+
+    def _read(self, index: int) -> CameraRgbd | None:
+        try:
+            return camera_rgbd_message(self._sequence.read(index), compress_depth=False)
+        except FrameError as error:
+            if self.rejected == 0:
+                self._warn(f"{error} It is left out; further bad frames are only counted.")
+            self.rejected += 1
+            return None

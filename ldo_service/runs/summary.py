@@ -1,0 +1,78 @@
+"""What a run has used, and the figures it ends with."""
+
+import os
+import platform
+import resource
+import time
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from ldo_service import __version__, kernels
+
+from .folder import RunFolder
+
+LIBRARIES = ("numpy", "gtsam", "opencv-python-headless", "msgspec")
+Percentiles = dict[str, float]  # p50, p95
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """Time that this process has used."""
+
+    wall_s: float
+    cpu_s: float
+
+    @staticmethod
+    def now() -> "Usage":
+        return Usage(time.perf_counter(), time.process_time())
+
+    def since(self, earlier: "Usage") -> "Usage":
+        return replace(self, wall_s=self.wall_s - earlier.wall_s, cpu_s=self.cpu_s - earlier.cpu_s)
+
+
+def summarise(
+    record: RunFolder,
+    used: Usage,
+    frames: int,
+    rejected: int,
+    stage_ms: dict[str, Percentiles],
+    drops: dict[str, int],
+) -> dict[str, Any]:
+    """The summary of a finished run; `drops` by "actor topic".
+
+    FPS counts everything from the first read to the last step; nothing is excluded as warm-up.
+    """
+    return {
+        "frames": frames,
+        "frames_rejected": rejected,
+        "status": record.statuses,
+        "keyframes": record.keyframes,
+        "gaussians": len(record.follower.map),
+        "fps": round((frames - rejected) / used.wall_s, 3),
+        "wall_s": round(used.wall_s, 3),
+        "cpu_s": round(used.cpu_s, 3),
+        "peak_rss_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024, 1),
+        "stage_ms": stage_ms,
+        "drops": drops,
+        "loops_accepted": 0,
+        "loops_rejected": 0,
+        "vlm_calls": 0,
+        "optimizations": record.corrections,
+        "isa": kernels.isa(),
+        "threads": os.cpu_count(),
+        "versions": {
+            "ldo-slam": __version__,
+            "python": platform.python_version(),
+            **{library: version(library) for library in LIBRARIES},
+        },
+    }
+
+
+def percentiles(values: list[float]) -> dict[str, float]:
+    return {
+        "p50": round(float(np.percentile(values, 50)), 3),
+        "p95": round(float(np.percentile(values, 95)), 3),
+    }

@@ -1,0 +1,34 @@
+"""A paced run uses the stages of the service."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ldo_service.config import load_config
+from ldo_service.datasets import Sequence
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.runs.folder import prepare
+from ldo_service.runs.realtime import run_in_real_time
+from ldo_service.runs.source import Selection
+
+
+@pytest.mark.timeout(60)
+def test_a_paced_run_takes_as_long_as_the_sequence_and_accounts_for_every_frame(
+    room: Sequence, tmp_path: Path
+) -> None:
+    frames = 45
+    for index in range(frames):
+        room.read(index)
+    prepare(tmp_path / "out", overwrite=False)
+    record = run_in_real_time(
+        room, tmp_path / "out", load_config(), Selection(max_frames=frames), print, lambda _n: None
+    )
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["wall_s"] >= (frames - 1) / 30
+    tracked = sum(summary["status"].values())
+    assert tracked + sum(summary["drops"].values()) >= frames - 4, "the rest came before a keyframe"
+    assert summary["keyframes"] > 1
+    truth = room.truth()
+    assert truth is not None
+    assert evaluate_trajectory(record.online(), truth).ate_m.rmse < 0.01
