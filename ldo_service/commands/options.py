@@ -22,8 +22,8 @@ Source = Annotated[
     tyro.conf.Positional,
     tyro.conf.arg(
         metavar="SOURCE",
-        help="folder of a data set (TUM RGB-D or Replica/NICE-SLAM, recognised by its files), "
-        "or synthetic:room",
+        help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export or 7-Scenes, "
+        "recognised by its files), or synthetic:room",
     ),
 ]
 Robot = Annotated[

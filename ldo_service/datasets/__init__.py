@@ -2,38 +2,66 @@
 
 from pathlib import Path
 
-from ldo_service.errors import DataError
+from ldo_service.errors import ConfigError, DataError
 
 from .replica import ReplicaSequence
+from .rig import SequenceOptions
+from .scannet import ScanNetSequence
 from .sequence import Cached, Sequence
+from .seven_scenes import SevenScenesSequence
 from .synthetic import SyntheticSequence
 from .tum import TumSequence
 
-__all__ = ["Cached", "Sequence", "open_sequence"]
+__all__ = ["Cached", "Sequence", "SequenceOptions", "open_sequence"]
 
 LAYOUTS = (
     "TUM RGB-D (rgb.txt and depth.txt), Replica as NICE-SLAM lays it out (results/frame*.jpg, "
-    "results/depth*.png), or the built-in synthetic:room"
+    "results/depth*.png), ScanNet as SensReader exports it (color/*.jpg, depth/*.png, "
+    "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or the built-in "
+    "synthetic:room"
 )
 
 
-def open_sequence(source: str) -> Sequence:
+def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequence:
     """The frames of a folder, recognised by its layout, or of `synthetic[:name]`.
 
-    Raises DataError naming the known layouts when there is nothing to read.
+    `options` are for ScanNet and 7-Scenes, whose depth and colour come from two cameras.
+    Raises DataError naming the known layouts when there is nothing to read, and ConfigError for
+    options that the layout has no use for.
     """
+    options = options or SequenceOptions()
     scheme, _, name = source.partition(":")
     if scheme == "synthetic":
+        _refuse(options, source)
         return SyntheticSequence.named(name or "room")
     folder = Path(source).expanduser()
     if not folder.is_dir():
         found = "is a file" if folder.exists() else "does not exist"
         raise DataError(f"{source} {found}. A source is a folder in one of the layouts {LAYOUTS}.")
+    return _open_folder(folder, options)
+
+
+def _open_folder(folder: Path, options: SequenceOptions) -> Sequence:
     if (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file():
+        _refuse(options, f"{folder} (TUM RGB-D)")
         return TumSequence(folder)
     if (folder / "results").is_dir():
+        _refuse(options, f"{folder} (Replica)")
         return ReplicaSequence(folder)
+    if (folder / "color").is_dir() and (folder / "depth").is_dir():
+        return ScanNetSequence(folder, options)
+    if any(folder.glob("frame-*.color.*")):
+        return SevenScenesSequence(folder, options)
     raise DataError(
         f"{folder} is in no known layout: it has neither rgb.txt with depth.txt nor a folder "
-        f"results/. Known layouts: {LAYOUTS}."
+        "results/, nor the folders color/ and depth/, nor files frame-*.color.*. Known layouts: "
+        f"{LAYOUTS}."
     )
+
+
+def _refuse(options: SequenceOptions, source: str) -> None:
+    if not options.is_default:
+        raise ConfigError(
+            f"{source} has depth registered to colour already: leave out the options of "
+            "registration, which are for ScanNet and 7-Scenes."
+        )

@@ -29,6 +29,21 @@ def read_depth(path: Path) -> np.ndarray:
     return image
 
 
+def first_size(paths: list[Path]) -> tuple[int, int]:
+    """Width and height of the first image that can be read. Raises the last one's FrameError."""
+    for path in paths[:-1]:
+        try:
+            return _size(path)
+        except FrameError:  # reading it later will say so
+            continue
+    return _size(paths[-1])
+
+
+def _size(path: Path) -> tuple[int, int]:
+    height, width = _decode(path, cv2.IMREAD_UNCHANGED).shape[:2]
+    return width, height
+
+
 def _decode(path: Path, flags: int) -> np.ndarray:
     try:
         data = path.read_bytes()

@@ -6,7 +6,6 @@ cam_params.json                          here or one folder up: {"camera": {"w",
                                          "fy", "cx", "cy", "scale"}}, scale in units per metre
 """
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +15,9 @@ from ldo_service.geometry import RawFrame, Trajectory, se3
 
 from .calibration import Calibration, number, pinhole, read_json
 from .images import read_color, read_depth
+from .matrices import is_rigid
+from .numbered import numbered, paired
 from .sequence import Sequence
-
-FRAME_RATE_HZ = 30  # the layout has no stamps; frame k is said to be taken at k / 30 s
 
 
 class ReplicaSequence(Sequence):
@@ -26,27 +25,19 @@ class ReplicaSequence(Sequence):
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        color = _numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)")
-        depth = _numbered(folder / "results", r"depth(\d+)\.png")
-        self._numbers = sorted(color.keys() & depth.keys())
-        if not self._numbers:
-            raise DataError(
-                f"{folder / 'results'} has {len(color)} images frame*.jpg and {len(depth)} "
-                "depth*.png, and no number that has both. Check the names of the files."
-            )
-        self._files = [(color[k], depth[k]) for k in self._numbers]
+        color = numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)")
+        depth = numbered(folder / "results", r"depth(\d+)\.png")
+        self._files = paired(color, depth, folder / "results")
         calibration = _calibration(folder)
         self.depth_scale = calibration.depth_scale
-        stamps_ns = np.array(self._numbers, np.int64) * 10**9 // FRAME_RATE_HZ
-        super().__init__(folder.resolve().name, calibration.camera, stamps_ns)
+        super().__init__(folder.resolve().name, calibration.camera, self._files.stamps_ns)
 
     def read(self, index: int) -> RawFrame:
-        color_path, depth_path = self._files[index]
         return RawFrame(
             index,
             int(self.stamps_ns[index]),
-            read_color(color_path),
-            read_depth(depth_path),
+            read_color(self._files.color[index]),
+            read_depth(self._files.depth[index]),
             self.depth_scale,
             self.raw_camera,
         )
@@ -57,14 +48,9 @@ class ReplicaSequence(Sequence):
             return None
         poses = _poses(path)
         # One line per frame here, or one per number where some frames were removed.
-        lines = np.array(self._numbers if len(poses) > len(self) else range(len(self)))
+        lines = self._files.numbers if len(poses) > len(self) else np.arange(len(self))
         known = lines < len(poses)
         return Trajectory(self.stamps_ns[known] / 1e9, poses[lines[known]])
-
-
-def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    matches = ((re.fullmatch(pattern, path.name), path) for path in folder.glob("*"))
-    return {int(match[1]): path for match, path in matches if match}
 
 
 def _calibration(folder: Path) -> Calibration:
@@ -92,16 +78,9 @@ def _pose(path: Path, line_number: int, line: str) -> np.ndarray:
         T_world_camera = np.array([float(word) for word in line.split()]).reshape(4, 4)
     except ValueError:
         T_world_camera = np.full((4, 4), np.nan)
-    if not _is_rigid(T_world_camera):
+    if not is_rigid(T_world_camera):
         raise DataError(
             f"{path}, line {line_number}: expected the 16 numbers of a rigid 4x4 camera-to-world "
             f"matrix by rows, found {line[:80]!r}."
         )
     return se3.orthonormalised(T_world_camera)
-
-
-def _is_rigid(T: np.ndarray) -> bool:
-    if not np.all(np.isfinite(T)):
-        return False
-    R = T[:3, :3]
-    return bool(np.allclose(R @ R.T, np.eye(3), atol=1e-3) and np.linalg.det(R) > 0)
