@@ -42,8 +42,9 @@ def read_transform(path: Path) -> np.ndarray | None:
 def read_intrinsics(path: Path, size: int, image: tuple[int, int]) -> Camera:
     """The pinhole camera of a matrix [size, size] for an image of (width, height) pixels."""
     K = read_matrix(path, size)
+    fx, fy, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
     try:
-        return Camera(*image, *(float(K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))))
+        return Camera(*image, fx, fy, cx, cy)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory, se3
-from ldo_service.geometry.registration import resample_color
+from ldo_service.geometry.resampling import resample_color
 
 from .images import first_size, read_color, read_depth
 from .matrices import read_intrinsics, read_trajectory, read_transform

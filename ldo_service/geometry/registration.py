@@ -1,17 +1,11 @@
-"""Colour and depth of two cameras, brought to one pixel grid. Conventions: `ldo_service.geometry`.
+"""Depth of one camera, brought to another. Conventions: `ldo_service.geometry`."""
 
-`register_depth` moves depth to the colour camera, across any baseline. `resample_color` moves
-colour to the depth camera, which is right only where the two share their centre and axes.
-"""
-
-from functools import lru_cache
-
-import cv2
 import numpy as np
 
 from ldo_service.errors import FrameError
 
 from .camera import Camera
+from .lens import project, rays
 
 SAME_SURFACE = 0.05  # neighbouring depths closer than this fraction of depth are one surface
 TIE_PX = 1e-3  # cells overlap by this much, so that float32 leaves no seam between them
@@ -28,24 +22,26 @@ def register_depth(
         project_color(T_color_depth @ (ray_depth * depth_m)),
 
     stretched to halfway to its neighbours where they lie on the same surface, so that neither a
-    finer colour image nor a slanted surface shows pinholes. The nearest cell wins a pixel.
+    finer colour image nor a slanted surface shows pinholes. The nearest cell wins a pixel, and a
+    pixel has one cell's depth: no surface is interpolated.
 
     depth_m        [Hd, Wd] z in metres, 0 where not measured; distorted as `depth_camera` says
     T_color_depth  [4, 4] from depth to colour coordinates
     Returns [Hc, Wc] float32, z in metres in the colour camera, 0 where nothing lands. A surface
     that only the colour camera sees stays empty. Rectify it together with the colour image.
-    Raises FrameError when the depth image is not of its camera's size. The result does not depend
-    on the order of the pixels.
+    Raises FrameError when the depth image is not of its camera's size. Deterministic: a minimum
+    does not depend on the order of the pixels.
     """
     if depth_m.shape != (depth_camera.height, depth_camera.width):
         raise FrameError(
             f"depth is {depth_m.shape[1]}x{depth_m.shape[0]} pixels and its camera "
             f"{depth_camera.width}x{depth_camera.height}. Give the intrinsics of this resolution."
         )
+    depth_m = np.asarray(depth_m, np.float32)
     x, y, z = _points(depth_m, depth_camera, T_color_depth)
     is_seen = (depth_m > 0) & (z > 0)
     z[~is_seen] = 1.0
-    u, v = _project(x / z, y / z, color_camera)
+    u, v = project(x / z, y / z, color_camera)
     is_seen &= np.isfinite(u)
     u[~is_seen] = v[~is_seen] = 0.0
     scale = np.minimum(depth_m / z, MAX_STRETCH)
@@ -57,113 +53,16 @@ def register_depth(
     return _nearest(z, is_seen, columns, rows, (color_camera.height, color_camera.width))
 
 
-def resample_color(
-    color: np.ndarray, color_camera: Camera, depth_camera: Camera
-) -> tuple[np.ndarray, np.ndarray]:
-    """Colour as the depth camera would see it, for two cameras of one centre and orientation.
-
-    Halved while it is more than 1.5 times finer, then interpolated bilinearly: no aliasing.
-    color [Hc, Wc, 3] uint8. Returns the image [Hd, Wd, 3] uint8 and is_seen [Hd, Wd] bool, false
-    where the colour camera does not look. Raises FrameError when sizes disagree.
-    """
-    if color.shape[:2] != (color_camera.height, color_camera.width):
-        raise FrameError(
-            f"colour is {color.shape[1]}x{color.shape[0]} pixels and its camera "
-            f"{color_camera.width}x{color_camera.height}. Give the intrinsics of this resolution."
-        )
-    while min(color_camera.fx / depth_camera.fx, color_camera.fy / depth_camera.fy) > 1.5:
-        color, color_camera = _halved(color), color_camera.halved()
-    u, v, is_seen = _color_of_depth_pixels(color_camera, depth_camera)
-    image = cv2.remap(color, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return image, is_seen
-
-
-def _halved(color: np.ndarray) -> np.ndarray:
-    height, width = color.shape[0] // 2, color.shape[1] // 2
-    return cv2.resize(
-        color[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA
-    )
-
-
-@lru_cache(maxsize=4)
-def _color_of_depth_pixels(
-    color_camera: Camera, depth_camera: Camera
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where in the colour image each depth pixel lies: u, v [Hd, Wd] float32; whether inside."""
-    u, v = _project(*_rays(depth_camera), color_camera)
-    width, height = color_camera.width, color_camera.height
-    with np.errstate(invalid="ignore"):
-        is_seen = (np.abs(u - (width - 1) / 2) <= width / 2) & (
-            np.abs(v - (height - 1) / 2) <= height / 2
-        )
-    return u, v, is_seen
-
-
 def _points(
     depth_m: np.ndarray, depth_camera: Camera, T_color_depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """x, y, z [Hd, Wd] float32 in the colour camera."""
-    ray_x, ray_y = _rays(depth_camera)
-    depth_m = np.asarray(depth_m, np.float32)
+    ray_x, ray_y = rays(depth_camera)
     R, t = T_color_depth[:3, :3].astype(np.float32), T_color_depth[:3, 3].astype(np.float32)
     x, y, z = (
         (R[row, 0] * ray_x + R[row, 1] * ray_y + R[row, 2]) * depth_m + t[row] for row in range(3)
     )
     return x, y, z
-
-
-@lru_cache(maxsize=4)
-def _rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Normalised coordinates x, y [H, W] float32 of the pixels, without the lens's distortion."""
-    if any(camera.distortion):
-        u, v = np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height)))
-        pixels = np.stack([u, v], -1).reshape(-1, 1, 2)
-        xy = cv2.undistortPoints(pixels, camera.matrix, np.array(camera.distortion))
-        xy = xy.reshape(camera.height, camera.width, 2)
-    else:
-        xy = camera.rays()[..., :2]
-    x, y = (np.ascontiguousarray(xy[..., axis], np.float32) for axis in (0, 1))
-    x.flags.writeable = y.flags.writeable = False
-    return x, y
-
-
-def _project(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels u, v float32 of normalised coordinates; NaN where the lens does not look.
-
-    OpenCV's model of distortion.
-    """
-    if any(camera.distortion):
-        x, y = _distorted(x, y, camera)
-    u = np.float32(camera.fx) * x + np.float32(camera.cx)
-    v = np.float32(camera.fy) * y + np.float32(camera.cy)
-    return u, v
-
-
-def _distorted(x: np.ndarray, y: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    k1, k2, p1, p2, k3, k4, k5, k6 = _coefficients(camera).astype(np.float32)
-    r2 = x * x + y * y
-    radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    radial[r2 > _turning_r2(camera)] = np.nan
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
-
-
-@lru_cache(maxsize=4)
-def _turning_r2(camera: Camera) -> float:
-    """Squared radius at which the lens's polynomial turns round; beyond, it describes no lens."""
-    k1, k2, _, _, k3, k4, k5, k6 = _coefficients(camera)
-    r = np.linspace(0.0, 4.0, 4001)
-    r2 = r * r
-    bent = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    turns = np.flatnonzero(np.diff(bent) <= 0)
-    return float(r2[turns[0]]) if len(turns) else np.inf
-
-
-def _coefficients(camera: Camera) -> np.ndarray:
-    """k1 k2 p1 p2 k3 k4 k5 k6, zero where the camera's model has fewer."""
-    return np.r_[camera.distortion, np.zeros(8)][:8]
 
 
 def _same_surface(z: np.ndarray, is_seen: np.ndarray, axis: int) -> np.ndarray:
