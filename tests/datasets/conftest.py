@@ -69,6 +69,67 @@ def _write_replica(folder: Path, numbers: list[int], params: dict | None = PARAM
     return folder
 
 
+def _write_matrix(path: Path, matrix: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join(" ".join(map(str, row)) for row in matrix.tolist()) + "\n")
+
+
+def _pose(k: int) -> np.ndarray:
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = k
+    return T_world_camera
+
+
+def _intrinsics(fx: float, fy: float, cx: float, cy: float, size: int) -> np.ndarray:
+    K = np.eye(size)
+    K[[0, 1, 0, 1], [0, 1, 2, 2]] = fx, fy, cx, cy
+    return K
+
+
+def _write_scannet(
+    folder: Path, numbers: list[int], T_sensor_depth: np.ndarray | None = None
+) -> Path:
+    """Colour of twice the size of depth; depth k is 1000 (k + 1); frame k stands at x = k m."""
+    for k in numbers:
+        _write_color(folder / f"color/{k}.jpg", _color_image(k, (2 * HEIGHT, 2 * WIDTH)))
+        _write_depth(folder / f"depth/{k}.png", 1000 * (k + 1))
+        _write_matrix(folder / f"pose/{k}.txt", _pose(k))
+    color, depth = (40.0, 42.0, 23.5, 15.5), (20.0, 21.0, 11.5, 7.5)
+    _write_matrix(folder / "intrinsic/intrinsic_color.txt", _intrinsics(*color, 4))
+    _write_matrix(folder / "intrinsic/intrinsic_depth.txt", _intrinsics(*depth, 4))
+    _write_matrix(folder / "intrinsic/extrinsic_color.txt", np.eye(4))
+    T = np.eye(4) if T_sensor_depth is None else T_sensor_depth
+    _write_matrix(folder / "intrinsic/extrinsic_depth.txt", T)
+    return folder
+
+
+def _write_seven_scenes(folder: Path, numbers: list[int], suffix: str = "png") -> Path:
+    """Depth k is 1000 (k + 1), frame k stands at x = k m; no intrinsics, so 640x480."""
+    for k in numbers:
+        name = f"frame-{k:06d}"
+        _write_color(folder / f"{name}.color.{suffix}", _color_image(k, (480, 640)))
+        _write_depth(folder / f"{name}.depth.png", 1000 * (k + 1), (480, 640))
+        _write_matrix(folder / f"{name}.pose.txt", _pose(k))
+    return folder
+
+
+@pytest.fixture
+def scannet_folder(tmp_path: Path) -> Callable[..., Path]:
+    """Call with frame numbers and, optionally, T_sensor_depth."""
+    return partial(_write_scannet, tmp_path / "scene0000_00")
+
+
+@pytest.fixture
+def seven_scenes_folder(tmp_path: Path) -> Callable[..., Path]:
+    """Call with frame numbers and, optionally, the suffix of the colour images."""
+    return partial(_write_seven_scenes, tmp_path / "seq-01")
+
+
+@pytest.fixture
+def write_matrix() -> Callable[..., None]:
+    return _write_matrix
+
+
 @pytest.fixture
 def write_tum() -> Callable[..., Path]:
     return _write_tum

@@ -1,9 +1,11 @@
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from ldo_service.datasets import open_sequence
-from ldo_service.errors import DataError
+from ldo_service.datasets import SequenceOptions, open_sequence
+from ldo_service.errors import ConfigError, DataError
 
 
 def test_synthetic_is_the_room() -> None:
@@ -17,7 +19,9 @@ def test_unknown_synthetic_name_lists_the_known_ones() -> None:
 
 def test_folder_of_no_known_layout_says_what_was_looked_for(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
-    with pytest.raises(DataError, match=r"rgb\.txt with depth\.txt.*results/.*TUM.*Replica"):
+    with pytest.raises(
+        DataError, match=r"rgb\.txt with depth\.txt.*results/.*TUM.*Replica.*ScanNet.*7-Scenes"
+    ):
         open_sequence(str(tmp_path))
 
 
@@ -40,3 +44,16 @@ def test_indices_outside_the_sequence_are_refused() -> None:
     for index in (-1, len(room)):
         with pytest.raises(IndexError, match="of 120"):
             room[index]
+
+
+def test_registration_is_refused_where_depth_is_registered_already(
+    tum_folder: Callable[..., Path], replica_folder: Callable[..., Path]
+) -> None:
+    for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):
+        with pytest.raises(ConfigError, match="registered to colour already"):
+            open_sequence(str(source), SequenceOptions(register_depth=True))
+
+
+def test_transform_that_is_not_rigid_is_refused() -> None:
+    with pytest.raises(ConfigError, match="expected a rigid transform"):
+        SequenceOptions(T_color_depth=2 * np.eye(4))
