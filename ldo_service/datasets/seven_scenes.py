@@ -30,10 +30,10 @@ DEPTH_SCALE = 1000.0  # units per metre
 NOT_MEASURED = 65535  # beside 0, as the data set's page says
 
 # Depth: the data set's page. Colour: 525 px is the Kinect's nominal focal length, also used for
-# 7-Scenes by Brachmann et al. (ICCV 2021); the row 238 aligned colour and depth edges best in
-# RedKitchen. Baseline: two published calibrations of other Kinects agree on 2.5 cm along x
-# (25.4 mm, ROS kinect_calibration; 25.6 mm, LIRIS human activities data set) and on no other
-# component above 2.2 mm, nor on a rotation apart from their own principal points.
+# 7-Scenes by Brachmann et al. (ICCV 2021). Baseline: two published calibrations of other Kinects
+# (25.4 mm, ROS kinect_calibration; 25.6 mm, LIRIS human activities data set) agree along x, and
+# on no other component above 2.2 mm; their rotations belong to their own principal points. Row
+# 238: with it and no rotation, edges of depth lie within a pixel of those of colour in RedKitchen.
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)
 COLOR_CAMERA = Camera(640, 480, 525.0, 525.0, 320.0, 238.0)
 T_COLOR_DEPTH = np.array([[1.0, 0, 0, -0.0254], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])

@@ -91,6 +91,18 @@ def test_colour_of_another_size_than_the_first_is_a_bad_frame(scannet_folder: Wr
         open_sequence(str(folder)).read(1)
 
 
+def test_depth_that_colour_does_not_look_at_is_left_out(
+    scannet_folder: Writer, write_matrix: Callable[..., None]
+) -> None:
+    folder = scannet_folder([0])
+    K = np.diag([80.0, 84.0, 1.0, 1.0])  # twice as long, so colour sees the middle half
+    K[0, 2], K[1, 2] = 23.5, 15.5
+    write_matrix(folder / "intrinsic/intrinsic_color.txt", K)
+    expected = np.zeros((16, 24), np.float32)
+    expected[4:12, 6:18] = 1.0
+    assert np.array_equal(open_sequence(str(folder))[0].depth_m, expected)
+
+
 def test_intrinsics_are_required_and_extrinsics_are_not(scannet_folder: Writer) -> None:
     folder = scannet_folder([0])
     for name in ("color", "depth"):
