@@ -7,8 +7,8 @@ camera-intrinsics.txt             optional, here or one folder up: 3x3 of the de
 
 The files are what a Kinect delivers without registration: colour and depth come from cameras
 2.5 cm apart with different focal lengths. By default frames are read as the files are, with the
-intrinsics of the depth camera for both images; edges of colour and depth then disagree by up to
-some ten pixels. `SequenceOptions.register_depth` brings depth to the colour camera instead, and
+intrinsics of the depth camera for both images; colour and depth then disagree by up to some
+thirty pixels. `SequenceOptions.register_depth` brings depth to the colour camera instead, and
 the poses with it. The published calibration has the depth camera alone (585, 585, 320, 240 px);
 the rest of RIG is the best known and can be replaced through the options.
 """

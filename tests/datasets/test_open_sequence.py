@@ -1,7 +1,6 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from ldo_service.datasets import SequenceOptions, open_sequence
@@ -52,8 +51,3 @@ def test_registration_is_refused_where_depth_is_registered_already(
     for source in (tum_folder(["1"], ["1"]), replica_folder([0]), "synthetic:room"):
         with pytest.raises(ConfigError, match="registered to colour already"):
             open_sequence(str(source), SequenceOptions(register_depth=True))
-
-
-def test_transform_that_is_not_rigid_is_refused() -> None:
-    with pytest.raises(ConfigError, match="expected a rigid transform"):
-        SequenceOptions(T_color_depth=2 * np.eye(4))
