@@ -21,11 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import numpy as np
 import yaml
 
 from ldo_service.actors.mapper import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.stage import StageConfig
 
@@ -41,6 +43,26 @@ class ServiceConfig:
     def __post_init__(self) -> None:
         if self.drain_s < 0 or self.silent_after_s <= 0:
             raise ConfigError(f"{self}: times must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class DataConfig:
+    """How data sets are read whose depth and colour come from two cameras (ScanNet, 7-Scenes)."""
+
+    register_depth: bool = False  # bring depth to the colour camera; False: as the files are
+    T_color_depth: tuple[float, ...] = ()  # 16 numbers, row-major, metres; empty: the data set's
+
+    def options(self) -> SequenceOptions:
+        """Raises ConfigError for numbers that are no rigid transform."""
+        if not self.T_color_depth:
+            return SequenceOptions(register_depth=self.register_depth)
+        if len(self.T_color_depth) != 16:
+            raise ConfigError(
+                f"data.T_color_depth has {len(self.T_color_depth)} numbers: write the 4x4 matrix "
+                "row by row."
+            )
+        T_color_depth = np.array(self.T_color_depth).reshape(4, 4)
+        return SequenceOptions(register_depth=self.register_depth, T_color_depth=T_color_depth)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +85,7 @@ class Config:
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    data: DataConfig = field(default_factory=DataConfig)
     run: RunConfig = field(default_factory=RunConfig)
     service: ServiceConfig = field(default_factory=ServiceConfig)
     stage: StageConfig = field(default_factory=StageConfig)

@@ -12,6 +12,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ldo_service.config import Config, load_config
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation.pictures import save_picture, trajectory_picture
@@ -45,7 +46,7 @@ def evaluate(
 
     Prints the protocol above the figures, and draws trajectory.png into DIR.
     """
-    truth = open_sequence(source).truth()
+    truth = open_sequence(source, run_config(folder).data.options()).truth()
     if truth is None:
         raise DataError(f"{source} has no ground truth, so there is nothing to compare with.")
     final = read_trajectory(folder, "trajectory.txt")
@@ -58,6 +59,13 @@ def evaluate(
     console.print(PROTOCOL, style="dim")
     console.print(errors_table(rows))
     console.print(f"Picture: {folder / 'trajectory.png'}")
+
+
+def run_config(folder: Path) -> Config:
+    """The configuration that a run was made with."""
+    if not (folder / "config.yaml").is_file():
+        raise DataError(f"{folder} has no config.yaml: is it what `ldo run` wrote?")
+    return load_config(folder / "config.yaml")
 
 
 def compare(folder: Path, final: Trajectory, truth: Trajectory) -> list[Row]:

@@ -8,12 +8,13 @@ import tyro
 from rich.console import Console
 
 from ldo_service.client import connect
+from ldo_service.config import load_config
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.errors import ConfigError, FrameError
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.wire import camera_rgbd_message, restamped
 
-from .options import Endpoint, Robot, Source
+from .options import ConfigFile, Endpoint, Robot, Settings, Source
 from .progress import progress
 from .run import selected
 
@@ -33,6 +34,8 @@ def publish(
         bool,
         tyro.conf.arg(help="stamp frames with the time of sending instead of the recorded one"),
     ] = False,
+    config: ConfigFile = None,
+    set: Settings = (),
 ) -> None:
     """Be a camera: publish a sequence's frames on camera/rgbd.
 
@@ -44,7 +47,7 @@ def publish(
     if rate is not None and rate <= 0:
         raise ConfigError(f"--rate {rate:g}: must be positive.")
     console = Console(stderr=True)
-    sequence = open_sequence(source)
+    sequence = open_sequence(source, load_config(config, set).data.options())
     indices = selected(stride, max_frames).indices(sequence)
     sent = 0
     with (

@@ -54,7 +54,7 @@ def run(
     settings = with_options(load_config(config, set), hold_out, threads)
     selection = selected(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
-    sequence = open_sequence(source)
+    sequence = open_sequence(source, settings.data.options())
     prepare(out, overwrite)
     with progress("run", len(selection.indices(sequence)), console) as advance:
         go = run_in_real_time if realtime else run_over_file
