@@ -1,42 +1,111 @@
 """Camera frames, checked and rectified.                                 actors/frame_source.py
 
-in   camera/rgbd   CameraRgbd   Latest(4)   a burst is smoothed, an old frame is worth less than
-                                            the next one
-out  frame/rgbd    FrameRgbd
+in   camera/rgbd    CameraRgbd    Latest(4)   a burst is smoothed, an old frame is worth less than
+                                              the next one
+in   camera/color   CameraColor   Latest(4)   the same, for cameras that send two topics: halves
+in   camera/depth   CameraDepth   Latest(4)   are paired by stamp
+out  frame/rgbd     FrameRgbd                 a pair has the stamp and the number of its colour
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 
-from ldo_service.errors import DataError
-from ldo_service.geometry import RgbdFrame, codecs
-from ldo_service.geometry.rectify import RawFrame, Rectifier
+import numpy as np
+
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import codecs
+from ldo_service.geometry.pairing import Pairing
+from ldo_service.geometry.rectify import RawFrame, Rectifier, in_metres
+from ldo_service.geometry.registration import register_depth
 from ldo_service.runtime import Actor, In, Latest, Out
-from ldo_service.schemas import CameraRgbd, FrameRgbd
-from ldo_service.schemas.topics import CAMERA_RGBD, FRAME_RGBD
-from ldo_service.wire import camera_of, rgbd_message
+from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd, Image
+from ldo_service.schemas.pose import IDENTITY
+from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, FRAME_RGBD
+from ldo_service.wire import camera_of, rgbd_message, transform
 
 log = logging.getLogger(__name__)
+
+Input = CameraRgbd | CameraColor | CameraDepth
+MANY_LOST = 30  # halves without one pair: a second of frames, no start-up effect any more
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSourceConfig:
+    max_skew_s: float = 0.015  # between the halves of a pair: under half a period at 30 Hz, so
+    # that the first depth within it is the nearest; at 1 rad/s it is 0.9 deg of turn
+    pair_buffer: int = 8  # halves of a stream that wait for the other: 0.27 s at 30 Hz, 7 MB VGA
+    min_side_px: int = 32  # smaller images hold too little to track, and hint at a wrong header
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.max_skew_s < 10:
+            raise ConfigError(f"frame_source.max_skew_s={self.max_skew_s:g}: must be within 0..10.")
+        if min(self.pair_buffer, self.min_side_px) < 1:
+            raise ConfigError(f"{self}: pair_buffer and min_side_px must be at least 1.")
 
 
 class FrameSource(Actor):
     """A frame that cannot be used is counted, and the first of each episode is logged."""
 
     name = "frame_source"
-    inputs = (In(CAMERA_RGBD, Latest(4)),)
+    inputs = (
+        In(CAMERA_RGBD, Latest(4)),
+        In(CAMERA_COLOR, Latest(4)),
+        In(CAMERA_DEPTH, Latest(4)),
+    )
     outputs = (Out(FRAME_RGBD),)
 
-    def __init__(self) -> None:
+    def __init__(self, config: FrameSourceConfig | None = None) -> None:
         super().__init__()
+        self.config = config or FrameSourceConfig()
         self._rectify = Rectifier()
+        self._pairing: Pairing[CameraColor, CameraDepth] = Pairing(
+            round(self.config.max_skew_s * 1e9), self.config.pair_buffer
+        )
         self._last_stamp_ns = -1
         self._rejected = 0
         self._is_rejecting = False
+        self._has_warned_of_skew = False
 
-    def handle(self, message: CameraRgbd) -> Iterator[FrameRgbd]:
+    def handle(self, message: Input) -> Iterator[FrameRgbd]:
+        if isinstance(message, CameraRgbd):
+            yield from self._frame(message, partial(_raw, message))
+        else:
+            for color, depth in self._paired(message):
+                yield from self._frame(color, partial(_joined, color, depth))
+
+    # --- pairs ------------------------------------------------------------------------------------
+    def _paired(self, half: CameraColor | CameraDepth) -> list[tuple[CameraColor, CameraDepth]]:
+        try:
+            if isinstance(half, CameraColor):
+                pairs = list(self._pairing.add_a(half))
+            else:
+                pairs = list(self._pairing.add_b(half))
+        except DataError as error:
+            self._reject(half, error)
+            return []
+        self._warn_when_nothing_pairs()
+        return pairs
+
+    def _warn_when_nothing_pairs(self) -> None:
+        lost = self._pairing.lost_a + self._pairing.lost_b
+        if self._pairing.pairs == 0 and lost >= MANY_LOST and not self._has_warned_of_skew:
+            self._has_warned_of_skew = True
+            log.warning(
+                "%d colour and %d depth images found no partner within %g ms: do both cameras "
+                "stamp by one clock? frame_source.max_skew_s allows more.",
+                self._pairing.lost_a, self._pairing.lost_b, 1e3 * self.config.max_skew_s,
+            )  # fmt: skip
+
+    # --- frames -----------------------------------------------------------------------------------
+    def _frame(
+        self, message: CameraRgbd | CameraColor, decoded: Callable[[], RawFrame]
+    ) -> Iterator[FrameRgbd]:
         try:
             self._require_later(message)
-            frame = self._rectified(message)
+            self._require_usable(message)
+            frame = self._rectify(decoded())
         except DataError as error:
             self._reject(message, error)
             return
@@ -44,36 +113,79 @@ class FrameSource(Actor):
         self._last_stamp_ns = message.stamp_ns
         yield rgbd_message(frame)
 
-    def _require_later(self, message: CameraRgbd) -> None:
+    def _require_later(self, message: CameraRgbd | CameraColor) -> None:
         if message.stamp_ns <= self._last_stamp_ns:
             raise DataError(
                 f"its stamp {message.stamp_ns} ns is not after the last one, "
-                f"{self._last_stamp_ns} ns. Send frames in the order of their exposure."
+                f"{self._last_stamp_ns} ns. Send frames in the order of their exposure; after the "
+                "camera's clock was set back, start anew with `ldo control reset`."
             )
 
-    def _rectified(self, message: CameraRgbd) -> RgbdFrame:
-        color, depth = message.color, message.depth
-        raw = RawFrame(
-            index=message.frame,
-            stamp_ns=message.stamp_ns,
-            color=codecs.decode_color(color.encoding, color.width, color.height, color.data),
-            depth=codecs.decode_depth(depth.encoding, depth.width, depth.height, depth.data),
-            depth_scale=message.depth_scale,
-            camera=camera_of(message.camera),
-        )
-        return self._rectify(raw)
+    def _require_usable(self, message: CameraRgbd | CameraColor) -> None:
+        width, height = message.camera.width, message.camera.height
+        if min(width, height) < self.config.min_side_px:
+            raise DataError(
+                f"{width}x{height} pixels are too few to track: a side needs "
+                f"{self.config.min_side_px}, by frame_source.min_side_px."
+            )
 
-    def _reject(self, message: CameraRgbd, error: DataError) -> None:
+    def _reject(self, message: Input, error: DataError) -> None:
         self._rejected += 1
         if not self._is_rejecting:
             log.warning("frame %d rejected: %s", message.frame, error)
         self._is_rejecting = True
 
+    # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, int]:
+        """Without halves that wait: after a crash one pair fewer is cheaper than saving images."""
         return {"last_stamp_ns": self._last_stamp_ns}
 
     def restore(self, state: dict[str, int]) -> None:  # type: ignore[override]
         self._last_stamp_ns = state["last_stamp_ns"]
 
     def facts(self) -> dict[str, float]:
-        return {"frames_rejected": self._rejected}
+        skews_ms = self._pairing.skews_ms() or [0.0]
+        return {
+            "frames_rejected": self._rejected,
+            "pairs": self._pairing.pairs,
+            "lost_color": self._pairing.lost_a,
+            "lost_depth": self._pairing.lost_b,
+            "skew_ms_p50": float(np.median(skews_ms)),  # of the recent pairs
+            "skew_ms_max": max(skews_ms),
+        }
+
+
+def _raw(message: CameraRgbd) -> RawFrame:
+    return RawFrame(
+        index=message.frame,
+        stamp_ns=message.stamp_ns,
+        color=_color_image(message.color),
+        depth=_depth_image(message.depth),
+        depth_scale=message.depth_scale,
+        camera=camera_of(message.camera),
+    )
+
+
+def _joined(color: CameraColor, depth: CameraDepth) -> RawFrame:
+    """The depth in the colour image, with the colour's stamp, number and camera."""
+    values, scale = _depth_image(depth.image), depth.depth_scale
+    if depth.camera != color.camera or depth.T_color_depth != IDENTITY:
+        depth_m = in_metres(values, scale)
+        cameras = camera_of(depth.camera), camera_of(color.camera)
+        values, scale = register_depth(depth_m, *cameras, transform(depth.T_color_depth)), 1.0
+    return RawFrame(
+        index=color.frame,
+        stamp_ns=color.stamp_ns,
+        color=_color_image(color.image),
+        depth=values,
+        depth_scale=scale,
+        camera=camera_of(color.camera),
+    )
+
+
+def _color_image(image: Image) -> np.ndarray:
+    return codecs.decode_color(image.encoding, image.width, image.height, image.data)
+
+
+def _depth_image(image: Image) -> np.ndarray:
+    return codecs.decode_depth(image.encoding, image.width, image.height, image.data)

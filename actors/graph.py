@@ -32,7 +32,11 @@ def _built(actor: type[Actor], does: str, make: Callable[[Config], Actor]) -> Bo
 
 
 GRAPH: tuple[Box, ...] = (
-    _built(FrameSource, "checks and rectifies camera frames", lambda _config: FrameSource()),
+    _built(
+        FrameSource,
+        "checks and rectifies camera frames",
+        lambda config: FrameSource(config.frame_source),
+    ),
     _built(Tracker, "finds the camera's pose", lambda config: Tracker(config.tracker)),
     Box(
         "detector",
@@ -86,7 +90,7 @@ def producer_of(topic: t.Topic) -> str:
             return box.name
     if topic is t.HEALTH:
         return "every stage"
-    return "outside" if topic is t.CAMERA_RGBD else "nobody yet"
+    return "outside" if topic in t.FROM_OUTSIDE else "nobody yet"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
@@ -127,4 +131,4 @@ def drawing(boxes: Iterable[Box] = GRAPH) -> str:
 
 def _makers(topic: t.Topic, boxes: tuple[Box, ...]) -> list[str]:
     makers = [box.name for box in boxes if any(out.topic is topic for out in box.outputs)]
-    return makers or (["camera"] if topic is t.CAMERA_RGBD else [])
+    return makers or (["camera"] if topic in t.FROM_OUTSIDE else [])

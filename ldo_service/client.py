@@ -22,8 +22,19 @@ import zenoh
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.links import Header, encode
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
-from ldo_service.schemas import CameraModel, CameraRgbd, Image, Message, TrackedPose, decode
-from ldo_service.schemas.topics import CAMERA_RGBD, POSE_TRACKED, Topic
+from ldo_service.schemas import (
+    CameraColor,
+    CameraDepth,
+    CameraModel,
+    CameraRgbd,
+    Image,
+    Message,
+    Pose,
+    TrackedPose,
+    decode,
+)
+from ldo_service.schemas.pose import IDENTITY
+from ldo_service.schemas.topics import FROM_OUTSIDE, POSE_TRACKED, Topic
 
 M = TypeVar("M", bound=Message)
 
@@ -35,9 +46,7 @@ class Client:
         self._session, self._network = session, network
         self._sent = 0
         self._epoch = time.time_ns()
-        self._camera = session.declare_publisher(
-            network.expression(CAMERA_RGBD.name), congestion_control=zenoh.CongestionControl.DROP
-        )
+        self._cameras: dict[type[Message], Any] = {}  # publisher by message
 
     def publish(
         self,
@@ -56,21 +65,62 @@ class Client:
         Raises ValueError for arrays that do not fit the camera.
         """
         message = CameraRgbd(
-            stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
+            stamp_ns=_stamp(stamp_ns),
             frame=self._sent,
             camera=camera,
             color=Image.raw("rgb8", color),
-            depth=Image.raw("z16" if depth.dtype == np.uint16 else "f32", depth),
+            depth=_raw_depth(depth),
             depth_scale=depth_scale,
         )
         self.send(message)
 
-    def send(self, frame: CameraRgbd) -> None:
-        """Send a frame, which may be compressed. May block for some milliseconds, and is dropped
-        when the network is congested."""
+    def publish_color(
+        self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
+    ) -> None:
+        """Send colour alone; `publish_depth` sends the other half. Arguments as in `publish`."""
+        image = Image.raw("rgb8", color)
+        self.send(
+            CameraColor(stamp_ns=_stamp(stamp_ns), frame=self._sent, camera=camera, image=image)
+        )
+
+    def publish_depth(
+        self,
+        depth: np.ndarray,
+        camera: CameraModel,
+        depth_scale: float,
+        T_color_depth: Pose = IDENTITY,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Send depth alone, of a camera of its own. It is paired with the colour of nearest stamp.
+
+        T_color_depth  from coordinates of the depth camera to the colour camera's
+        Other arguments as in `publish`.
+        """
+        message = CameraDepth(
+            stamp_ns=_stamp(stamp_ns),
+            frame=self._sent,
+            camera=camera,
+            image=_raw_depth(depth),
+            depth_scale=depth_scale,
+            T_color_depth=T_color_depth,
+        )
+        self.send(message)
+
+    def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
+        """Send a frame or half of one, which may be compressed. May block for some milliseconds,
+        and is dropped when the network is congested."""
         header = Header("camera", self._epoch, self._sent, frame.stamp_ns)
-        self._camera.put(msgspec.msgpack.encode(frame), attachment=encode(header))
+        self._camera(type(frame)).put(msgspec.msgpack.encode(frame), attachment=encode(header))
         self._sent += 1
+
+    def _camera(self, kind: type[Message]) -> Any:
+        if kind not in self._cameras:
+            (topic,) = (topic for topic in FROM_OUTSIDE if topic.message is kind)
+            self._cameras[kind] = self._session.declare_publisher(
+                self._network.expression(topic.name),
+                congestion_control=zenoh.CongestionControl.DROP,
+            )
+        return self._cameras[kind]
 
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
         """Every tracked pose as it comes, for ever; of those not taken in time the newest stay."""
@@ -110,6 +160,14 @@ class Client:
     def _subscriber(self, name: str, keep: int) -> Any:
         ring = zenoh.handlers.RingChannel(keep)
         return self._session.declare_subscriber(self._network.expression(name), ring)
+
+
+def _stamp(stamp_ns: int | None) -> int:
+    return time.time_ns() if stamp_ns is None else stamp_ns
+
+
+def _raw_depth(depth: np.ndarray) -> Image:
+    return Image.raw("z16" if depth.dtype == np.uint16 else "f32", depth)
 
 
 def _type_of(topic: Topic) -> type[Message]:

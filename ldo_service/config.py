@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 import yaml
 
+from ldo_service.actors.frame_source import FrameSourceConfig
 from ldo_service.actors.mapper import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.tracker import TrackerConfig
@@ -82,6 +83,7 @@ class RunConfig:
 
 @dataclass(frozen=True, slots=True)
 class Config:
+    frame_source: FrameSourceConfig = field(default_factory=FrameSourceConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

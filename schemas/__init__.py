@@ -7,7 +7,14 @@ default; what a field means never changes. Conventions of frames and units are t
 """
 
 from ldo_service.schemas.array import Array
-from ldo_service.schemas.frames import CameraModel, CameraRgbd, FrameRgbd, Image
+from ldo_service.schemas.frames import (
+    CameraColor,
+    CameraDepth,
+    CameraModel,
+    CameraRgbd,
+    FrameRgbd,
+    Image,
+)
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import Keyframe
@@ -18,6 +25,8 @@ from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 __all__ = [
     "AnchorMotion",
     "Array",
+    "CameraColor",
+    "CameraDepth",
     "CameraModel",
     "CameraRgbd",
     "Correction",

@@ -1,4 +1,4 @@
-"""RGB-D frames: as a camera sends them, and rectified."""
+"""RGB-D frames: as a camera sends them, whole or in halves, and rectified."""
 
 from typing import Literal
 
@@ -7,6 +7,7 @@ import numpy as np
 
 from ldo_service.schemas.array import Array
 from ldo_service.schemas.message import Message, require_count, require_finite
+from ldo_service.schemas.pose import IDENTITY, Pose
 
 MAX_PIXELS = 1 << 25  # 33 megapixels: no RGB-D camera has more, and a lying header could ask for TB
 
@@ -84,18 +85,40 @@ class CameraRgbd(Message, frozen=True, kw_only=True):
 
     def check(self) -> None:
         require_count("frame", self.frame)
-        require_finite("depth_scale", (self.depth_scale,))
-        if self.depth_scale <= 0:
-            raise ValueError(f"depth_scale {self.depth_scale:g} must be positive")
-        size = (self.camera.width, self.camera.height)
-        if (self.color.width, self.color.height) != size:
-            raise ValueError("colour and camera differ in size")
-        if (self.depth.width, self.depth.height) != size:
-            raise ValueError("depth and camera differ in size: it must be registered to colour")
-        if self.color.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
-            raise ValueError(f"colour cannot be encoded as {self.color.encoding}")
-        if self.depth.encoding not in ("png", "z16", "z16+zstd", "f32", "f32+zstd"):
-            raise ValueError(f"depth cannot be encoded as {self.depth.encoding}")
+        require_color(self.color, self.camera)
+        if (self.depth.width, self.depth.height) != (self.color.width, self.color.height):
+            raise ValueError("depth and colour differ in size: it must be registered to colour")
+        require_depth(self.depth, self.camera, self.depth_scale)
+
+
+class CameraColor(Message, frozen=True, kw_only=True):
+    """camera/color: one colour exposure. Its stamp becomes that of the frame it is paired into."""
+
+    frame: int  # running number of the camera program, and of the frame it is paired into
+    camera: CameraModel
+    image: Image
+
+    def check(self) -> None:
+        require_count("frame", self.frame)
+        require_color(self.image, self.camera)
+
+
+class CameraDepth(Message, frozen=True, kw_only=True):
+    """camera/depth: one depth exposure, with a stamp and a camera of its own.
+
+    Depth whose camera is the colour camera and whose T_color_depth is the identity is registered
+    already; any other is moved into the colour image.
+    """
+
+    frame: int  # running number of the camera program; pairs are made by stamp, not by it
+    camera: CameraModel  # of the depth image
+    image: Image
+    depth_scale: float  # as in camera/rgbd
+    T_color_depth: Pose = IDENTITY  # from coordinates of the depth camera to the colour camera's
+
+    def check(self) -> None:
+        require_count("frame", self.frame)
+        require_depth(self.image, self.camera, self.depth_scale)
 
 
 class FrameRgbd(Message, frozen=True, kw_only=True):
@@ -109,6 +132,23 @@ class FrameRgbd(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         require_count("frame", self.frame)
         require_rgbd(self.camera, self.color, self.depth_m)
+
+
+def require_color(image: Image, camera: CameraModel) -> None:
+    if (image.width, image.height) != (camera.width, camera.height):
+        raise ValueError("colour and its camera differ in size")
+    if image.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
+        raise ValueError(f"colour cannot be encoded as {image.encoding}")
+
+
+def require_depth(image: Image, camera: CameraModel, depth_scale: float) -> None:
+    require_finite("depth_scale", (depth_scale,))
+    if depth_scale <= 0:
+        raise ValueError(f"depth_scale {depth_scale:g} must be positive")
+    if (image.width, image.height) != (camera.width, camera.height):
+        raise ValueError("depth and its camera differ in size")
+    if image.encoding not in ("png", "z16", "z16+zstd", "f32", "f32+zstd"):
+        raise ValueError(f"depth cannot be encoded as {image.encoding}")
 
 
 def require_rgbd(camera: CameraModel, color: Array, depth_m: Array) -> None:

@@ -6,7 +6,7 @@ topic without a message type is declared, and has neither producer nor format ye
 
 from dataclasses import dataclass
 
-from ldo_service.schemas.frames import CameraRgbd, FrameRgbd
+from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health
 from ldo_service.schemas.keyframe import Keyframe
@@ -31,6 +31,8 @@ class Topic:
 
 
 CAMERA_RGBD = Topic("camera/rgbd", CameraRgbd, "one exposure, as the camera sends it")
+CAMERA_COLOR = Topic("camera/color", CameraColor, "its colour half, where colour comes apart")
+CAMERA_DEPTH = Topic("camera/depth", CameraDepth, "its depth half; paired with colour by stamp")
 FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "the frame, rectified, depth in metres")
 POSE_TRACKED = Topic("pose/tracked", TrackedPose, "where the camera is", is_state=True)
 KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "a frame that the map is made from")
@@ -51,6 +53,8 @@ LOOP_CANDIDATE = Topic("loop/candidate", None, "every candidate, and why it was 
 
 TOPICS: tuple[Topic, ...] = (
     CAMERA_RGBD,
+    CAMERA_COLOR,
+    CAMERA_DEPTH,
     FRAME_RGBD,
     POSE_TRACKED,
     KEYFRAME_NEW,
@@ -68,3 +72,5 @@ TOPICS: tuple[Topic, ...] = (
     GRAPH_CORRECTION,
     HEALTH,
 )
+
+FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs

@@ -64,10 +64,15 @@ class RawFrame:
 
     def depth_m(self) -> np.ndarray:
         """Depth [H, W] float32 in metres, 0 where not measured."""
-        with np.errstate(invalid="ignore", over="ignore"):
-            depth_m = self.depth.astype(np.float32) / np.float32(self.depth_scale)
-            depth_m[~((depth_m > 0) & (depth_m < np.inf))] = 0.0
-        return depth_m
+        return in_metres(self.depth, self.depth_scale)
+
+
+def in_metres(depth: np.ndarray, depth_scale: float) -> np.ndarray:
+    """Depth [H, W] float32 in metres, 0 where `depth`, in 1/depth_scale metres, is no distance."""
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        depth_m = depth.astype(np.float32) / np.float32(depth_scale)
+        depth_m[~((depth_m > 0) & (depth_m < np.inf))] = 0.0
+    return depth_m
 
 
 def _size(image: np.ndarray) -> str:

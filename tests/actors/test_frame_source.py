@@ -1,14 +1,24 @@
-"""Camera frames are checked, rectified, and rejected one by one."""
+"""Camera frames are checked, paired, rectified, and rejected one by one."""
 
 import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
 from ldo_service.datasets import Sequence
-from ldo_service.geometry import codecs
-from ldo_service.schemas import CameraRgbd, Image
-from ldo_service.wire import camera_rgbd_message
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, RgbdFrame, codecs, se3
+from ldo_service.schemas import (
+    CameraColor,
+    CameraDepth,
+    CameraModel,
+    CameraRgbd,
+    FrameRgbd,
+    Image,
+    Message,
+    encode,
+)
+from ldo_service.wire import camera_message, camera_rgbd_message, pose_message
 
 
 @pytest.fixture
@@ -42,7 +52,7 @@ def test_stamps_that_go_back_are_rejected(message: CameraRgbd) -> None:
     source = FrameSource()
     assert len(list(source.handle(message))) == 1
     assert list(source.handle(message)) == []
-    assert source.facts() == {"frames_rejected": 1}
+    assert source.facts()["frames_rejected"] == 1
 
 
 def test_a_broken_image_is_rejected_and_the_stream_goes_on(
@@ -55,7 +65,7 @@ def test_a_broken_image_is_rejected_and_the_stream_goes_on(
         assert list(source.handle(bad)) == []
     later = msgspec.structs.replace(message, stamp_ns=message.stamp_ns + 10)
     assert len(list(source.handle(later))) == 1
-    assert source.facts() == {"frames_rejected": 3}
+    assert source.facts()["frames_rejected"] == 3
     assert len(caplog.records) == 1, "one warning per episode, not one per frame"
 
 
@@ -66,7 +76,7 @@ def test_an_image_of_another_size_than_announced_is_rejected(
     lying = Image(encoding="jpeg", width=320, height=240, data=memoryview(half))
     source = FrameSource()
     assert list(source.handle(msgspec.structs.replace(message, color=lying))) == []
-    assert source.facts() == {"frames_rejected": 1}
+    assert source.facts()["frames_rejected"] == 1
 
 
 def test_a_successor_still_knows_the_last_stamp(message: CameraRgbd) -> None:
@@ -74,3 +84,153 @@ def test_a_successor_still_knows_the_last_stamp(message: CameraRgbd) -> None:
     list(first.handle(message))
     second.restore(first.snapshot())
     assert list(second.handle(message)) == []
+
+
+# --- colour and depth on two topics ---------------------------------------------------------------
+def color_half(frame: RgbdFrame, stamp_ns: int | None = None) -> CameraColor:
+    return CameraColor(
+        stamp_ns=frame.stamp_ns if stamp_ns is None else stamp_ns,
+        frame=frame.index,
+        camera=camera_message(frame.camera),
+        image=Image.raw("rgb8", frame.color),
+    )
+
+
+def depth_half(
+    frame: RgbdFrame, stamp_ns: int | None = None, T_color_depth: np.ndarray | None = None
+) -> CameraDepth:
+    return CameraDepth(
+        stamp_ns=frame.stamp_ns if stamp_ns is None else stamp_ns,
+        frame=frame.index + 1000,
+        camera=camera_message(frame.camera),
+        image=Image.raw("f32", frame.depth_m),
+        depth_scale=1.0,
+        T_color_depth=pose_message(np.eye(4) if T_color_depth is None else T_color_depth),
+    )
+
+
+def frames_of(source: FrameSource, *messages: Message) -> list[FrameRgbd]:
+    return [frame for message in messages for frame in source.handle(message)]
+
+
+def coarser(frame: RgbdFrame) -> RgbdFrame:
+    """Every second pixel, exactly."""
+    k = frame.camera
+    camera = Camera(k.width // 2, k.height // 2, k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
+    color, depth_m = (np.ascontiguousarray(a[::2, ::2]) for a in (frame.color, frame.depth_m))
+    return RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index)
+
+
+def test_halves_of_one_camera_become_the_frame_that_a_whole_exposure_would(room: Sequence) -> None:
+    whole = frames_of(FrameSource(), camera_rgbd_message(room.read(3)))
+    color, depth = color_half(room[3]), depth_half(room[3])
+    assert frames_of(FrameSource(), color, depth) == whole
+    assert frames_of(FrameSource(), depth, color) == whole, "in either order"
+
+
+def test_a_pair_has_the_stamp_and_the_number_of_its_colour(room: Sequence) -> None:
+    color = color_half(room[3], stamp_ns=50_000_000)
+    depth = depth_half(room[3], stamp_ns=57_000_000)
+    source = FrameSource()
+    (frame,) = frames_of(source, color, depth)
+    assert (frame.stamp_ns, frame.frame) == (50_000_000, 3)
+    facts = source.facts()
+    assert (facts["pairs"], facts["skew_ms_p50"], facts["skew_ms_max"]) == (1, 7.0, 7.0)
+
+
+def test_halves_further_apart_than_the_allowed_skew_are_lost_and_counted(room: Sequence) -> None:
+    source = FrameSource(FrameSourceConfig(max_skew_s=0.005))
+    halves = [
+        half
+        for i in range(5)
+        for half in (
+            color_half(room[i], stamp_ns=i * 33_000_000),
+            depth_half(room[i], stamp_ns=i * 33_000_000 + 10_000_000),
+        )
+    ]
+    assert frames_of(source, *halves) == []
+    facts = source.facts()
+    assert (facts["pairs"], facts["lost_color"], facts["lost_depth"]) == (0, 5, 4)
+
+
+def test_two_clocks_are_said_once(room: Sequence, caplog: pytest.LogCaptureFixture) -> None:
+    source = FrameSource()
+    for i in range(100):
+        frames_of(source, color_half(room[0], i * 33_000_000))
+        frames_of(source, depth_half(room[0], 10**18 + i * 33_000_000))
+    assert [r for r in caplog.records if "one clock" in r.message] == caplog.records
+    assert len(caplog.records) == 1
+
+
+def test_coarser_depth_is_brought_to_the_colour_image(room: Sequence) -> None:
+    color, depth = color_half(room[3]), depth_half(coarser(room[3]))
+    (frame,) = frames_of(FrameSource(), color, depth)
+    assert frame.camera == color.camera
+    error = np.abs(frame.depth_m.numpy() - room[3].depth_m)
+    assert np.median(error) < 0.01
+    assert (frame.depth_m.numpy() > 0).mean() > 0.98
+
+
+def test_depth_of_a_camera_beside_is_moved_by_its_extrinsics(room: Sequence) -> None:
+    """The judge: depth seen from the next pose, whose place relative to this one is exact."""
+    truth = room.truth()
+    assert truth is not None
+    here, there = 3, 9
+    T_color_depth = se3.inverse(truth.T_world_camera[here]) @ truth.T_world_camera[there]
+    assert np.linalg.norm(T_color_depth[:3, 3]) > 0.02, "a baseline as large as a camera's"
+    color = color_half(room[here])
+    moved, not_moved = (
+        frames_of(FrameSource(), color, depth_half(room[there], color.stamp_ns, T))[0]
+        for T in (T_color_depth, np.eye(4))
+    )
+    assert _median_error(moved, room[here]) < 0.003
+    assert _median_error(not_moved, room[here]) > 0.01
+
+
+def _median_error(frame: FrameRgbd, truth: RgbdFrame) -> float:
+    depth_m = frame.depth_m.numpy()
+    seen = (depth_m > 0) & (truth.depth_m > 0)
+    assert seen.mean() > 0.8
+    return float(np.median(np.abs(depth_m - truth.depth_m)[seen]))
+
+
+def test_a_stream_of_halves_gives_the_same_bytes_again(room: Sequence) -> None:
+    halves = [
+        half for i in range(4) for half in (color_half(room[i]), depth_half(coarser(room[i])))
+    ]
+    first, second = (
+        [encode(frame) for frame in frames_of(FrameSource(), *halves)] for _ in range(2)
+    )
+    assert len(first) == 4
+    assert first == second
+
+
+def test_halves_whose_stamps_go_back_are_rejected(room: Sequence) -> None:
+    source = FrameSource()
+    assert len(frames_of(source, color_half(room[3]), depth_half(room[3]))) == 1
+    assert frames_of(source, color_half(room[2]), depth_half(room[2])) == []
+    assert source.facts()["frames_rejected"] == 2
+    assert len(frames_of(source, color_half(room[4]), depth_half(room[4]))) == 1
+
+
+def test_an_image_too_small_to_track_is_rejected() -> None:
+    camera = CameraModel(width=8, height=6, fx=6, fy=6, cx=3.5, cy=2.5)
+    tiny = CameraRgbd(
+        stamp_ns=1,
+        frame=0,
+        camera=camera,
+        color=Image.raw("rgb8", np.zeros((6, 8, 3), np.uint8)),
+        depth=Image.raw("f32", np.ones((6, 8), np.float32)),
+        depth_scale=1.0,
+    )
+    source = FrameSource()
+    assert frames_of(source, tiny) == []
+    assert source.facts()["frames_rejected"] == 1
+
+
+@pytest.mark.parametrize(
+    "fields", [{"max_skew_s": -0.1}, {"max_skew_s": 60.0}, {"pair_buffer": 0}, {"min_side_px": 0}]
+)
+def test_impossible_settings_are_refused(fields: dict[str, float]) -> None:
+    with pytest.raises(ConfigError):
+        FrameSourceConfig(**fields)  # type: ignore[arg-type]

@@ -15,6 +15,8 @@ import numpy as np
 from ldo_service.schemas import (
     AnchorMotion,
     Array,
+    CameraColor,
+    CameraDepth,
     CameraModel,
     CameraRgbd,
     Correction,
@@ -63,6 +65,20 @@ EXAMPLES: dict[str, Message] = {
         color=Image(encoding="bgr8", width=2, height=1, data=memoryview(b"\1\2\3\4\5\6")),
         depth=Image(encoding="z16", width=2, height=1, data=memoryview(b"\x88\x13\0\0")),
         depth_scale=5000.0,
+    ),
+    "camera_color": CameraColor(
+        stamp_ns=1_700_000_000_000_000_002,
+        frame=8,
+        camera=CAMERA,
+        image=Image(encoding="jpeg", width=3, height=2, data=memoryview(b"\xff\xd8\xff\xd9")),
+    ),
+    "camera_depth": CameraDepth(
+        stamp_ns=1_700_000_000_000_000_003,
+        frame=9,
+        camera=CameraModel(width=2, height=1, fx=1.5, fy=1.25, cx=0.5, cy=0.25),
+        image=Image(encoding="z16+zstd", width=2, height=1, data=memoryview(b"\x28\xb5\x2f\xfd")),
+        depth_scale=1000.0,
+        T_color_depth=POSE,
     ),
     "frame_rgbd": FrameRgbd(stamp_ns=2, frame=8, camera=CAMERA, color=COLOR, depth_m=DEPTH),
     "keyframe": Keyframe(

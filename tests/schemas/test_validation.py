@@ -210,6 +210,26 @@ IDENTITIES = [[0, 0, 0, 1, 0, 0, 0], [1, 0, 0, 1, 0, 0, 0]]
 
 
 @pytest.mark.parametrize(
+    ("name", "fields", "complaint"),
+    [
+        ("camera_color", {"frame": -1}, "frame is -1"),
+        ("camera_color", {"image": image("rgb8", 2, 1, bytes(6))}, "differ in size"),
+        ("camera_color", {"image": image("z16", 3, 2, bytes(12))}, "colour cannot"),
+        ("camera_depth", {"frame": -1}, "frame is -1"),
+        ("camera_depth", {"depth_scale": 0.0}, "depth_scale"),
+        ("camera_depth", {"depth_scale": INF}, "depth_scale"),
+        ("camera_depth", {"image": image("z16", 1, 1, bytes(2))}, "differ in size"),
+        ("camera_depth", {"image": image("rgb8", 2, 1, bytes(6))}, "depth cannot"),
+    ],
+)
+def test_half_an_exposure_that_contradicts_itself_is_refused(
+    name: str, fields: dict[str, Any], complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        changed(name, **fields)
+
+
+@pytest.mark.parametrize(
     ("keyframes", "poses", "complaint"),
     [
         ([4, 0], IDENTITIES, "ascending"),

@@ -1,0 +1,145 @@
+"""Halves find the nearest partner within reach, in order, and nothing waits for ever."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ldo_service.errors import ConfigError, FrameError
+from ldo_service.geometry import associate
+from ldo_service.geometry.pairing import Pairing
+
+MS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Half:
+    stamp_ns: int
+
+
+def pairing(max_skew_ms: int = 15, buffer: int = 8) -> Pairing[Half, Half]:
+    return Pairing(max_skew_ms * MS, buffer)
+
+
+def fed(pairs: Pairing[Half, Half], *events: tuple[str, int]) -> list[tuple[int, int]]:
+    """Stamps in ms of the pairs that come out of halves ("a" or "b", stamp in ms)."""
+    out = []
+    for stream, stamp_ms in events:
+        add = pairs.add_a if stream == "a" else pairs.add_b
+        out += [(a.stamp_ns // MS, b.stamp_ns // MS) for a, b in add(Half(stamp_ms * MS))]
+    return out
+
+
+def at_30_hz(offset_ms: int, count: int = 10) -> list[tuple[str, int]]:
+    """Two streams, b later by an offset, in order of their stamps."""
+    a = [("a", 33 * i) for i in range(count)]
+    b = [("b", 33 * i + offset_ms) for i in range(count)]
+    return sorted(a + b, key=lambda event: event[1])
+
+
+def test_equal_stamps_are_paired_at_once() -> None:
+    pairs = pairing()
+    assert fed(pairs, ("a", 100)) == []
+    assert fed(pairs, ("b", 100)) == [(100, 100)]
+    assert (pairs.pairs, pairs.lost_a, pairs.lost_b, pairs.skews_ms()) == (1, 0, 0, [0.0])
+
+
+@pytest.mark.parametrize("offset_ms", [-12, -3, 0, 4, 15])
+def test_a_pair_within_the_allowed_skew_waits_for_nothing_else(offset_ms: int) -> None:
+    pairs = pairing()
+    for i in range(5):
+        assert fed(pairs, ("a", 100 + 33 * i)) == []
+        expected = (100 + 33 * i, 100 + 33 * i + offset_ms)
+        assert fed(pairs, ("b", expected[1])) == [expected]
+    assert max(pairs.skews_ms()) == abs(offset_ms)
+
+
+def test_halves_too_far_apart_are_never_paired_and_counted() -> None:
+    pairs = pairing(max_skew_ms=5)
+    assert fed(pairs, *at_30_hz(offset_ms=16)) == []
+    assert pairs.lost_a + pairs.lost_b == 19, "the last one still waits"
+
+
+def test_the_nearest_is_taken_though_an_earlier_one_is_within_reach() -> None:
+    pairs = pairing()
+    at_90_hz = [("b", 11 * i + 3) for i in range(9)]
+    fed(pairs, *at_90_hz)  # its period is known now
+    assert fed(pairs, ("b", 102), ("a", 112)) == [], "102 is 10 ms away: a nearer one may come"
+    assert fed(pairs, ("b", 113)) == [(112, 113)]
+    assert pairs.lost_a == 0
+
+
+def test_a_dropped_half_costs_its_partner_only() -> None:
+    pairs = pairing()
+    events = [event for event in at_30_hz(offset_ms=2) if event not in (("a", 99), ("b", 200))]
+    assert fed(pairs, *events) == [(33 * i, 33 * i + 2) for i in range(10) if i not in (3, 6)]
+    assert (pairs.lost_a, pairs.lost_b) == (1, 1)
+
+
+def test_one_stream_may_come_much_later_than_the_other() -> None:
+    pairs = pairing()
+    late = [("a", 33 * i) for i in range(6)] + [("b", 33 * i + 1) for i in range(6)]
+    assert fed(pairs, *late) == [(33 * i, 33 * i + 1) for i in range(6)]
+
+
+def test_a_stream_alone_keeps_a_bounded_number_waiting() -> None:
+    pairs = pairing(buffer=4)
+    assert fed(pairs, *(("a", 33 * i) for i in range(20))) == []
+    assert pairs.lost_a == 16
+    assert fed(pairs, ("b", 33 * 19)) == [(33 * 19, 33 * 19)]
+
+
+def test_a_pair_does_not_wait_for_ever_for_a_nearer_half() -> None:
+    pairs = pairing(buffer=3)
+    fed(pairs, *(("b", 11 * i) for i in range(9)))  # at 90 Hz, and then no more
+    assert fed(pairs, ("a", 98), ("a", 131), ("a", 164)) == []
+    assert fed(pairs, ("a", 197)) == [(98, 88)]
+
+
+def test_stamps_that_go_back_are_refused_and_harm_nothing() -> None:
+    pairs = pairing()
+    fed(pairs, ("a", 100))
+    for stamp_ms in (100, 67):
+        with pytest.raises(FrameError, match="not after the last one"):
+            fed(pairs, ("a", stamp_ms))
+    assert fed(pairs, ("b", 101)) == [(100, 101)]
+
+
+@pytest.mark.parametrize(("max_skew_ns", "buffer"), [(-1, 8), (1, 0)])
+def test_impossible_limits_are_refused(max_skew_ns: int, buffer: int) -> None:
+    with pytest.raises(ConfigError):
+        Pairing(max_skew_ns, buffer)
+
+
+stamps = st.lists(st.integers(0, 500), unique=True, max_size=20).map(sorted)
+
+
+@given(stamps, stamps, st.randoms())
+def test_pairs_keep_order_and_reach_and_every_half_is_accounted_for(a, b, random) -> None:
+    pairs, out, left = pairing(buffer=4), [], {"a": list(a), "b": list(b)}
+    while left["a"] or left["b"]:
+        stream = random.choice([name for name in left if left[name]])
+        out += fed(pairs, (stream, left[stream].pop(0)))
+    for side in (0, 1):
+        of_side = [pair[side] for pair in out]
+        assert of_side == sorted(set(of_side))
+    assert all(abs(one - other) <= 15 for one, other in out)
+    assert pairs.pairs == len(out)
+    assert 0 <= len(a) - len(out) - pairs.lost_a <= 4
+    assert 0 <= len(b) - len(out) - pairs.lost_b <= 4
+
+
+@given(st.lists(st.integers(-15, 15), min_size=1, max_size=30))
+def test_jitter_below_half_a_period_gives_the_pairs_of_the_offline_judge(jitter) -> None:
+    a = [33 * i + 40 for i in range(len(jitter))]
+    b = [stamp + j for stamp, j in zip(a, jitter, strict=True)]
+    events = sorted([("a", s) for s in a] + [("b", s) for s in b], key=lambda e: (e[1], e[0]))
+    if len(set(b)) < len(b) or b != sorted(b):
+        return
+    pairs = pairing()
+    judge = associate(np.array(a), np.array(b), 15)
+    waiting = fed(pairs, *events)
+    assert waiting == [(a[i], b[j]) for i, j in judge][: len(waiting)]
+    assert len(waiting) >= len(judge) - 1, "only the last may still wait for a nearer one"
