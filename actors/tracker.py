@@ -28,9 +28,38 @@ from ldo_service.wire import (
     rgbd_of,
 )
 
+UNIT_WITHIN = 1e-3  # of a quaternion's norm: four digits, as people copy them, and then normalised
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """Where the camera sits on the robot: T_base_camera.
+
+    `camera` has the optical axes of this project: x right, y down, z forward. For a base whose x
+    is forward and z up (REP-103) a camera that looks ahead has quaternion 0.5 -0.5 0.5 -0.5.
+    """
+
+    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the camera's centre in base
+    quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # base is the camera
+
+    def __post_init__(self) -> None:
+        if not np.isfinite((*self.translation_m, *self.quaternion_wxyz)).all():
+            raise ConfigError(f"tracker.T_base_camera holds NaN or infinity: {self}.")
+        norm = float(np.linalg.norm(self.quaternion_wxyz))
+        if abs(norm - 1.0) > UNIT_WITHIN:
+            raise ConfigError(
+                f"tracker.T_base_camera.quaternion_wxyz={list(self.quaternion_wxyz)} has norm "
+                f"{norm:.4g}: a rotation has norm 1. The order is w x y z."
+            )
+
+    def matrix(self) -> np.ndarray:
+        """T_base_camera [4, 4]."""
+        return se3.from_quaternion(np.array(self.translation_m), np.array(self.quaternion_wxyz))
+
 
 @dataclass(frozen=True, slots=True)
 class TrackerConfig:
+    T_base_camera: Mounting = field(default_factory=Mounting)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     hold_out: int = 0  # every n-th frame is tracked and never mapped, to judge the map by; 0: none
 
@@ -49,6 +78,7 @@ class Tracker(Actor):
     def __init__(self, config: TrackerConfig | None = None) -> None:
         super().__init__()
         self.config = config or TrackerConfig()
+        self._T_base_camera = pose_message(self.config.T_base_camera.matrix())
         self._odometry = Odometry(self.config.odometry)
         self._poses = KeyframePoses()  # of the keyframes that the odometry remembers
         self._id_of_frame: dict[int, int] = {}  # keyframe id by frame index, for the same ones
@@ -139,6 +169,7 @@ class Tracker(Actor):
             residual_depth=tracked.depth_noise_scale,
             overlap=tracked.overlap,
             iterations=tracked.iterations,
+            T_base_camera=self._T_base_camera,
         )
 
     # --- state ------------------------------------------------------------------------------------

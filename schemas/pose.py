@@ -56,6 +56,7 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     residual_depth: float = 0.0  # robust sigma over that of the sensor model
     overlap: float = 0.0  # share of the reference's surface that this frame sees
     iterations: int = 0
+    T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera)
 
     def check(self) -> None:
         require_count("frame", self.frame)

@@ -2,13 +2,16 @@
 
 import msgspec
 import numpy as np
+import pytest
 
-from ldo_service.actors.tracker import Tracker, TrackerConfig
+from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
-from ldo_service.geometry import se3
-from ldo_service.schemas import Correction, FrameRgbd, Keyframe, TrackedPose
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
+from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
-from ldo_service.wire import correction_message, transform
+from ldo_service.wire import correction_message, rgbd_message, rgbd_of, transform
 
 
 def poses_of(messages) -> list[TrackedPose]:
@@ -130,3 +133,112 @@ def test_only_new_keyframes_are_new_objects_in_the_state(frames) -> None:
 def test_a_correction_before_any_frame_is_harmless() -> None:
     correction: Correction = correction_message(0, 1, {0: np.eye(4)})
     assert list(Tracker().handle(correction)) == []
+
+
+# --- the robot's base -----------------------------------------------------------------------------
+AHEAD = (0.5, -0.5, 0.5, -0.5)  # optical axes in a base with x forward and z up
+
+
+def test_a_pose_says_where_the_camera_sits_on_the_robot(frames) -> None:
+    mounting = Mounting(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
+    (pose,) = poses_of(handled(Tracker(TrackerConfig(T_base_camera=mounting)), frames[:1]))
+    T_base_camera = transform(pose.T_base_camera)
+    forward, down = [0, 0, 1], [0, 1, 0]
+    np.testing.assert_allclose(T_base_camera[:3, :3] @ forward, [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(T_base_camera[:3, :3] @ down, [0, 0, -1], atol=1e-12)
+    T_odom_base = transform(pose.T_odom_camera) @ se3.inverse(T_base_camera)
+    camera_in_base = se3.transform(se3.inverse(T_odom_base), np.zeros((1, 3)))  # first: odom
+    np.testing.assert_allclose(camera_in_base, [[0.2, 0.0, 0.5]], atol=1e-12)
+
+
+def test_without_a_mounting_the_base_is_the_camera_and_poses_are_as_ever(frames, tracked) -> None:
+    assert all(pose.T_base_camera == IDENTITY for pose in poses_of(tracked))
+    mounted = Tracker(TrackerConfig(T_base_camera=Mounting(quaternion_wxyz=AHEAD)))
+    for pose, other in zip(poses_of(tracked), poses_of(handled(mounted, frames[:5])), strict=False):
+        assert pose == msgspec.structs.replace(other, T_base_camera=IDENTITY)
+
+
+def test_a_quaternion_of_four_digits_is_normalised() -> None:
+    mounting = Mounting(quaternion_wxyz=(0.7071, 0.0, 0.7071, 0.0))
+    np.testing.assert_allclose(np.linalg.det(mounting.matrix()), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"quaternion_wxyz": (0.0, 0.0, 0.0, 0.0)},
+        {"quaternion_wxyz": (1.0, 1.0, 0.0, 0.0)},
+        {"quaternion_wxyz": (float("nan"), 0.0, 0.0, 1.0)},
+        {"translation_m": (0.0, float("inf"), 0.0)},
+    ],
+)
+def test_an_impossible_mounting_is_refused(fields) -> None:
+    with pytest.raises(ConfigError, match="T_base_camera"):
+        Mounting(**fields)
+
+
+# --- frames that are not what they should be ------------------------------------------------------
+def halved(message: FrameRgbd) -> FrameRgbd:
+    """Every second pixel: what a camera sends that was switched to half its resolution."""
+    frame, k = rgbd_of(message), rgbd_of(message).camera
+    camera = Camera(k.width // 2, k.height // 2, k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
+    color, depth_m = (np.ascontiguousarray(a[::2, ::2]) for a in (frame.color, frame.depth_m))
+    return rgbd_message(RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index))
+
+
+def cropped(message: FrameRgbd) -> FrameRgbd:
+    """The middle of the image: what another lens sees."""
+    frame, k = rgbd_of(message), rgbd_of(message).camera
+    camera = Camera(k.width - 80, k.height - 60, k.fx, k.fy, k.cx - 40, k.cy - 30)
+    color, depth_m = (np.ascontiguousarray(a[30:-30, 40:-40]) for a in (frame.color, frame.depth_m))
+    return rgbd_message(RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index))
+
+
+@pytest.mark.parametrize("other_camera", [halved, cropped])
+def test_another_camera_mid_stream_is_tracked_against_the_same_surface(
+    room: Sequence, frames, other_camera
+) -> None:
+    """Alignment is of surface points, whichever camera saw them."""
+    truth = room.truth()
+    assert truth is not None
+    tracker = Tracker()
+    mixed = [*frames[:10], *(other_camera(f) for f in frames[10:20]), *frames[20:30]]
+    poses = poses_of(handled(tracker, mixed))
+    T_odom_world = se3.inverse(truth.T_world_camera[0])
+    assert [pose.status for pose in poses] == ["OK"] * 30
+    for pose in poses:
+        T_true = T_odom_world @ truth.T_world_camera[pose.frame]
+        error = se3.inverse(T_true) @ transform(pose.T_odom_camera)
+        assert np.linalg.norm(error[:3, 3]) < 5e-3
+
+
+def without_depth(message: FrameRgbd) -> FrameRgbd:
+    nothing = np.zeros_like(message.depth_m.numpy())
+    return msgspec.structs.replace(message, depth_m=Array.of(nothing))
+
+
+def test_frames_without_any_depth_are_not_trusted_and_tracking_recovers(frames) -> None:
+    tracker = Tracker()
+    blind = [without_depth(frame) for frame in frames[10:16]]
+    poses = poses_of(handled(tracker, [*frames[:10], *blind, *frames[16:22]]))
+    assert all(pose.status == "OK" for pose in (*poses[:10], *poses[16:]))
+    assert all(pose.status in ("WEAK", "LOST") for pose in poses[10:16])
+    assert not any(pose.keyframe is not None for pose in poses[10:16])
+
+
+def test_a_stream_that_begins_without_depth_begins_where_depth_comes(frames) -> None:
+    tracker = Tracker()
+    made = handled(tracker, [*(without_depth(frame) for frame in frames[:3]), *frames[3:5]])
+    assert [pose.status for pose in poses_of(made)][-2:] == ["OK", "OK"]
+    (keyframe,) = (message for message in made if isinstance(message, Keyframe))
+    assert keyframe.frame == 3
+
+
+def test_the_smallest_frames_that_come_through_break_nothing(frames) -> None:
+    for size in (32, 33, 40):
+        camera = Camera(size, size, 30.0, 30.0, size / 2, size / 2)
+        color = np.random.default_rng(0).integers(0, 255, (size, size, 3)).astype(np.uint8)
+        depth_m = np.ones((size, size), np.float32)
+        tiny = rgbd_message(RgbdFrame(color, depth_m, camera, 1, 1))
+        assert len(poses_of(handled(Tracker(), [tiny, tiny]))) == 2
+        assert len(poses_of(handled(Tracker(), [*frames[:2], tiny, frames[2]]))) == 4
