@@ -229,6 +229,11 @@ class Mapper(Actor):
             }
         return {"map": self._checkpoint} if self._checkpoint else {}
 
+    def checkpoint(self) -> dict[str, Any]:
+        """With the map as it is now."""
+        self._checkpoint = {}
+        return self.snapshot()
+
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["map"]
         stamp_ns, keyframe = saved["newest"]

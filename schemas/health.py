@@ -17,6 +17,7 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
     gaps: int  # lossless only: came out of order and was asked for again
     waiting: int  # in the mailbox now
     peak: int  # most that ever waited
+    paused: int = 0  # left out while the service was paused
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
@@ -46,6 +47,7 @@ class Health(Message, frozen=True, kw_only=True):
     inputs: tuple[InputCount, ...]
     outputs: tuple[OutputCount, ...]
     facts: dict[str, float] = {}  # what the actor counts itself
+    held: bool = False  # takes nothing, on request
 
     def check(self) -> None:
         for name in ("pid", "epoch", "steps", "failures", "restarts", "set_aside"):

@@ -44,6 +44,10 @@ class Actor:
         """What a successor needs to go on; called after every step, so it must be cheap."""
         return {}
 
+    def checkpoint(self) -> State:
+        """The same with nothing left for later, however long it takes; on request."""
+        return self.snapshot()
+
     def restore(self, state: State) -> None:
         """Go on from a predecessor's snapshot."""
 

@@ -27,7 +27,7 @@ class Consumers:
 
     def __init__(self, expected: Iterable[str]) -> None:
         self._known = {name: Consumer() for name in expected}
-        self._expected = frozenset(self._known)
+        self.expected = frozenset(self._known)
         self._evicted: dict[str, int] = {}  # what each had handled when patience was over
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ class Consumers:
         """It holds nothing up any more, unless it must not miss a message."""
         consumer = self._known[name]
         consumer.alive, consumer.shut_since_s = False, None
-        if name not in self._expected:
+        if name not in self.expected:
             del self._known[name]
 
     def overdue(self, now_s: float, patience_s: float, seq: int) -> list[str]:

@@ -29,6 +29,7 @@ class Inlet:
     rejected: int = 0
     gaps: int = 0
     peak: int = 0
+    paused: int = 0
 
     def accept(self, header: Header) -> bool:  # noqa: ARG002
         """Whether to take the message in."""
@@ -61,6 +62,15 @@ class Inlet:
         self.delivered += not rejected
         self.rejected += rejected
 
+    def leave_out(self) -> None:
+        """What waits is not taken any more: the stage is held."""
+        self.paused += len(self.waiting)
+        self.waiting.clear()
+
+    def renew(self) -> None:
+        """Forget what waits."""
+        self.waiting.clear()
+
     def statistics(self) -> InputCount:
         return InputCount(
             topic=self.port.topic.name,
@@ -70,6 +80,7 @@ class Inlet:
             gaps=self.gaps,
             waiting=len(self.waiting),
             peak=self.peak,
+            paused=self.paused,
         )
 
 
@@ -107,6 +118,15 @@ class LosslessInlet(Inlet):
             return False
         self.arrived += 1
         return True
+
+    def leave_out(self) -> None:
+        """Nothing: it waits in its window."""
+
+    def renew(self) -> None:
+        """Forget what waits and who sent it: whoever sends has to welcome us again."""
+        super().renew()
+        self.epoch = self.handled = self.arrived = 0
+        self.gap = False
 
     def _overflow(self, newest: Delivery) -> list[Delivery]:  # noqa: ARG002
         return []  # `accept` keeps to the window

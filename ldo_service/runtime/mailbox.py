@@ -20,6 +20,7 @@ from .links import (
     grant_key,
     welcome_key,
 )
+from .orders import Order
 from .ports import In, Lossless
 from .transport import Publisher, Transport, call_soon
 
@@ -39,7 +40,8 @@ class Mailbox:
         self._order: deque[Delivery] = deque()
         self._ready = asyncio.Event()
         self._wake_pending = self._grant_pending = False
-        self._closed = False
+        self._closed = self._held = False
+        self._orders: deque[Order] = deque()
         self._grants: dict[str, Publisher] = {}
         self._inlets: dict[str, Inlet] = {}
         for port in ports:
@@ -67,7 +69,9 @@ class Mailbox:
         with self._lock:
             if self._closed:
                 return
-            if header is None:
+            if self._held and not isinstance(inlet, LosslessInlet):
+                inlet.paused += 1
+            elif header is None:
                 inlet.rejected += 1
             elif inlet.accept(header):
                 self._store(inlet, Delivery(inlet.port, header, body))
@@ -103,13 +107,15 @@ class Mailbox:
             call_soon(self._loop, self.send_grants)
 
     # --- taking, on the event loop --------------------------------------------------------------
-    async def take(self) -> Delivery | None:
-        """The oldest delivery; None when the mailbox was closed and is empty."""
+    async def take(self) -> Delivery | Order | None:
+        """An order, else the oldest delivery; None when the mailbox was closed and is empty."""
         while True:
             with self._lock:
                 self._wake_pending = False
                 self._ready.clear()
-                if self._order:
+                if self._orders:
+                    return self._orders.popleft()
+                if self._order and not self._held:
                     delivery = self._order.popleft()
                     self._inlets[delivery.port.topic.name].waiting.popleft()
                     return delivery
@@ -124,6 +130,41 @@ class Mailbox:
             inlet.done(delivery, rejected)
         if isinstance(inlet, LosslessInlet):
             self._send_grant(inlet)
+
+    def tell(self, order: Order) -> None:
+        """It is taken before any delivery."""
+        self._orders.append(order)
+        self._ready.set()
+
+    def hold(self) -> None:
+        """Give out no deliveries until `release`; what has a policy of Latest is left out."""
+        with self._lock:
+            self._held = True
+            for inlet in self._inlets.values():
+                inlet.leave_out()
+            self._keep_only_waiting()
+
+    def release(self) -> None:
+        with self._lock:
+            self._held = False
+        self._ready.set()
+
+    @property
+    def is_held(self) -> bool:
+        return self._held
+
+    def renew(self) -> None:
+        """Forget what waits, and join the producers again."""
+        with self._lock:
+            for inlet in self._inlets.values():
+                inlet.renew()
+            self._keep_only_waiting()
+        self.send_grants()
+
+    def _keep_only_waiting(self) -> None:
+        """Under the lock."""
+        waiting = {id(d) for inlet in self._inlets.values() for d in inlet.waiting}
+        self._order = deque(d for d in self._order if id(d) in waiting)
 
     def send_grants(self) -> None:
         """Repeat every grant: lost ones heal, new producers learn of us."""
@@ -141,10 +182,10 @@ class Mailbox:
     def close(self) -> None:
         """Take nothing more in; what waits can still be taken."""
         with self._lock:
-            self._closed = True
+            self._closed, self._held = True, False
         self._ready.set()
 
-    def release(self) -> None:
+    def disconnect(self) -> None:
         for publisher in self._grants.values():
             publisher.close()
 

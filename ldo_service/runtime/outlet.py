@@ -147,6 +147,17 @@ class Outlet:
         self._consumers.join(name, self._seq)
         self._post_welcomes()
 
+    def renew(self, epoch: int) -> None:
+        """Number from 0 again: what was sent is forgotten, and every consumer joins anew."""
+        if self._repeating is not None:
+            self._repeating.cancel()
+        self._epoch, self._seq = epoch, 0
+        self._consumers = Consumers(self._consumers.expected)
+        self._unhandled.clear()
+        self._parts.clear()
+        self._last_value = ()
+        self._post_welcomes()
+
     def _post_welcomes(self) -> None:
         self._welcomes.post(b"", encode(Welcome(self._epoch, self._consumers.starts())))
 

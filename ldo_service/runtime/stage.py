@@ -16,6 +16,7 @@ from . import links
 from .actor import Actor
 from .inlet import Delivery
 from .mailbox import Mailbox
+from .orders import Order, OrderTaker
 from .outlet import Outlet
 from .restart import RestartBudget
 from .state_store import MemoryStore, StateStore
@@ -74,7 +75,7 @@ class Stage:
         self._on_evicted = on_evicted
         self._actor = self._successor()
         self.name = self._actor.name
-        self._epoch = 1 + secrets.randbits(62)  # a number no earlier run of this stage had
+        self._epoch = _new_epoch()
         self._vitals = Vitals()
         self._budget = RestartBudget(
             self.name,
@@ -130,6 +131,7 @@ class Stage:
             )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
         mailbox = Mailbox(self.name, self._actor.inputs, self._transport)
+        self._orders = OrderTaker(self.name, self._transport, mailbox.tell)
         if self._drain_requested:
             mailbox.close()
         else:
@@ -138,7 +140,8 @@ class Stage:
 
     def _close_ports(self, mailbox: Mailbox) -> None:
         mailbox.close()
-        mailbox.release()
+        mailbox.disconnect()
+        self._orders.close()
         for outlet in self._outlets.values():
             outlet.close()
         self._health.close()
@@ -146,6 +149,9 @@ class Stage:
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         while delivery := await mailbox.take():
+            if isinstance(delivery, Order):
+                await self._obey(delivery, mailbox)
+                continue
             message = self._decode(delivery)
             if message is not None:
                 await self._step(message)
@@ -209,6 +215,37 @@ class Stage:
             return
         for out in last_words:
             await self._send(out)
+
+    # --- orders ---------------------------------------------------------------------------------
+    async def _obey(self, order: Order, mailbox: Mailbox) -> None:
+        try:
+            match order.what:
+                case "hold":
+                    mailbox.hold()
+                case "release":
+                    mailbox.release()
+                case "renew":
+                    await self._renew(mailbox)
+                case "save":
+                    await self._worker.run(self._checkpoint)
+        except Exception as error:
+            log.exception("%s could not %s", self.name, order.what)
+            self._orders.report(order, f"{type(error).__name__}: {error}")
+        else:
+            self._orders.report(order, "")
+
+    async def _renew(self, mailbox: Mailbox) -> None:
+        """Begin anew; to everyone else it looks like a process that was started again."""
+        self._store.forget(self.name)
+        self._actor = await self._worker.run(self._make)
+        self._epoch = _new_epoch()
+        self._vitals.facts = {}
+        mailbox.renew()
+        for outlet in self._outlets.values():
+            outlet.renew(self._epoch)
+
+    def _checkpoint(self) -> None:
+        self._store.save(self.name, self._actor.checkpoint())
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _handle(self, message: Message) -> list[Produced]:
@@ -279,6 +316,12 @@ class Stage:
         return self._vitals.health(
             actor=self.name,
             epoch=self._epoch,
+            held=self._mailbox is not None and self._mailbox.is_held,
             inputs=self._mailbox.statistics() if self._mailbox else (),
             outputs=tuple(outlet.statistics() for outlet in self._outlets.values()),
         )
+
+
+def _new_epoch() -> int:
+    """A number no earlier run of this stage had."""
+    return 1 + secrets.randbits(62)

@@ -24,6 +24,10 @@ class StateStore(Protocol):
 
     def load(self, actor: str) -> State | None: ...
 
+    def forget(self, actor: str) -> None:
+        """As if nothing had been saved."""
+        ...
+
 
 class MemoryStore:
     """Outlives an actor that failed, not its process."""
@@ -37,6 +41,9 @@ class MemoryStore:
 
     def load(self, actor: str) -> State | None:
         return self._states.get(actor)
+
+    def forget(self, actor: str) -> None:
+        self._states.pop(actor, None)
 
 
 class FolderStore:
@@ -84,6 +91,14 @@ class FolderStore:
             log.error("%s: its saved state cannot be read and is left out: %s", actor, error)
             return None
         return parts or None
+
+    def forget(self, actor: str) -> None:
+        folder = self._folder / actor
+        (folder / CONTENTS).unlink(missing_ok=True)  # first: what it does not name is not read
+        for file in folder.glob("*"):
+            file.unlink()
+        self._saved.pop(actor, None)
+        self._files.pop(actor, None)
 
 
 def _read_contents(folder: Path) -> dict[str, str]:

@@ -13,7 +13,7 @@ Facts of zenoh-python 1.x that shape this file:
 import asyncio
 import json
 import logging
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import BoundedSemaphore, Lock
@@ -90,6 +90,7 @@ class ZenohTransport:
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
         self._answering = Worker("answers")
+        self._responding: set[asyncio.Task[None]] = set()
         self._query_slots = BoundedSemaphore(MAX_QUERIES)
 
     def publisher(self, key: str) -> "ZenohPublisher":
@@ -141,7 +142,41 @@ class ZenohTransport:
         handler = zenoh.handlers.Callback(asked, indirect=False)
         self._declared.append(self._session.declare_queryable(expression, handler))
 
+    def respond(self, key: str, respond: Callable[[bytes], Awaitable[bytes]]) -> None:
+        """Answer each query on a key with what `respond`, on the event loop, makes of its payload.
+
+        For requests that are done before they are answered; `answer` is for values that are there.
+        """
+        expression = self._network.expression(key)
+
+        async def reply(query: zenoh.Query, request: bytes) -> None:
+            try:
+                with query, suppress(zenoh.ZError):  # the asker may be gone
+                    body = await respond(request)
+                    await self._answering.run(query.reply, expression, body)
+            finally:
+                self._query_slots.release()
+
+        def start(query: zenoh.Query, request: bytes) -> None:
+            task = self._loop.create_task(reply(query, request))
+            self._responding.add(task)
+            task.add_done_callback(self._responding.discard)
+
+        def asked(query: zenoh.Query) -> None:
+            if self._query_slots.acquire(blocking=False):
+                payload = query.payload
+                request = payload.to_bytes() if payload is not None else b""
+                call_soon(self._loop, start, query, request)
+            else:
+                with query:
+                    query.reply_err(b"too many queries: ask again later")
+
+        handler = zenoh.handlers.Callback(asked, indirect=False)
+        self._declared.append(self._session.declare_queryable(expression, handler))
+
     def close(self) -> None:
+        for task in self._responding:
+            task.cancel()
         for declared in self._declared:
             with suppress(zenoh.ZError):  # the session may be closed already
                 declared.undeclare()
