@@ -90,11 +90,15 @@ def producer_of(topic: t.Topic) -> str:
             return box.name
     if topic is t.HEALTH:
         return "every stage"
+    if topic is t.CONTROL:
+        return "outside"
     return "outside" if topic in t.FROM_OUTSIDE else "nobody yet"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
     """Name and policy of each consumer."""
+    if topic is t.CONTROL:
+        return [("the service", "one at a time")]
     return [
         (box.name, str(port.policy)) for box in GRAPH for port in box.inputs if port.topic is topic
     ]

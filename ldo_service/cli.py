@@ -68,6 +68,7 @@ def first_lines() -> Iterator[str]:
 def verbs() -> dict[str, Callable[..., None]]:
     """Each verb's function; its docstring is its help."""
     from ldo_service.commands import (
+        control,
         demo,
         doctor,
         evaluate,
@@ -84,6 +85,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         "eval": evaluate.evaluate,
         "serve": serve.serve,
         "publish": publish.publish,
+        "control": control.control,
         "topics": topics.topics,
         "config": show_config.show_config,
         "doctor": doctor.doctor,

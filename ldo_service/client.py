@@ -27,6 +27,8 @@ from ldo_service.schemas import (
     CameraDepth,
     CameraModel,
     CameraRgbd,
+    ControlAnswer,
+    ControlRequest,
     Image,
     Message,
     Pose,
@@ -34,7 +36,7 @@ from ldo_service.schemas import (
     decode,
 )
 from ldo_service.schemas.pose import IDENTITY
-from ldo_service.schemas.topics import FROM_OUTSIDE, POSE_TRACKED, Topic
+from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, POSE_TRACKED, Topic
 
 M = TypeVar("M", bound=Message)
 
@@ -156,6 +158,25 @@ class Client:
             consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
         )
         return [_message(r.ok, _type_of(topic)) for r in replies if r.ok is not None]
+
+    def control(self, verb: str, timeout_s: float = 120.0) -> ControlAnswer:
+        """Ask the service to pause, resume, save or reset; returns when all actors have done it.
+
+        `ok` of the answer is false when one has not, or when there is no such verb; `text` says.
+        Raises ConfigError when nobody answers.
+        """
+        replies = self._session.get(
+            self._network.expression(CONTROL.name),
+            payload=msgspec.msgpack.encode(ControlRequest(stamp_ns=time.time_ns(), verb=verb)),
+            timeout=timeout_s,
+        )
+        for reply in replies:
+            if reply.ok is not None:
+                return _message(reply.ok, ControlAnswer)
+        raise ConfigError(
+            f"nobody answers on {self._network.expression(CONTROL.name)}: is this the name of the "
+            "robot, and is its service up? `ldo doctor` tells."
+        )
 
     def _subscriber(self, name: str, keep: int) -> Any:
         ring = zenoh.handlers.RingChannel(keep)

@@ -14,15 +14,21 @@ class MapFollower:
     """
 
     def __init__(self) -> None:
+        self._parts: dict[int, MapSnapshot] = {}
+        self._begin()
+
+    def _begin(self) -> None:
         self.map = GaussianMap()
         self.version = 0
         self.is_behind = False
-        self._parts: dict[int, MapSnapshot] = {}
+        self._parts.clear()
 
     def take(self, message: MapDelta | MapSnapshot) -> bool:
         """Whether `map` changed."""
         if isinstance(message, MapSnapshot):
             return self._take_part(message)
+        if message.since == 0 and self.version:
+            self._begin()  # the mapper began anew
         if message.version <= self.version:
             return False
         if message.since != self.version:

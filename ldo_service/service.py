@@ -19,6 +19,7 @@ import zenoh
 
 from ldo_service.actors.graph import RUNNING, Box, box_named
 from ldo_service.config import Config, config_yaml
+from ldo_service.control import Control
 from ldo_service.errors import ConfigError, StageStalled
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.graph import lossless_consumers
@@ -32,6 +33,7 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.supervision import Runner, Stop, supervise
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
+from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE
 
 log = logging.getLogger(__name__)
 
@@ -44,6 +46,7 @@ class Service:
     network: Network
     state: Path
     only: tuple[str, ...] = ()
+    is_state_kept: bool = True  # the folder outlives the service
 
     def run(self) -> None:
         """Serve until SIGINT or SIGTERM; a second one stops at once.
@@ -67,12 +70,31 @@ class Service:
             loop.add_signal_handler(number, stop.ask)
         watch = asyncio.create_task(self._stop_with_parent(stop))
         runners = self._runners(transport)
+        control = None if self.only else self._open_control(transport)
         log.info("serving %s on %s", ", ".join(r.name for r in runners), self.network.endpoint)
         try:
             await supervise(runners, stop, self.config.service.drain_s)
         finally:
             watch.cancel()
+            if control:
+                control.close()
             transport.close()
+
+    def _open_control(self, transport: ZenohTransport) -> Control:
+        control = Control(
+            transport,
+            actors=[box.name for box in RUNNING],
+            sources=[box.name for box in RUNNING if _is_fed_from_outside(box)],
+            saved_where=self._saved_where(),
+            timeout_s=self.config.service.control_timeout_s,
+        )
+        transport.respond(CONTROL.name, control.answer)
+        return control
+
+    def _saved_where(self) -> str:
+        if self.is_state_kept:
+            return str(self.state)
+        return f"{self.state}, which goes with the service (--state DIR keeps it)"
 
     # --- who runs where ---------------------------------------------------------------------------
     def _runners(self, transport: ZenohTransport) -> list[Runner]:
@@ -150,6 +172,10 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     except OSError as error:
         raise ConfigError(f"{folder} cannot be used for state: {error.strerror}.") from error
     return folder
+
+
+def _is_fed_from_outside(box: Box) -> bool:
+    return any(port.topic in FROM_OUTSIDE for port in box.inputs)
 
 
 def is_child() -> bool:

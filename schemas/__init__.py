@@ -7,6 +7,7 @@ default; what a field means never changes. Conventions of frames and units are t
 """
 
 from ldo_service.schemas.array import Array
+from ldo_service.schemas.control import ControlAnswer, ControlRequest
 from ldo_service.schemas.frames import (
     CameraColor,
     CameraDepth,
@@ -29,6 +30,8 @@ __all__ = [
     "CameraDepth",
     "CameraModel",
     "CameraRgbd",
+    "ControlAnswer",
+    "ControlRequest",
     "Correction",
     "FrameRgbd",
     "Gaussians",

@@ -7,11 +7,13 @@ from ldo_service.schemas.topics import TOPICS
 
 
 def message_types() -> tuple[type[Message], ...]:
-    return tuple(topic.message for topic in TOPICS if topic.message is not None)
+    both = [message for topic in TOPICS for message in (topic.message, topic.answer)]
+    return tuple(message for message in both if message is not None)
 
 
 def json_schema() -> dict[str, object]:
-    """One document: `$defs` has each message by name, `topics` says which travels where.
+    """One document: `$defs` has each message by name, `topics` says which travels where, `answers`
+    what a query on a topic that is asked is answered with.
 
     Binary fields, base64 strings in JSON Schema's terms, are MessagePack's `bin` on the wire.
     """
@@ -24,5 +26,10 @@ def json_schema() -> dict[str, object]:
             topic.name: {"$ref": f"#/$defs/{topic.message.__name__}"}
             for topic in TOPICS
             if topic.message is not None
+        },
+        "answers": {
+            topic.name: {"$ref": f"#/$defs/{topic.answer.__name__}"}
+            for topic in TOPICS
+            if topic.answer is not None
         },
     }

@@ -6,6 +6,7 @@ topic without a message type is declared, and has neither producer nor format ye
 
 from dataclasses import dataclass
 
+from ldo_service.schemas.control import ControlAnswer, ControlRequest
 from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health
@@ -24,6 +25,7 @@ class Topic:
     says: str
     is_state: bool = False
     key: str | None = None  # field by which `Latest(per_key=True)` tells messages apart
+    answer: type[Message] | None = None  # where `message` is what a query asks
 
     def expression(self, robot: str) -> str:
         """The Zenoh key expression."""
@@ -41,6 +43,9 @@ MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
 GRAPH_CORRECTION = Topic("graph/correction", Correction, "all keyframe poses", is_state=True)
 HEALTH = Topic("health", Health, "counters and latency of an actor (health/<actor>)")
+CONTROL = Topic(
+    "control", ControlRequest, "asked: pause, resume, save or reset", answer=ControlAnswer
+)
 
 DETECTION_BOXES = Topic("detection/boxes", None, "boxes with class and score, per keyframe")
 LABEL_REQUEST = Topic("label/request", None, "image crops of a region to be named", key="region")
@@ -71,6 +76,7 @@ TOPICS: tuple[Topic, ...] = (
     LOOP_CANDIDATE,
     GRAPH_CORRECTION,
     HEALTH,
+    CONTROL,
 )
 
 FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs

@@ -42,4 +42,10 @@ def serve(
     """
     with ExitStack() as stack:
         folder = state_folder(state, stack)
-        Service(load_config(config, set), Network(robot, endpoint), folder, tuple(only)).run()
+        Service(
+            load_config(config, set),
+            Network(robot, endpoint),
+            folder,
+            tuple(only),
+            is_state_kept=state is not None,
+        ).run()

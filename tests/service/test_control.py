@@ -1,0 +1,95 @@
+"""`ldo control` on a running service, whose optimizer is a process of its own."""
+
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from ldo_service.schemas.topics import MAP_SNAPSHOT
+from tests.service.conftest import LDO, LiveService, live_service, wait_until
+
+
+def ldo_control(service: LiveService, verb: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*LDO, "control", verb, "--endpoint", service.endpoint], capture_output=True, text=True
+    )
+
+
+@pytest.mark.timeout(90)
+def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        publisher = service.publisher("synthetic:room", "--rate", "15", "--restamp")
+        service.wait_for_poses(15)
+        # pause: frames come and no pose goes
+        assert ldo_control(service, "pause").returncode == 0
+        service.poses()
+        wait_until(lambda: _paused(service) > 5, 10, "paused frames are counted")
+        assert service.poses() == []
+        assert service.client.control("resume").ok
+        last = service.wait_for_poses(15)[-1]
+        assert last.keyframe is None or last.keyframe > 0
+        # save: the map is on the disk, whole, though no checkpoint was due
+        saved = ldo_control(service, "save")
+        assert (saved.returncode, str(tmp_path / "s") in saved.stdout) == (0, True)
+        for actor in ("frame_source", "tracker", "mapper", "optimizer"):
+            assert (tmp_path / "s" / "state" / actor / "contents.msgpack").exists()
+        # reset: all begin anew, in their processes
+        before = {name: (h.epoch, h.pid) for name, h in service.update_health().items()}
+        assert ldo_control(service, "reset").returncode == 0
+        service.wait_for_poses(1)
+        wait_until(
+            lambda: all(h.epoch != before[a][0] for a, h in service.update_health().items()),
+            10,
+            "new epochs",
+        )
+        assert {name: h.pid for name, h in service.health.items()} == {
+            name: pid for name, (_, pid) in before.items()
+        }
+        poses = service.wait_for_poses(15)
+        assert all(pose.status == "OK" for pose in poses)
+        wait_until(lambda: bool(service.client.last(MAP_SNAPSHOT)), 10, "a new map")
+        wait_until(
+            lambda: service.update_health()["optimizer"].facts.get("optimizations", 0) > 0,
+            10,
+            "corrections of the new run",
+        )
+        publisher.kill()
+        publisher.wait()
+        assert service.client.control("dance").text.startswith("there is no 'dance'")
+        assert service.stop() == 0
+        assert "Traceback" not in service.log
+
+
+def _paused(service: LiveService) -> int:
+    return sum(count.paused for count in service.update_health()["frame_source"].inputs)
+
+
+@pytest.mark.timeout(60)
+def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
+    arguments = ("--set", "service.control_timeout_s=1", "--set", "service.silent_after_s=30")
+    with live_service(tmp_path, *arguments) as service:
+        service.wait_for_actors()
+        stopped = service.health["optimizer"].pid
+        os.kill(stopped, signal.SIGSTOP)
+        try:
+            done = ldo_control(service, "save")
+            assert done.returncode == 4
+            assert "optimizer did not answer" in done.stderr
+        finally:
+            os.kill(stopped, signal.SIGCONT)
+
+
+@pytest.mark.timeout(60)
+def test_a_robot_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        done = subprocess.run(
+            [*LDO, "control", "pause", "--robot", "r2", "--endpoint", service.endpoint],
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 2
+        assert "is this the name of the robot" in done.stderr
