@@ -33,8 +33,14 @@ class Mailbox:
     A delivery counts as handled when `done` is called: a consumer that dies before gets it again.
     """
 
-    def __init__(self, consumer: str, ports: tuple[In, ...], transport: Transport) -> None:
-        self._consumer = consumer
+    def __init__(
+        self,
+        consumer: str,
+        ports: tuple[In, ...],
+        transport: Transport,
+        max_bytes: int = 64_000_000,  # of a Latest input: lossless ones come from our own actors
+    ) -> None:
+        self._consumer, self._max_bytes = consumer, max_bytes
         self._loop = asyncio.get_running_loop()
         self._lock = Lock()  # of everything below that both sides use
         self._order: deque[Delivery] = deque()
@@ -72,11 +78,20 @@ class Mailbox:
             if self._held and not isinstance(inlet, LosslessInlet):
                 inlet.paused += 1
             elif header is None:
-                inlet.rejected += 1
+                self._reject(inlet, "its header cannot be read")
+            elif body.nbytes > self._max_bytes and not isinstance(inlet, LosslessInlet):
+                self._reject(inlet, f"{body.nbytes} bytes are more than stage.max_message_mb")
             elif inlet.accept(header):
                 self._store(inlet, Delivery(inlet.port, header, body))
             else:
                 self._ask_for_grants()
+
+    def _reject(self, inlet: Inlet, why: str) -> None:
+        """Before anything is decoded. Under the lock."""
+        if inlet.rejected == 0:
+            log.warning("%s: %s rejected: %s. Those that follow are counted.",
+                        self._consumer, inlet.port.topic.name, why)  # fmt: skip
+        inlet.rejected += 1
 
     def _store(self, inlet: Inlet, delivery: Delivery) -> None:
         for displaced in inlet.offer(delivery):

@@ -10,7 +10,7 @@ import msgspec
 
 from ldo_service.errors import ConfigError, StageStalled
 from ldo_service.schemas import Health, Message, decode, encode
-from ldo_service.schemas.topics import HEALTH
+from ldo_service.schemas.topics import HEALTH, Topic
 
 from . import links
 from .actor import Actor
@@ -38,10 +38,14 @@ class StageConfig:
     heartbeat_s: float = 0.5  # a stopped process shows within two of these
     stall_after_s: float = 60.0  # 100x the slowest step measured (mapper, 1.5 M Gaussians)
     evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
+    max_message_mb: float = 64.0  # larger ones are not decoded: raw colour and depth of 8 MP are 58
 
     def __post_init__(self) -> None:
         times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
-        if min(times) <= 0 or min(self.max_restarts, self.restart_delay_s) < 0:
+        if (
+            min(*times, self.max_message_mb) <= 0
+            or min(self.max_restarts, self.restart_delay_s) < 0
+        ):
             raise ConfigError(f"{self}: counts and times must be positive.")
 
 
@@ -86,6 +90,7 @@ class Stage:
         )
         self._drain_requested = False
         self._mailbox: Mailbox | None = None
+        self._rejecting: set[Topic] = set()  # topics whose last message could not be decoded
         self._outlets: dict[type[Message], Outlet] = {}
 
     # --- life -----------------------------------------------------------------------------------
@@ -130,7 +135,12 @@ class Stage:
                 self._on_evicted,
             )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
-        mailbox = Mailbox(self.name, self._actor.inputs, self._transport)
+        mailbox = Mailbox(
+            self.name,
+            self._actor.inputs,
+            self._transport,
+            max_bytes=round(self._config.max_message_mb * 1e6),
+        )
         self._orders = OrderTaker(self.name, self._transport, mailbox.tell)
         if self._drain_requested:
             mailbox.close()
@@ -164,13 +174,17 @@ class Stage:
         topic, header = delivery.port.topic, delivery.header
         assert topic.message is not None
         try:
-            return decode(delivery.body, topic.message)
+            message = decode(delivery.body, topic.message)
         except msgspec.DecodeError as error:
-            log.warning(
-                "%s: %s #%d from %s rejected: %s",
-                self.name, topic.name, header.seq, header.source, error,
-            )  # fmt: skip
+            if topic not in self._rejecting:
+                log.warning(
+                    "%s: %s #%d from %s rejected: %s. Those that follow are counted.",
+                    self.name, topic.name, header.seq, header.source, error,
+                )  # fmt: skip
+            self._rejecting.add(topic)
             return None
+        self._rejecting.discard(topic)
+        return message
 
     async def _step(self, message: Message) -> None:
         for _attempt in range(2):

@@ -118,3 +118,23 @@ async def test_a_body_that_does_not_decode_is_rejected_and_the_next_is_handled()
         await eventually(lambda: stage.health().inputs[0].delivered == 1)
         assert stage.health().inputs[0].rejected == 2
         assert stage.health().failures == 0
+
+
+async def test_a_message_over_the_size_limit_is_rejected_before_it_is_decoded() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(4)),), transport, max_bytes=100)
+    transport.deliver(NUMBERS.name, b"", bytes(101))
+    transport.deliver(NUMBERS.name, b"", bytes(100))  # no message either, but that shows later
+    (counted,) = mailbox.statistics()
+    assert (counted.rejected, counted.waiting) == (1, 1)
+
+
+async def test_rejections_are_said_once_an_episode_and_counted_each(caplog) -> None:
+    transport, seen = MemoryTransport(), []
+    stage = collector(transport, seen, policy=Latest(8))
+    good, bad = encode_message(number(3)), b"\x80"
+    async with running(stage):
+        for body in (bad, bad, good, bad):
+            transport.deliver(NUMBERS.name, b"", body)
+        await eventually(lambda: stage.health().inputs[0].rejected == 3)
+    assert len([r for r in caplog.records if "rejected" in r.message]) == 2

@@ -363,7 +363,13 @@ async def test_a_declared_topic_without_a_format_is_left_out() -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"max_restarts": -1}, {"heartbeat_s": 0}, {"stall_after_s": 0}, {"evict_after_s": 0}],
+    [
+        {"max_restarts": -1},
+        {"heartbeat_s": 0},
+        {"stall_after_s": 0},
+        {"evict_after_s": 0},
+        {"max_message_mb": 0},
+    ],
 )
 def test_an_impossible_configuration_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
