@@ -21,7 +21,7 @@ import zenoh
 
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.links import Header, encode
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
+from ldo_service.runtime.zenoh_transport import ALIVE, DEFAULT_ENDPOINT, Network, open_session
 from ldo_service.schemas import (
     CameraColor,
     CameraDepth,
@@ -158,6 +158,12 @@ class Client:
             consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
         )
         return [_message(r.ok, _type_of(topic)) for r in replies if r.ok is not None]
+
+    def alive(self, timeout_s: float = 1.0) -> set[str]:
+        """Names of the actors whose process is there."""
+        expression = self._network.expression(f"{ALIVE}/*")
+        replies = self._session.liveliness().get(expression, timeout=timeout_s)
+        return {str(r.ok.key_expr).rsplit("/", 1)[1] for r in replies if r.ok is not None}
 
     def control(self, verb: str, timeout_s: float = 120.0) -> ControlAnswer:
         """Ask the service to pause, resume, save or reset; returns when all actors have done it.

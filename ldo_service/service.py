@@ -21,6 +21,7 @@ from ldo_service.actors.graph import RUNNING, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.control import Control
 from ldo_service.errors import ConfigError, StageStalled
+from ldo_service.metrics import HealthCollector, exported
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.graph import lossless_consumers
 from ldo_service.runtime.process import (
@@ -33,7 +34,7 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.supervision import Runner, Stop, supervise
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
-from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE
+from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,7 @@ class Service:
     state: Path
     only: tuple[str, ...] = ()
     is_state_kept: bool = True  # the folder outlives the service
+    metrics_port: int | None = None  # for Prometheus, on loopback
 
     def run(self) -> None:
         """Serve until SIGINT or SIGTERM; a second one stops at once.
@@ -56,14 +58,20 @@ class Service:
         check_graph(RUNNING)
         self._require_known(self.only)
         self._require_known(self.config.service.spawned)
-        with open_session(self.network, router=not self.only) as session:
+        health = HealthCollector()
+        with ExitStack() as stack:
+            if self.metrics_port is not None:
+                stack.enter_context(exported(health, self.metrics_port))
+            session = stack.enter_context(open_session(self.network, router=not self.only))
             try:
-                asyncio.run(self._serve(session))
+                asyncio.run(self._serve(session, health))
             except StageStalled as error:
                 _leave(error)  # its thread cannot be stopped, and would keep the process alive
 
-    async def _serve(self, session: zenoh.Session) -> None:
+    async def _serve(self, session: zenoh.Session, health: HealthCollector) -> None:
         transport = ZenohTransport(session, self.network)
+        if self.metrics_port is not None:
+            transport.subscribe(f"{HEALTH.name}/*", health.heard)
         stop = Stop()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -12,7 +12,9 @@ from importlib.metadata import PackageNotFoundError, version
 from rich.console import Console
 
 from ldo_service import __version__, kernels
+from ldo_service.actors.graph import RUNNING
 from ldo_service.client import connect
+from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.errors import ConfigError, LdoError
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import Health
@@ -92,39 +94,59 @@ def extras() -> Iterator[Finding]:
 
 def service(robot: str, endpoint: str) -> Iterator[Finding]:
     try:
-        actors = heard(robot, endpoint)
+        actors = seen(robot, endpoint)
     except ConfigError:
         yield Finding("absent", f"no service on {endpoint}: `ldo serve` starts one")
         return
-    if not actors:
+    if not any(actor.has_token or actor.health for actor in actors):
         yield Finding(
             "bad",
             f"something answers on {endpoint}, and no actor of robot {robot!r} is heard: is that "
             "its name, and does the router's access control let this client subscribe?",
         )
-    for health in actors.values():
-        yield from _of_actor(health)
+        return
+    for actor in actors:
+        yield from of_actor(actor)
 
 
-def heard(robot: str, endpoint: str) -> dict[str, Health]:
-    """The last heartbeat of each actor. Raises ConfigError when nobody answers."""
-    actors: dict[str, Health] = {}
+def seen(robot: str, endpoint: str) -> list[Seen]:
+    """Every actor of the graph, listened to for a while. Raises ConfigError when nobody answers."""
+    heard: dict[str, tuple[float, Health]] = {}
     with connect(robot, endpoint) as client, client.listen(f"{HEALTH.name}/*", Health) as inbox:
         until_s = time.monotonic() + LISTEN_S
         while time.monotonic() < until_s:
             for health in inbox():
-                actors[health.actor] = health
+                heard[health.actor] = (time.monotonic(), health)
             time.sleep(0.05)
-    return actors
+        alive, now_s = client.alive(), time.monotonic()
+    names = [box.name for box in RUNNING]
+    names += sorted((set(heard) | alive) - set(names))  # of a later version
+    return [_seen(name, name in alive, heard.get(name), now_s) for name in names]
 
 
-def _of_actor(health: Health) -> Iterator[Finding]:
+def _seen(name: str, has_token: bool, last: tuple[float, Health] | None, now_s: float) -> Seen:
+    if last is None:
+        return Seen(name, has_token, None, LISTEN_S)
+    heard_at_s, health = last
+    return Seen(name, has_token, health, LISTEN_S, heartbeat_age_s=now_s - heard_at_s)
+
+
+def of_actor(actor: Seen) -> Iterator[Finding]:
+    """How it is, then what is wrong with it."""
+    wrong = list(troubles(actor))
+    if actor.health is not None:
+        yield Finding("bad" if wrong else "ok", _in_numbers(actor.health))
+    for trouble in wrong:
+        yield Finding("bad", f"{actor.actor} {trouble}")
+    for remark in remarks(actor):
+        yield Finding("absent", f"{actor.actor} {remark}")
+
+
+def _in_numbers(health: Health) -> str:
     dropped = sum(i.dropped for i in health.inputs)
     rejected = sum(i.rejected for i in health.inputs)
-    troubled = health.set_aside > 0 or health.restarts > 0
-    yield Finding(
-        "bad" if troubled else "ok",
+    return (
         f"{health.actor} (process {health.pid}): {health.state}, {health.steps} steps of "
         f"{health.step_ms_p50:.1f} ms p50, {health.step_ms_p95:.1f} ms p95, {dropped} dropped, "
-        f"{rejected} rejected, {health.restarts} restarts, {health.rss_mb:.0f} MB",
+        f"{rejected} rejected, {health.restarts} restarts, {health.rss_mb:.0f} MB"
     )

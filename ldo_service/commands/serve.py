@@ -32,6 +32,12 @@ def serve(
             help="where actors keep what a successor needs; default: a temporary folder",
         ),
     ] = None,
+    metrics: Annotated[
+        int | None,
+        tyro.conf.arg(
+            metavar="PORT", help="export every actor's health for Prometheus on 127.0.0.1:PORT"
+        ),
+    ] = None,
 ) -> None:
     """Run the service: camera frames in on camera/rgbd; poses, map and health out.
 
@@ -48,4 +54,5 @@ def serve(
             folder,
             tuple(only),
             is_state_kept=state is not None,
+            metrics_port=metrics,
         ).run()

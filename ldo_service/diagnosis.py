@@ -1,0 +1,103 @@
+"""What is wrong with an actor, from what can be seen from outside, and what to do about it.
+
+Three levels: its liveliness token (there while its process is), its heartbeat (twice a second while
+its event loop turns), and the age of its last step (young while it works).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from ldo_service.schemas import Health
+
+SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians)
+IDLE_S = 5.0  # a mailbox with messages is emptied within a step; a camera sends many a second
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What was seen of an actor while somebody listened for `listened_s`."""
+
+    actor: str
+    has_token: bool
+    health: Health | None  # its last heartbeat
+    listened_s: float
+    heartbeat_age_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    what: str
+    advice: str
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.advice}"
+
+
+def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
+    """What must be mended; nothing when the actor is well."""
+    if not seen.has_token and seen.health is None:
+        yield Trouble(
+            "is not running",
+            "the log of `ldo serve` says how it ended, and when it is started again",
+        )
+    elif seen.health is None:
+        yield _silent(f"for {seen.listened_s:.1f} s")
+    elif seen.heartbeat_age_s > 3 * heartbeat_s:
+        yield _silent(f"for {seen.heartbeat_age_s:.1f} s")
+    else:
+        if not seen.has_token:
+            yield Trouble(
+                "reports, and its liveliness token is absent",
+                "it is ending, or the router's access control hides it: look again in 10 s",
+            )
+        yield from _of_steps(seen.health)
+        yield from _of_failures(seen.health)
+
+
+def _silent(how_long: str) -> Trouble:
+    return Trouble(
+        f"has a process, and no heartbeat {how_long}",
+        "the process is stopped or its machine overloaded; the service kills and restarts one "
+        "that stays so for service.silent_after_s",
+    )
+
+
+def _of_steps(health: Health) -> Iterator[Trouble]:
+    waiting = sum(count.waiting for count in health.inputs)
+    if health.busy_s > SLOW_STEP_S:
+        yield Trouble(
+            f"has been busy with one message for {health.busy_s:.0f} s",
+            "give it less work per message; beyond stage.stall_after_s it is given up",
+        )
+    elif waiting and health.step_age_s > IDLE_S and not health.held:
+        yield Trouble(
+            f"took none of {waiting} waiting messages for {health.step_age_s:.0f} s",
+            "it waits for room at a consumer: look at the actors that take what it makes",
+        )
+
+
+def _of_failures(health: Health) -> Iterator[Trouble]:
+    if health.set_aside or health.restarts:
+        yield Trouble(
+            f"failed {health.failures} times, was restarted {health.restarts} times and set "
+            f"{health.set_aside} messages aside",
+            "the log of `ldo serve` has each failure",
+        )
+
+
+def remarks(seen: Seen) -> Iterator[str]:
+    """What a person wants to know and nobody has to mend."""
+    health = seen.health
+    if health is None:
+        return
+    from_camera = [count for count in health.inputs if count.topic.startswith("camera/")]
+    if health.held:
+        yield "is paused: `ldo control resume` ends it"
+    elif from_camera and sum(count.delivered for count in from_camera) == 0:
+        topics = ", ".join(count.topic for count in from_camera)
+        yield (
+            f"has had no frame yet on {topics}: start a camera, or `ldo publish SOURCE`; a camera "
+            "that runs may be denied by the router's access control, which tells it nothing"
+        )
+    elif from_camera and health.step_age_s > IDLE_S:
+        yield f"had its last frame {health.step_age_s:.0f} s ago"

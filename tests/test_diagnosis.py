@@ -1,0 +1,73 @@
+"""Each of the three levels of health, judged, and what to do."""
+
+import msgspec
+import pytest
+
+from ldo_service.diagnosis import Seen, remarks, troubles
+from ldo_service.schemas import Health, InputCount
+
+
+def health(**fields) -> Health:
+    counts = InputCount(
+        topic="frame/rgbd", delivered=9, dropped=0, rejected=0, gaps=0, waiting=0, peak=1
+    )
+    well = Health(
+        stamp_ns=1, actor="tracker", state="ready", pid=1, epoch=1, steps=9, failures=0, restarts=0,
+        set_aside=0, step_age_s=0.1, busy_s=0.0, step_ms_p50=1.0, step_ms_p95=2.0, rss_mb=100.0,
+        inputs=(counts,), outputs=(),
+    )  # fmt: skip
+    return msgspec.structs.replace(well, **fields)
+
+
+def inputs(topic: str = "frame/rgbd", **fields) -> tuple[InputCount, ...]:
+    return (msgspec.structs.replace(health().inputs[0], topic=topic, **fields),)
+
+
+def seen(of: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1) -> Seen:
+    return Seen("tracker", has_token, of, 1.5, heartbeat_age_s)
+
+
+@pytest.mark.parametrize(
+    "actor",
+    [
+        seen(health()),
+        seen(health(step_age_s=3600.0)),  # nothing to do is no trouble
+        seen(health(step_age_s=60.0, held=True, inputs=inputs(waiting=3))),
+        seen(health(busy_s=0.5, state="busy", inputs=inputs(waiting=8))),
+        seen(health(inputs=inputs(dropped=500, rejected=3))),  # what a slow machine does
+    ],
+)
+def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
+    assert list(troubles(actor)) == []
+
+
+@pytest.mark.parametrize(
+    ("actor", "says"),
+    [
+        (seen(None, has_token=False), "is not running"),
+        (seen(None), "no heartbeat for 1.5 s"),
+        (seen(health(), heartbeat_age_s=1.6), "no heartbeat for 1.6 s"),
+        (seen(health(), has_token=False), "token is absent"),
+        (seen(health(busy_s=12.0, inputs=inputs(waiting=1))), "busy with one message for 12 s"),
+        (seen(health(step_age_s=20.0, inputs=inputs(waiting=4))), "none of 4 waiting messages"),
+        (seen(health(set_aside=1, failures=2, restarts=2)), "1 messages aside"),
+    ],
+)
+def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
+    (trouble,) = troubles(actor)
+    assert says in trouble.what
+    assert len(trouble.advice) > 20
+
+
+@pytest.mark.parametrize(
+    ("of", "says"),
+    [
+        (health(held=True), "ldo control resume"),
+        (health(inputs=inputs("camera/rgbd", delivered=0)), "no frame yet"),
+        (health(inputs=inputs("camera/rgbd"), step_age_s=9.0), "last frame 9 s ago"),
+    ],
+)
+def test_what_is_no_fault_is_a_remark(of: Health, says: str) -> None:
+    (remark,) = remarks(seen(of))
+    assert says in remark
+    assert list(troubles(seen(of))) == []
