@@ -31,6 +31,9 @@ from ldo_service.wire import (
 UNIT_WITHIN = 1e-3  # of a quaternion's norm: four digits, as people copy them, and then normalised
 
 
+RECENT_KEYFRAMES = 32  # four windows of keyframe/new: the optimizer cannot be further behind
+
+
 @dataclass(frozen=True, slots=True)
 class Mounting:
     """Where the camera sits on the robot: T_base_camera.
@@ -81,44 +84,44 @@ class Tracker(Actor):
         self._T_base_camera = pose_message(self.config.T_base_camera.matrix())
         self._odometry = Odometry(self.config.odometry)
         self._poses = KeyframePoses()  # of the keyframes that the odometry remembers
-        self._id_of_frame: dict[int, int] = {}  # keyframe id by frame index, for the same ones
-        self._next_id = 0
-        self._without_room = 0
+        self._made = self._without_room = 0
         self._saved: dict[str, Any] = {}  # the remembered keyframes as they were put away
 
     def handle(self, message: FrameRgbd | Correction) -> Iterator[TrackedPose | Keyframe]:
         if isinstance(message, Correction):
-            self._poses.correct(message.graph_version, keyframe_poses_of(message))
+            T_map = keyframe_poses_of(message, only=self._poses)
+            self._poses.correct(message.graph_version, T_map)
         else:
             yield from self._track(rgbd_of(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
         tracked = self._odometry.track(frame)
-        keyframe = self._keyframe_id(frame, tracked)
-        if tracked.method == "first" and keyframe is None:
-            return  # nobody is there to map it yet: begin with a later frame
-        reference = self._id_of_frame.get(tracked.keyframe_index)
+        keyframe = self._make_keyframe(frame, tracked) if self._may_map(frame, tracked) else None
         if keyframe is not None:
-            yield self._keyframe(frame, tracked, keyframe, reference)
-            self._remember(frame, tracked, keyframe, reference)
-        yield self._tracked_pose(frame, tracked, keyframe, reference)
+            yield keyframe
+        elif tracked.method == "first":
+            return  # nobody is there to map it yet: begin with a later frame
+        yield self._tracked_pose(frame, tracked, None if keyframe is None else keyframe.keyframe)
 
     # --- keyframes --------------------------------------------------------------------------------
-    def _keyframe_id(self, frame: RgbdFrame, tracked: Tracked) -> int | None:
-        """The id this frame gets as a keyframe; None when it is none."""
+    def _may_map(self, frame: RgbdFrame, tracked: Tracked) -> bool:
+        """Whether the frame becomes a keyframe: wanted, not held out, and everyone has room."""
         if not tracked.wants_keyframe or tracked.status is not Status.OK:
-            return None
+            return False
         hold_out = self.config.hold_out
         if hold_out and frame.index % hold_out == hold_out - 1:
-            return None
-        if not self.has_room(KEYFRAME_NEW):
-            self._without_room += 1
-            return None
-        return self._next_id
+            return False
+        has_room = self.has_room(KEYFRAME_NEW)
+        self._without_room += not has_room
+        return has_room
 
-    def _keyframe(
-        self, frame: RgbdFrame, tracked: Tracked, keyframe: int, reference: int | None
-    ) -> Keyframe:
+    def _make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> Keyframe:
+        keyframe = self._odometry.make_keyframe(frame, tracked)
+        self._poses.chain(
+            keyframe, tracked.keyframe, tracked.T_keyframe_camera, tracked.T_odom_camera
+        )
+        self._poses.keep_only((*self._odometry.keyframes(), *self._recent(keyframe)))
+        self._made += 1
         return Keyframe(
             stamp_ns=frame.stamp_ns,
             keyframe=keyframe,
@@ -126,33 +129,24 @@ class Tracker(Actor):
             camera=camera_message(frame.camera),
             color=Array.of(frame.color),
             depth_m=Array.of(frame.depth_m),
-            reference=reference,
+            reference=tracked.keyframe,
             T_reference_keyframe=pose_message(tracked.T_keyframe_camera),
             information=matrix6_message(tracked.information),
             T_odom_keyframe=pose_message(tracked.T_odom_camera),
             overlap=tracked.overlap,
         )
 
-    def _remember(
-        self, frame: RgbdFrame, tracked: Tracked, keyframe: int, reference: int | None
-    ) -> None:
-        self._odometry.make_keyframe(frame, tracked)
-        self._poses.chain(keyframe, reference, tracked.T_keyframe_camera, tracked.T_odom_camera)
-        self._id_of_frame[frame.index] = keyframe
-        self._next_id = keyframe + 1
-        kept = self._odometry.keyframe_indices()
-        self._id_of_frame = {i: k for i, k in self._id_of_frame.items() if i in kept}
-        self._poses.keep_only(self._id_of_frame.values())
+    def _recent(self, keyframe: int) -> Iterator[int]:
+        """Keyframes that the optimizer may not have placed yet; their poses are small."""
+        return (k for k in self._poses if k > keyframe - RECENT_KEYFRAMES)
 
     # --- poses ------------------------------------------------------------------------------------
     def _tracked_pose(
-        self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None, reference: int | None
+        self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None
     ) -> TrackedPose:
-        hangs_on = keyframe if reference is None else reference
-        T_reference_camera = np.eye(4) if reference is None else tracked.T_keyframe_camera
-        if hangs_on is not None and hangs_on not in self._poses:
-            hangs_on, T_reference_camera = keyframe, np.eye(4)  # its reference was just forgotten
-        T_map_odom = np.eye(4) if hangs_on is None else self._poses.T_map_odom(hangs_on)
+        """The first keyframe refers to itself; before it nothing is known."""
+        reference = keyframe if tracked.keyframe is None else tracked.keyframe
+        T_map_odom = np.eye(4) if reference is None else self._poses.T_map_odom(reference)
         return TrackedPose(
             stamp_ns=frame.stamp_ns,
             frame=frame.index,
@@ -160,8 +154,8 @@ class Tracker(Actor):
             T_odom_camera=pose_message(tracked.T_odom_camera),
             T_map_odom=pose_message(se3.orthonormalised(T_map_odom)),
             graph_version=self._poses.version,
-            reference=hangs_on,
-            T_reference_camera=pose_message(T_reference_camera),
+            reference=reference,
+            T_reference_camera=pose_message(tracked.T_keyframe_camera),
             keyframe=keyframe,
             covariance=matrix6_message(np.linalg.pinv(tracked.information, hermitian=True)),
             inlier_fraction=tracked.inlier_fraction,
@@ -176,24 +170,17 @@ class Tracker(Actor):
     def snapshot(self) -> dict[str, Any]:
         """A part for each remembered keyframe, written once, and one for what changes."""
         state = self._odometry.state()
-        kept = {str(k["index"]): k for k in state.pop("keyframes")}
+        kept = {str(k["id"]): k for k in state.pop("keyframes")}
         self._saved = {name: self._saved.get(name, kept[name]) for name in kept}
-        changing = {
-            "odometry": state,
-            "kept": list(kept),
-            "poses": self._poses.snapshot(),
-            "ids": list(self._id_of_frame.items()),
-            "next_id": self._next_id,
-        }
+        changing = {"odometry": state, "kept": list(kept), "poses": self._poses.snapshot()}
         return {**{f"keyframe_{name}": part for name, part in self._saved.items()}, "now": changing}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]
         self._saved = {name: state[f"keyframe_{name}"] for name in now["kept"]}
         self._odometry.restore({**now["odometry"], "keyframes": list(self._saved.values())})
+        self._odometry.skip_keyframe_id()  # one more may have been sent and not saved
         self._poses.restore(now["poses"])
-        self._id_of_frame = {int(index): int(keyframe) for index, keyframe in now["ids"]}
-        self._next_id = now["next_id"]
 
     def facts(self) -> dict[str, float]:
-        return {"keyframes": self._next_id, "keyframes_without_room": self._without_room}
+        return {"keyframes": self._made, "keyframes_without_room": self._without_room}

@@ -1,6 +1,7 @@
 """Between messages and numerics: the one place that knows both."""
 
 import time
+from collections.abc import Iterable
 
 import msgspec
 import numpy as np
@@ -86,13 +87,19 @@ def correction_message(
     )
 
 
-def keyframe_poses_of(correction: Correction) -> dict[int, np.ndarray]:
-    """T_map_keyframe [4, 4] by keyframe id."""
+def keyframe_poses_of(
+    correction: Correction, only: Iterable[int] | None = None
+) -> dict[int, np.ndarray]:
+    """T_map_keyframe [4, 4] by keyframe id; of `only` those and the newest one it names."""
+    keyframes = correction.keyframes.numpy()
     rows = correction.T_map_keyframe.numpy()
-    return {
-        int(k): se3.from_quaternion(row[:3], row[3:])
-        for k, row in zip(correction.keyframes.numpy(), rows, strict=True)
-    }
+    if only is not None and len(keyframes):
+        chosen = np.isin(keyframes, list(only))
+        chosen[-1] = True
+        keyframes, rows = keyframes[chosen], rows[chosen]
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = se3.rotation(rows[:, 3:]), rows[:, :3]
+    return dict(zip(keyframes.tolist(), T, strict=True))
 
 
 def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:

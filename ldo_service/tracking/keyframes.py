@@ -20,9 +20,13 @@ class KeyframeConfig:
     max_rotation_rad: float = radians(15.0)
     max_translation: float = 0.08  # of the median depth
     min_frames: int = 2  # at most every 2nd frame
-    max_frames: int = 30  # at least every 30th
+    max_frames: int = 30  # at least every 30th, if the camera moved at all
+    still_overlap: float = 0.97  # of the visible surface: above, and
+    still_motion: float = 0.01  # rad, and fraction of the median depth: below, it stands still
 
     def __post_init__(self) -> None:
+        if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
+            raise ConfigError("still_overlap must be within 0..1, still_motion at least 0.")
         if not 0 <= self.min_overlap <= 1:
             raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
         if not 1 <= self.min_frames <= self.max_frames:
@@ -38,7 +42,7 @@ class Keyframe:
 
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
-    index: int  # `RgbdFrame.index`
+    id: int  # ascending, given by the odometry: a camera's frame numbers may start again
 
     @cached_property
     def reference(self) -> Reference:
@@ -61,10 +65,13 @@ def is_due(
     """Whether a view has left its keyframe far enough, `frames` frames after it."""
     if frames < config.min_frames:
         return False
-    translation = np.linalg.norm(T_keyframe_camera[:3, 3]) / median_depth_m
+    translation = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / median_depth_m
+    rotation_rad = se3.rotation_angle(T_keyframe_camera)
+    if max(translation, rotation_rad) < config.still_motion and overlap > config.still_overlap:
+        return False  # a robot that waits must not fill its map
     return bool(
         frames >= config.max_frames
         or overlap < config.min_overlap
         or translation > config.max_translation
-        or se3.rotation_angle(T_keyframe_camera) > config.max_rotation_rad
+        or rotation_rad > config.max_rotation_rad
     )

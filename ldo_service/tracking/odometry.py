@@ -57,7 +57,7 @@ class Tracked:
 
     T_odom_camera: np.ndarray  # [4, 4]
     T_keyframe_camera: np.ndarray  # [4, 4]
-    keyframe_index: int  # `RgbdFrame.index` of the keyframe
+    keyframe: int | None  # id of the keyframe it was aligned to; None before the first
     status: Status
     method: str  # "first", "direct", "features", "relocalised", "none"
     wants_keyframe: bool
@@ -91,26 +91,34 @@ class Odometry:
             (keyframe, candidate), status = found, Status.OK
         return self._accepted(frame, keyframe, candidate, status)
 
-    def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> None:
-        """Track against this frame, the one just tracked, from now on.
+    def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
+        """Track against this frame, the one just tracked, from now on; its id as a keyframe.
 
         Raises ValueError for a LOST frame, whose pose is unknown.
         """
         if tracked.status is Status.LOST:
             raise ValueError(f"frame {frame.index} is LOST and cannot be a keyframe.")
-        view = self._view(frame)
+        before, view = self._state, self._view(frame)
         view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
-        keyframe = Keyframe(view, tracked.T_odom_camera, frame.index)
-        memory = (*self._state.memory, keyframe)[-self.config.relocalisation.memory :]
+        keyframe = Keyframe(view, tracked.T_odom_camera, before.next_id)
         self._state = replace(
-            self._state, memory=memory, keyframe=keyframe, frames_since_keyframe=0
+            before,
+            memory=(*before.memory, keyframe)[-self.config.relocalisation.memory :],
+            keyframe=keyframe,
+            frames_since_keyframe=0,
+            next_id=before.next_id + 1,
         )
+        return keyframe.id
 
-    def keyframe_indices(self) -> frozenset[int]:
-        """`RgbdFrame.index` of the keyframes that a frame may still be aligned to."""
+    def skip_keyframe_id(self) -> None:
+        """Leave an id unused, for one that may have been given and forgotten."""
+        self._state = replace(self._state, next_id=self._state.next_id + 1)
+
+    def keyframes(self) -> tuple[int, ...]:
+        """Ids of the keyframes that a frame may still be aligned to, ascending."""
         current = self._state.keyframe
         kept = (*self._state.memory, *(() if current is None else (current,)))
-        return frozenset(keyframe.index for keyframe in kept)
+        return tuple(sorted({keyframe.id for keyframe in kept}))
 
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values: 1.5 MB a keyframe."""
@@ -131,7 +139,7 @@ class Odometry:
         usable = measured >= self.config.judgement.min_paired
         self._state = replace(self._state, motion=Motion(stamp_ns=frame.stamp_ns))
         status, method = (Status.OK, "first") if usable else (Status.LOST, "none")
-        return Tracked(np.eye(4), np.eye(4), frame.index, status, method, wants_keyframe=usable)
+        return Tracked(np.eye(4), np.eye(4), None, status, method, wants_keyframe=usable)
 
     def _followed(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
         """Alignment from the predicted pose; from every other guess too, where that is not sure."""
@@ -213,9 +221,15 @@ class Odometry:
     ) -> None:
         before = self._state
         if status is not before.status:
-            log.info("tracking %s, was %s; keyframe %d", status, before.status, keyframe.index)
-        frames = before.frames_since_keyframe + 1
-        self._state = State(before.memory, keyframe, motion, history, status, frames)
+            log.info("tracking %s, was %s; keyframe %d", status, before.status, keyframe.id)
+        self._state = replace(
+            before,
+            keyframe=keyframe,
+            motion=motion,
+            history=history,
+            status=status,
+            frames_since_keyframe=before.frames_since_keyframe + 1,
+        )
 
 
 def _report(
@@ -229,7 +243,7 @@ def _report(
     return Tracked(
         T_odom_camera,
         alignment.T_reference_camera,
-        keyframe.index,
+        keyframe.id,
         status,
         method,
         wants_keyframe,

@@ -19,6 +19,7 @@ class State:
     history: History = field(default_factory=History)
     status: Status = Status.OK
     frames_since_keyframe: int = 0
+    next_id: int = 0  # of the next keyframe
 
 
 def packed(state: State) -> dict[str, Any]:
@@ -34,6 +35,7 @@ def packed(state: State) -> dict[str, Any]:
         "history": asdict(state.history),
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
+        "next_id": state.next_id,
     }
 
 
@@ -47,6 +49,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         history=History(**{name: tuple(noise) for name, noise in values["history"].items()}),
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
+        next_id=values["next_id"],
     )
 
 
@@ -57,11 +60,11 @@ def _packed(keyframe: Keyframe) -> dict[str, Any]:
         "depth_m": view.depth_m,
         "camera": asdict(view.camera),
         "T_odom_keyframe": keyframe.T_odom_keyframe,
-        "index": keyframe.index,
+        "id": keyframe.id,
     }
 
 
 def _unpacked(kept: dict[str, Any], config: PyramidConfig) -> Keyframe:
     camera = Camera(**{**kept["camera"], "distortion": tuple(kept["camera"]["distortion"])})
     view = build_pyramid(kept["gray"], kept["depth_m"], camera, config)
-    return Keyframe(view, kept["T_odom_keyframe"], kept["index"])
+    return Keyframe(view, kept["T_odom_keyframe"], kept["id"])

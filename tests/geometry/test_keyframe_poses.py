@@ -56,7 +56,7 @@ def test_a_correction_returns_the_motion_of_every_keyframe(steps) -> None:
         np.testing.assert_allclose(poses[keyframe], new[keyframe], atol=1e-12)
 
 
-def test_keyframes_newer_than_a_correction_follow_its_newest(steps) -> None:
+def test_keyframes_newer_than_a_correction_follow_their_references(steps) -> None:
     poses = chained(steps)
     T_3_5 = se3.inverse(poses[3]) @ poses[5]
     rng = np.random.default_rng(3)
@@ -65,16 +65,18 @@ def test_keyframes_newer_than_a_correction_follow_its_newest(steps) -> None:
     np.testing.assert_allclose(se3.inverse(poses[3]) @ poses[5], T_3_5, atol=1e-12)
 
 
-def test_order_of_correction_and_keyframe_does_not_matter(steps) -> None:
+@pytest.mark.parametrize("reference", [1, 4])
+def test_order_of_correction_and_keyframe_does_not_matter(steps, reference: int) -> None:
     rng = np.random.default_rng(4)
     before, after = chained(steps[:5]), chained(steps[:5])
-    new = {k: before[k] @ random_pose(rng, 0.05) for k in range(5)}
-    T_odom_5 = before[4] @ steps[5]
-    before.chain(5, 4, steps[5], T_odom_5)
+    new = {k: before[k] @ random_pose(rng, 0.05) for k in range(5)}  # each moves differently
+    T_odom_5 = before[reference] @ steps[5]
+    before.chain(5, reference, steps[5], T_odom_5)
     before.correct(1, new)
     after.correct(1, new)
-    after.chain(5, 4, steps[5], T_odom_5)
+    after.chain(5, reference, steps[5], T_odom_5)
     np.testing.assert_allclose(before[5], after[5], atol=1e-12)
+    np.testing.assert_allclose(after[5], new[reference] @ steps[5], atol=1e-12)
 
 
 def test_an_older_correction_changes_nothing(steps) -> None:

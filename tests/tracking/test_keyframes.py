@@ -12,6 +12,9 @@ TURNED = se3.exp(np.array([0, np.radians(16), 0, 0, 0, 0]))
 MOVED = se3.exp(np.array([0, 0, 0, 0.2, 0, 0]))
 
 
+SLIGHTLY = se3.exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
+
+
 @pytest.mark.parametrize(
     ("T", "overlap", "median_depth_m", "frames", "expected"),
     [
@@ -21,7 +24,10 @@ MOVED = se3.exp(np.array([0, 0, 0, 0.2, 0, 0]))
         (MOVED, 1.0, 2.0, 5, True),
         (MOVED, 1.0, 3.0, 5, False),  # the same way means less in a larger room
         (TURNED, 0.2, 2.0, 1, False),  # at most every 2nd frame
-        (np.eye(4), 1.0, 2.0, 30, True),  # at least every 30th
+        (SLIGHTLY, 1.0, 2.0, 30, True),  # at least every 30th
+        (SLIGHTLY, 1.0, 2.0, 29, False),
+        (np.eye(4), 1.0, 2.0, 3000, False),  # a camera that stands still fills no map
+        (np.eye(4), 0.9, 2.0, 30, True),  # unless what it sees has changed
     ],
 )
 def test_keyframe_is_due_when_the_view_has_changed(

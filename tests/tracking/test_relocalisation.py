@@ -32,7 +32,7 @@ def test_right_keyframe_is_found_whatever_its_age(large_room) -> None:
         place = found(large_room, large_room.view(T_odom_keyframe @ T_NEAR))
         assert place is not None
         keyframe, candidate = place
-        assert keyframe.index == index
+        assert keyframe.id == index
         np.testing.assert_allclose(candidate.alignment.T_reference_camera, T_NEAR, atol=1e-3)
 
 

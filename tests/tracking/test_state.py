@@ -22,7 +22,7 @@ def test_current_keyframe_keeps_its_place_in_memory(room) -> None:
     known = keyframes(room, 3)
     state = State(memory=known, keyframe=known[1], frames_since_keyframe=4)
     restored = unpacked(packed(state), PyramidConfig())
-    assert [k.index for k in restored.memory] == [0, 1, 2]
+    assert [k.id for k in restored.memory] == [0, 1, 2]
     assert restored.keyframe is restored.memory[1]
     assert restored.frames_since_keyframe == 4
 
@@ -32,6 +32,6 @@ def test_forgotten_current_keyframe_is_kept_beside_the_memory(room) -> None:
     restored = unpacked(
         packed(replace(State(), memory=known[1:], keyframe=known[0])), PyramidConfig()
     )
-    assert [k.index for k in restored.memory] == [1, 2]
+    assert [k.id for k in restored.memory] == [1, 2]
     assert restored.keyframe is not None
-    assert restored.keyframe.index == 0
+    assert restored.keyframe.id == 0
