@@ -49,6 +49,11 @@ from ldo_service.wire import (
 Output = ModelView | MapDelta | MapSnapshot
 
 
+# A successor starts from a checkpoint and must not use a version again that followers may hold:
+# more than a mapper could use up between two checkpoints.
+VERSIONS_IN_A_CHECKPOINT = 1 << 20
+
+
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
     insertion: InsertionConfig = field(default_factory=InsertionConfig)
@@ -83,6 +88,7 @@ class Mapper(Actor):
         self._threads = self.config.thread_count()
         self._map = GaussianMap()
         self._poses = KeyframePoses()
+        self._applied: dict[int, np.ndarray] = {}  # T_map_keyframe that the Gaussians stand at
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
         self._since_snapshot = (
             self.config.snapshot_keyframes
@@ -108,6 +114,7 @@ class Mapper(Actor):
             transform(message.T_reference_keyframe),
             transform(message.T_odom_keyframe),
         )
+        self._applied[message.keyframe] = T_map_keyframe
         self._newest = (message.stamp_ns, message.keyframe)
         frame = rgbd_of(message)
         # add what the map does not explain
@@ -131,21 +138,24 @@ class Mapper(Actor):
     def _correct(self, message: Correction) -> Iterator[MapDelta]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         moved = self._poses.correct(message.graph_version, keyframe_poses_of(message))
-        motions = tuple(
-            AnchorMotion(keyframe=keyframe, T_new_old=pose_message(T_new_old))
-            for keyframe, T_new_old in moved.items()
-            if self._is_noticeable(T_new_old)
-        )
-        if motions:
+        motions = tuple(filter(None, map(self._motion, moved)))
+        if motions and len(self._map):
             since = self._map.version
             self._map.move_anchors({m.keyframe: transform(m.T_new_old) for m in motions})
             yield self._delta(since, motions=motions)
 
-    def _is_noticeable(self, T_new_old: np.ndarray) -> bool:
-        return (
-            float(np.linalg.norm(T_new_old[:3, 3])) > self.config.motion_min_m
-            or se3.rotation_angle(T_new_old) > self.config.motion_min_rad
-        )
+    def _motion(self, keyframe: int) -> AnchorMotion | None:
+        """From where its Gaussians are to where the keyframe is; None while it is too little, which
+        adds up until it is enough."""
+        T_new_old = pose_message(self._poses[keyframe] @ se3.inverse(self._applied[keyframe]))
+        motion = transform(T_new_old)
+        if (
+            float(np.linalg.norm(motion[:3, 3])) <= self.config.motion_min_m
+            and se3.rotation_angle(motion) <= self.config.motion_min_rad
+        ):
+            return None
+        self._applied[keyframe] = motion @ self._applied[keyframe]
+        return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
 
     # --- messages ---------------------------------------------------------------------------------
     def _delta(
@@ -220,13 +230,10 @@ class Mapper(Actor):
     def snapshot(self) -> dict[str, Any]:
         """The map every few keyframes: between, the same object as before."""
         newest = self._newest[1]
-        saved = self._checkpoint.get("newest", (0, -1))[1]
-        if newest - saved >= self.config.checkpoint_keyframes or (newest >= 0 and saved < 0):
-            self._checkpoint = {
-                "newest": self._newest,
-                "map": self._map.snapshot(),
-                "poses": self._poses.snapshot(),
-            }
+        saved = self._checkpoint["newest"][1] if self._checkpoint else None
+        is_due = saved is None or newest - saved >= self.config.checkpoint_keyframes
+        if newest >= 0 and is_due:
+            self._put_away()
         return {"map": self._checkpoint} if self._checkpoint else {}
 
     def checkpoint(self) -> dict[str, Any]:
@@ -234,12 +241,22 @@ class Mapper(Actor):
         self._checkpoint = {}
         return self.snapshot()
 
+    def _put_away(self) -> None:
+        self._checkpoint = {
+            "newest": self._newest,
+            "map": self._map.snapshot(),
+            "poses": self._poses.snapshot(),
+            "applied": np.array(list(self._applied.values())).reshape(-1, 4, 4),
+        }
+
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["map"]
         stamp_ns, keyframe = saved["newest"]
         self._newest = (int(stamp_ns), int(keyframe))
         self._map = GaussianMap.restore(saved["map"])
+        self._map.version += VERSIONS_IN_A_CHECKPOINT
         self._poses.restore(saved["poses"])
+        self._applied = dict(zip(self._poses, saved["applied"], strict=True))
 
     def facts(self) -> dict[str, float]:
         return {

@@ -45,7 +45,7 @@ def test_a_successor_goes_on_with_a_newer_version(keyframes) -> None:
     second.restore(first.snapshot())
     (expected,) = handled(first, keyframes[-1:])
     (correction,) = handled(second, keyframes[-1:])
-    assert correction.graph_version > expected.graph_version - 1
+    assert correction.graph_version > expected.graph_version, "one may have been sent and not saved"
     for keyframe, T in keyframe_poses_of(correction).items():
         np.testing.assert_allclose(T, keyframe_poses_of(expected)[keyframe], atol=1e-6)
 
