@@ -7,6 +7,8 @@ import numpy as np
 
 from ldo_service.errors import DataError
 
+WIDEST, NARROWEST = 0.02, 100.0  # focal lengths over the side: 175 and 0.6 degrees of view
+
 
 @dataclass(frozen=True, slots=True)
 class Camera:
@@ -30,8 +32,12 @@ class Camera:
             raise DataError(f"camera of {self.width}x{self.height} pixels: both must be positive.")
         if not all(isfinite(n) for n in numbers):
             raise DataError(f"camera intrinsics {numbers} hold NaN or infinity: recalibrate.")
-        if self.fx <= 0 or self.fy <= 0:
-            raise DataError(f"focal lengths fx={self.fx:g}, fy={self.fy:g} px must be positive.")
+        for name, focal, side in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
+            if not NARROWEST * side >= focal >= WIDEST * side:
+                raise DataError(
+                    f"focal length {name}={focal:g} px does not go with an image of {side} px: no "
+                    "camera sees that little or that much. Is it in pixels, and of this image?"
+                )
         if not (-self.width < self.cx < 2 * self.width):
             raise DataError(f"cx={self.cx:g} px is far outside an image {self.width} px wide.")
         if not (-self.height < self.cy < 2 * self.height):

@@ -17,16 +17,14 @@ def decode_color(encoding: str, width: int, height: int, data: memoryview) -> np
         return _pixels(data, np.uint8, (height, width, 3))
     if encoding == "bgr8":
         return np.ascontiguousarray(_pixels(data, np.uint8, (height, width, 3))[..., ::-1])
-    bgr = _decompress(data, cv2.IMREAD_COLOR, encoding)
-    _require_size(bgr, width, height, encoding)
+    bgr = _decompress(data, cv2.IMREAD_COLOR, encoding, width, height)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
 
 
 def decode_depth(encoding: str, width: int, height: int, data: memoryview) -> np.ndarray:
     """[H, W] uint16 or float32, as stored. Raises FrameError for bytes that are no such image."""
     if encoding == "png":
-        depth = _decompress(data, cv2.IMREAD_UNCHANGED, encoding)
-        _require_size(depth, width, height, encoding)
+        depth = _decompress(data, cv2.IMREAD_UNCHANGED, encoding, width, height)
         if depth.dtype != np.uint16 or depth.ndim != 2:
             raise FrameError(f"depth PNG holds {depth.dtype}{depth.shape}, must be 16-bit grey.")
         return depth
@@ -65,11 +63,42 @@ def _expand(data: memoryview, size: int) -> bytes:
         raise FrameError(f"depth cannot be decompressed: {error}.") from error
 
 
-def _decompress(data: memoryview, flags: int, encoding: str) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+def _decompress(data: memoryview, flags: int, encoding: str, width: int, height: int) -> np.ndarray:
+    """A header of another size is refused before memory is taken for it."""
+    announced = announced_size(data)
+    if announced is not None and announced != (width, height):
+        raise FrameError(
+            f"{encoding} image is {announced[0]}x{announced[1]}, announced as {width}x{height}."
+        )
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise FrameError(f"{encoding} image cannot be decoded: {error.err}.") from error
     if image is None:
         raise FrameError(f"{len(data)} bytes are no readable {encoding} image.")
+    _require_size(image, width, height, encoding)
     return image
+
+
+def announced_size(data: memoryview) -> tuple[int, int] | None:
+    """Width and height that the header of a PNG or JPEG announces; None when it has none."""
+    if bytes(data[:8]) == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    if bytes(data[:2]) == b"\xff\xd8":
+        return _jpeg_size(data)
+    return None
+
+
+def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
+    """From the first start-of-frame segment."""
+    at = 2
+    while at + 9 <= len(data) and data[at] == 0xFF:
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = (int.from_bytes(data[at + i : at + i + 2], "big") for i in (5, 7))
+            return width, height
+        at += 2 + length
+    return None
 
 
 def _require_size(image: np.ndarray, width: int, height: int, encoding: str) -> None:

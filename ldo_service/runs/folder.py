@@ -11,7 +11,6 @@ summary.json            counts, speed, memory, versions
 
 import csv
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,13 @@ from ldo_service.schemas import (
 )
 from ldo_service.wire import keyframe_poses_of, transform
 
+WRITTEN = frozenset(
+    {
+        *("trajectory_online.txt", "trajectory.txt", "frames.csv", "keyframes.json", "map.ply"),
+        *("config.yaml", "summary.json"),
+        *("trajectory.png", "views.png"),  # by `ldo eval` and `ldo demo`
+    }
+)
 COLUMNS = (
     *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
@@ -40,24 +46,25 @@ COLUMNS = (
 
 
 def prepare(folder: Path, overwrite: bool) -> None:
-    """An empty folder to write to. Raises ConfigError when it is not empty or not writable."""
+    """An empty folder to write to. Raises ConfigError when it is not empty or not writable.
+
+    `overwrite` deletes the files of an earlier run, and refuses when anything else lies there.
+    """
     try:
-        if folder.is_dir() and any(folder.iterdir()):
-            if not overwrite:
-                raise ConfigError(f"{folder} is not empty. Choose another, or add --overwrite.")
-            _require_a_run(folder)
-            shutil.rmtree(folder)
         folder.mkdir(parents=True, exist_ok=True)
+        found = sorted(folder.iterdir())
+        if found and not overwrite:
+            raise ConfigError(f"{folder} is not empty. Choose another, or add --overwrite.")
+        foreign = [path.name for path in found if path.name not in WRITTEN or path.is_dir()]
+        if foreign:
+            raise ConfigError(
+                f"{folder} holds {foreign[0]}, which no run wrote, so --overwrite leaves all of it "
+                "alone. Choose another folder."
+            )
+        for path in found:
+            path.unlink()
     except OSError as error:
         raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
-
-
-def _require_a_run(folder: Path) -> None:
-    """Overwriting deletes: only what looks like an earlier run."""
-    if not any((folder / name).exists() for name in ("config.yaml", "summary.json")):
-        raise ConfigError(
-            f"{folder} holds no earlier run, so --overwrite leaves it alone. Choose another."
-        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,13 +73,18 @@ def test_bad_arguments_are_a_configuration_error(capsys, tmp_path: Path, argumen
     assert_one_paragraph(err)
 
 
-def test_a_full_folder_is_refused_and_left_alone(capsys, tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
+@pytest.mark.parametrize("beside", [(), ("config.yaml",), ("config.yaml", "summary.json")])
+def test_a_full_folder_is_refused_and_left_alone(capsys, tmp_path: Path, beside) -> None:
+    (tmp_path / "src").mkdir()
+    (tmp_path / "src" / "thesis.tex").write_text("years of work")
+    for name in beside:
+        (tmp_path / name).write_text("{}")
     for extra in ((), ("--overwrite",)):
         code, _, err = ldo(capsys, "run", "synthetic:room", "--out", str(tmp_path), *extra)
         assert code == 2
         assert_one_paragraph(err)
-    assert (tmp_path / "thesis.tex").read_text() == "years of work"
+    assert (tmp_path / "src" / "thesis.tex").read_text() == "years of work"
+    assert all((tmp_path / name).read_text() == "{}" for name in beside)
 
 
 def test_an_unwritable_folder_is_said(capsys) -> None:

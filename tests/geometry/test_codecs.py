@@ -76,3 +76,18 @@ def test_a_small_message_cannot_unpack_to_gigabytes() -> None:
 def test_broken_compression_is_refused() -> None:
     with pytest.raises(FrameError, match="decompressed"):
         codecs.decode_depth("z16+zstd", 9, 6, memoryview(b"not zstd at all"))
+
+
+def test_a_header_that_asks_for_gigabytes_is_refused_before_decoding() -> None:
+    _, data = cv2.imencode(".png", COLOR)
+    huge = bytearray(data.tobytes())
+    huge[16:24] = (60000).to_bytes(4, "big") * 2
+    with pytest.raises(FrameError, match="60000x60000, announced as 9x6"):
+        codecs.decode_color("png", 9, 6, memoryview(bytes(huge)))
+
+
+def test_announced_sizes_are_those_of_the_image() -> None:
+    _, png = cv2.imencode(".png", COLOR)
+    assert codecs.announced_size(memoryview(png.tobytes())) == (9, 6)
+    assert codecs.announced_size(memoryview(codecs.encode_jpeg(COLOR))) == (9, 6)
+    assert codecs.announced_size(memoryview(b"neither")) is None
