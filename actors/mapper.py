@@ -69,7 +69,10 @@ class MapperConfig:
     def __post_init__(self) -> None:
         counts = (self.snapshot_keyframes, self.part_gaussians, self.checkpoint_keyframes)
         if min(counts) < 1 or self.threads < 0 or self.snapshot_growth < 0:
-            raise ConfigError(f"{self}: counts must be at least 1, threads and growth at least 0.")
+            raise ConfigError(
+                f"mapper: counts {counts} must be at least 1, threads {self.threads} and "
+                f"snapshot_growth {self.snapshot_growth:g} at least 0."
+            )
 
     def thread_count(self) -> int:
         return self.threads or max(1, (os.cpu_count() or 1) - 1)

@@ -6,6 +6,7 @@ gave up, 5 a replay diverged. An error is one paragraph; --debug adds the traceb
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 
@@ -40,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
+    signal.signal(signal.SIGTERM, _interrupt)
     try:
         if not words or words[0] in ("-h", "--help"):
             print(HELP.format(verbs="\n".join(first_lines())))
@@ -54,9 +56,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Console(stderr=True, highlight=False, markup=False).print(f"ldo: {error}", soft_wrap=True)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
+        Console(stderr=True).print("ldo: interrupted; a run keeps what it has done.")
         sys.exit(130)
     except BrokenPipeError:  # `ldo topics | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _interrupt(_number: int, _frame: object) -> None:
+    """SIGTERM ends a verb as Ctrl-C does."""
+    raise KeyboardInterrupt
 
 
 def first_lines() -> Iterator[str]:

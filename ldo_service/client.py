@@ -124,6 +124,11 @@ class Client:
             )
         return self._cameras[kind]
 
+    @property
+    def is_heard(self) -> bool:
+        """Whether anybody subscribes to this client's camera/rgbd."""
+        return self._camera(CameraRgbd).matching_status.matching
+
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
         """Every tracked pose as it comes, for ever; of those not taken in time the newest stay."""
         for _, message in self.messages(POSE_TRACKED, keep):

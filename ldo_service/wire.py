@@ -1,9 +1,7 @@
 """Between messages and numerics: the one place that knows both."""
 
-import time
 from collections.abc import Iterable
 
-import msgspec
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
@@ -120,8 +118,3 @@ def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgb
         depth=Image(encoding=encoding, width=width, height=height, data=memoryview(data)),
         depth_scale=raw.depth_scale,
     )
-
-
-def restamped(message: CameraRgbd) -> CameraRgbd:
-    """The same exposure, stamped with the time of now."""
-    return msgspec.structs.replace(message, stamp_ns=time.time_ns())

@@ -69,7 +69,7 @@ def demo(
         for index in range(len(sequence)):
             sequence.read(index)
             advance(index + 1)
-    config = with_options(load_config(), hold_out=HOLD_OUT, threads=0)
+    config = with_options(load_config(), hold_out=HOLD_OUT, threads=None)
     with progress("tracking and mapping", len(sequence), console) as advance:
         record = run_over_file(sequence, out, config, Selection(), console.print, advance)
     views = list(held_out_views(record, sequence, config.mapper.thread_count()))
@@ -82,7 +82,7 @@ def held_out_views(record: RunFolder, sequence: Sequence, threads: int) -> Itera
     rows, final = record.follower.map.rows, record.final()
     for index in range(HOLD_OUT - 1, len(sequence), HOLD_OUT):
         frame = sequence[index]
-        position = np.flatnonzero(np.isclose(final.stamps_s, frame.stamp_ns * 1e-9, atol=1e-6))
+        position = np.flatnonzero(np.abs(final.stamps_s - frame.stamp_ns * 1e-9) < 1e-6)
         if len(position):
             T_camera_map = se3.inverse(final.T_world_camera[position[0]])
             yield View(frame, render(rows, frame.camera, T_camera_map, threads=threads))

@@ -92,9 +92,12 @@ def read_trajectory(folder: Path, name: str) -> Trajectory:
 
 def stamps_with_status(folder: Path, status: str) -> np.ndarray:
     """Stamps in seconds of the frames with a status."""
-    with (folder / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    return np.array([int(row["stamp_ns"]) * 1e-9 for row in rows if row["status"] == status])
+    try:
+        with (folder / "frames.csv").open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        return np.array([int(row["stamp_ns"]) * 1e-9 for row in rows if row["status"] == status])
+    except (OSError, KeyError, ValueError) as error:
+        raise DataError(f"{folder / 'frames.csv'} cannot be read: {error!r}.") from error
 
 
 def at_stamps(trajectory: Trajectory, stamps_s: np.ndarray) -> Trajectory:

@@ -1,22 +1,25 @@
 """ldo publish"""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
+import msgspec
 import tyro
 from rich.console import Console
 
-from ldo_service.client import connect
+from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence, open_sequence
-from ldo_service.errors import ConfigError, FrameError
+from ldo_service.errors import ConfigError, DataError, FrameError
+from ldo_service.runs.source import Selection
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
-from ldo_service.wire import camera_rgbd_message, restamped
+from ldo_service.wire import camera_rgbd_message
 
 from .options import ConfigFile, Endpoint, Robot, Settings, Source
 from .progress import progress
-from .run import selected
+
+MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad
 
 
 def publish(
@@ -44,27 +47,54 @@ def publish(
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
     """
-    if rate is not None and rate <= 0:
+    if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
-    console = Console(stderr=True)
     sequence = open_sequence(source, load_config(config, set).data.options())
-    indices = selected(stride, max_frames).indices(sequence)
-    sent = 0
+    indices = Selection(stride, max_frames).indices(sequence)
+    console = Console(stderr=True)
     with (
         connect(robot, endpoint) as service,
         progress("publish", len(indices), console) as advance,
     ):
+        camera = Camera(service, sequence, restamp, console.print)
         for done, index in enumerate(paced(sequence, indices, rate), 1):
-            try:
-                raw = sequence.read(index)
-            except FrameError as error:
-                console.print(f"{error} It is left out.")
-                continue
-            message = camera_rgbd_message(raw)
-            service.send(restamped(message) if restamp else message)
-            sent += 1
+            camera.send(index)
             advance(done)
-    console.print(f"{sent} frames published")
+    console.print(f"{camera.sent} frames published, {camera.bad} bad, {camera.unheard} unheard")
+    if camera.bad > MAX_BAD * len(indices):
+        raise DataError(f"{camera.bad} of {len(indices)} frames could not be read.")
+
+
+class Camera:
+    """Sends frames of a sequence; tells once of bad ones, and of each time that nobody listens."""
+
+    def __init__(
+        self, service: Client, sequence: Sequence, restamp: bool, say: Callable[[str], None]
+    ) -> None:
+        self._service, self._sequence, self._restamp, self._say = service, sequence, restamp, say
+        self._was_heard = True
+        self.sent = self.bad = self.unheard = 0
+
+    def send(self, index: int) -> None:
+        self._notice_listeners()
+        try:
+            message = camera_rgbd_message(self._sequence.read(index))
+        except FrameError as error:
+            if self.bad == 0:
+                self._say(f"{error} It is left out; further bad frames are only counted.")
+            self.bad += 1
+            return
+        if self._restamp:
+            message = msgspec.structs.replace(message, stamp_ns=time.time_ns())
+        self._service.send(message)
+        self.sent += 1
+        self.unheard += not self._was_heard
+
+    def _notice_listeners(self) -> None:
+        is_heard = self._service.is_heard
+        if self._was_heard and not is_heard:
+            self._say("nobody listens to camera/rgbd: is the service still running?")
+        self._was_heard = is_heard
 
 
 def paced(sequence: Sequence, indices: range, rate: float | None) -> Iterator[int]:

@@ -31,12 +31,12 @@ def run(
     ] = None,
     stride: Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")] = 1,
     hold_out: Annotated[
-        int,
+        int | None,
         tyro.conf.arg(metavar="N", help="track every n-th frame and never map it; 0: map all"),
-    ] = 0,
+    ] = None,
     threads: Annotated[
-        int, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
-    ] = 0,
+        int | None, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
+    ] = None,
     realtime: Annotated[
         bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
     ] = False,
@@ -52,7 +52,7 @@ def run(
     """
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
-    selection = selected(stride, max_frames)
+    selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_sequence(source, settings.data.options())
     prepare(out, overwrite)
@@ -62,17 +62,14 @@ def run(
     Console().print(summary_table(record.summary, out))
 
 
-def with_options(config: Config, hold_out: int, threads: int) -> Config:
+def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:
     """The configuration with what has an option of its own."""
-    tracker = replace(config.tracker, hold_out=hold_out) if hold_out else config.tracker
-    mapper = replace(config.mapper, threads=threads) if threads else config.mapper
+    tracker, mapper = config.tracker, config.mapper
+    if hold_out is not None:
+        tracker = replace(tracker, hold_out=hold_out)
+    if threads is not None:
+        mapper = replace(mapper, threads=threads)
     return replace(config, tracker=tracker, mapper=mapper)
-
-
-def selected(stride: int, max_frames: int | None) -> Selection:
-    if stride < 1 or (max_frames is not None and max_frames < 1):
-        raise ConfigError("--stride and --max-frames must be at least 1.")
-    return Selection(stride, max_frames)
 
 
 def require_held_out(stride: int, hold_out: int) -> None:

@@ -39,9 +39,9 @@ def read_json(path: Path) -> dict[str, Any]:
 def number(fields: dict[str, Any], key: str, path: Path) -> float:
     """The number under `key`. Raises DataError naming file and key."""
     value = fields.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         found = "it is missing" if key not in fields else f"it is {value!r}"
-        raise DataError(f'{path}: expected a number under "{key}", but {found}.')
+        raise DataError(f'{path}: expected a finite number under "{key}", but {found}.')
     return float(value)
 
 

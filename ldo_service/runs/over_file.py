@@ -26,8 +26,9 @@ def run_over_file(
 ) -> RunFolder:
     """Run every actor over the chosen frames and write the folder.
 
-    Independent of the machine's load: see `runtime.logical_clock`. Raises DataError when nothing
-    or too little can be read, and StageError when an actor fails.
+    Independent of the machine's load: see `runtime.logical_clock`. A run that is interrupted or
+    fails leaves what it has done, and its summary says so. Raises DataError when nothing or too
+    little can be read, and StageError when an actor fails.
     """
     indices = selection.indices(sequence)
     actors = {actor.name: actor for actor in make_actors(config)}
@@ -42,12 +43,17 @@ def run_over_file(
         lambda _actor, message, step_ms: record.observe(message, step_ms),
     )
     started = Usage.now()
-    for done in clock.run(reader):
-        advance(done + 1 + reader.rejected)
-    used = Usage.now().since(started)
-    rejected = reader.rejected + int(actors["frame_source"].facts()["frames_rejected"])
-    stage_ms = {name: percentiles(steps) for name, steps in clock.step_ms().items() if steps}
-    record.close(summarise(record, used, len(indices), rejected, stage_ms, drops={}))
+    is_finished = False
+    try:
+        for done in clock.run(reader):
+            advance(done + 1 + reader.rejected)
+        is_finished = True
+    finally:
+        used = Usage.now().since(started)
+        rejected = reader.rejected + int(actors["frame_source"].facts()["frames_rejected"])
+        stage_ms = {name: percentiles(steps) for name, steps in clock.step_ms().items() if steps}
+        summary = summarise(record, used, len(indices), rejected, stage_ms, drops={})
+        record.close({**summary, "interrupted": not is_finished})
     require_usable(record, config.run.max_rejected)
     return record
 

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from ldo_service.datasets import Sequence
-from ldo_service.errors import DataError, FrameError
+from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.schemas import CameraRgbd
 from ldo_service.wire import camera_rgbd_message
 
@@ -19,7 +19,14 @@ class Selection:
     """Which frames of a sequence."""
 
     stride: int = 1
-    max_frames: int | None = None
+    max_frames: int | None = None  # None: all
+
+    def __post_init__(self) -> None:
+        if self.stride < 1 or (self.max_frames is not None and self.max_frames < 1):
+            raise ConfigError(
+                f"a stride of {self.stride} and at most {self.max_frames} frames: both must be at "
+                "least 1."
+            )
 
     def indices(self, sequence: Sequence) -> range:
         """Raises DataError when nothing is left."""

@@ -67,8 +67,13 @@ def open_session(network: Network, router: bool = False) -> zenoh.Session:
         "connect/timeout_ms": 3000,
     }
     config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
+    try:
+        for key, value in settings.items():
+            config.insert_json5(key, json.dumps(value))
+    except zenoh.ZError as error:
+        raise ConfigError(
+            f"endpoint {network.endpoint!r}: write it like {DEFAULT_ENDPOINT}."
+        ) from error
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
