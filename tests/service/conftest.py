@@ -6,7 +6,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
@@ -36,12 +36,20 @@ def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
 class LiveService:
     """`ldo serve`, its log, and a client that listens to health and poses."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
+    def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = LDO) -> None:
         self.endpoint = free_endpoint()
         self.log_path = folder / "serve.log"
         self._log = self.log_path.open("w")
         self.process = subprocess.Popen(
-            [*LDO, "serve", "--endpoint", self.endpoint, "--state", str(folder / "s"), *arguments],
+            [
+                *command,
+                "serve",
+                "--endpoint",
+                self.endpoint,
+                "--state",
+                str(folder / "s"),
+                *arguments,
+            ],
             stderr=self._log,
         )
         self._stack = ExitStack()
@@ -103,8 +111,10 @@ class LiveService:
 
 
 @contextmanager
-def live_service(folder: Path, *arguments: str) -> Iterator[LiveService]:
-    service = LiveService(folder, *arguments)
+def live_service(
+    folder: Path, *arguments: str, command: Sequence[str] = LDO
+) -> Iterator[LiveService]:
+    service = LiveService(folder, *arguments, command=command)
     try:
         yield service
     finally:

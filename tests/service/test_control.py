@@ -67,6 +67,7 @@ def _paused(service: LiveService) -> int:
     return sum(count.paused for count in service.update_health()["frame_source"].inputs)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
     arguments = ("--set", "service.control_timeout_s=1", "--set", "service.silent_after_s=30")
@@ -82,6 +83,7 @@ def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
             os.kill(stopped, signal.SIGCONT)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_a_robot_that_is_not_there_is_said(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:

@@ -35,6 +35,7 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(tmp_pat
         assert "optimizer has a process, and no heartbeat" in " ".join(ill.stdout.split())
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(60)
 def test_prometheus_sees_every_actor_count(tmp_path: Path) -> None:
     port = free_port()

@@ -1,0 +1,190 @@
+"""An actor that hangs or raises, and bytes that are no frames, in a live service."""
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import msgpack
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+
+from ldo_service.datasets import Sequence
+from ldo_service.runtime.zenoh_transport import Network, open_session
+from ldo_service.schemas import CameraRgbd, TrackedPose, encode
+from ldo_service.wire import camera_rgbd_message, restamped
+from tests.service.conftest import LiveService, live_service, wait_until
+
+PROGRAM = Path(__file__).with_name("troubled_service.py")
+APART = ("--set", "service.spawned=[optimizer,tracker]")
+
+
+@pytest.fixture
+def troubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    """A live service whose tracker has trouble at frame 20."""
+
+    def start(trouble: str, *arguments: str):
+        monkeypatch.setenv("TROUBLE", trouble)
+        monkeypatch.setenv("TROUBLE_FOLDER", str(tmp_path))
+        return live_service(tmp_path, *arguments, command=(sys.executable, str(PROGRAM)))
+
+    return start
+
+
+def begin(service: LiveService, room: Sequence) -> None:
+    """Until every actor has joined and frame 0 has a pose: before, the tracker says nothing."""
+    first, poses = camera_rgbd_message(room.read(0)), []
+    for stamp_ns in range(1, 200):
+        service.client.send(msgspec.structs.replace(first, stamp_ns=stamp_ns))
+        time.sleep(0.2)
+        poses += service.poses()
+        if poses:
+            return
+    pytest.fail(f"no pose (log: {service.log})")
+
+
+def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> list[TrackedPose]:
+    """Send frames, each when the one before has its pose."""
+    poses: list[TrackedPose] = []
+    for index in indices:
+        service.client.send(camera_rgbd_message(room.read(index)))
+        while not poses or poses[-1].frame != index:  # one of `begin` may still come
+            poses += service.wait_for_poses(1)
+    return [pose for pose in poses if pose.frame]
+
+
+@pytest.mark.timeout(60)
+def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
+    troubled: Callable, room: Sequence
+) -> None:
+    with troubled("hang", *APART, "--set", "stage.stall_after_s=1") as service:
+        service.wait_for_actors()
+        begin(service, room)
+        tracked(service, room, range(1, 20))
+        first = service.update_health()["tracker"].pid
+        service.client.send(camera_rgbd_message(room.read(20)))
+        wait_until(lambda: service.update_health()["tracker"].pid != first, 30, "a new process")
+        assert {pose.status for pose in tracked(service, room, range(21, 30))} == {"OK"}
+        assert "tracker has been busy with one message" in service.log
+        assert "tracker: its process ended with exit code 4" in service.log
+        assert service.stop() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60)
+def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
+    troubled: Callable, room: Sequence
+) -> None:
+    with troubled("once") as service:
+        service.wait_for_actors()
+        begin(service, room)
+        tracked(service, room, range(1, 20))
+        service.client.send(camera_rgbd_message(room.read(20)))
+        wait_until(lambda: service.update_health()["tracker"].set_aside == 1, 10, "it is counted")
+        tracker = service.health["tracker"]
+        assert (tracker.failures, tracker.restarts) == (2, 2)
+        poses = tracked(service, room, range(21, 30))
+        assert [(pose.frame, pose.status) for pose in poses] == [(i, "OK") for i in range(21, 30)]
+        assert "failed twice and is set aside" in service.log
+        assert service.stop() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(60)
+def test_an_actor_that_always_fails_is_given_up_with_exit_code_4(
+    troubled: Callable, room: Sequence
+) -> None:
+    with troubled("always") as service:
+        service.wait_for_actors()
+        begin(service, room)
+        tracked(service, room, range(1, 20))
+        for index in range(20, 24):  # two failures each: the budget is 5
+            service.client.send(camera_rgbd_message(room.read(index)))
+            time.sleep(0.2)
+        assert service.process.wait(30) == 4
+        assert "tracker failed 6 times within 60 s and was given up" in service.log
+
+
+# --- bytes that are no frames ---------------------------------------------------------------------
+def not_frames(good: CameraRgbd) -> Iterator[bytes]:
+    """What a confused or hostile program may send in place of a frame."""
+    body = encode(good)
+    fields = msgpack.unpackb(body)
+    yield b""
+    yield b"\xc1\xff\x00"
+    yield body[: len(body) // 2]
+    yield msgpack.packb({**fields, "type": "Keyframe"})
+    yield msgpack.packb({"type": "CameraRgbd"})
+    yield msgpack.packb({**fields, "camera": {**fields["camera"], "width": 1 << 14}})
+    yield msgpack.packb({**fields, "color": {**fields["color"], "height": 239}})
+    yield msgpack.packb({**fields, "camera": {**fields["camera"], "fx": float("nan")}})
+    yield msgpack.packb({**fields, "depth_scale": 0.0})
+    yield b"\x81\xa1y" + b"\x91" * 100_000
+    yield bytes(65_000_000)  # over stage.max_message_mb
+
+
+@pytest.mark.timeout(60)
+def test_what_is_no_frame_is_rejected_and_counted_while_the_stream_goes_on(
+    tmp_path: Path, room: Sequence
+) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        begin(service, room)
+        good = camera_rgbd_message(room.read(0))
+        bad = list(not_frames(good))
+        with open_session(Network("robot", service.endpoint)) as session:
+            camera = session.declare_publisher(
+                "ldo/robot/camera/rgbd", congestion_control=zenoh.CongestionControl.BLOCK
+            )
+            for number, body in enumerate(bad):
+                send(service, camera, room, number)
+                camera.put(body)
+                wait_until(lambda n=number + 1: rejected(service) == n, 10, f"body {number}")
+            poses = [send(service, camera, room, number) for number in range(len(bad), 20)]
+        assert [pose.status for pose in poses] == ["OK"] * len(poses)
+        assert service.health["frame_source"].failures == 0
+        assert service.log.count("rejected") <= 2 * len(bad)
+        assert service.stop() == 0
+        assert "Traceback" not in service.log
+
+
+def send(service: LiveService, camera: zenoh.Publisher, room: Sequence, index: int):
+    """The pose of a frame that a camera without our package sends."""
+    camera.put(encode(restamped(camera_rgbd_message(room.read(index)))))
+    return service.wait_for_poses(1)[-1]
+
+
+def rejected(service: LiveService) -> int:
+    return service.update_health()["frame_source"].inputs[0].rejected
+
+
+@pytest.mark.timeout(60)
+def test_a_camera_that_goes_blind_and_sees_again_is_tracked_on(
+    tmp_path: Path, room: Sequence
+) -> None:
+    """Colour and depth on two topics; the depth is all zero for a while."""
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        begin(service, room)
+        statuses = []
+        for index in range(1, 25):
+            frame, is_blind = room[index], 9 <= index < 15
+            message = camera_rgbd_message(room.read(index))
+            depth = np.zeros_like(frame.depth_m) if is_blind else frame.depth_m
+            stamp_ns = 1_000_000_000 + index * 33_000_000
+            service.client.publish_color(frame.color, message.camera, stamp_ns)
+            service.client.publish_depth(depth, message.camera, 1.0, stamp_ns=stamp_ns + 2_000_000)
+            statuses.append(service.wait_for_poses(1)[-1].status)
+        assert statuses[:8] == ["OK"] * 8
+        assert "OK" not in statuses[8:14]
+        assert statuses[-5:] == ["OK"] * 5
+        wait_until(lambda: facts(service)["pairs"] == 24, 5, "the pairs are counted")
+        assert facts(service)["skew_ms_max"] == 2.0
+        assert service.stop() == 0
+        assert "Traceback" not in service.log
+
+
+def facts(service: LiveService) -> dict[str, float]:
+    return service.update_health()["frame_source"].facts

@@ -1,0 +1,47 @@
+"""`ldo` with a tracker that has trouble at frame 20: arguments of `ldo`, and in the environment
+
+TROUBLE=hang     the handler does not return, in the first process that gets there
+TROUBLE=once     that frame makes it raise each time it is tried
+TROUBLE=always   every frame from there on does
+"""
+
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from ldo_service import cli, service
+from ldo_service.actors import graph
+from ldo_service.actors.tracker import Tracker
+from ldo_service.schemas import Correction, FrameRgbd
+
+TROUBLE, FRAME = os.environ["TROUBLE"], 20
+HUNG = Path(os.environ["TROUBLE_FOLDER"]) / "has_hung"
+
+
+class TroubledTracker(Tracker):
+    def handle(self, message: FrameRgbd | Correction):
+        if isinstance(message, FrameRgbd):
+            meet_trouble(message.frame)
+        yield from super().handle(message)
+
+
+def meet_trouble(frame: int) -> None:
+    if TROUBLE == "hang" and frame >= FRAME and not HUNG.exists():
+        HUNG.touch()
+        time.sleep(1e6)
+    if frame == FRAME if TROUBLE == "once" else TROUBLE == "always" and frame >= FRAME:
+        raise RuntimeError(f"trouble at frame {frame}")
+
+
+def troubled(box: graph.Box) -> graph.Box:
+    if box.name != "tracker":
+        return box
+    return replace(box, make=lambda config: TroubledTracker(config.tracker))
+
+
+if __name__ == "__main__":
+    service.RUNNING = tuple(map(troubled, service.RUNNING))
+    service.python_command = lambda *arguments: [sys.executable, __file__, *arguments]
+    cli.main(sys.argv[1:])
