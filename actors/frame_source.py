@@ -20,10 +20,10 @@ from ldo_service.geometry.pairing import Pairing
 from ldo_service.geometry.rectify import RawFrame, Rectifier, in_metres
 from ldo_service.geometry.registration import register_depth
 from ldo_service.runtime import Actor, In, Latest, Out
-from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd, Image
+from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, FRAME_RGBD
-from ldo_service.wire import camera_of, rgbd_message, transform
+from ldo_service.wire import camera_of, raw_frame_of, rgbd_message, transform
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class FrameSource(Actor):
 
     def handle(self, message: Input) -> Iterator[FrameRgbd]:
         if isinstance(message, CameraRgbd):
-            yield from self._frame(message, partial(_raw, message))
+            yield from self._frame(message, partial(raw_frame_of, message, message.frame))
         else:
             for color, depth in self._paired(message):
                 yield from self._frame(color, partial(_joined, color, depth))
@@ -155,37 +155,20 @@ class FrameSource(Actor):
         }
 
 
-def _raw(message: CameraRgbd) -> RawFrame:
-    return RawFrame(
-        index=message.frame,
-        stamp_ns=message.stamp_ns,
-        color=_color_image(message.color),
-        depth=_depth_image(message.depth),
-        depth_scale=message.depth_scale,
-        camera=camera_of(message.camera),
-    )
-
-
 def _joined(color: CameraColor, depth: CameraDepth) -> RawFrame:
     """The depth in the colour image, with the colour's stamp, number and camera."""
-    values, scale = _depth_image(depth.image), depth.depth_scale
+    image, scale = depth.image, depth.depth_scale
+    values = codecs.decode_depth(image.encoding, image.width, image.height, image.data)
     if depth.camera != color.camera or depth.T_color_depth != IDENTITY:
         depth_m = in_metres(values, scale)
         cameras = camera_of(depth.camera), camera_of(color.camera)
         values, scale = register_depth(depth_m, *cameras, transform(depth.T_color_depth)), 1.0
+    image = color.image
     return RawFrame(
         index=color.frame,
         stamp_ns=color.stamp_ns,
-        color=_color_image(color.image),
+        color=codecs.decode_color(image.encoding, image.width, image.height, image.data),
         depth=values,
         depth_scale=scale,
         camera=camera_of(color.camera),
     )
-
-
-def _color_image(image: Image) -> np.ndarray:
-    return codecs.decode_color(image.encoding, image.width, image.height, image.data)
-
-
-def _depth_image(image: Image) -> np.ndarray:
-    return codecs.decode_depth(image.encoding, image.width, image.height, image.data)

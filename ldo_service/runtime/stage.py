@@ -251,7 +251,7 @@ class Stage:
     async def _renew(self, mailbox: Mailbox) -> None:
         """Begin anew; to everyone else it looks like a process that was started again."""
         self._store.forget(self.name)
-        self._actor = await self._worker.run(self._make)
+        self._actor = await self._worker.run(self._successor)
         self._epoch = _new_epoch()
         self._vitals.facts = {}
         mailbox.renew()
