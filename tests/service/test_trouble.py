@@ -55,6 +55,18 @@ def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> lis
     return [pose for pose in poses if pose.frame]
 
 
+def followed(service: LiveService, room: Sequence, start: int, poses: int) -> list[TrackedPose]:
+    """Send frames until so many have a pose: a process that just started may miss the first."""
+    got: list[TrackedPose] = []
+    for index in range(start, start + 40):
+        service.client.send(camera_rgbd_message(room.read(index)))
+        time.sleep(0.2)
+        got += service.poses()
+        if len(got) >= poses:
+            return got
+    pytest.fail(f"{len(got)} poses (log: {service.log})")
+
+
 @pytest.mark.timeout(60)
 def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
     troubled: Callable, room: Sequence
@@ -66,7 +78,7 @@ def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
         first = service.update_health()["tracker"].pid
         service.client.send(camera_rgbd_message(room.read(20)))
         wait_until(lambda: service.update_health()["tracker"].pid != first, 30, "a new process")
-        assert {pose.status for pose in tracked(service, room, range(21, 30))} == {"OK"}
+        assert {pose.status for pose in followed(service, room, 21, poses=5)} == {"OK"}
         assert "tracker has been busy with one message" in service.log
         assert "tracker: its process ended with exit code 4" in service.log
         assert service.stop() == 0
