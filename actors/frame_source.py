@@ -9,12 +9,12 @@ import logging
 from collections.abc import Iterator
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import RgbdFrame, codecs
-from ldo_service.geometry.rectify import RawFrame, Rectifier
+from ldo_service.geometry import RgbdFrame
+from ldo_service.geometry.rectify import Rectifier
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import CameraRgbd, FrameRgbd
 from ldo_service.schemas.topics import CAMERA_RGBD, FRAME_RGBD
-from ldo_service.wire import camera_of, rgbd_message
+from ldo_service.wire import raw_frame_of, rgbd_message
 
 log = logging.getLogger(__name__)
 
@@ -52,16 +52,7 @@ class FrameSource(Actor):
             )
 
     def _rectified(self, message: CameraRgbd) -> RgbdFrame:
-        color, depth = message.color, message.depth
-        raw = RawFrame(
-            index=message.frame,
-            stamp_ns=message.stamp_ns,
-            color=codecs.decode_color(color.encoding, color.width, color.height, color.data),
-            depth=codecs.decode_depth(depth.encoding, depth.width, depth.height, depth.data),
-            depth_scale=message.depth_scale,
-            camera=camera_of(message.camera),
-        )
-        return self._rectify(raw)
+        return self._rectify(raw_frame_of(message, message.frame))
 
     def _reject(self, message: CameraRgbd, error: DataError) -> None:
         self._rejected += 1

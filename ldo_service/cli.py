@@ -72,9 +72,11 @@ def verbs() -> dict[str, Callable[..., None]]:
         doctor,
         evaluate,
         publish,
+        replay,
         run,
         serve,
         show_config,
+        simulate,
         topics,
     )
 
@@ -84,6 +86,9 @@ def verbs() -> dict[str, Callable[..., None]]:
         "eval": evaluate.evaluate,
         "serve": serve.serve,
         "publish": publish.publish,
+        "record": serve.record,
+        "replay": replay.replay,
+        "simulate": simulate.simulate,
         "topics": topics.topics,
         "config": show_config.show_config,
         "doctor": doctor.doctor,

@@ -115,6 +115,19 @@ def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgb
     )
 
 
+def raw_frame_of(message: CameraRgbd, index: int) -> RawFrame:
+    """The frame as the camera delivered it, decompressed. Raises DataError."""
+    color, depth = message.color, message.depth
+    return RawFrame(
+        index=index,
+        stamp_ns=message.stamp_ns,
+        color=codecs.decode_color(color.encoding, color.width, color.height, color.data),
+        depth=codecs.decode_depth(depth.encoding, depth.width, depth.height, depth.data),
+        depth_scale=message.depth_scale,
+        camera=camera_of(message.camera),
+    )
+
+
 def restamped(message: CameraRgbd) -> CameraRgbd:
     """The same exposure, stamped with the time of now."""
     return msgspec.structs.replace(message, stamp_ns=time.time_ns())

@@ -11,7 +11,6 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation.pictures import save_picture, trajectory_picture
 from ldo_service.evaluation.trajectory import (
@@ -20,6 +19,7 @@ from ldo_service.evaluation.trajectory import (
     evaluate_trajectory,
 )
 from ldo_service.geometry import Trajectory
+from ldo_service.recordings.sequence import open_source
 
 from .options import Json, Source
 
@@ -43,7 +43,7 @@ def evaluate(
 
     Prints the protocol above the figures, and draws trajectory.png into DIR.
     """
-    truth = open_sequence(source).truth()
+    truth = open_source(source).truth()
     if truth is None:
         raise DataError(f"{source} has no ground truth, so there is nothing to compare with.")
     final = read_trajectory(folder, "trajectory.txt")

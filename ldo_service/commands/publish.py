@@ -8,8 +8,9 @@ import tyro
 from rich.console import Console
 
 from ldo_service.client import connect
-from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, FrameError
+from ldo_service.recordings.sequence import open_source
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.wire import camera_rgbd_message, restamped
 
@@ -44,7 +45,7 @@ def publish(
     if rate is not None and rate <= 0:
         raise ConfigError(f"--rate {rate:g}: must be positive.")
     console = Console(stderr=True)
-    sequence = open_sequence(source)
+    sequence = open_source(source)
     indices = selected(stride, max_frames).indices(sequence)
     sent = 0
     with (

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
+from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.over_file import Selection, run_over_file
 
@@ -47,7 +47,7 @@ def run(
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
     selection = selected(stride, max_frames)
-    sequence = open_sequence(source)
+    sequence = open_source(source)
     prepare(out, overwrite)
     with progress("run", len(selection.indices(sequence)), console) as advance:
         record = run_over_file(sequence, out, settings, selection, console.print, advance)

@@ -1,31 +1,29 @@
 """A run over a sequence, on the logical clock."""
 
 import os
-import platform
 import resource
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ldo_service import __version__, kernels
+from ldo_service import kernels
 from ldo_service.actors.graph import make_actors
 from ldo_service.config import Config, config_yaml
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import CameraRgbd
+from ldo_service.versions import versions
 from ldo_service.wire import camera_rgbd_message
 
 from .folder import RunFolder
 
 READ_AHEAD = 3  # frames decoded before they are needed: one decoding, one waiting, one to spare
-LIBRARIES = ("numpy", "gtsam", "opencv-python-headless", "msgspec")
 
 Warn = Callable[[str], None]
 Advance = Callable[[int], None]  # called with the number of frames done
@@ -92,10 +90,7 @@ def run_over_file(
     record = RunFolder(folder, config_yaml(config), config.tracker.hold_out)
     clock = LogicalClock(
         list(actors.values()),
-        {
-            "mapper": config.run.mapper_latency_frames,
-            "optimizer": config.run.optimizer_latency_frames,
-        },
+        config.run.latency_frames(),
         lambda _actor, message, step_ms: record.observe(message, step_ms),
     )
     started = Usage.now()
@@ -151,11 +146,7 @@ def summarise(
         "optimizations": record.corrections,
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
-        "versions": {
-            "ldo-slam": __version__,
-            "python": platform.python_version(),
-            **{library: version(library) for library in LIBRARIES},
-        },
+        "versions": versions(),
     }
 
 

@@ -1,0 +1,87 @@
+"""A recording as it is read: a folder with a file for each process that an actor lived in."""
+
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ldo_service.errors import ConfigError, DataError
+
+from .journal import CHANNELS, Entry, Step
+from .mcap_index import McapIndex, Place
+from .recording_file import ABOUT
+
+NAME = re.compile(r"(?P<actor>\w+?)(\.(?P<number>\d+))?\.mcap")
+ENTRIES: Mapping[str, Any] = {channel: kind for kind, channel in CHANNELS.items()}
+
+
+class JournalFile:
+    """What an actor lived in one process. Raises DataError when it cannot be read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._index = McapIndex(path)
+        self._entries = [place for place in self._index.places if place.topic in ENTRIES]
+        self.messages = [place for place in self._index.places if place.topic not in ENTRIES]
+        self._by_number = {place.number: place for place in self.messages}
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """Actor, robot, configuration, instruction set, versions."""
+        return self._index.metadata.get(ABOUT, {})
+
+    @property
+    def is_whole(self) -> bool:
+        """It was closed in peace."""
+        return self._index.is_whole
+
+    @property
+    def steps(self) -> int:
+        return sum(place.topic == CHANNELS[Step] for place in self._entries)
+
+    def entries(self) -> Iterator[Entry]:
+        for place in self._entries:
+            try:
+                yield msgspec.msgpack.decode(self._index.body(place), type=ENTRIES[place.topic])
+            except msgspec.DecodeError as error:
+                raise DataError(f"{self.path}, {place.topic} {place.number}: {error}.") from error
+
+    def body(self, message: Place) -> bytes:
+        return self._index.body(message)
+
+    def taken(self, step: Step) -> bytes:
+        """The message of a step."""
+        if step.taken not in self._by_number:
+            raise DataError(f"{self.path}: the message of step {step.step} is missing.")
+        return self.body(self._by_number[step.taken])
+
+    def close(self) -> None:
+        self._index.close()
+
+
+def recorded_actors(folder: Path) -> dict[str, list[Path]]:
+    """By actor: its files, in the order of its lives."""
+    found: dict[str, list[tuple[int, Path]]] = {}
+    for path in folder.glob("*.mcap"):
+        match = NAME.fullmatch(path.name)
+        if match:
+            found.setdefault(match["actor"], []).append((int(match["number"] or 1), path))
+    return {actor: [path for _, path in sorted(files)] for actor, files in sorted(found.items())}
+
+
+def new_path(folder: Path, actor: str) -> Path:
+    """For the next life of an actor."""
+    lives = len(recorded_actors(folder).get(actor, ()))
+    return folder / (f"{actor}.{lives + 1}.mcap" if lives else f"{actor}.mcap")
+
+
+def prepare_recording(folder: Path) -> None:
+    """A folder that holds nothing yet. Raises ConfigError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise ConfigError(f"{folder} is not empty. Choose another folder for the recording.")
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
