@@ -9,7 +9,7 @@
 Needs pytest, which is not installed with this package.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +27,7 @@ def replay_recording(folder: Path | str, *actors: str) -> dict[str, Replayed]:
 
     Raises ReplayDiverged at the first difference, DataError for a recording with a gap.
     """
-    results: dict[str, Replayed] = {}
-    for actor in open_recording(Path(folder), actors):
-        try:
-            results[actor.name] = actor.verify()
-        finally:
-            actor.close()
-    return results
+    return {actor.name: actor.verify() for actor in open_recording(Path(folder), actors)}
 
 
 def recorded(folder: Path | str) -> Callable[..., Any]:
@@ -41,9 +35,8 @@ def recorded(folder: Path | str) -> Callable[..., Any]:
     absent = pytest.param(None, marks=pytest.mark.skip(f"no recording in {folder}: `ldo record`"))
 
     @pytest.fixture(params=list(recorded_actors(Path(folder))) or [absent])
-    def recorded_actor(request: pytest.FixtureRequest) -> Iterator[RecordedActor]:
+    def recorded_actor(request: pytest.FixtureRequest) -> RecordedActor:
         (actor,) = open_recording(Path(folder), (request.param,))
-        yield actor
-        actor.close()
+        return actor
 
     return recorded_actor

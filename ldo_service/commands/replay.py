@@ -1,7 +1,8 @@
 """ldo replay"""
 
+import itertools
 from collections import Counter
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
 from typing import Annotated
 
 import tyro
@@ -33,24 +34,19 @@ def replay(
       ldo replay recordings/desk --verify
     """
     console = Console(stderr=True, highlight=False)
-    with ExitStack() as stack:
-        actors = [stack.enter_context(closing(a)) for a in open_recording(recording, tuple(actor))]
-        for caveat in dict.fromkeys(line for recorded in actors for line in recorded.caveats()):
-            console.print(f"note: {caveat}", soft_wrap=True)
-        replayed = [_replay(recorded, verify, console) for recorded in actors]
+    actors = open_recording(recording, tuple(actor))
+    for caveat in dict.fromkeys(line for recorded in actors for line in recorded.caveats()):
+        console.print(f"note: {caveat}", soft_wrap=True)
+    with progress("replay", sum(recorded.steps for recorded in actors), console) as advance:
+        step = map(advance, itertools.count(1))
+        replayed = [_replay(recorded, verify, console, lambda: next(step)) for recorded in actors]
     Console().print(_table(replayed))
 
 
-def _replay(recorded: RecordedActor, verify: bool, console: Console) -> Replayed:
-    done = 0
-    with progress(recorded.name, recorded.steps, console) as advance:
-
-        def step() -> None:
-            nonlocal done
-            done += 1
-            advance(done)
-
-        replayed = recorded.replay(step)
+def _replay(
+    recorded: RecordedActor, verify: bool, console: Console, advance: Callable[[], None]
+) -> Replayed:
+    replayed = recorded.replay(advance)
     for note in replayed.notes:
         console.print(f"note: {note}", soft_wrap=True)
     if verify:
@@ -61,14 +57,25 @@ def _replay(recorded: RecordedActor, verify: bool, console: Console) -> Replayed
 
 
 def _table(rows: list[Replayed]) -> Table:
-    table = Table("actor", "steps", "starts", "failed", "took", "made", "same")
+    table = Table("actor", "steps", "took", "made", "same")
     for row in rows:
-        failed = f"{row.failures} ({row.set_aside} set aside)" if row.failures else "0"
-        starts = f"{row.starts} ({row.restored} from a state)" if row.restored else str(row.starts)
-        same = "yes" if row.difference is None else f"no: {row.difference.step}"
-        counts = (_counts(row.taken), _counts(row.made))
-        table.add_row(row.actor, str(row.steps), starts, failed, *counts, same)
+        same = "yes" if row.difference is None else f"until\n{row.difference.step}"
+        took, made = _counts(row.taken), _counts(row.made)
+        table.add_row("\n".join(_life(row)), str(row.steps), took, made, same)
     return table
+
+
+def _life(row: Replayed) -> Iterator[str]:
+    """Its name, and what did not go smoothly."""
+    yield row.actor
+    if row.starts != 1:
+        yield f"{row.starts} starts"
+    if row.restored:
+        yield f"{row.restored} restored"
+    if row.failures:
+        yield f"{row.failures} failed"
+    if row.set_aside:
+        yield f"{row.set_aside} set aside"
 
 
 def _counts(messages: Counter[str]) -> str:

@@ -38,10 +38,6 @@ class RecordedActor:
         replayed.verify()
         return replayed
 
-    def close(self) -> None:
-        for file in self.files:
-            file.close()
-
     def _make(self, about: Mapping[str, str]) -> Actor:
         make = box_named(self.name).make
         assert make is not None

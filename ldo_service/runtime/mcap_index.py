@@ -49,22 +49,20 @@ class McapIndex:
         self._topics: dict[int, str] = {}
         self._chunk: tuple[int, bytes] = (-1, b"")  # the one read last
         try:
-            self._file = self.path.open("rb")
-            self._read_index(self._file, self.path.stat().st_size)
+            with self.path.open("rb") as file:
+                self._read_index(file, self.path.stat().st_size)
         except (OSError, struct.error, McapError, ValueError) as error:
             raise DataError(f"{self.path} cannot be read as a recording: {error}.") from error
 
     def body(self, place: Place) -> bytes:
-        if place.chunk is None:
-            self._file.seek(place.start)
-            return self._file.read(place.size)
-        if self._chunk[0] != place.chunk:
-            self._file.seek(place.chunk)
-            self._chunk = (place.chunk, _read_chunk(self._file))
+        with self.path.open("rb") as file:
+            if place.chunk is None:
+                file.seek(place.start)
+                return file.read(place.size)
+            if self._chunk[0] != place.chunk:
+                file.seek(place.chunk)
+                self._chunk = (place.chunk, _read_chunk(file))
         return self._chunk[1][place.start : place.start + place.size]
-
-    def close(self) -> None:
-        self._file.close()
 
     def _read_index(self, file: BinaryIO, size: int) -> None:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:

@@ -57,9 +57,6 @@ class JournalFile:
             raise DataError(f"{self.path}: the message of step {step.step} is missing.")
         return self.body(self._by_number[step.taken])
 
-    def close(self) -> None:
-        self._index.close()
-
 
 def recorded_actors(folder: Path) -> dict[str, list[Path]]:
     """By actor: its files, in the order of its lives."""
