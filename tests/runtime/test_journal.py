@@ -87,6 +87,18 @@ def test_the_room_that_a_step_saw_is_kept(tmp_path: Path) -> None:
     assert [output.topic for output in steps(tmp_path)[0].outputs] == [DOUBLES.name]
 
 
+def test_what_was_done_is_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    """So that a process that is killed leaves it behind."""
+    seen: list[int] = []
+
+    def look(recorder: Recorder, _value: int) -> None:
+        recorder._writer.submit(int).result(10)  # it has caught up
+        seen.append(len(steps(tmp_path)))
+
+    recorded(tmp_path, [1, 2, 3, 4], meanwhile=look)
+    assert seen == [0, 1, 2, 3]
+
+
 def test_other_programs_read_it(tmp_path: Path) -> None:
     path = recorded(tmp_path, [5, 6])
     with path.open("rb") as stream:
