@@ -21,6 +21,7 @@ def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recor
         "versions": json.dumps(versions()),
     }
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         return Recorder(new_path(folder, actor), about, config.record)
     except OSError as error:
         raise ConfigError(f"{folder} cannot be recorded to: {error.strerror}.") from error

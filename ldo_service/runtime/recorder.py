@@ -13,7 +13,7 @@ from ldo_service.schemas.topics import Topic
 
 from .actor import State
 from .inlet import Delivery
-from .journal import Gap, Journal, Kind, Started, Step, digest, digest_of, outputs_of
+from .journal import Gap, Journal, Kind, Started, Step, checksum, digest_of, outputs_of
 from .recording_file import RecordConfig, RecordingFile
 from .state_store import encode_state
 from .step import Produced
@@ -157,7 +157,7 @@ class Recorder(Journal):
                 source=header.source,
                 epoch=header.epoch,
                 seq=header.seq,
-                body=digest(taken.delivery.body),
+                checksum=checksum(taken.delivery.body),
             )
         self._file.add_entry(step)
         if self._file.is_over_limit():

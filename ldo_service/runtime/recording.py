@@ -60,18 +60,23 @@ class JournalFile:
 
 def recorded_actors(folder: Path) -> dict[str, list[Path]]:
     """By actor: its files, in the order of its lives."""
-    found: dict[str, list[tuple[int, Path]]] = {}
-    for path in folder.glob("*.mcap"):
-        match = NAME.fullmatch(path.name)
-        if match:
-            found.setdefault(match["actor"], []).append((int(match["number"] or 1), path))
-    return {actor: [path for _, path in sorted(files)] for actor, files in sorted(found.items())}
+    return {actor: list(lives.values()) for actor, lives in sorted(_lives(folder).items())}
 
 
 def new_path(folder: Path, actor: str) -> Path:
     """For the next life of an actor."""
-    lives = len(recorded_actors(folder).get(actor, ()))
-    return folder / (f"{actor}.{lives + 1}.mcap" if lives else f"{actor}.mcap")
+    last = max(_lives(folder).get(actor, ()), default=0)
+    return folder / (f"{actor}.{last + 1}.mcap" if last else f"{actor}.mcap")
+
+
+def _lives(folder: Path) -> dict[str, dict[int, Path]]:
+    """By actor, then by number from 1, ascending."""
+    matches = [(NAME.fullmatch(path.name), path) for path in folder.glob("*.mcap")]
+    numbered = sorted((int(m["number"] or 1), m["actor"], path) for m, path in matches if m)
+    lives: dict[str, dict[int, Path]] = {}
+    for number, actor, path in numbered:
+        lives.setdefault(actor, {})[number] = path
+    return lives
 
 
 def prepare_recording(folder: Path) -> None:

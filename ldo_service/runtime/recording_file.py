@@ -1,4 +1,4 @@
-"""One file of a recording, as it is written: MCAP, which tools such as Foxglove open.
+"""One file of a recording, as it is written: MCAP, which has readers in many languages.
 
 Records are not chunked: writing costs a fifth, and a file that was cut off by a kill or a full
 disk is good up to its last whole record.

@@ -14,7 +14,7 @@ from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.schemas import Message, decode
 
 from .actor import Actor
-from .journal import Gap, Output, Started, Step, digest, digest_of, outputs_of
+from .journal import Gap, Output, Started, Step, checksum, digest_of, outputs_of
 from .recording import JournalFile
 from .state_store import decode_state
 from .step import Produced, produce
@@ -133,9 +133,9 @@ class Life:
     def _message(self, actor: Actor, step: Step) -> Message:
         self._replayed.taken[step.topic] += 1
         body = self._file.taken(step)
-        if digest(body) != step.body:
-            what = f"the digest of {step.topic}, which it took,"
-            raise self._diverged(step, what, step.body, digest(body))
+        if checksum(body) != step.checksum:
+            what = f"the checksum of {step.topic}, which it took,"
+            raise self._diverged(step, what, step.checksum, checksum(body))
         kinds = {port.topic.name: port.topic.message for port in actor.inputs}
         kind = kinds.get(step.topic)
         if kind is None:

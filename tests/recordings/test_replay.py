@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from ldo_service import kernels
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
 from ldo_service.recordings.replay import open_recording
-from ldo_service.runtime.journal import Step, digest
+from ldo_service.runtime.journal import Step, checksum
 from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
 from tests.commands.test_cli import assert_one_paragraph, ldo
@@ -51,17 +51,17 @@ def test_one_bit_of_a_frame_is_found(spoilt: Path, capsys: pytest.CaptureFixture
     error = err[err.index("ldo: ") :]
     assert_one_paragraph(error)
     assert "frame_source diverged at step 7 (frame_source.mcap, camera/rgbd #7)" in error
-    assert len(set(re.findall(r"\b[0-9a-f]{32}\b", error))) == 2
+    assert len(set(re.findall(r"\b[0-9a-f]{8}\b", error))) == 2
 
 
 def test_one_bit_changes_what_the_actor_makes(spoilt: Path) -> None:
-    """The same, where whoever changed the frame also changed its digest."""
-    rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7, mend_digest=True)
+    """The same, where whoever changed the frame also changed its checksum."""
+    rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7, mend_checksum=True)
     with pytest.raises(ReplayDiverged, match=r"step 7 .*output 1 of 1 differs: frame/rgbd"):
         replay_recording(spoilt)
 
 
-def rewrite(path: Path, flip_a_pixel_of: int, mend_digest: bool = False) -> None:
+def rewrite(path: Path, flip_a_pixel_of: int, mend_checksum: bool = False) -> None:
     """Copy with the MCAP library, one bit of one decoded frame flipped."""
     copy = path.with_suffix(".new")
     flipped = b""
@@ -75,9 +75,9 @@ def rewrite(path: Path, flip_a_pixel_of: int, mend_digest: bool = False) -> None
             body, topic = message.data, channel.topic
             if topic == "camera/rgbd" and message.sequence == flip_a_pixel_of:
                 body = flipped = encode(with_a_flipped_bit(decode(body, CameraRgbd)))
-            if topic == "journal/step" and message.sequence == flip_a_pixel_of and mend_digest:
+            if topic == "journal/step" and message.sequence == flip_a_pixel_of and mend_checksum:
                 step = msgspec.msgpack.decode(body, type=Step)
-                mended = msgspec.structs.replace(step, body=digest(flipped))
+                mended = msgspec.structs.replace(step, checksum=checksum(flipped))
                 body = msgspec.msgpack.encode(mended)
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, "msgpack", 0)

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 
 from ldo_service.errors import ConfigError
 from ldo_service.runtime import recording_file
-from ldo_service.runtime.journal import Gap, Started, Step, digest
+from ldo_service.runtime.journal import Gap, Started, Step, checksum
 from ldo_service.runtime.recorder import Recorder
 from ldo_service.runtime.recording import new_path, prepare_recording, recorded_actors
 from ldo_service.runtime.recording_file import RecordConfig
@@ -62,7 +62,7 @@ def test_the_message_is_kept_as_it_came(tmp_path: Path) -> None:
         "region": "",
         "data": b"",
     }
-    assert digest(body) == step.body
+    assert checksum(body) == step.checksum
 
 
 def test_a_failed_message_is_kept_once_with_both_attempts_and_both_starts(tmp_path: Path) -> None:
