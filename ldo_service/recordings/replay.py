@@ -71,8 +71,11 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
     unknown = [name for name in only if name not in found]
     if unknown:
         raise ConfigError(f"{folder} has no actor {unknown[0]!r}: it has {', '.join(found)}.")
-    return [
+    actors = [
         RecordedActor(name, tuple(JournalFile(path) for path in paths))
         for name, paths in found.items()
         if not only or name in only
     ]
+    if not any(actor.steps for actor in actors):
+        raise DataError(f"{folder} holds no step of {', '.join(only) or 'any actor'}.")
+    return actors

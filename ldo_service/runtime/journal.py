@@ -98,8 +98,8 @@ class Journal:
     def started(self, state: State | None) -> None:
         """An actor is in place."""
 
-    def took(self, delivery: Delivery) -> None:
-        """The message that the next steps speak of."""
+    def took(self, delivery: Delivery, stamp_ns: int) -> None:
+        """The message that the next steps speak of; the stamp is the message's own."""
 
     def stepped(
         self,

@@ -17,11 +17,17 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
 
 from ldo_service.errors import DataError
 
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the body
+
+UNREADABLE = (
+    *(OSError, struct.error, McapError, ZstdError, ValueError, LookupError),
+    *(MemoryError, OverflowError),  # a damaged length asks for too much
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +57,7 @@ class McapIndex:
         try:
             with self.path.open("rb") as file:
                 self._read_index(file, self.path.stat().st_size)
-        except (OSError, struct.error, McapError, ValueError) as error:
+        except UNREADABLE as error:
             raise DataError(f"{self.path} cannot be read as a recording: {error}.") from error
 
     def body(self, place: Place) -> bytes:

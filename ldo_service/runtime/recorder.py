@@ -21,10 +21,13 @@ from .worker import Worker
 
 log = logging.getLogger(__name__)
 
+ENTRY_BYTES = 1000  # of memory that an entry takes beside its body
+
 
 @dataclass(frozen=True, slots=True)
 class Taken:
     number: int
+    stamp_ns: int
     delivery: Delivery
 
 
@@ -59,7 +62,7 @@ class Recorder(Journal):
         size = sum(map(len, (parts or {}).values()))
         self._submit(size, self._file.add_entry, Started(step=self._steps, state=parts))
 
-    def took(self, delivery: Delivery) -> None:
+    def took(self, delivery: Delivery, stamp_ns: int) -> None:
         size = len(delivery.body)
         with self._lock:
             has_place = self._waiting + size <= self._max_waiting
@@ -67,7 +70,7 @@ class Recorder(Journal):
             self._lose(delivery)
             return
         self._mark_gap()
-        self._taken = Taken(self._numbers, delivery)
+        self._taken = Taken(self._numbers, stamp_ns, delivery)
         self._numbers += 1
         self._submit(size, self._write_message, self._taken)
 
@@ -101,6 +104,7 @@ class Recorder(Journal):
 
     def statistics(self) -> dict[str, float]:
         return {
+            "journal_is_open": float(self._file.is_open),
             "journal_steps": self._steps,
             "journal_lost": self._lost_before + self._lost,
             "journal_waiting_mb": self._waiting / 1e6,
@@ -127,6 +131,7 @@ class Recorder(Journal):
 
     # --- in the writer's thread -------------------------------------------------------------------
     def _submit(self, size: int, job: Callable[..., None], *args: object) -> None:
+        size += ENTRY_BYTES
         with self._lock:
             self._waiting += size
         self._writer.submit(self._run, size, job, *args)
@@ -134,15 +139,17 @@ class Recorder(Journal):
     def _run(self, size: int, job: Callable[..., None], *args: object) -> None:
         try:
             job(*args)
+        except Exception:
+            log.exception("%s: this recording ends here", self._file.path)
+            self._file.abandon()
         finally:
             with self._lock:
                 self._waiting -= size
 
     def _write_message(self, taken: Taken) -> None:
-        delivery = taken.delivery
-        topic, header = delivery.port.topic, delivery.header
+        topic, body = taken.delivery.port.topic, taken.delivery.body
         assert topic.message is not None
-        self._file.add(topic.name, topic.message, delivery.body, taken.number, header.stamp_ns)
+        self._file.add(topic.name, topic.message, body, taken.number, taken.stamp_ns)
 
     def _write_step(self, step: Step, taken: Taken | None, produced: tuple[Produced, ...]) -> None:
         if not self._file.is_open:

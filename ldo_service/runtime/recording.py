@@ -8,6 +8,7 @@ from typing import Any
 import msgspec
 
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.schemas import decode
 
 from .journal import CHANNELS, Entry, Step
 from .mcap_index import McapIndex, Place
@@ -44,7 +45,7 @@ class JournalFile:
     def entries(self) -> Iterator[Entry]:
         for place in self._entries:
             try:
-                yield msgspec.msgpack.decode(self._index.body(place), type=ENTRIES[place.topic])
+                yield decode(self._index.body(place), ENTRIES[place.topic])
             except msgspec.DecodeError as error:
                 raise DataError(f"{self.path}, {place.topic} {place.number}: {error}.") from error
 

@@ -107,6 +107,10 @@ class RecordingFile:
     def _give_up(self, error: OSError) -> None:
         """What was written before stays readable. The robot goes on."""
         log.error("%s: %s: this recording ends here", self.path, error.strerror)
+        self.abandon()
+
+    def abandon(self) -> None:
+        """Take nothing more, and leave the end as it is."""
         self.is_open = False
         with suppress(OSError):  # what it could not flush
             self._file.close()

@@ -73,6 +73,7 @@ class Life:
     def __init__(self, file: JournalFile, make: Make, replayed: Replayed) -> None:
         self._file, self._make, self._replayed = file, make, replayed
         self._actor: Actor | None = None  # None: nothing is known until the next start
+        self._last: Step | None = None
 
     def live(self) -> Iterator[Step]:
         for entry in self._file.entries():
@@ -84,16 +85,34 @@ class Life:
                 case Step() if self._actor is not None:
                     self._replayed.steps += 1
                     self._step(self._actor, entry)
+                    self._last = entry
                     yield entry
         if not self._file.is_whole:
-            self._note("was cut off; it is replayed up to its last whole step.")
+            self._note(f"was cut off{self._under_way()}; it is replayed up to there.")
+
+    def _under_way(self) -> str:
+        """What was taken last and not finished: perhaps what killed it."""
+        taken = self._file.messages
+        if not taken or (self._last and self._last.taken == taken[-1].number):
+            return ""
+        return f" while it handled {taken[-1].topic} of stamp {taken[-1].stamp_ns}"
 
     def _start(self, start: Started) -> None:
         self._actor = self._make(self._file.about)
         self._replayed.starts += 1
         if start.state is not None:
             self._replayed.restored += 1
-            self._actor.restore({part: decode_state(body) for part, body in start.state.items()})
+            self._restore(self._actor, start, start.state)
+
+    def _restore(self, actor: Actor, start: Started, state: Mapping[str, bytes]) -> None:
+        try:
+            actor.restore({part: decode_state(body) for part, body in state.items()})
+        except Exception as error:
+            where = f"the start before step {start.step} ({self._file.path.name})"
+            what = "the state it began from"
+            raise ReplayDiverged(
+                self._replayed.actor, where, what, "taken up", f"refused, {error!r},"
+            ) from error
 
     def _skip(self, gap: Gap) -> None:
         self._actor = None

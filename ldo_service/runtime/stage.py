@@ -156,7 +156,7 @@ class Stage:
         while delivery := await mailbox.take():
             message = self._decode(delivery)
             if message is not None:
-                self._journal.took(delivery)
+                self._journal.took(delivery, message.stamp_ns)
                 await self._step(message)
             mailbox.done(delivery, rejected=message is None)
         await self._say_last_words()

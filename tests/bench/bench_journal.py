@@ -45,7 +45,7 @@ def main(folder: Path) -> None:
         body = bodies[i % 8]
         delivery = Delivery(In(FRAME_RGBD, Latest(1)), Header("camera", 1, i, i), memoryview(body))
         started_s = time.perf_counter()
-        recorder.took(delivery)
+        recorder.took(delivery, i)
         recorder.stepped("done", {}, [Produced(FRAME_RGBD, messages[i % 8], body)])
         loop_s += time.perf_counter() - started_s
         time.sleep(1 / 60)  # the loop has other work, at twice the rate of a camera

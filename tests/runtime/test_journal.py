@@ -1,5 +1,6 @@
 """What a recording holds, and what becomes of the robot when it cannot be written."""
 
+import asyncio
 import json
 import resource
 from collections.abc import Iterator
@@ -13,14 +14,26 @@ import pytest
 from mcap.reader import make_reader
 
 from ldo_service.errors import ConfigError
-from ldo_service.runtime import recording_file
+from ldo_service.runtime import In, Latest, recording_file
 from ldo_service.runtime.journal import Gap, Started, Step, checksum
 from ldo_service.runtime.recorder import Recorder
-from ldo_service.runtime.recording import new_path, prepare_recording, recorded_actors
+from ldo_service.runtime.recording import JournalFile, new_path, prepare_recording, recorded_actors
 from ldo_service.runtime.recording_file import RecordConfig
+from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.schemas import encode
 
-from .cast import DOUBLES, NUMBERS, PIECES
-from .journals import UNLUCKY, files, live, recorded
+from .cast import (
+    DOUBLES,
+    LATEST_NUMBER,
+    NUMBERS,
+    PIECES,
+    QUICK,
+    eventually,
+    number,
+    running,
+)
+from .journals import UNLUCKY, Tally, files, live, recorded
 
 
 def entries(folder: Path) -> list[Started | Step | Gap]:
@@ -99,6 +112,25 @@ def test_what_was_done_is_in_the_file_before_it_is_closed(tmp_path: Path) -> Non
     assert seen == [0, 1, 2, 3]
 
 
+def test_a_message_without_a_header_keeps_its_own_stamp(tmp_path: Path) -> None:
+    """As programs send it that know nothing of ours."""
+
+    class FromOutside(Tally):
+        inputs = (In(LATEST_NUMBER, Latest(4)),)
+
+    async def life() -> None:
+        transport = MemoryTransport()
+        recorder = Recorder(tmp_path / "tally.mcap", {}, RecordConfig())
+        stage = Stage(FromOutside, transport, config=QUICK, journal=recorder)
+        async with running(stage):
+            for stamp_ns in (100, 200):
+                transport.deliver(LATEST_NUMBER.name, b"", encode(number(stamp_ns)))
+            await eventually(lambda: stage.health().steps == 2)
+
+    asyncio.run(life())
+    assert [m.stamp_ns for m in JournalFile(tmp_path / "tally.mcap").messages] == [100, 200]
+
+
 def test_other_programs_read_it(tmp_path: Path) -> None:
     path = recorded(tmp_path, [5, 6])
     with path.open("rb") as stream:
@@ -136,7 +168,7 @@ class BusyDisk:
 def test_a_slow_disk_leaves_a_gap_that_is_marked_and_said_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    tiny = RecordConfig(queue_mb=0.0003)  # six small messages
+    tiny = RecordConfig(queue_mb=0.012)  # six small messages and their steps
     recorded(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
     gaps = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
     (gap,) = gaps
@@ -148,13 +180,13 @@ def test_a_slow_disk_leaves_a_gap_that_is_marked_and_said_once(
 
 
 def test_the_robot_does_not_wait_for_the_disk(tmp_path: Path) -> None:
-    tiny = RecordConfig(queue_mb=0.0003)
+    tiny = RecordConfig(queue_mb=0.012)
     never = BusyDisk(1, until=40)
     recorded(tmp_path, range(1, 41), config=tiny, meanwhile=never)  # or `eventually` gives up
 
 
 async def test_what_is_lost_shows_in_health(tmp_path: Path) -> None:
-    tiny = RecordConfig(queue_mb=0.0003)
+    tiny = RecordConfig(queue_mb=0.012)
     stage = await live(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
     facts = stage.health().facts
     (gap,) = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
@@ -182,6 +214,19 @@ def test_a_full_disk_ends_the_recording_and_not_the_robot(
     assert 0 < len(steps(tmp_path)) < 40
     assert caplog.text.count("this recording ends here") == 1
     assert not files(tmp_path)[0].is_whole
+
+
+def test_a_fault_of_the_recorder_ends_the_recording_and_not_the_robot(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def spoil(recorder: Recorder, value: int) -> None:
+        if value == 3:
+            recorder._submit(0, lambda: 1 // 0)  # type: ignore[arg-type]
+
+    recorded(tmp_path, [1, 2, 3, 4, 5], meanwhile=spoil)
+    assert len(steps(tmp_path)) == 2
+    assert caplog.text.count("this recording ends here") == 1
+    assert "ZeroDivisionError" in caplog.text
 
 
 def test_the_recording_ends_at_its_limit(

@@ -9,6 +9,9 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from ldo_service.errors import DataError, ReplayDiverged
+from ldo_service.runtime import recording_file
+from ldo_service.runtime.actor import State
+from ldo_service.runtime.mcap_index import McapIndex
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.schemas import Message
 
@@ -61,14 +64,16 @@ def test_a_failure_that_does_not_repeat_is_noted_and_no_difference(tmp_path: Pat
 
 def test_a_killed_actor_and_its_successor_replay(tmp_path: Path) -> None:
     first = recorded(tmp_path, [1, 2, 3, 4, 5], is_killed=True)
-    first.write_bytes(first.read_bytes()[:-500])  # its summary, and the end of its last records
+    last = McapIndex(first).places[-1]
+    first.write_bytes(first.read_bytes()[: last.start + last.size // 2])  # half its last step
     recorded(tmp_path, [5, 6, 7])
     assert [file.is_whole for file in files(tmp_path)] == [False, True]
     result = replayed(tmp_path)
     result.verify()
     assert (result.starts, result.restored) == (2, 1)
     assert "tally.mcap was cut off" in result.notes[0]
-    assert result.steps > 4
+    assert "test/number of stamp 5" in result.notes[0]
+    assert result.steps == 4 + 4
 
 
 def test_a_file_that_was_cut_anywhere_replays_up_to_its_last_whole_step(tmp_path: Path) -> None:
@@ -104,6 +109,16 @@ def test_changed_code_is_named_with_actor_step_and_output(tmp_path: Path) -> Non
     assert error.recorded in str(error)
     assert error.replayed in str(error)
     assert error.recorded != error.replayed
+
+
+def test_a_state_that_cannot_be_taken_up_any_more_is_a_difference(tmp_path: Path) -> None:
+    class Changed(Tally):
+        def restore(self, state: State) -> None:
+            self._sum = state["total"]
+
+    recorded(tmp_path, [1, 2, 3, UNLUCKY])
+    with pytest.raises(ReplayDiverged, match=r"start before step 4 .*refused, KeyError"):
+        replayed(tmp_path, Changed).verify()
 
 
 def test_an_output_more_or_less_is_a_difference(tmp_path: Path) -> None:
@@ -161,7 +176,7 @@ def test_an_actor_that_talks_to_the_outside_is_left_out(tmp_path: Path) -> None:
 
 # --- what was not recorded ------------------------------------------------------------------------
 def test_a_replay_ends_at_a_gap_and_does_not_pass(tmp_path: Path) -> None:
-    tiny = RecordConfig(queue_mb=0.0003)
+    tiny = RecordConfig(queue_mb=0.012)
     recorded(tmp_path, range(20, 60), config=tiny, meanwhile=BusyDisk(25, 50))
     result = replayed(tmp_path)
     assert result.difference is None
@@ -171,13 +186,24 @@ def test_a_replay_ends_at_a_gap_and_does_not_pass(tmp_path: Path) -> None:
 
 
 def test_after_a_gap_a_restart_is_replayed_again(tmp_path: Path) -> None:
-    tiny = RecordConfig(queue_mb=0.0003)
+    tiny = RecordConfig(queue_mb=0.012)
     values = [*range(20, 60), UNLUCKY, 60, 61]
     recorded(tmp_path, values, config=tiny, meanwhile=BusyDisk(25, 50))
     result = replayed(tmp_path)
     assert result.difference is None
     assert (result.starts, result.failures, result.set_aside) == (3, 1, 1)
     assert not result.is_complete
+
+
+def test_a_recording_that_ended_at_its_limit_replays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recording_file, "CHECK_EVERY_BYTES", 100)
+    recorded(tmp_path, range(20, 60), config=RecordConfig(max_gb=6e-6))
+    result = replayed(tmp_path)
+    result.verify()
+    assert 0 < result.steps < 40
+    assert result.notes == [f"tally.mcap ends at its size limit, before step {result.steps}."]
 
 
 def test_a_missing_message_is_bad_data(tmp_path: Path) -> None:
@@ -222,6 +248,24 @@ def rewrite(
             )
         writer.finish()
     copy.rename(path)
+
+
+@pytest.mark.parametrize("compression", list(CompressionType)[::2], ids=lambda c: c.name)
+def test_damage_anywhere_is_bad_data_or_a_difference(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    path = recorded(tmp_path, [1, 2, 3, UNLUCKY, 4])
+    rewrite(path, compression)
+    whole, rng, found = path.read_bytes(), random.Random(2), 0
+    for place in rng.sample(range(len(whole)), 300):
+        damaged = bytearray(whole)
+        damaged[place] ^= 1 << rng.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            replayed(tmp_path).verify()
+        except (DataError, ReplayDiverged):
+            found += 1
+    assert found > 20
 
 
 @pytest.mark.parametrize("content", [b"", b"not a recording at all", b"\x89MCAP0\r\n\x05\x01"])
