@@ -81,9 +81,11 @@ def verbs() -> dict[str, Callable[..., None]]:
         doctor,
         evaluate,
         publish,
+        replay,
         run,
         serve,
         show_config,
+        simulate,
         topics,
     )
 
@@ -94,6 +96,9 @@ def verbs() -> dict[str, Callable[..., None]]:
         "serve": serve.serve,
         "publish": publish.publish,
         "control": control.control,
+        "record": serve.record,
+        "replay": replay.replay,
+        "simulate": simulate.simulate,
         "topics": topics.topics,
         "config": show_config.show_config,
         "doctor": doctor.doctor,

@@ -30,6 +30,7 @@ from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.tracker import TrackerConfig
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
+from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.stage import StageConfig
 
 
@@ -81,6 +82,10 @@ class RunConfig:
         if not 0 <= self.max_rejected <= 1:
             raise ConfigError(f"run.max_rejected={self.max_rejected:g} must be within 0..1.")
 
+    def latency_frames(self) -> dict[str, int]:
+        """By actor; the others answer within the frame."""
+        return {"mapper": self.mapper_latency_frames, "optimizer": self.optimizer_latency_frames}
+
 
 @dataclass(frozen=True, slots=True)
 class Config:
@@ -91,6 +96,7 @@ class Config:
     data: DataConfig = field(default_factory=DataConfig)
     run: RunConfig = field(default_factory=RunConfig)
     service: ServiceConfig = field(default_factory=ServiceConfig)
+    record: RecordConfig = field(default_factory=RecordConfig)
     stage: StageConfig = field(default_factory=StageConfig)
 
 

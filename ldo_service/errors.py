@@ -63,4 +63,15 @@ class StageStalled(StageError):
 
 
 class ReplayDiverged(LdoError):
+    """`what` differs from `recorded` to `replayed` in a step of an actor."""
+
     exit_code = 5
+
+    def __init__(self, actor: str, step: str, what: str, recorded: str, replayed: str) -> None:
+        super().__init__(
+            f"{actor} diverged at {step}: {what} was {recorded} when recorded and is {replayed} "
+            "now. Either the recording was changed, or the code, a library or the instruction "
+            "set, or the actor uses something that is not recorded, such as a clock."
+        )
+        self.actor, self.step, self.what = actor, step, what
+        self.recorded, self.replayed = recorded, replayed

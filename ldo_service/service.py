@@ -22,14 +22,17 @@ from ldo_service.config import Config, config_yaml
 from ldo_service.control import Control
 from ldo_service.errors import ConfigError, StageStalled
 from ldo_service.metrics import HealthCollector, exported
+from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     PARENT_VARIABLE,
     ChildProcess,
     leave_with_parent,
     python_command,
 )
+from ldo_service.runtime.recording import prepare_recording
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.supervision import Runner, Stop, supervise
@@ -49,6 +52,7 @@ class Service:
     only: tuple[str, ...] = ()
     is_state_kept: bool = True  # the folder outlives the service
     metrics_port: int | None = None  # for Prometheus, on loopback
+    recording: Path | None = None  # what every actor takes is recorded there
 
     def run(self) -> None:
         """Serve until SIGINT or SIGTERM; a second one stops at once.
@@ -59,6 +63,8 @@ class Service:
         self._require_known(self.only)
         self._require_known(self.config.service.spawned)
         health = HealthCollector()
+        if self.recording and not self.only:
+            prepare_recording(self.recording)
         with ExitStack() as stack:
             if self.metrics_port is not None:
                 stack.enter_context(exported(health, self.metrics_port))
@@ -137,7 +143,13 @@ class Service:
                 out.topic.name: lossless_consumers(RUNNING, out.topic.name) for out in box.outputs
             },
             on_evicted=evicted,
+            journal=self._journal(box.name),
         )
+
+    def _journal(self, actor: str) -> Journal:
+        if self.recording is None:
+            return Journal()
+        return open_recorder(self.recording, actor, self.network.robot, self.config)
 
     def _child(self, box: Box, transport: ZenohTransport) -> ChildProcess:
         config = self.state / "config.yaml"
@@ -146,6 +158,7 @@ class Service:
             *("serve", "--only", box.name, "--robot", self.network.robot),
             *("--endpoint", self.network.endpoint),
             *("--config", str(config), "--state", str(self.state)),
+            *(("--record", str(self.recording)) if self.recording else ()),
         )
         stage = self.config.stage
         return ChildProcess(

@@ -13,7 +13,6 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation.pictures import save_picture, trajectory_picture
 from ldo_service.evaluation.trajectory import (
@@ -22,6 +21,7 @@ from ldo_service.evaluation.trajectory import (
     evaluate_trajectory,
 )
 from ldo_service.geometry import Trajectory
+from ldo_service.recordings.sequence import open_source
 
 from .options import Json, Source
 
@@ -46,7 +46,7 @@ def evaluate(
 
     Prints the protocol above the figures, and draws trajectory.png into DIR.
     """
-    truth = open_sequence(source, run_config(folder).data.options()).truth()
+    truth = open_source(source, run_config(folder).data.options()).truth()
     if truth is None:
         raise DataError(f"{source} has no ground truth, so there is nothing to compare with.")
     final = read_trajectory(folder, "trajectory.txt")

@@ -23,7 +23,27 @@ Source = Annotated[
     tyro.conf.arg(
         metavar="SOURCE",
         help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export or 7-Scenes, "
-        "recognised by its files), or synthetic:room",
+        "recognised by its files), a recording, or synthetic:room",
+    ),
+]
+Recording = Annotated[
+    Path,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="DIR", help="folder that `ldo record` wrote"),
+]
+Only = Annotated[
+    tyro.conf.UseAppendAction[tuple[str, ...]],
+    tyro.conf.arg(
+        metavar="ACTOR",
+        help="run this actor alone, as a part of a service that runs already; may be repeated",
+    ),
+]
+StateFolder = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        name="state",
+        metavar="DIR",
+        help="where actors keep what a successor needs; default: a temporary folder",
     ),
 ]
 Robot = Annotated[

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
-from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
+from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.source import Selection
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.wire import camera_rgbd_message
@@ -49,7 +50,7 @@ def publish(
     """
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
-    sequence = open_sequence(source, load_config(config, set).data.options())
+    sequence = open_source(source, load_config(config, set).data.options())
     indices = Selection(stride, max_frames).indices(sequence)
     console = Console(stderr=True)
     with (

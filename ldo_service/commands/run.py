@@ -10,8 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
+from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
@@ -54,7 +54,7 @@ def run(
     settings = with_options(load_config(config, set), hold_out, threads)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
-    sequence = open_sequence(source, settings.data.options())
+    sequence = open_source(source, settings.data.options())
     prepare(out, overwrite)
     with progress("run", len(selection.indices(sequence)), console) as advance:
         go = run_in_real_time if realtime else run_over_file

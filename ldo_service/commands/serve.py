@@ -1,4 +1,4 @@
-"""ldo serve"""
+"""ldo serve, ldo record"""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -10,27 +10,19 @@ from ldo_service.config import load_config
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network
 from ldo_service.service import Service, state_folder
 
-from .options import ConfigFile, Endpoint, Robot, Settings
+from .options import ConfigFile, Endpoint, Only, Robot, Settings, StateFolder
 
 
 def serve(
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
-    only: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(
-            metavar="ACTOR",
-            help="run this actor alone, as a part of a service that runs already; may be repeated",
-        ),
-    ] = (),
+    only: Only = (),
     config: ConfigFile = None,
     set: Settings = (),
-    state: Annotated[
+    state: StateFolder = None,
+    record: Annotated[
         Path | None,
-        tyro.conf.arg(
-            metavar="DIR",
-            help="where actors keep what a successor needs; default: a temporary folder",
-        ),
+        tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
     ] = None,
     metrics: Annotated[
         int | None,
@@ -55,4 +47,29 @@ def serve(
             tuple(only),
             is_state_kept=state is not None,
             metrics_port=metrics,
+            recording=record,
         ).run()
+
+
+def record(
+    out: Annotated[
+        Path,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="DIR", help="new folder: a file per actor, in the MCAP format"),
+    ],
+    robot: Robot = "robot",
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    only: Only = (),
+    config: ConfigFile = None,
+    set: Settings = (),
+    state: StateFolder = None,
+) -> None:
+    """Run the service as `ldo serve` does, and record what every actor takes.
+
+    640x480 at 30 Hz makes 100 MB a second; record.max_gb bounds it. `ldo replay DIR --verify` lives
+    it again, and DIR is a data set for every verb that takes a SOURCE.
+
+      ldo record recordings/desk
+      ldo publish synthetic:room --rate 15      (in another terminal)
+    """
+    serve(robot, endpoint, only, config, set, state, record=out)

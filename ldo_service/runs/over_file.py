@@ -36,10 +36,7 @@ def run_over_file(
     record = RunFolder(folder, config_yaml(config), config.tracker.hold_out)
     clock = LogicalClock(
         list(actors.values()),
-        {
-            "mapper": config.run.mapper_latency_frames,
-            "optimizer": config.run.optimizer_latency_frames,
-        },
+        config.run.latency_frames(),
         lambda _actor, message, step_ms: record.observe(message, step_ms),
     )
     started = Usage.now()

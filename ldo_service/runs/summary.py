@@ -1,20 +1,18 @@
 """What a run has used, and the figures it ends with."""
 
 import os
-import platform
 import resource
 import time
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from ldo_service import __version__, kernels
+from ldo_service import kernels
+from ldo_service.versions import versions
 
 from .folder import RunFolder
 
-LIBRARIES = ("numpy", "gtsam", "opencv-python-headless", "msgspec")
 Percentiles = dict[str, float]  # p50, p95
 
 
@@ -63,11 +61,7 @@ def summarise(
         "optimizations": record.corrections,
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
-        "versions": {
-            "ldo-slam": __version__,
-            "python": platform.python_version(),
-            **{library: version(library) for library in LIBRARIES},
-        },
+        "versions": versions(),
     }
 
 

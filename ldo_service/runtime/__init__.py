@@ -10,6 +10,8 @@
     ChildProcess  an actor in a process of its own, seen from the process that started it
     supervise   one task group; an exhausted restart budget ends the process
     check_graph refuses a cycle of lossless inputs before anything starts
+    Journal     what determined each step of an actor; a Recorder keeps it in a file
+    replay      an actor lives its recorded life again; what it makes must be the same
     run_on_logical_clock   the whole graph over a file, independent of the machine's load
 
 A handler is an ordinary generator: it opens no socket, reads no clock, starts no task. The stage

@@ -25,6 +25,7 @@ class Actor:
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
+    talks_outside: ClassVar[bool] = False  # asks what no journal records: a replay leaves it out
 
     def __init__(self) -> None:
         self.room: Mapping[Topic, int] = {}

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import msgspec
@@ -15,11 +15,13 @@ from ldo_service.schemas.topics import HEALTH, Topic
 from . import links
 from .actor import Actor
 from .inlet import Delivery
+from .journal import Journal
 from .mailbox import Mailbox
 from .orders import Order, OrderTaker
 from .outlet import Outlet
 from .restart import RestartBudget
 from .state_store import MemoryStore, StateStore
+from .step import Produced, produce
 from .transport import Transport
 from .vitals import Vitals
 from .worker import Worker
@@ -49,19 +51,15 @@ class StageConfig:
             raise ConfigError(f"{self}: counts and times must be positive.")
 
 
-@dataclass(frozen=True, slots=True)
-class Produced:
-    message: Message
-    body: bytes
-
-
 class Stage:
     """`run` until `drain` or cancelled.
 
     A failed step is tried once more by a successor that starts from the last state; a message that
     fails twice is set aside and counted. `expected` names, for each output topic, the consumers
-    that must not miss a message.
+    that must not miss a message. Everything that a step depends on is told to the `journal`.
     """
+
+    JOURNAL_WITHIN_S = 5.0  # a stage that ends waits so long for its journal to be written
 
     def __init__(
         self,
@@ -72,11 +70,13 @@ class Stage:
         store: StateStore | None = None,
         expected: Mapping[str, frozenset[str]] | None = None,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
+        journal: Journal | None = None,
     ) -> None:
         self._make, self._transport, self._config = make, transport, config
         self._store = store or MemoryStore()
         self._expected = expected or {}
         self._on_evicted = on_evicted
+        self._journal = journal or Journal()
         self._actor = self._successor()
         self.name = self._actor.name
         self._epoch = _new_epoch()
@@ -113,6 +113,7 @@ class Stage:
             await asyncio.gather(*tasks, return_exceptions=True)
             self._worker.close()
             self._close_ports(self._mailbox)
+            await self._close_journal()
 
     def drain(self) -> None:
         """Soft stop: handle what has arrived, say the last words, end."""
@@ -156,6 +157,13 @@ class Stage:
             outlet.close()
         self._health.close()
 
+    async def _close_journal(self) -> None:
+        written = asyncio.wrap_future(self._journal.close())
+        done, _ = await asyncio.wait({written}, timeout=self.JOURNAL_WITHIN_S)
+        if not done:
+            written.cancel()
+            log.error("%s: the end of its recording is not written", self.name)
+
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         while delivery := await mailbox.take():
@@ -164,6 +172,7 @@ class Stage:
                 continue
             message = self._decode(delivery)
             if message is not None:
+                self._journal.took(delivery, message.stamp_ns)
                 await self._step(message)
             mailbox.done(delivery, rejected=message is None)
         await self._say_last_words()
@@ -191,6 +200,7 @@ class Stage:
             if await self._try(message):
                 return
         self._vitals.set_aside += 1
+        self._journal.stepped("set_aside", {})
         log.error(
             "%s: %s of stamp %d failed twice and is set aside",
             self.name, type(message).__name__, message.stamp_ns,
@@ -202,10 +212,12 @@ class Stage:
         try:
             with self._vitals.step():
                 produced = await self._worker.run(self._handle, message)
-        except Exception:
+        except Exception as error:
             log.exception("%s failed on %s", self.name, type(message).__name__)
+            self._journal.stepped("failed", self._actor.room, error=repr(error))
             await self._restart()
             return False
+        self._journal.stepped("done", self._actor.room, produced)
         for out in produced:
             await self._send(out)
         await self._worker.run(self._save)
@@ -227,8 +239,10 @@ class Stage:
             self._vitals.failures += 1
             log.exception("%s failed on its last words", self.name)
             return
+        self._journal.stepped("finished", self._actor.room, last_words)
         for out in last_words:
             await self._send(out)
+        await self._worker.run(self._save, True)
 
     # --- orders ---------------------------------------------------------------------------------
     async def _obey(self, order: Order, mailbox: Mailbox) -> None:
@@ -263,31 +277,17 @@ class Stage:
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _handle(self, message: Message) -> list[Produced]:
-        return self._collect(self._actor.handle(message))
+        return produce(self._actor, self._actor.handle(message))
 
     def _finish(self) -> list[Produced]:
-        return self._collect(self._actor.finish())
+        return produce(self._actor, self._actor.finish())
 
-    def _collect(self, messages: Iterable[Message]) -> list[Produced]:
-        """Raises when a message is none of the outputs, or has no room where none may wait."""
-        produced: list[Produced] = []
-        room = dict(self._actor.room)
-        for message in messages:
-            if type(message) not in self._outlets:
-                raise TypeError(f"{type(message).__name__} is none of {self.name}'s outputs")
-            topic = self._outlets[type(message)].topic
-            if topic in room:
-                room[topic] -= 1
-                if room[topic] < 0:
-                    raise RuntimeError(f"{self.name} made {topic.name} without room for it")
-            produced.append(Produced(message, encode(message)))
-        return produced
-
-    def _save(self) -> None:
+    def _save(self, everything: bool = False) -> None:
         """A full disk must not stop the robot: it goes on, and a restart would lose a few steps."""
-        self._vitals.facts = self._actor.facts()
+        self._vitals.facts = {**self._actor.facts(), **self._journal.statistics()}
         try:
-            self._store.save(self.name, self._actor.snapshot())
+            state = self._actor.checkpoint() if everything else self._actor.snapshot()
+            self._store.save(self.name, state)
         except Exception:
             self._vitals.failures += 1
             log.exception("%s: its state could not be saved", self.name)
@@ -298,6 +298,7 @@ class Stage:
         if state is not None:
             actor.restore(state)
             log.info("%s goes on from its last state", actor.name)
+        self._journal.started(state)
         return actor
 
     async def _restart(self) -> None:

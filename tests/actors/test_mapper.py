@@ -169,15 +169,6 @@ def test_between_checkpoints_the_state_is_the_same_object(keyframes) -> None:
     assert mapper.snapshot()["map"] is first
 
 
-def test_a_checkpoint_on_request_holds_the_map_as_it_is(keyframes) -> None:
-    mapper, successor = Mapper(CONFIG), Mapper(CONFIG)
-    for keyframe in keyframes[:3]:
-        list(mapper.handle(keyframe))
-        mapper.snapshot()
-    successor.restore(mapper.checkpoint())
-    assert_equal_maps(followed(changes(mapper.finish())), successor)
-
-
 def test_a_follower_notices_that_the_mapper_began_anew(keyframes) -> None:
     """Before its first snapshot: the first change is one of an empty map."""
     config = MapperConfig(snapshot_keyframes=100)

@@ -78,7 +78,7 @@ def test_missing_parameters_name_both_places(replica_folder: Writer) -> None:
 
 @pytest.mark.parametrize("params", [{}, {"scale": 1000}, {"w": 4, "h": 4}])
 def test_incomplete_parameters_are_named(replica_folder: Writer, params: dict) -> None:
-    with pytest.raises(DataError, match=r"cam_params\.json: expected a number"):
+    with pytest.raises(DataError, match=r"cam_params\.json: expected a finite number"):
         open_sequence(str(replica_folder([0], params=params)))
 
 

@@ -1,0 +1,82 @@
+"""ldo replay"""
+
+import itertools
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service.recordings.replay import RecordedActor, open_recording
+from ldo_service.runtime.replay import Replayed
+
+from .options import Recording
+from .progress import progress
+
+
+def replay(
+    recording: Recording,
+    verify: Annotated[
+        bool, tyro.conf.arg(help="end with exit code 5 at the first difference")
+    ] = False,
+    actor: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="NAME", help="this actor alone; may be repeated; default: all"),
+    ] = (),
+) -> None:
+    """Feed fresh actors what they took in a recording, and compare what they make of it.
+
+    Restarts, failures and the room that each step saw are part of it. Nothing is sent. Without
+    --verify a difference is printed and is no error.
+
+      ldo replay recordings/desk --verify
+    """
+    console = Console(stderr=True, highlight=False)
+    actors = open_recording(recording, tuple(actor))
+    for caveat in dict.fromkeys(line for recorded in actors for line in recorded.caveats()):
+        console.print(f"note: {caveat}", soft_wrap=True)
+    with progress("replay", sum(recorded.steps for recorded in actors), console) as advance:
+        step = map(advance, itertools.count(1))
+        replayed = [_replay(recorded, verify, console, lambda: next(step)) for recorded in actors]
+    Console().print(_table(replayed))
+
+
+def _replay(
+    recorded: RecordedActor, verify: bool, console: Console, advance: Callable[[], None]
+) -> Replayed:
+    replayed = recorded.replay(advance)
+    for note in replayed.notes:
+        console.print(f"note: {note}", soft_wrap=True)
+    if verify:
+        replayed.verify()
+    elif replayed.difference:
+        console.print(f"{replayed.difference}", soft_wrap=True)
+    return replayed
+
+
+def _table(rows: list[Replayed]) -> Table:
+    table = Table("actor", "steps", "took", "made", "same")
+    for row in rows:
+        same = "yes" if row.difference is None else f"until\n{row.difference.step}"
+        took, made = _counts(row.taken), _counts(row.made)
+        table.add_row("\n".join(_life(row)), str(row.steps), took, made, same)
+    return table
+
+
+def _life(row: Replayed) -> Iterator[str]:
+    """Its name, and what did not go smoothly."""
+    yield row.actor
+    if row.starts != 1:
+        yield f"{row.starts} starts"
+    if row.restored:
+        yield f"{row.restored} restored"
+    if row.failures:
+        yield f"{row.failures} failed"
+    if row.set_aside:
+        yield f"{row.set_aside} set aside"
+
+
+def _counts(messages: Counter[str]) -> str:
+    return "\n".join(f"{count} {topic}" for topic, count in messages.items())

@@ -1,0 +1,57 @@
+"""ldo simulate"""
+
+import json
+from dataclasses import asdict
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service.config import load_config
+from ldo_service.recordings.sequence import open_source
+from ldo_service.runs.simulation import Made, simulate_graph
+from ldo_service.runs.source import Selection
+
+from .options import ConfigFile, Json, Settings, Source
+from .progress import progress
+from .run import with_options
+
+
+def simulate(
+    source: Source,
+    config: ConfigFile = None,
+    set: Settings = (),
+    max_frames: Annotated[
+        int | None, tyro.conf.arg(metavar="N", help="stop after so many frames")
+    ] = None,
+    stride: Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")] = 1,
+    threads: Annotated[
+        int | None, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
+    ] = None,
+    json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Run every actor on a logical clock and print a digest of all that each one made.
+
+    The digests depend on the frames, the configuration and the instruction set alone: not on the
+    number of threads, nor on the machine's load. Nothing is written.
+
+      ldo simulate synthetic:room --max-frames 60 --json
+    """
+    console = Console(stderr=True, highlight=False)
+    settings = with_options(load_config(config, set), hold_out=None, threads=threads)
+    sequence = open_source(source, settings.data.options())
+    selection = Selection(stride, max_frames)
+    with progress("simulate", len(selection.indices(sequence)), console) as advance:
+        made = simulate_graph(sequence, settings, selection, console.print, advance)
+    if json_:
+        print(json.dumps({actor: asdict(digest) for actor, digest in made.items()}))
+    else:
+        Console().print(_table(made))
+
+
+def _table(made: dict[str, Made]) -> Table:
+    table = Table("actor", "messages", "digest")
+    for actor, digest in made.items():
+        table.add_row(actor, str(digest.messages), digest.digest)
+    return table

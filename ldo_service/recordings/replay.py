@@ -1,0 +1,81 @@
+"""A recording lived again, one fresh actor after the other."""
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from ldo_service import kernels
+from ldo_service.actors.graph import box_named
+from ldo_service.config import config_of
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.runtime import Actor
+from ldo_service.runtime.recording import JournalFile, recorded_actors
+from ldo_service.runtime.replay import Replayed, replay
+from ldo_service.versions import versions
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedActor:
+    """The lives of one actor. Raises DataError when a file cannot be read."""
+
+    name: str
+    files: tuple[JournalFile, ...]
+
+    @property
+    def steps(self) -> int:
+        return sum(file.steps for file in self.files)
+
+    def replay(self, advance: Callable[[], None] = lambda: None) -> Replayed:
+        """Feed it to a fresh actor; `advance` is called after each step."""
+        return replay(self.name, self.files, self._make, advance)
+
+    def verify(self) -> Replayed:
+        """Replay. Raises ReplayDiverged, or DataError when something was not recorded."""
+        replayed = self.replay()
+        replayed.verify()
+        return replayed
+
+    def _make(self, about: Mapping[str, str]) -> Actor:
+        make = box_named(self.name).make
+        assert make is not None
+        return make(config_of(yaml.safe_load(about.get("config", "")) or {}))
+
+    def caveats(self) -> list[str]:
+        """Why the bits may differ here although nothing is wrong."""
+        return [line for file in self.files[:1] for line in _caveats(file.about)]
+
+
+def _caveats(about: Mapping[str, str]) -> list[str]:
+    lines: list[str] = []
+    isa, ours = about.get("isa", kernels.isa()), kernels.isa()
+    if isa != ours:
+        lines.append(
+            f"recorded with the instruction set {isa}, this is {ours}: the last bits may differ. "
+            f"Force it with LDO_ISA={isa}, on a machine that has it."
+        )
+    now = versions()
+    for name, version in json.loads(about.get("versions", "{}")).items():
+        if now.get(name) != version:
+            lines.append(f"recorded with {name} {version}, this is {now.get(name)}.")
+    return lines
+
+
+def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedActor]:
+    """The recorded actors, or some of them. Raises DataError or ConfigError."""
+    found = recorded_actors(folder)
+    if not found:
+        raise DataError(f"{folder} holds no recording: `ldo record {folder}` would make one.")
+    unknown = [name for name in only if name not in found]
+    if unknown:
+        raise ConfigError(f"{folder} has no actor {unknown[0]!r}: it has {', '.join(found)}.")
+    actors = [
+        RecordedActor(name, tuple(JournalFile(path) for path in paths))
+        for name, paths in found.items()
+        if not only or name in only
+    ]
+    if not any(actor.steps for actor in actors):
+        raise DataError(f"{folder} holds no step of {', '.join(only) or 'any actor'}.")
+    return actors

@@ -1,0 +1,72 @@
+"""The whole service in one event loop, recorded over the synthetic room."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from ldo_service.actors.graph import RUNNING
+from ldo_service.config import Config
+from ldo_service.datasets import Sequence
+from ldo_service.recordings.write import open_recorder
+from ldo_service.runtime import Out
+from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.outlet import Outlet
+from ldo_service.runtime.stage import Stage
+from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.schemas.topics import CAMERA_RGBD
+from ldo_service.wire import camera_rgbd_message
+from tests.runtime.cast import eventually, running, send
+
+FRAMES = 30
+
+
+def stages(folder: Path, transport: MemoryTransport) -> list[Stage]:
+    made: list[Stage] = []
+    for box in RUNNING:
+        assert box.make is not None
+        make, topics = box.make, [out.topic.name for out in box.outputs]
+        made.append(
+            Stage(
+                lambda make=make: make(Config()),
+                transport,
+                expected={name: lossless_consumers(RUNNING, name) for name in topics},
+                journal=open_recorder(folder, box.name, "robot", Config()),
+            )
+        )
+    return made
+
+
+async def live(folder: Path, sequence: Sequence) -> None:
+    """Frame by frame, then a soft stop, producers first."""
+    transport = MemoryTransport()
+    actors = stages(folder, transport)
+    camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
+    async with running(*actors) as tasks:
+        tracker = next(stage for stage in actors if stage.name == "tracker")
+        for index in range(FRAMES):
+            await send(camera, camera_rgbd_message(sequence.read(index)))
+            await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
+        for stage, task in zip(actors, tasks, strict=True):
+            stage.drain()
+            await task
+
+
+def frames_of(tracker: Stage) -> int:
+    return next(i.delivered for i in tracker.health().inputs if i.topic == "frame/rgbd")
+
+
+@pytest.fixture(scope="session")
+def recording(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of thirty frames; not to be changed."""
+    folder = tmp_path_factory.mktemp("recording")
+    asyncio.run(live(folder, room))
+    return folder
+
+
+@pytest.fixture
+def spoilt(recording: Path, tmp_path: Path) -> Path:
+    """A copy, to be changed."""
+    for path in recording.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path

@@ -1,0 +1,112 @@
+"""The graph on the logical clock: digests that depend on the input alone."""
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.config import load_config
+from ldo_service.datasets import Cached, Sequence
+from ldo_service.errors import DataError, FrameError
+from ldo_service.geometry import RawFrame
+from ldo_service.runs.simulation import Made, simulate_graph
+from ldo_service.runs.source import Selection
+from ldo_service.schemas import Keyframe
+from tests.actors.conftest import frames, keyframes, tracked  # noqa: F401
+from tests.commands.test_cli import ldo
+
+FRAMES = 30
+
+
+def simulated(sequence: Sequence, *settings: str) -> dict[str, Made]:
+    config = load_config(settings=settings)
+    return simulate_graph(sequence, config, Selection(max_frames=FRAMES), print, lambda _done: None)
+
+
+@pytest.fixture(scope="module")
+def made(room: Sequence) -> dict[str, Made]:
+    return simulated(room)
+
+
+def test_every_actor_has_a_digest(made: dict[str, Made]) -> None:
+    assert list(made) == ["frame_source", "tracker", "mapper", "optimizer"]
+    assert made["frame_source"].messages == FRAMES
+    assert len({entry.digest for entry in made.values()}) == 4
+
+
+@pytest.mark.parametrize("threads", [1, 2, 5])
+def test_digests_do_not_depend_on_threads(
+    room: Sequence, made: dict[str, Made], threads: int
+) -> None:
+    assert simulated(room, f"mapper.threads={threads}") == made
+
+
+class OnePixel(Cached):
+    """A sequence with one colour value of one frame changed by one."""
+
+    def read(self, index: int) -> RawFrame:
+        raw = super().read(index)
+        if index != FRAMES // 2:
+            return raw
+        color = np.array(raw.color)
+        color[100, 100, 1] ^= 1
+        return replace(raw, color=color)
+
+
+def test_one_pixel_changes_the_digests(room: Sequence, made: dict[str, Made]) -> None:
+    changed = simulated(OnePixel(room))
+    assert changed["frame_source"].digest != made["frame_source"].digest
+    assert changed["frame_source"].messages == made["frame_source"].messages
+
+
+def test_the_latency_is_an_input(room: Sequence, made: dict[str, Made]) -> None:
+    later = simulated(room, "run.optimizer_latency_frames=6")
+    assert later["frame_source"] == made["frame_source"]
+    assert later["tracker"] != made["tracker"]
+
+
+def test_the_renderer_uses_the_threads_it_is_given(
+    keyframes: list[Keyframe],  # noqa: F811
+) -> None:
+    def share_of_helpers(threads: int) -> float:
+        """CPU time that threads other than this one spend while it maps."""
+        mapper = Mapper(MapperConfig(threads=threads))
+        whole_s, own_s = time.process_time(), time.thread_time()
+        for keyframe in keyframes:
+            list(mapper.handle(keyframe))
+        whole_s, own_s = time.process_time() - whole_s, time.thread_time() - own_s
+        return 1 - own_s / whole_s
+
+    assert share_of_helpers(1) < 0.02
+    assert share_of_helpers(8) > 0.1
+
+
+def test_nothing_readable_is_bad_data(room: Sequence) -> None:
+    class Spoilt(Cached):
+        def read(self, index: int) -> RawFrame:
+            raise FrameError(f"frame {index} is truncated.")
+
+    with pytest.raises(DataError, match="no frame"):
+        simulated(Spoilt(room))
+
+
+def test_the_last_line_is_json_for_scripts(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ("simulate", "synthetic:room", "--max-frames", "4", "--threads", "2", "--json")
+    code, out, _ = ldo(capsys, *arguments)
+    assert code == 0
+    digests = json.loads(out.splitlines()[-1])
+    assert digests["frame_source"]["messages"] == 4
+    assert all(len(bytes.fromhex(entry["digest"])) == 16 for entry in digests.values())
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_real_frames_give_the_same_digests_for_one_thread_and_two(data: Path) -> None:
+    from ldo_service.datasets import open_sequence
+
+    kitchen = open_sequence(str(data / "tum" / "kitchen"))
+    assert simulated(kitchen, "mapper.threads=1") == simulated(kitchen, "mapper.threads=2")
