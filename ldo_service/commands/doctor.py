@@ -37,12 +37,17 @@ LIBRARIES = {  # name on the package index: name to import
 }
 EXTRAS = {"viewer": ("viser", "gsply"), "cuda": ("torch", "gsplat")}
 LISTEN_S = 1.5  # three heartbeats
-MARKS = {"ok": "[green]ok[/]     ", "absent": "[dim]absent[/] ", "bad": "[red]bad[/]    "}
+MARKS = {
+    "ok": "[green]ok[/]     ",
+    "absent": "[dim]absent[/] ",
+    "bad": "[red]bad[/]    ",
+    "note": "[dim]note[/]   ",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    mark: str  # "ok", "absent": fine without; "bad": something to mend
+    mark: str  # "ok", "absent": fine without; "note": good to know; "bad": to be mended
     text: str
 
 
@@ -139,14 +144,15 @@ def of_actor(actor: Seen) -> Iterator[Finding]:
     for trouble in wrong:
         yield Finding("bad", f"{actor.actor} {trouble}")
     for remark in remarks(actor):
-        yield Finding("absent", f"{actor.actor} {remark}")
+        yield Finding("note", f"{actor.actor} {remark}")
 
 
 def _in_numbers(health: Health) -> str:
     dropped = sum(i.dropped for i in health.inputs)
     rejected = sum(i.rejected for i in health.inputs)
+    state = "held" if health.held else health.state
     return (
-        f"{health.actor} (process {health.pid}): {health.state}, {health.steps} steps of "
+        f"{health.actor} (process {health.pid}): {state}, {health.steps} steps of "
         f"{health.step_ms_p50:.1f} ms p50, {health.step_ms_p95:.1f} ms p95, {dropped} dropped, "
         f"{rejected} rejected, {health.restarts} restarts, {health.rss_mb:.0f} MB"
     )
