@@ -36,11 +36,14 @@ class FrameSourceConfig:
     max_skew_s: float = 0.015  # between the halves of a pair: under half a period at 30 Hz, so
     # that the first depth within it is the nearest; at 1 rad/s it is 0.9 deg of turn
     pair_buffer: int = 8  # halves of a stream that wait for the other: 0.27 s at 30 Hz, 7 MB VGA
+    restart_after_s: float = 1.0  # a stamp so much earlier is no jitter: the camera started again
     min_side_px: int = 32  # smaller images hold too little to track, and hint at a wrong header
 
     def __post_init__(self) -> None:
         if not 0 <= self.max_skew_s < 10:
             raise ConfigError(f"frame_source.max_skew_s={self.max_skew_s:g}: must be within 0..10.")
+        if not self.restart_after_s > 0:
+            raise ConfigError("frame_source.restart_after_s must be positive.")
         if min(self.pair_buffer, self.min_side_px) < 1:
             raise ConfigError(f"{self}: pair_buffer and min_side_px must be at least 1.")
 
@@ -60,15 +63,15 @@ class FrameSource(Actor):
         super().__init__()
         self.config = config or FrameSourceConfig()
         self._rectify = Rectifier()
-        self._pairing: Pairing[CameraColor, CameraDepth] = Pairing(
-            round(self.config.max_skew_s * 1e9), self.config.pair_buffer
-        )
+        self._pairing = self._new_pairing()
         self._last_stamp_ns = -1
+        self._sessions = 1  # of the camera
         self._rejected = 0
         self._is_rejecting = False
         self._has_warned_of_skew = False
 
     def handle(self, message: Input) -> Iterator[FrameRgbd]:
+        self._notice_restart(message)
         if isinstance(message, CameraRgbd):
             yield from self._frame(message, partial(raw_frame_of, message, message.frame))
         else:
@@ -117,9 +120,20 @@ class FrameSource(Actor):
         if message.stamp_ns <= self._last_stamp_ns:
             raise DataError(
                 f"its stamp {message.stamp_ns} ns is not after the last one, "
-                f"{self._last_stamp_ns} ns. Send frames in the order of their exposure; after the "
-                "camera's clock was set back, start anew with `ldo control reset`."
+                f"{self._last_stamp_ns} ns. Send frames in the order of their exposure."
             )
+
+    def _notice_restart(self, message: Input) -> None:
+        """A camera that starts again may count time from an earlier point."""
+        back_s = (self._last_stamp_ns - message.stamp_ns) * 1e-9
+        if back_s > self.config.restart_after_s:
+            log.warning("stamps went back by %.1f s: the camera has started again", back_s)
+            self._sessions += 1
+            self._last_stamp_ns = -1
+            self._pairing = self._new_pairing()
+
+    def _new_pairing(self) -> Pairing[CameraColor, CameraDepth]:
+        return Pairing(round(self.config.max_skew_s * 1e9), self.config.pair_buffer)
 
     def _require_usable(self, message: CameraRgbd | CameraColor) -> None:
         width, height = message.camera.width, message.camera.height
@@ -147,6 +161,7 @@ class FrameSource(Actor):
         skews_ms = self._pairing.skews_ms() or [0.0]
         return {
             "frames_rejected": self._rejected,
+            "camera_sessions": self._sessions,
             "pairs": self._pairing.pairs,
             "lost_color": self._pairing.lost_a,
             "lost_depth": self._pairing.lost_b,

@@ -23,7 +23,8 @@ def open_source(source: str, options: SequenceOptions | None = None) -> Sequence
 
 
 class RecordingSequence(Sequence):
-    """Frames whose stamp is not after the one before are left out, as the frame source does."""
+    """Frames whose stamp is not after the one before are left out: of a camera that started again,
+    the first session is the data set."""
 
     def __init__(self, folder: Path) -> None:
         paths = recorded_actors(folder).get(FrameSource.name, [])

@@ -234,3 +234,21 @@ def test_an_image_too_small_to_track_is_rejected() -> None:
 def test_impossible_settings_are_refused(fields: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
         FrameSourceConfig(**fields)  # type: ignore[arg-type]
+
+
+def test_a_camera_that_starts_again_is_followed(room: Sequence) -> None:
+    """With recorded stamps, as when a recording is published twice."""
+    source = FrameSource()
+    messages = [camera_rgbd_message(room.read(i)) for i in range(0, 60, 20)]
+    for _ in range(2):
+        assert len([out for message in messages for out in source.handle(message)]) == 3
+    assert source.facts()["camera_sessions"] == 2
+    assert source.facts()["frames_rejected"] == 0
+
+
+def test_one_stamp_in_the_far_future_does_not_lock_the_camera_out(room: Sequence) -> None:
+    source = FrameSource()
+    message = camera_rgbd_message(room.read(0))
+    future = msgspec.structs.replace(message, stamp_ns=10**18)
+    frames = [message, future, camera_rgbd_message(room.read(1))]
+    assert len([out for frame in frames for out in source.handle(frame)]) == 3

@@ -84,10 +84,3 @@ def test_a_header_that_asks_for_gigabytes_is_refused_before_decoding() -> None:
     huge[16:24] = (60000).to_bytes(4, "big") * 2
     with pytest.raises(FrameError, match="60000x60000, announced as 9x6"):
         codecs.decode_color("png", 9, 6, memoryview(bytes(huge)))
-
-
-def test_announced_sizes_are_those_of_the_image() -> None:
-    _, png = cv2.imencode(".png", COLOR)
-    assert codecs.announced_size(memoryview(png.tobytes())) == (9, 6)
-    assert codecs.announced_size(memoryview(codecs.encode_jpeg(COLOR))) == (9, 6)
-    assert codecs.announced_size(memoryview(b"neither")) is None

@@ -120,12 +120,12 @@ def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> No
 def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        first = service.publisher("synthetic:room", "--rate", "15", "--restamp")
+        first = service.publisher("synthetic:room", "--rate", "15")
         service.wait_for_poses(20)
         first.kill()
         first.wait()
         service.poses()
-        second = service.publisher("synthetic:room", "--rate", "15", "--restamp")
+        second = service.publisher("synthetic:room", "--rate", "15")
         poses = service.wait_for_poses(60)
         assert sum(pose.status == "OK" for pose in poses) >= 50
         second.kill()
