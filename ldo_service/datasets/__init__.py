@@ -9,7 +9,7 @@ from .rig import SequenceOptions
 from .scannet import ScanNetSequence
 from .sequence import Cached, Sequence
 from .seven_scenes import SevenScenesSequence
-from .synthetic import SyntheticSequence
+from .synthetic import open_synthetic
 from .tum import TumSequence
 
 __all__ = ["Cached", "Sequence", "SequenceOptions", "open_sequence"]
@@ -17,8 +17,8 @@ __all__ = ["Cached", "Sequence", "SequenceOptions", "open_sequence"]
 LAYOUTS = (
     "TUM RGB-D (rgb.txt and depth.txt), Replica as NICE-SLAM lays it out (results/frame*.jpg, "
     "results/depth*.png), ScanNet as SensReader exports it (color/*.jpg, depth/*.png, "
-    "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or the built-in "
-    "synthetic:room"
+    "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or one of the "
+    "built-in synthetic:room, synthetic:tour and synthetic:flat"
 )
 
 
@@ -33,7 +33,7 @@ def open_sequence(source: str, options: SequenceOptions | None = None) -> Sequen
     scheme, _, name = source.partition(":")
     if scheme == "synthetic":
         _refuse(options, source)
-        return SyntheticSequence.named(name or "room")
+        return open_synthetic(name or "room")
     folder = Path(source).expanduser()
     if not folder.is_dir():
         found = "is a file" if folder.exists() else "does not exist"

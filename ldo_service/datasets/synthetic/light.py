@@ -3,7 +3,7 @@
 import numpy as np
 
 from .room import Room
-from .solids import Vector, interval, vector
+from .solids import Solid, Vector, interval, vector
 
 LAMP_GRID = 4  # the lamp is an area of 4x4 points: its shadows are soft
 LIGHT_CELL_M = 0.06
@@ -39,25 +39,35 @@ def light_on_face(room: Room, face: int) -> np.ndarray:
     p[axis] = np.full(rows * columns, center[axis] + sign * size[axis] / 2)
     point = vector(p)
     normal = vector(-sign if i == axis else 0.0 for i in range(3))
-    light = shade(vector(room.lamp_center_m), point, normal, _lit(room, point))
+    light = shade(
+        vector(room.lamp_center_m),
+        point,
+        normal,
+        lit_share(room.lamp_center_m, room.lamp_side_m, room.furniture, point),
+    )
     return light.reshape(rows, columns)
 
 
-def _lit(room: Room, point: Vector) -> np.ndarray:
-    """The share [P] of the lamp that is seen from each point."""
+def lit_share(
+    lamp_center_m: tuple[float, float, float],
+    lamp_side_m: float,
+    solids: tuple[Solid, ...],
+    point: Vector,
+) -> np.ndarray:
+    """The share [P] of a square lamp that is seen from each point past the solids."""
     total = np.zeros(len(point[0]))
-    x, y, z = room.lamp_center_m
+    x, y, z = lamp_center_m
     for k in range(LAMP_GRID**2):
         row, column = divmod(k, LAMP_GRID)
-        dx, dy = (((i + 0.5) / LAMP_GRID - 0.5) * room.lamp_side_m for i in (column, row))
+        dx, dy = (((i + 0.5) / LAMP_GRID - 0.5) * lamp_side_m for i in (column, row))
         to_lamp = (x + dx - point[0], y + dy - point[1], z - point[2])
-        total += ~_is_blocked(room, point, to_lamp)
+        total += ~_is_blocked(solids, point, to_lamp)
     return total / LAMP_GRID**2
 
 
-def _is_blocked(room: Room, point: Vector, way: Vector) -> np.ndarray:
+def _is_blocked(solids: tuple[Solid, ...], point: Vector, way: Vector) -> np.ndarray:
     blocked = np.zeros(len(point[0]), bool)
-    for solid in room.furniture:
+    for solid in solids:
         enter, leave = interval(
             solid.shape, solid.point_to_local(point), solid.direction_to_local(way)
         )

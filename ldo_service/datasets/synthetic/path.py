@@ -76,8 +76,8 @@ def poses(path: Path, count: int, seed: int) -> np.ndarray:
     """T_world_camera [count, 4, 4]: cubic splines through the path, and the sway of a hand."""
     rng = np.random.default_rng(seed)
     along = np.arange(count) * (len(path.eyes_m) / count)
-    eyes = _closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)
-    targets = _closed_spline(path.targets_m, along) + _sway(rng, count, SWAY_TARGET_M)
+    eyes = closed_spline(path.eyes_m, along) + _sway(rng, count, SWAY_EYE_M)
+    targets = closed_spline(path.targets_m, along) + _sway(rng, count, SWAY_TARGET_M)
     return np.array([look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)])
 
 
@@ -97,10 +97,10 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 def _sway(rng: np.random.Generator, count: int, amplitude_m: float) -> np.ndarray:
     knots = rng.random((max(4, count // SWAY_FRAMES), 3)) * 2 - 1
-    return amplitude_m * _closed_spline(knots, np.arange(count) * (len(knots) / count))
+    return amplitude_m * closed_spline(knots, np.arange(count) * (len(knots) / count))
 
 
-def _closed_spline(knots: np.ndarray, along: np.ndarray) -> np.ndarray:
+def closed_spline(knots: np.ndarray, along: np.ndarray) -> np.ndarray:
     """Catmull-Rom spline [P, 3] through `knots` [M, 3] at `along` [P] in 0..M."""
     cell = along.astype(np.int64)
     t = (along - cell)[:, None]

@@ -1,13 +1,15 @@
-"""Rays against boxes, ellipsoids and cylinders: three shapes of the cube -1..1, stretched."""
+"""Rays against convex shapes of the cube -1..1, stretched: boxes, ellipsoids, cylinders, cones."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 Vector = tuple[np.ndarray, np.ndarray, np.ndarray]  # x, y, z, each [P], or [] for one point
-Shape = Literal["box", "ball", "cylinder"]
+Shape = Literal["box", "ball", "cylinder", "wheel", "cone", "bucket", "lampshade"]
+# Round about z, with radius m + k z: a cone's apex is up, a bucket is wide above.
+TAPERS = {"cone": (0.5, -0.5), "bucket": (0.8125, 0.1875), "lampshade": (0.75, -0.25)}
 
 
 def vector(components: Iterable[np.ndarray | float]) -> Vector:
@@ -54,6 +56,15 @@ class Solid:
         c, s = self.heading
         return (c * x - s * y, s * x + c * y, z), axis
 
+    def surface(self, point: Vector) -> tuple[Vector, np.ndarray, np.ndarray]:
+        """Unit normals, and texture coordinates u_m, v_m along the two other own axes, v up."""
+        local = self.point_to_local(point)
+        normal, axis = self.normal(local)
+        own = np.stack([q * (size / 2) for q, size in zip(local, self.size_m, strict=True)])
+        rays = np.arange(len(axis))
+        u_m, v_m = own[np.where(axis == 0, 1, 0), rays], own[np.where(axis == 2, 1, 2), rays]
+        return normal, u_m, v_m
+
     def corners_m(self) -> np.ndarray:
         """The 8 corners [8, 3] of its bounding box in the world."""
         (c, s), half = self.heading, np.array(self.size_m) / 2
@@ -67,10 +78,15 @@ def interval(shape: Shape, o: Vector, d: Vector) -> tuple[np.ndarray, np.ndarray
     with np.errstate(divide="ignore", invalid="ignore"):
         if shape == "ball":
             return _round(o, d, 3)
+        if shape == "wheel":
+            return interval("cylinder", _upright(o), _upright(d))
         bounds = [_slab(o[2], d[2])]
-        bounds += (
-            [_round(o, d, 2)] if shape == "cylinder" else [_slab(o[0], d[0]), _slab(o[1], d[1])]
-        )
+        if shape in TAPERS:
+            bounds.append(_taper(o, d, *TAPERS[shape]))
+        elif shape == "cylinder":
+            bounds.append(_round(o, d, 2))
+        else:
+            bounds += [_slab(o[0], d[0]), _slab(o[1], d[1])]
         enter, leave = bounds[0]
         for near, far in bounds[1:]:
             enter, leave = np.maximum(enter, near), np.minimum(leave, far)
@@ -93,6 +109,31 @@ def _round(o: Vector, d: Vector, dimensions: int) -> tuple[np.ndarray, np.ndarra
     return (-b - root) / a, (-b + root) / a
 
 
+def _taper(o: Vector, d: Vector, m: float, k: float) -> tuple[np.ndarray, np.ndarray]:
+    """The endless half cone x^2 + y^2 < (m + k z)^2 on the side of its apex where z = 0 lies.
+
+    A ray flatter than the cone cuts one half of the double cone between its two roots; a steeper
+    one lies in our half before the first root or after the second.
+    """
+    r, dr = m + k * o[2], k * d[2]
+    a = d[0] * d[0] + d[1] * d[1] - dr * dr
+    b = o[0] * d[0] + o[1] * d[1] - r * dr
+    c = o[0] * o[0] + o[1] * o[1] - r * r
+    square = b * b - a * c
+    root = np.sqrt(np.maximum(square, 0.0))
+    p, q = (-b - root) / a, (-b + root) / a
+    near, far = np.minimum(p, q), np.maximum(p, q)
+    steep = a < 0
+    enter = np.where(steep, np.where(dr > 0, far, -np.inf), near)
+    leave = np.where(steep, np.where(dr > 0, np.inf, near), far)
+    return enter, np.where(~steep & (square < 0), -np.inf, leave)
+
+
+def _upright(v: Vector) -> Vector:
+    """Own axes turned so that a wheel's axle, x, becomes z."""
+    return v[1], v[2], v[0]
+
+
 def _box_normal(q: Vector) -> Vector:
     stacked = np.stack(q)
     main = np.abs(stacked) == np.max(np.abs(stacked), axis=0)
@@ -109,4 +150,29 @@ def _cylinder_normal(q: Vector) -> Vector:
     return np.where(cap, 0.0, q[0]), np.where(cap, 0.0, q[1]), np.where(cap, np.sign(q[2]), 0.0)
 
 
-_NORMALS = {"box": _box_normal, "ball": _ball_normal, "cylinder": _cylinder_normal}
+def _wheel_normal(q: Vector) -> Vector:
+    y, z, x = _cylinder_normal(_upright(q))
+    return x, y, z
+
+
+def _taper_normal(m: float, k: float) -> Callable[[Vector], Vector]:
+    def normal(q: Vector) -> Vector:
+        r = np.maximum(m + k * q[2], 1e-12)
+        cap = q[2] * q[2] * r * r > q[0] * q[0] + q[1] * q[1]
+        side = -k * r
+        return (
+            np.where(cap, 0.0, q[0]),
+            np.where(cap, 0.0, q[1]),
+            np.where(cap, np.sign(q[2]), side),
+        )
+
+    return normal
+
+
+_NORMALS: dict[str, Callable[[Vector], Vector]] = {
+    "box": _box_normal,
+    "ball": _ball_normal,
+    "cylinder": _cylinder_normal,
+    "wheel": _wheel_normal,
+    **{shape: _taper_normal(*taper) for shape, taper in TAPERS.items()},
+}

@@ -1,0 +1,121 @@
+"""Rays of a camera against solids within a shell: exact depth and which surface was met."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+
+from .solids import Solid, Vector, interval, vector
+
+NEAR_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """What P rays met: depth_m [P], surface [P] (0-5 faces of the shell, then solids)."""
+
+    depth_m: np.ndarray
+    surface: np.ndarray
+
+
+class View:
+    """The rays of one camera pose, and what each solid within the shell can cover in its image."""
+
+    def __init__(
+        self,
+        shell: Solid,
+        solids: tuple[Solid, ...],
+        camera: Camera,
+        T_world_camera: np.ndarray,
+    ) -> None:
+        self.camera = camera
+        self._shell = shell
+        self._solids = solids
+        self._T = T_world_camera
+        self._windows = [_window(solid, camera, T_world_camera) for solid in solids]
+
+    def cast(self, u: np.ndarray, v: np.ndarray) -> Hits:
+        """The nearest surface along each ray; v ascends."""
+        direction = self._directions(u, v)
+        depth_m, surface = self._cast_at_shell(direction)
+        for k, (solid, window) in enumerate(zip(self._solids, self._windows, strict=True)):
+            rays = window.covered(u, v)
+            d = solid.direction_to_local(vector(component[rays] for component in direction))
+            enter, leave = interval(solid.shape, solid.point_to_local(self._origin()), d)
+            nearer = (enter < leave) & (enter > NEAR_M) & (enter < depth_m[rays])
+            depth_m[rays[nearer]] = enter[nearer]
+            surface[rays[nearer]] = 6 + k
+        return Hits(depth_m, surface)
+
+    def points(self, u: np.ndarray, v: np.ndarray, depth_m: np.ndarray) -> Vector:
+        d, o = self._directions(u, v), self._origin()
+        return o[0] + d[0] * depth_m, o[1] + d[1] * depth_m, o[2] + d[2] * depth_m
+
+    def _cast_at_shell(self, direction: Vector) -> tuple[np.ndarray, np.ndarray]:
+        o = self._shell.point_to_local(self._origin())
+        d = self._shell.direction_to_local(direction)
+        with np.errstate(divide="ignore"):
+            leaves = np.stack([(np.where(d[i] > 0, 1.0, -1.0) - o[i]) / d[i] for i in range(3)])
+        leaves = np.where(np.isfinite(leaves), leaves, np.inf)
+        axis = np.argmin(leaves, axis=0)
+        rays = np.arange(len(axis))
+        return leaves[axis, rays], 2 * axis + (np.stack(d)[axis, rays] > 0)
+
+    def _origin(self) -> Vector:
+        return vector(self._T[:3, 3])
+
+    def _directions(self, u: np.ndarray, v: np.ndarray) -> Vector:
+        """World directions with z = 1 in the camera, so that their parameter is depth."""
+        x, y = (u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy
+        R = self._T
+        return (
+            R[0, 0] * x + R[0, 1] * y + R[0, 2],
+            R[1, 0] * x + R[1, 1] * y + R[1, 2],
+            R[2, 0] * x + R[2, 1] * y + R[2, 2],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """The part of an image that a solid can cover, in pixels."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    def covered(self, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Indices of the pixels in it; v ascends."""
+        first = int(np.searchsorted(v, self.top))
+        stop = int(np.searchsorted(v, self.bottom, side="right"))
+        u = u[first:stop]
+        return first + np.flatnonzero((u >= self.left) & (u <= self.right))
+
+
+def _window(solid: Solid, camera: Camera, T: np.ndarray) -> _Window:
+    """Bounds of the projected corners; the whole image for a solid beside the camera."""
+    offset = solid.corners_m() - T[:3, 3]
+    x, y, z = (
+        offset[:, 0] * T[0, i] + offset[:, 1] * T[1, i] + offset[:, 2] * T[2, i] for i in range(3)
+    )
+    right, bottom = (camera.width - camera.cx) / camera.fx, (camera.height - camera.cy) / camera.fy
+    left, top = (-1 - camera.cx) / camera.fx, (-1 - camera.cy) / camera.fy
+    beside = (x > right * z).all() or (x < left * z).all()
+    if z.max() < NEAR_M or beside or (y > bottom * z).all() or (y < top * z).all():
+        return _Window(1, 0, 1, 0)
+    if z.min() < NEAR_M:
+        return _Window(-1, camera.width, -1, camera.height)
+    u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
+    return _Window(u.min() - 1, u.max() + 1, v.min() - 1, v.max() + 1)
+
+
+def outline(surface: np.ndarray) -> np.ndarray:
+    """Pixels [H, W] with a neighbour on another surface."""
+    edge = np.zeros(surface.shape, bool)
+    across, down = surface[:, 1:] != surface[:, :-1], surface[1:] != surface[:-1]
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge

@@ -1,0 +1,123 @@
+"""Rendered frames kept on disk, so that a sequence is ray cast once per machine."""
+
+import hashlib
+import logging
+import os
+import shutil
+import struct
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import zstandard
+
+from ldo_service.errors import FrameError
+from ldo_service.geometry import codecs
+
+log = logging.getLogger(__name__)
+
+LIMIT_BYTES = 3 << 30  # of all sequences together; one of 640x480 takes 0.3-0.9 GB
+_HEADER = struct.Struct("<16s4I")  # digest of the rest, lengths of the four images
+_DIGEST_BYTES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class StoredFrame:
+    """What is kept of a frame: color [H, W, 3], depth_m [H, W] float32, labels [H, W]."""
+
+    color: np.ndarray
+    depth_m: np.ndarray
+    class_ids: np.ndarray
+    instance_ids: np.ndarray
+
+
+def cache_root() -> Path:
+    """LDO_CACHE, or ldo-slam in the user's cache folder."""
+    if folder := os.environ.get("LDO_CACHE"):
+        return Path(folder).expanduser()
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ldo-slam"
+
+
+class FrameCache:
+    """The frames of one sequence, in a folder named by what determines their bytes.
+
+    Older sequences make room when all together take more than LIMIT_BYTES. A cache that cannot be
+    written is not an error: frames are then rendered whenever they are read.
+    """
+
+    def __init__(self, identity: str, width: int, height: int) -> None:
+        key = hashlib.blake2b(identity.encode(), digest_size=10).hexdigest()
+        self.folder = cache_root() / "synthetic-flat" / key
+        self._size = (height, width)
+
+    def load(self, index: int) -> StoredFrame | None:
+        """The frame, or None where it is missing or damaged."""
+        try:
+            data = self._path(index).read_bytes()
+        except OSError:
+            return None
+        try:
+            return self._unpacked(data)
+        except (FrameError, struct.error, zstandard.ZstdError, ValueError) as error:
+            log.warning("cached frame %s is damaged and rendered again: %s", index, error)
+            return None
+
+    def store(self, index: int, frame: StoredFrame) -> None:
+        """Keep the frame; a reader sees all of it or nothing."""
+        try:
+            self._make_room()
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
+                file.write(_packed(frame))
+            os.replace(file.name, self._path(index))
+        except OSError as error:
+            log.warning("frame %s cannot be cached in %s: %s", index, self.folder, error)
+
+    def _path(self, index: int) -> Path:
+        return self.folder / f"{index:04d}.frame"
+
+    def _make_room(self) -> None:
+        """Once per sequence: drop the sequences used longest ago until the rest fits."""
+        if self.folder.exists() or not self.folder.parent.exists():
+            return
+        others = sorted(self.folder.parent.iterdir(), key=lambda other: other.stat().st_mtime)
+        sizes = [sum(file.stat().st_size for file in other.iterdir()) for other in others]
+        total = sum(sizes) + LIMIT_BYTES // 3  # what this one may need
+        for other, size in zip(others, sizes, strict=True):
+            if total <= LIMIT_BYTES:
+                return
+            shutil.rmtree(other, ignore_errors=True)
+            total -= size
+
+    def _unpacked(self, data: bytes) -> StoredFrame:
+        digest, *lengths = _HEADER.unpack_from(data)
+        body = data[_HEADER.size :]
+        if len(body) != sum(lengths) or _digest(body) != digest:
+            raise FrameError(f"{len(data)} bytes do not match their digest.")
+        parts, start = [], 0
+        for length in lengths:
+            parts.append(memoryview(body)[start : start + length])
+            start += length
+        height, width = self._size
+        color = codecs.decode_color("png", width, height, parts[0])
+        depth_m = codecs.decode_depth("f32+zstd", width, height, parts[1])
+        return StoredFrame(
+            color, depth_m, self._plane(parts[2], np.uint8), self._plane(parts[3], np.uint16)
+        )
+
+    def _plane(self, data: memoryview, dtype: type) -> np.ndarray:
+        return np.frombuffer(zstandard.decompress(data), dtype).reshape(self._size)
+
+
+def _packed(frame: StoredFrame) -> bytes:
+    _, png = cv2.imencode(".png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+    planes = (frame.depth_m, frame.class_ids, frame.instance_ids)
+    parts = [png.tobytes(), *(zstandard.compress(plane.tobytes(), 3) for plane in planes)]
+    body = b"".join(parts)
+    return _HEADER.pack(_digest(body), *map(len, parts)) + body
+
+
+def _digest(body: bytes) -> bytes:
+    return hashlib.blake2b(body, digest_size=_DIGEST_BYTES).digest()

@@ -1,0 +1,135 @@
+"""Machines of kitchen, bath and living room."""
+
+from ldo_service.datasets.synthetic.flat.paint import Paints
+
+from .build import Builder, Solids, ball, box, cylinder, legs, solid
+
+
+def tv(paint: Paints, shape: int) -> Solids:
+    """A wide one on a foot, or a flat one to hang up."""
+    case, width = paint("plastic"), 1.0 if shape == 0 else 0.8
+    height = 0.56 * width
+    z = 0.06 if shape == 0 else 0.0
+    panel = box((0, 0, z), (width, 0.05, height), case)
+    glass = box((0, -0.027, z + 0.02), (width - 0.04, 0.004, height - 0.04), paint("screen"))
+    foot = (box((0, 0, 0), (0.4, 0.2, 0.02), case), box((0, 0, 0.02), (0.08, 0.05, 0.05), case))
+    return (panel, glass, *foot) if shape == 0 else (panel, glass)
+
+
+def refrigerator(paint: Paints, _: int) -> Solids:
+    case, metal = paint("plastic"), paint("metal")
+    doors = [box((0, -0.31, z), (0.58, 0.03, h), case) for z, h in ((0.06, 1.0), (1.09, 0.58))]
+    grips = [box((-0.24, -0.34, z), (0.02, 0.03, h), metal) for z, h in ((0.6, 0.36), (1.15, 0.3))]
+    return box((0, 0, 0.03), (0.6, 0.6, 1.68), case), *doors, *grips
+
+
+def oven(paint: Paints, _: int) -> Solids:
+    case, metal, glass = paint("metal"), paint("metal"), paint("screen")
+    plates = [(x, y) for x in (-0.14, 0.14) for y in (-0.12, 0.14)]
+    knobs = [solid("ball", (x, -0.3, 0.74), (0.04, 0.04, 0.04), metal) for x in (-0.2, 0, 0.2)]
+    return (
+        box((0, 0, 0.04), (0.6, 0.56, 0.8), case),
+        box((0, -0.285, 0.16), (0.48, 0.02, 0.42), glass),
+        box((0, -0.31, 0.62), (0.46, 0.03, 0.03), metal),
+        *knobs,
+        *(cylinder((x, y, 0.84), 0.2, 0.012, glass) for x, y in plates),
+    )
+
+
+def microwave(paint: Paints, _: int) -> Solids:
+    case = paint("metal")
+    return (
+        box((0, 0, 0.01), (0.48, 0.34, 0.28), case),
+        box((-0.07, -0.172, 0.04), (0.3, 0.008, 0.22), paint("screen")),
+        box((0.18, -0.172, 0.04), (0.09, 0.01, 0.22), paint("plastic")),
+    )
+
+
+def toaster(paint: Paints, _: int) -> Solids:
+    case = paint("metal")
+    slots = [box((0, y, 0.2), (0.22, 0.03, 0.004), paint("screen")) for y in (-0.04, 0.04)]
+    return box((0, 0, 0.01), (0.28, 0.18, 0.19), case), *slots
+
+
+def sink(paint: Paints, _: int) -> Solids:
+    """A basin on a column, with its tap."""
+    glaze, metal = paint("ceramic"), paint("metal")
+    return (
+        cylinder((0, 0.05, 0), 0.18, 0.7, glaze),
+        solid("bucket", (0, 0, 0.68), (0.56, 0.44, 0.18), glaze),
+        solid("cylinder", (0, -0.02, 0.858), (0.42, 0.3, 0.006), paint("screen")),
+        cylinder((0, 0.18, 0.86), 0.03, 0.16, metal),
+        box((0, 0.1, 1.0), (0.025, 0.16, 0.025), metal),
+    )
+
+
+def toilet(paint: Paints, _: int) -> Solids:
+    glaze = paint("ceramic")
+    return (
+        solid("bucket", (0, -0.12, 0), (0.38, 0.5, 0.4), glaze),
+        solid("cylinder", (0, -0.12, 0.4), (0.4, 0.5, 0.035), paint("plastic")),
+        box((0, 0.2, 0.36), (0.4, 0.18, 0.4), glaze),
+    )
+
+
+def speaker(paint: Paints, shape: int) -> Solids:
+    """A tower, or a small box for a shelf."""
+    case, cone = paint("wood"), paint("screen")
+    height, width = (0.8, 0.22) if shape == 0 else (0.3, 0.18)
+    at = [(0.3 * height, 0.16), (0.68 * height, 0.12)]
+    cones = [box((0, -0.112, z), (d, 0.01, d), cone) for z, d in at]
+    return box((0, 0, 0), (width, 0.22, height), case), *cones
+
+
+def fan(paint: Paints, _: int) -> Solids:
+    metal, blade = paint("metal"), paint("plastic")
+    disc = solid("wheel", (0, 0, 0.95), (0.04, 0.4, 0.4), blade, (0.0, 1.0))
+    foot = (cylinder((0, 0, 0), 0.34, 0.03, metal), cylinder((0, 0, 0.03), 0.03, 1.0, metal))
+    return *foot, disc, ball((0, 0, 1.09), (0.12, 0.16, 0.12), metal)
+
+
+def radiator(paint: Paints, _: int) -> Solids:
+    white = paint("plastic")
+    ribs = [
+        box((x / 10, 0, 0.12), (0.07, 0.09, 0.6), white) for x in (-4, -3, -2, -1, 0, 1, 2, 3, 4)
+    ]
+    pipes = [box((0, 0, z), (0.9, 0.05, 0.05), white) for z in (0.16, 0.62)]
+    return *ribs, *pipes
+
+
+def projector(paint: Paints, _: int) -> Solids:
+    """On a stand of its own."""
+    case, metal = paint("plastic"), paint("metal")
+    lens = solid("wheel", (-0.07, -0.14, 0.93), (0.06, 0.09, 0.09), paint("screen"), (0.0, 1.0))
+    table = box((0, 0, 0.86), (0.42, 0.34, 0.02), metal)
+    return (
+        *legs(0.4, 0.32, 0.86, 0.03, metal),
+        table,
+        box((0, 0, 0.88), (0.34, 0.25, 0.13), case),
+        lens,
+    )
+
+
+def printer(paint: Paints, _: int) -> Solids:
+    case = paint("plastic")
+    return (
+        box((0, 0, 0), (0.42, 0.36, 0.2), case),
+        box((0, 0.06, 0.2), (0.36, 0.22, 0.06), paint("plastic")),
+        box((0, -0.2, 0.05), (0.3, 0.12, 0.02), paint("screen")),
+    )
+
+
+BUILDERS: dict[str, Builder] = {
+    "tv": tv,
+    "refrigerator": refrigerator,
+    "oven": oven,
+    "microwave": microwave,
+    "toaster": toaster,
+    "sink": sink,
+    "toilet": toilet,
+    "speaker": speaker,
+    "fan": fan,
+    "radiator": radiator,
+    "projector": projector,
+    "printer": printer,
+}
