@@ -121,10 +121,10 @@ def test_views_of_the_same_point_agree(exact: FlatSequence, i: int, j: int) -> N
     assert overlap > 0.5
     assert np.median(np.abs(color)) <= 2
     assert abs(color.mean()) < 1.5
-    assert np.median(np.abs(depth)) < 1e-5
+    assert np.median(np.abs(depth)) < 5e-5  # depth is not linear between pixels
 
 
-@pytest.mark.parametrize("index", [20, 200])
+@pytest.mark.parametrize("index", [20, 180])
 def test_floor_and_ceiling_are_where_they_were_built(exact: FlatSequence, index: int) -> None:
     z_m, names = world_points(exact, index)[..., 2], exact.labels(index).class_ids
     floor = names == CLASS_NAMES.index("floor")
@@ -203,13 +203,16 @@ def test_dark_surfaces_and_far_ones_lose_their_depth(
     assert lost_bright < 0.15
 
 
-def test_the_projector_leaves_a_shadow_on_the_right_of_what_is_near() -> None:
-    depth_m = np.full((1, 100), 3.0)
-    depth_m[:, 40:50] = 1.0
-    shadow = is_shadowed(depth_m, 0.075 * 520)
-    width = 0.075 * 520 * (1 / 1.0 - 1 / 3.0)
-    assert shadow[0, 50 : 50 + int(width)].all()
-    assert shadow.sum() == pytest.approx(width, abs=1)
+@pytest.mark.parametrize(("left", "right", "near_m"), [(40, 50, 1.0), (30, 70, 2.0)])
+def test_the_projector_lights_what_it_sees(left: int, right: int, near_m: float) -> None:
+    """The shadow of a bar is as wide as the bar, and moved right by the parallax."""
+    depth_m, parallax_px_m = np.full((1, 200), 3.0), 0.075 * 520
+    depth_m[:, left:right] = near_m
+    shift = parallax_px_m * (1 / near_m - 1 / 3.0)
+    behind = np.zeros(200, bool)
+    behind[round(left + shift) : round(right + shift)] = True
+    behind[left:right] = False
+    assert np.sum(is_shadowed(depth_m, parallax_px_m)[0] != behind) <= 1
 
 
 def test_blur_follows_the_motion_and_keeps_what_rests() -> None:
@@ -226,7 +229,7 @@ def test_blur_follows_the_motion_and_keeps_what_rests() -> None:
 def test_quick_turns_blur_and_exposure_drifts(exact: FlatSequence, noisy: FlatSequence) -> None:
     def sharpness(sequence: FlatSequence) -> float:
         grey = cv2.GaussianBlur(sequence.read(FAST_TURN).color.mean(axis=2), (0, 0), 1.0)
-        return float(np.abs(np.diff(grey, axis=1)).mean())
+        return float(np.abs(np.diff(grey, axis=1)).mean() / grey.mean())
 
     assert sharpness(noisy) < 0.9 * sharpness(exact)
     unsaturated = [
@@ -361,7 +364,7 @@ def test_a_cache_that_cannot_be_written_only_costs_time(
 
 def test_the_oldest_sequence_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LDO_CACHE", str(tmp_path))
-    monkeypatch.setattr(cache, "LIMIT_BYTES", 3000)
+    monkeypatch.setattr(cache, "LIMIT_BYTES", 1500)
     frame = cache.StoredFrame(
         np.zeros((8, 8, 3), np.uint8),
         np.ones((8, 8), np.float32),
@@ -374,7 +377,7 @@ def test_the_oldest_sequence_makes_room(tmp_path: Path, monkeypatch: pytest.Monk
     kept = [cache.FrameCache(name, 8, 8).load(0) is not None for name in names]
     assert kept[-1]
     assert not kept[0]
-    assert sum(path.stat().st_size for path in tmp_path.rglob("*.frame")) <= 3000
+    assert sum(path.stat().st_size for path in tmp_path.rglob("*.frame")) <= 1500
 
 
 @pytest.mark.parametrize("shape", ["wheel", *TAPERS])
@@ -416,6 +419,6 @@ def test_normals_look_back_along_the_ray_and_across_the_surface(shape: str) -> N
         interval(shape, solid.point_to_local(vector(point + s * normal)), local[1])
         for s in (1e-4, -1e-4)
     )
-    assert (outside[0] > -1e-3).all() or (outside[0] >= outside[1]).any()
+    assert not ((outside[0] < 0) & (outside[1] > 0)).any()
     assert ((within[0] < 0) & (within[1] > 0)).mean() > 0.97
     assert (leave > enter).all()

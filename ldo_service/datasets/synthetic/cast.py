@@ -1,5 +1,6 @@
 """Rays of a camera against solids within a shell: exact depth and which surface was met."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,14 @@ class Hits:
 
     depth_m: np.ndarray
     surface: np.ndarray
+
+    def by_surface(self) -> Iterator[tuple[int, np.ndarray]]:
+        """Each surface that was met, with the indices of its rays."""
+        order = np.argsort(self.surface, kind="stable")
+        met, starts = np.unique(self.surface[order], return_index=True)
+        bounds = np.append(starts, len(order))
+        for surface, start, stop in zip(met, bounds[:-1], bounds[1:], strict=True):
+            yield int(surface), order[start:stop]
 
 
 class View:

@@ -9,15 +9,18 @@ LAMP_GRID = 4  # the lamp is an area of 4x4 points: its shadows are soft
 LIGHT_CELL_M = 0.06
 AMBIENT = 0.42  # share of light that comes from everywhere
 LAMP = 0.55
+SIDE = 0.06  # of the ambient light: more from +x
 
 
-def shade(lamp_m: Vector, point: Vector, normal: Vector, lit: np.ndarray | float) -> np.ndarray:
+def shade(
+    lamp_m: Vector, point: Vector, normal: Vector, lit: np.ndarray | float, side: float = SIDE
+) -> np.ndarray:
     """Light [P] on a surface: from everywhere, more from above, and from a lamp of share `lit`."""
     x, y, z = (a - b for a, b in zip(lamp_m, point, strict=True))
     distance_sq = x * x + y * y + z * z
     cosine = (x * normal[0] + y * normal[1] + z * normal[2]) / np.sqrt(distance_sq)
     falloff = 1.35 / (1.0 + 0.1 * distance_sq)
-    ambient = AMBIENT * (1.0 + 0.18 * normal[2] + 0.06 * normal[0])
+    ambient = AMBIENT * (1.0 + 0.18 * normal[2] + side * normal[0])
     return ambient + LAMP * falloff * lit * np.maximum(cosine, 0.0)
 
 

@@ -44,15 +44,13 @@ class Renderer:
     def _color(self, view: View, u: np.ndarray, v: np.ndarray, hits: Hits) -> np.ndarray:
         """Reflected light [P, 3] in 0..1: albedo times diffuse shading."""
         color = np.empty((len(u), 3))
-        order = np.argsort(hits.surface, kind="stable")
-        surfaces, starts = np.unique(hits.surface[order], return_index=True)
-        for surface, rays in zip(surfaces, np.split(order, starts[1:]), strict=True):
+        for surface, rays in hits.by_surface():
             point = view.points(u[rays], v[rays], hits.depth_m[rays])
             footprint_m = hits.depth_m[rays] / view.camera.fx
             if surface < 6:
-                color[rays] = self._wall_color(int(surface), point, footprint_m)
+                color[rays] = self._wall_color(surface, point, footprint_m)
             else:
-                color[rays] = self._solid_color(int(surface) - 6, point, footprint_m)
+                color[rays] = self._solid_color(surface - 6, point, footprint_m)
         return np.clip(color, 0.0, 1.0)
 
     def _wall_color(self, face: int, point: Vector, footprint_m: np.ndarray) -> np.ndarray:

@@ -79,7 +79,7 @@ class FrameCache:
         return self.folder / f"{index:04d}.frame"
 
     def _make_room(self) -> None:
-        """Once per sequence: drop the sequences used longest ago until the rest fits."""
+        """Once per sequence: drop the sequences written longest ago until the rest fits."""
         if self.folder.exists() or not self.folder.parent.exists():
             return
         others = sorted(self.folder.parent.iterdir(), key=lambda other: other.stat().st_mtime)

@@ -49,7 +49,8 @@ LIVING_ROOM: tuple[Row, ...] = (
     ("backpack", 0, (-1.4, 1.55, 0), RIGHT),
     ("sports ball", 0, (-1.45, 0.3, 0), DOOR),
     ("skateboard", 0, (-1.05, 0.04, 0), BACK),
-    ("clock", 1, (-1.2, 0.0, 1.8), BACK),
+    ("clock", 1, (-1.45, 0.0, 1.75), BACK),
+    ("picture frame", 2, (-0.9, 0.0, 1.65), BACK),
     ("rug", 0, (0.1, 1.5, 0), ASKEW),
     ("door", 0, (0.4, 0.04, 0), RIGHT),
 )
@@ -99,6 +100,7 @@ KITCHEN: tuple[Row, ...] = (
     ("toolbox", 0, (1.3, 0.4, 0), BACK),
     ("cardboard box", 1, (-1.85, 0.3, 0), BACK),
     ("coat rack", 0, (-1.2, 0.3, 0), BACK),
+    ("picture frame", 0, (-0.85, 0.0, 1.75), BACK),
     ("door", 0, (0.4, 0.04, 0), RIGHT),
 )
 
@@ -106,6 +108,8 @@ HALL: tuple[Row, ...] = (
     ("fire extinguisher", 0, (0.1, 0.68, 0), DOOR),
     ("picture frame", 2, (1.5, 0.8, 1.7), DOOR),
     ("picture frame", 2, (-1.5, -0.8, 1.7), BACK),
+    ("picture frame", 0, (-0.15, -0.8, 1.65), BACK),
+    ("clock", 0, (0.2, 0.8, 1.6), DOOR),
     ("cardboard box", 0, (-0.35, -0.6, 0), BACK),
 )
 

@@ -72,20 +72,18 @@ class FlatRenderer:
     def _reflected(self, view: View, u: np.ndarray, v: np.ndarray, hits: Hits) -> np.ndarray:
         """Light [P, 3] in 0..1: albedo times diffuse shading."""
         light = np.zeros((len(u), 3))
-        order = np.argsort(hits.surface, kind="stable")
-        met, starts = np.unique(hits.surface[order], return_index=True)
-        for surface, rays in zip(met, np.split(order, starts[1:]), strict=True):
+        for surface, rays in hits.by_surface():
             if surface >= SHELL_FACES:
                 point = view.points(u[rays], v[rays], hits.depth_m[rays])
                 footprint_m = hits.depth_m[rays] / view.camera.fx
-                light[rays] = self._on_solid(int(surface) - SHELL_FACES, point, footprint_m)
+                light[rays] = self._on_solid(surface - SHELL_FACES, point, footprint_m)
         return np.clip(light, 0.0, 1.0)
 
     def _on_solid(self, index: int, point: Vector, footprint_m: np.ndarray) -> np.ndarray:
         solid, lamp = self._table.solids[index], self._lamps[self._table.rooms[index]]
         normal, u_m, v_m = solid.surface(point)
         albedo = self._flat.textures[solid.texture].sample(u_m, v_m, footprint_m)
-        light = shade(vector(lamp), point, normal, 1.0)
+        light = shade(vector(lamp), point, normal, 1.0, side=0.0)  # half a turn must not show
         if index < len(self._flat.panels):
             panel, local = self._flat.panels[index], solid.point_to_local(point)
             shadowed = interpolated_on_panel(panel, self._panel_light[index], local)

@@ -90,12 +90,15 @@ def blur(light: np.ndarray, du_px: np.ndarray, dv_px: np.ndarray) -> np.ndarray:
 def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
     """Pixels [H, W] that the projector, to the left of the camera, does not reach.
 
-    It sees pixel u at u + b f / z: where a row is overtaken by what is nearer, to its right, the
-    light falls on that.
+    It sees pixel u of depth z at u + b f / z; of all that it sees there, only the nearest is lit.
     """
-    seen_at = np.arange(depth_m.shape[1]) + baseline_px_m / depth_m
-    nearest = np.minimum.accumulate(seen_at[:, ::-1], axis=1)[:, ::-1]
-    return seen_at > nearest + 0.5
+    height, width = depth_m.shape
+    shift = baseline_px_m / np.maximum(depth_m, NEAREST_M)
+    column = np.floor(np.arange(width) + shift + 0.5).astype(np.int64)
+    row = np.broadcast_to(np.arange(height)[:, None], depth_m.shape)
+    nearest_m = np.full((height, int(column.max()) + 1), np.inf)
+    np.minimum.at(nearest_m, (row, column), depth_m)
+    return depth_m > 1.05 * nearest_m[row, column]
 
 
 def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:

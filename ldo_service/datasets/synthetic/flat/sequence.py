@@ -45,7 +45,7 @@ NAMED = {"flat": FlatConfig(), "flat-exact": FlatConfig(noise=False)}
 
 
 class FlatSequence(Sequence):
-    """A walk through the flat, 42 s at 15 Hz; frames are rendered once, then come from the disk.
+    """A walk through the flat, 43 s at 15 Hz; frames are rendered once, then come from the disk.
 
     class_names   names of the class ids
     things        objects; instance id i is things[i - 1], id 0 the building

@@ -20,7 +20,8 @@ def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]
     """Light [rows, columns] on a grid over the face of the panel that its room sees."""
     point, (rows, columns) = _grid_on_face(panel)
     lit = lit_share(lamp_center_m, LAMP_SIDE_M, solids, point)
-    return shade(vector(lamp_center_m), point, _normal(panel), lit).reshape(rows, columns)
+    light = shade(vector(lamp_center_m), point, _normal(panel), lit, side=0.0)
+    return light.reshape(rows, columns)
 
 
 def interpolated_on_panel(panel: Panel, grid: np.ndarray, local: Vector) -> np.ndarray:

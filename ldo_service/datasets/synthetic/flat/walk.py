@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.datasets.synthetic.path import closed_spline
 
 RATE_HZ = 15
-FRAMES = 630
+FRAMES = 640
 
 # Eye x, y, z in metres and gaze x, y, z; from room A's door to room B's. Half a turn about the
 # world's z axis makes the way back from B to A of them.
@@ -32,13 +32,13 @@ FIRST_HALF = np.array(
 SECOND_HALF = np.array(
     [
         # room A, from right to left
-        [-1.05, 1.05, 1.40, 0.20, 0.97, -0.16],
+        [-1.05, 1.05, 1.40, -0.18, 0.98, -0.16],
         [-0.80, 1.55, 1.38, -0.10, 0.99, -0.20],
         [-0.82, 2.10, 1.42, -0.50, 0.86, -0.20],
         [-1.20, 2.42, 1.46, -0.86, 0.50, -0.16],
         [-1.58, 2.15, 1.48, -0.99, -0.10, -0.16],
-        [-1.52, 1.60, 1.50, -0.80, -0.60, -0.14],
-        [-1.25, 1.10, 1.46, -0.30, -0.95, -0.12],
+        [-1.50, 1.60, 1.50, -0.72, -0.68, -0.16],
+        [-1.22, 1.10, 1.46, -0.10, -0.98, -0.14],
         # corridor
         [-1.00, 0.55, 1.42, 0.22, -0.97, -0.08],
         [-0.66, 0.10, 1.44, 0.78, -0.62, -0.10],
@@ -50,7 +50,7 @@ SECOND_HALF = np.array(
 HALF_TURN = np.array([-1, -1, 1, -1, -1, 1])
 KNOTS = np.concatenate([FIRST_HALF, FIRST_HALF * HALF_TURN, SECOND_HALF, SECOND_HALF * HALF_TURN])
 
-WALK_M_S, TURN_RAD_S = 0.66, 0.95  # paces: what takes longer, walking or turning, sets the time
+WALK_M_S, TURN_RAD_S = 0.63, 1.02  # paces: walking or turning, what is slower sets the time
 STEPS_PER_KNOT = 64  # of the table that turns time into a place on the way
 
 SWAY_S, SWAY_EYE_M, SWAY_GAZE = 0.6, 0.012, 0.022  # a hand's drift, and
