@@ -36,7 +36,7 @@ class Sensor:
         way its surface takes. What is uncovered behind an edge meanwhile is not seen.
         """
         gain = 1 + EXPOSURE_SPREAD * self._drift(frame)
-        blurred = blur(rendering.light, *self._motion_px(frame, rendering.depth_m))
+        blurred = blur(rendering.light, *self.motion_px(frame, rendering.depth_m))
         return gain * blurred + NOISE * normal(rng, blurred.shape)
 
     def depth_m(self, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
@@ -53,14 +53,7 @@ class Sensor:
         seen &= ~is_shadowed(exact, BASELINE_PX_M * self.camera.fx)
         return np.where(seen & ~_is_too_dark(rendering.light, rng), measured, 0.0)
 
-    def _drift(self, frame: int) -> float:
-        """Slow, between -1 and 1."""
-        count = int(FRAMES / RATE_HZ / EXPOSURE_S)
-        knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
-        drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
-        return float(min(max(drift, -1.0), 1.0))
-
-    def _motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far [H, W] the surface at each pixel moves in u and v while the shutter is open."""
         half = SHUTTER_S * RATE_HZ / 2
         T_world_camera = self.walk.pose(frame)
@@ -69,6 +62,13 @@ class Sensor:
             for step in (-half, half)
         )
         return closed[0] - opened[0], closed[1] - opened[1]
+
+    def _drift(self, frame: int) -> float:
+        """Slow, between -1 and 1."""
+        count = int(FRAMES / RATE_HZ / EXPOSURE_S)
+        knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
+        drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
+        return float(min(max(drift, -1.0), 1.0))
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

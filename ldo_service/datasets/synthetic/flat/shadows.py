@@ -19,7 +19,7 @@ Point = tuple[float, float, float]
 def light_on_panel(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> np.ndarray:
     """Light [rows, columns] on a grid over the face of the panel that its room sees."""
     point, (rows, columns) = _grid_on_face(panel)
-    lit = lit_share(lamp_center_m, LAMP_SIDE_M, solids, point)
+    lit = lit_share(lamp_center_m, LAMP_SIDE_M, _between(panel, lamp_center_m, solids), point)
     light = shade(vector(lamp_center_m), point, _normal(panel), lit, side=0.0)
     return light.reshape(rows, columns)
 
@@ -38,6 +38,19 @@ def is_on_face(panel: Panel, local: Vector) -> np.ndarray:
 
 def _side(panel: Panel) -> float:
     return 2.0 * (panel.face % 2) - 1.0
+
+
+def _between(panel: Panel, lamp_center_m: Point, solids: tuple[Solid, ...]) -> tuple[Solid, ...]:
+    """The solids that meet the box about panel and lamp: no other can throw a shadow on it."""
+    reach = np.array([LAMP_SIDE_M / 2, LAMP_SIDE_M / 2, 0.0])
+    corners = [*panel.solid.corners_m(), lamp_center_m - reach, lamp_center_m + reach]
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    boxes = [solid.corners_m() for solid in solids]
+    return tuple(
+        solid
+        for solid, box in zip(solids, boxes, strict=True)
+        if (box.max(axis=0) > low).all() and (box.min(axis=0) < high).all()
+    )
 
 
 def _normal(panel: Panel) -> Vector:
