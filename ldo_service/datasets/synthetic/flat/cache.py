@@ -69,9 +69,7 @@ class FrameCache:
         try:
             self._make_room()
             self.folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self.folder, delete=False) as file:
-                file.write(_packed(frame))
-            os.replace(file.name, self._path(index))
+            _write_whole(self._path(index), _packed(frame))
         except OSError as error:
             log.warning("frame %s cannot be cached in %s: %s", index, self.folder, error)
 
@@ -109,6 +107,18 @@ class FrameCache:
 
     def _plane(self, data: memoryview, dtype: type) -> np.ndarray:
         return np.frombuffer(zstandard.decompress(data), dtype).reshape(self._size)
+
+
+def _write_whole(path: Path, data: bytes) -> None:
+    """Write beside it first: nobody sees half a file, and a failure leaves none behind."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+        try:
+            file.write(data)
+            file.flush()
+            os.replace(file.name, path)
+        except BaseException:
+            os.unlink(file.name)
+            raise
 
 
 def _packed(frame: StoredFrame) -> bytes:
