@@ -19,6 +19,8 @@ NEAREST_M, FARTHEST_M = 0.4, 5.0
 BASELINE_PX_M = 0.075  # of projector and camera, times the focal length in pixels
 DARK = 0.12  # below this brightness the projected pattern begins to be lost
 PATCH_PX = 8  # holes on dark surfaces come in patches
+WINDOW_PX = 6  # the pattern is matched in windows: neighbours err alike
+SHARED_NOISE, OWN_NOISE = 0.8, 0.6  # of a disparity's noise; their squares add up to 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +44,13 @@ class Sensor:
     def depth_m(self, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
         """Depth [H, W] as measured; 0 where nothing is.
 
-        Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step, ragged
-        edges, no measurement in the projector's shadow, on dark patches and outside 0.4-5 m.
+        Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step that
+        neighbours share, ragged edges, no measurement in the projector's shadow, on dark patches
+        and outside 0.4-5 m.
         """
         exact = rendering.depth_m
         disparity = 1 / (_ragged(exact, rng) * DISPARITY_STEP_PER_M)
-        disparity = disparity + DISPARITY_SIGMA_STEPS * normal(rng, exact.shape)
+        disparity = disparity + DISPARITY_SIGMA_STEPS * _matching_noise(rng, exact.shape)
         measured = 1 / (np.maximum(np.floor(disparity + 0.5), 1.0) * DISPARITY_STEP_PER_M)
         seen = (measured >= NEAREST_M) & (measured <= FARTHEST_M)
         seen &= ~is_shadowed(exact, BASELINE_PX_M * self.camera.fx)
@@ -111,11 +114,25 @@ def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Patches [H, W] that are lost, the more the darker the surface is."""
     brightness = (light[..., 0] + light[..., 1] + light[..., 2]) / 3
-    height, width = brightness.shape
-    coarse = rng.random((height // PATCH_PX + 2, width // PATCH_PX + 2))
-    v, u = np.mgrid[:height, :width] / PATCH_PX
-    patches = _sampled(coarse[..., None], u, v)[..., 0]
+    patches = _enlarged(rng.random(_coarse(brightness.shape, PATCH_PX)), PATCH_PX, brightness.shape)
     return brightness < DARK * patches * (0.5 + rng.random(brightness.shape))
+
+
+def _matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Unit variance [H, W], most of it shared within a window."""
+    shared = _enlarged(normal(rng, _coarse(shape, WINDOW_PX)), WINDOW_PX, shape)
+    # interpolation keeps 2/3 of the variance along each axis, hence 1.5
+    return SHARED_NOISE * 1.5 * shared + OWN_NOISE * normal(rng, shape)
+
+
+def _coarse(shape: tuple[int, ...], cell_px: int) -> tuple[int, int]:
+    return shape[0] // cell_px + 2, shape[1] // cell_px + 2
+
+
+def _enlarged(coarse: np.ndarray, cell_px: int, shape: tuple[int, ...]) -> np.ndarray:
+    """A coarse grid, interpolated to an image [H, W] with cells of `cell_px`."""
+    v, u = np.mgrid[: shape[0], : shape[1]] / cell_px
+    return _sampled(coarse[..., None], u, v)[..., 0]
 
 
 def _projected(
