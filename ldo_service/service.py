@@ -6,6 +6,7 @@ the same folder for its state.
 """
 
 import asyncio
+import fcntl
 import logging
 import os
 import signal
@@ -41,6 +42,9 @@ from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 
 log = logging.getLogger(__name__)
 
+MAPPED = ("mapper", "optimizer")  # have state from the first keyframe on
+ENTANGLED = ("tracker", *MAPPED)
+
 
 @dataclass(frozen=True, slots=True)
 class Service:
@@ -66,6 +70,8 @@ class Service:
         if self.recording and not self.only:
             prepare_recording(self.recording)
         with ExitStack() as stack:
+            if not self.only:
+                claim_state(self.state, stack)
             if self.metrics_port is not None:
                 stack.enter_context(exported(health, self.metrics_port))
             session = stack.enter_context(open_session(self.network, router=not self.only))
@@ -134,17 +140,24 @@ class Service:
 
         make = box.make
         assert make is not None
-        return Stage(
-            lambda: make(self.config),
-            transport,
-            config=self.config.stage,
-            store=FolderStore(self.state / "state"),
-            expected={
-                out.topic.name: lossless_consumers(RUNNING, out.topic.name) for out in box.outputs
-            },
-            on_evicted=evicted,
-            journal=self._journal(box.name),
-        )
+        try:
+            return Stage(
+                lambda: make(self.config),
+                transport,
+                config=self.config.stage,
+                store=FolderStore(self.state / "state"),
+                expected={
+                    out.topic.name: lossless_consumers(RUNNING, out.topic.name)
+                    for out in box.outputs
+                },
+                on_evicted=evicted,
+                journal=self._journal(box.name),
+            )
+        except (KeyError, ValueError, TypeError, IndexError) as error:
+            raise ConfigError(
+                f"the state of {box.name} in {self.state} does not fit this version ({error!r}). "
+                "Choose another folder with --state, or delete this one to start anew."
+            ) from error
 
     def _journal(self, actor: str) -> Journal:
         if self.recording is None:
@@ -193,6 +206,29 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     except OSError as error:
         raise ConfigError(f"{folder} cannot be used for state: {error.strerror}.") from error
     return folder
+
+
+def claim_state(folder: Path, stack: ExitStack) -> None:
+    """Keep the folder to this service, and see that the states in it belong together.
+
+    Keyframe ids and versions run through all of them: going on from a part would join keyframes of
+    two different journeys. Raises ConfigError.
+    """
+    lock = stack.enter_context((folder / "lock").open("w"))
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise ConfigError(
+            f"another service keeps its state in {folder}: choose another with --state."
+        ) from error
+    store = FolderStore(folder / "state")
+    missing = [name for name in ENTANGLED if store.load(name) is None]
+    has_keyframes = not set(MAPPED) <= set(missing)
+    if missing and has_keyframes:
+        raise ConfigError(
+            f"{folder} has no readable state of {', '.join(missing)} beside that of the others. "
+            "Choose another folder with --state, or delete this one to start anew."
+        )
 
 
 def _is_fed_from_outside(box: Box) -> bool:

@@ -23,7 +23,7 @@ Source = Annotated[
     tyro.conf.arg(
         metavar="SOURCE",
         help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export or 7-Scenes, "
-        "recognised by its files), a recording, or synthetic:room",
+        "recognised by its files), a recording, or synthetic:room, :tour or :flat",
     ),
 ]
 Recording = Annotated[

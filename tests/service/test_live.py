@@ -10,7 +10,7 @@ import pytest
 
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
-from tests.service.conftest import LDO, is_running, live_service, wait_until
+from tests.service.conftest import LDO, free_endpoint, is_running, live_service, wait_until
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 EVERY_ACTOR = ("frame_source", "tracker", "mapper", "optimizer")
@@ -74,6 +74,47 @@ def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
         assert second.returncode == 2
         assert "another `ldo serve`" in second.stderr
         assert "Traceback" not in second.stderr
+
+
+@pytest.mark.timeout(90)
+def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(tmp_path: Path) -> None:
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        camera = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "40")
+        service.wait_for_poses(30)
+        state = tmp_path / "s"
+        assert "another service keeps its state" in refused(state)
+        assert camera.wait(20) == 0
+        wait_until(lambda: service.update_health()["mapper"].facts["keyframes"] > 2, 10, "a map")
+        assert service.stop() == 0
+        keyframes = service.health["mapper"].facts["keyframes"]
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        camera = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "60")
+        service.wait_for_poses(40)
+        wait_until(
+            lambda: service.update_health()["mapper"].facts.get("keyframes", 0) > keyframes,
+            10,
+            "the map goes on",
+        )
+        assert service.stop() == 0
+        camera.kill()
+        camera.wait()
+    for part in (state / "state" / "tracker").iterdir():
+        part.write_bytes(b"torn")
+    assert "no readable state of tracker" in refused(state)
+
+
+def refused(state: Path) -> str:
+    """What a service says that cannot have a state folder."""
+    done = subprocess.run(
+        [*LDO, "serve", "--endpoint", free_endpoint(), "--state", str(state)],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    return done.stderr
 
 
 @pytest.mark.timeout(60)
