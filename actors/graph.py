@@ -4,7 +4,7 @@ The drawing and the table of topics in README are printed from here (`ldo topics
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.mapper import Mapper
@@ -18,17 +18,31 @@ from ldo_service.schemas import topics as t
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """An actor of the design. Without `make` it is drawn and left out of every run."""
+    """An actor of the design, with all its ports.
+
+    Without `make` it is drawn and left out of every run. An actor that runs may not have all of
+    its ports yet: `built` is the class that says which.
+    """
 
     name: str
     does: str
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
     make: Callable[[Config], Actor] | None = None
+    built: type[Actor] | None = None
 
 
-def _built(actor: type[Actor], does: str, make: Callable[[Config], Actor]) -> Box:
-    return Box(actor.name, does, actor.inputs, actor.outputs, make)
+def _built(
+    actor: type[Actor],
+    does: str,
+    make: Callable[[Config], Actor],
+    later: tuple[In | Out, ...] = (),
+) -> Box:
+    """An actor that runs; `later` are ports of the design that come with their use."""
+    inputs = tuple(port for port in later if isinstance(port, In))
+    outputs = tuple(port for port in later if isinstance(port, Out))
+    ports = actor.inputs + inputs, actor.outputs + outputs
+    return Box(actor.name, does, *ports, make, built=actor)
 
 
 GRAPH: tuple[Box, ...] = (
@@ -37,7 +51,12 @@ GRAPH: tuple[Box, ...] = (
         "checks and rectifies camera frames",
         lambda config: FrameSource(config.frame_source),
     ),
-    _built(Tracker, "finds the camera's pose", lambda config: Tracker(config.tracker)),
+    _built(
+        Tracker,
+        "finds the camera's pose",
+        lambda config: Tracker(config.tracker),
+        later=(In(t.MAP_VIEW, Latest(1)),),
+    ),
     Box(
         "detector",
         "finds objects of known classes",
@@ -50,7 +69,19 @@ GRAPH: tuple[Box, ...] = (
         inputs=(In(t.LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),),
         outputs=(Out(t.LABEL_OPEN),),
     ),
-    _built(Mapper, "keeps the map of Gaussians", lambda config: Mapper(config.mapper)),
+    _built(
+        Mapper,
+        "keeps the map of Gaussians",
+        lambda config: Mapper(config.mapper),
+        later=(
+            In(t.DETECTION_BOXES, Lossless(8)),
+            In(t.LABEL_OPEN, Latest(1, per_key=True)),
+            Out(t.LABEL_REQUEST),
+            Out(t.MAP_OBJECTS),
+            Out(t.OBJECT_OBSERVATION),
+            Out(t.KEYFRAME_REFINEMENT),
+        ),
+    ),
     Box(
         "loop_closer",
         "recognises places",
@@ -62,10 +93,22 @@ GRAPH: tuple[Box, ...] = (
         ),
         outputs=(Out(t.LOOP_CLOSURE), Out(t.LOOP_CANDIDATE)),
     ),
-    _built(Optimizer, "makes keyframe poses agree", lambda config: Optimizer(config.optimizer)),
+    _built(
+        Optimizer,
+        "makes keyframe poses agree",
+        lambda config: Optimizer(config.optimizer),
+        later=(
+            In(t.LOOP_CLOSURE, Lossless(8)),
+            In(t.OBJECT_OBSERVATION, Lossless(8)),
+            In(t.KEYFRAME_REFINEMENT, Lossless(8)),
+        ),
+    ),
 )
 
-RUNNING: tuple[Box, ...] = tuple(box for box in GRAPH if box.make is not None)
+# The actors of a run, with the ports that they have today.
+RUNNING: tuple[Box, ...] = tuple(
+    replace(box, inputs=box.built.inputs, outputs=box.built.outputs) for box in GRAPH if box.built
+)
 
 
 def box_named(name: str) -> Box:

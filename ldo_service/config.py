@@ -115,7 +115,9 @@ def config_of(tree: dict[str, Any]) -> Config:
     """The defaults, changed by a tree of plain values."""
     _check_names(tree, Config, "")
     try:
-        return msgspec.convert(tree, Config)
+        config = msgspec.convert(tree, Config)
+        _refuse_nan(config, "")
+        return config
     except msgspec.ValidationError as error:
         raise ConfigError(_without_path_sugar(str(error))) from error
 
@@ -170,6 +172,16 @@ def _check_names(tree: Any, schema: type, prefix: str) -> None:
             raise ConfigError(f"there is no setting {prefix}{name}. {hint}")
         if dataclasses.is_dataclass(types[name]):
             _check_names(value, types[name], f"{prefix}{name}.")
+
+
+def _refuse_nan(config: Any, prefix: str) -> None:
+    """NaN passes every comparison that a section makes."""
+    for entry in dataclasses.fields(config):
+        value = getattr(config, entry.name)
+        if dataclasses.is_dataclass(value):
+            _refuse_nan(value, f"{prefix}{entry.name}.")
+        elif value != value or (isinstance(value, tuple) and any(v != v for v in value)):
+            raise ConfigError(f"{prefix}{entry.name} is NaN: write a number.")
 
 
 def _without_path_sugar(message: str) -> str:

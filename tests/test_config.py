@@ -41,6 +41,8 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("tracker.hold_out", "section.field=value"),
         ("tracker.hold_out.deeper=5", "Expected `int`"),
         ("mapper=3", "section.field=value"),
+        ("stage.heartbeat_s=.nan", "stage.heartbeat_s is NaN"),
+        ("stage.restart_delay_max_s=-1", "positive"),
     ],
 )
 def test_a_wrong_setting_is_said_plainly(setting: str, says: str) -> None:

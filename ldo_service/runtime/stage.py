@@ -46,7 +46,7 @@ class StageConfig:
         times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
         if (
             min(*times, self.max_message_mb) <= 0
-            or min(self.max_restarts, self.restart_delay_s) < 0
+            or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
         ):
             raise ConfigError(f"{self}: counts and times must be positive.")
 
