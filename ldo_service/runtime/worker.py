@@ -22,7 +22,8 @@ class Worker:
         self._jobs: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._lock = Lock()
         self._closed = False
-        Thread(target=self._work, name=name, daemon=True).start()
+        self._thread = Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
 
     def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
         """Run soon, in the thread. After `close` the future is cancelled at once."""
@@ -43,6 +44,11 @@ class Worker:
             if not self._closed:
                 self._closed = True
                 self._jobs.put(None)
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the thread after `close`: one that is inside a library while the interpreter
+        ends would be killed there, which some libraries answer with an abort."""
+        self._thread.join(timeout_s)
 
     def _work(self) -> None:
         while entry := self._jobs.get():

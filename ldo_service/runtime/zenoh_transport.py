@@ -13,6 +13,7 @@ Facts of zenoh-python 1.x that shape this file:
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -32,6 +33,7 @@ log = logging.getLogger(__name__)
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ALIVE = "link/alive"
 MAX_QUERIES = 16  # that may wait for their answer; who asks more often gets an error
+LEAVE_WITHIN_S = 2.0  # for what is still being sent when a transport closes
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +96,15 @@ class ZenohTransport:
         self._session, self._network = session, network
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
+        self._publishers: list[ZenohPublisher] = []
         self._answering = Worker("answers")
         self._responding: set[asyncio.Task[None]] = set()
         self._query_slots = BoundedSemaphore(MAX_QUERIES)
 
     def publisher(self, key: str) -> "ZenohPublisher":
-        return ZenohPublisher(self._session, self._network.expression(key))
+        publisher = ZenohPublisher(self._session, self._network.expression(key))
+        self._publishers.append(publisher)
+        return publisher
 
     def subscribe(self, key: str, on_message: OnMessage) -> None:
         def store(sample: zenoh.Sample) -> None:
@@ -187,6 +192,10 @@ class ZenohTransport:
                 declared.undeclare()
         self._declared.clear()
         self._answering.close()
+        until_s = time.monotonic() + LEAVE_WITHIN_S
+        for leaving in (*self._publishers, self._answering):
+            leaving.close()
+            leaving.join(max(0.0, until_s - time.monotonic()))
 
 
 class ZenohPublisher:
@@ -225,6 +234,9 @@ class ZenohPublisher:
         """What was sent or posted so far still leaves."""
         self._thread.submit(self._undeclare)
         self._thread.close()
+
+    def join(self, timeout_s: float) -> None:
+        self._thread.join(timeout_s)
 
     def _undeclare(self) -> None:
         with suppress(zenoh.ZError):
