@@ -1,7 +1,35 @@
-"""The map of 3D Gaussians: what it holds, how it is seen, and how it grows."""
+"""The map of 3D Gaussians: what it holds, how it is seen, how it grows and how it is optimised."""
 
+from .adam import Adam, AdamConfig
+from .exposure import Exposure, fitted_exposure
 from .insertion import InsertionConfig, insert
+from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
+from .optimise import Optimised, Optimiser, OptimiserConfig
+from .pruning import PruningConfig, superfluous
+from .rasteriser import Rasteriser, RowGradients
 from .render import Rendering, render
+from .views import View
 
-__all__ = ["GaussianMap", "InsertionConfig", "Rendering", "insert", "render"]
+__all__ = [
+    "Adam",
+    "AdamConfig",
+    "Exposure",
+    "GaussianMap",
+    "ImageLoss",
+    "InsertionConfig",
+    "LossWeights",
+    "Optimised",
+    "Optimiser",
+    "OptimiserConfig",
+    "PruningConfig",
+    "Rasteriser",
+    "Rendering",
+    "RowGradients",
+    "View",
+    "fitted_exposure",
+    "image_loss",
+    "insert",
+    "render",
+    "superfluous",
+]

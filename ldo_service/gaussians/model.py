@@ -19,7 +19,7 @@ class GaussianMap:
     """
 
     def __init__(self, capacity: int = 4096) -> None:
-        self._rows = _aligned_rows(capacity)
+        self._rows = aligned_rows(capacity)
         self._ids = np.zeros(capacity, np.int64)
         self._anchors = np.zeros(capacity, np.int32)
         self._size = 0
@@ -157,13 +157,13 @@ class GaussianMap:
         if size <= len(self._rows):
             return
         capacity = max(size, 2 * len(self._rows))
-        grown = _aligned_rows(capacity), np.zeros(capacity, np.int64), np.zeros(capacity, np.int32)
+        grown = aligned_rows(capacity), np.zeros(capacity, np.int64), np.zeros(capacity, np.int32)
         for new, old in zip(grown, (self._rows, self._ids, self._anchors), strict=True):
             new[: self._size] = old[: self._size]
         self._rows, self._ids, self._anchors = grown
 
 
-def _aligned_rows(capacity: int) -> np.ndarray:
+def aligned_rows(capacity: int) -> np.ndarray:
     """Zeroed rows [capacity, 16], each of which fills one 64-byte cache line."""
     memory = np.zeros(capacity * ROW + 16, np.float32)
     skip = (-memory.ctypes.data % 64) // 4

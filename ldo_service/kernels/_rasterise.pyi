@@ -21,3 +21,45 @@ def rasterise(
     what they hold. Releases the GIL. Raises ValueError for wrong shapes, types, strides, sizes
     and cameras. Bitwise equal for any number of threads.
     """
+
+class Pass:
+    """What the gradients of one rendering need, and memory that the next rendering uses again.
+
+    One call at a time may use it: a second one, from another thread, raises ValueError.
+    """
+
+    def __init__(self) -> None: ...
+
+def rasterise_planes(
+    forward: Pass,
+    rows: NDArray[np.float32],
+    T_camera_map: NDArray[np.float32],
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    planes: NDArray[np.float32],
+    threads: int = 1,
+) -> int:
+    """Write red, green, blue, weighted depth and opacity to `planes` [5, H, W].
+
+    Returns the number V of Gaussians that may touch the image. Otherwise as `rasterise`.
+    """
+
+def backpropagate(
+    forward: Pass,
+    rows: NDArray[np.float32],
+    planes: NDArray[np.float32],
+    gradients: NDArray[np.float32],
+    indices: NDArray[np.uint32],
+    row_gradients: NDArray[np.float32],
+    needle_weight: float = 0.0,
+    needle_log_ratio: float = 0.0,
+    threads: int = 1,
+) -> NDArray[np.float64]:
+    """Derivatives of L, given those by the planes that `rasterise_planes` last wrote.
+
+    `rows` and `planes` must be as they were then. Writes the V row numbers, ascending, to
+    `indices` [V] and dL/drow to `row_gradients` [V, 16], with the sum of the Gaussian's weights
+    in field 14; returns dL/dxi [6] for T_map_camera exp(xi), rotation first.
+    """

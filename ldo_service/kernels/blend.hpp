@@ -27,6 +27,43 @@ struct Lanes {  // column and row of each lane in its 4x4 block
   Floats x, y;
 };
 
+// The 4x4 pixels at (x, y), as far as they lie in the image.
+class PixelBlock {
+ public:
+  PixelBlock(int x, int y, const View& view)
+      : first_(static_cast<int64_t>(y) * view.width + x),
+        stride_(view.width),
+        columns_(std::min(4, view.width - x)),
+        rows_(std::min(4, view.height - y)) {}
+
+  Floats load(const float* plane) const {  // zero outside
+    alignas(64) float pixels[kLanes] = {};
+    each_row([&](int row, auto columns) {
+      std::memcpy(pixels + 4 * row, plane + first_ + row * stride_, columns * sizeof(float));
+    });
+    return Floats::load(pixels);
+  }
+  void store(Floats values, float* plane) const {
+    alignas(64) float pixels[kLanes];
+    values.store(pixels);
+    each_row([&](int row, auto columns) {
+      std::memcpy(plane + first_ + row * stride_, pixels + 4 * row, columns * sizeof(float));
+    });
+  }
+
+ private:
+  template <class F>
+  void each_row(F f) const {
+    if (columns_ == 4 && rows_ == 4) {  // of known size: plain moves
+      for (int row = 0; row < 4; ++row) f(row, std::integral_constant<int, 4>{});
+    } else {
+      for (int row = 0; columns_ > 0 && row < rows_; ++row) f(row, columns_);
+    }
+  }
+  const int64_t first_, stride_;
+  const int columns_, rows_;
+};
+
 // Bit i is set where the ellipse alpha >= 1/255 reaches block i of the tile at (x, y): on the two
 // sides of the block nearest to the centre, the ridge line finds the point of largest alpha.
 inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, float y) {
@@ -43,22 +80,37 @@ inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, floa
   return bits(max(exponent(side_x, best_y), exponent(best_x, side_y)) >= least);
 }
 
+// alpha of one splat at sixteen pixels, before it is capped and where it is too weak to count:
+// log2 alpha = a dx^2 + b dx dy + c dy^2 + log2 o.
+[[gnu::always_inline]] inline Floats log2_alpha_of(const Splat& s, Floats dx, Floats dy) {
+  return dx * (dx * s.a + dy * s.b) + (dy * dy * s.c + s.log2_opacity);
+}
+
+[[gnu::always_inline]] inline Floats capped_alpha(Floats log2_alpha) {
+  return select(log2_alpha >= kLog2MinAlpha, exp2(min(log2_alpha, kLog2MaxAlpha)), 0.0f);
+}
+
 // Adds one splat to sixteen pixels at (px, py).
+template <bool WithMedian>
 [[gnu::always_inline]] inline void blend_splat(const Splat& s, Floats px, Floats py, Block& block) {
-  const Floats dx = px - s.u, dy = py - s.v;
-  const Floats log2_alpha = dx * (dx * s.a + dy * s.b) + (dy * dy * s.c + s.log2_opacity);
-  const Mask counts = log2_alpha >= kLog2MinAlpha;
-  const Floats alpha = select(counts, exp2(min(log2_alpha, kLog2MaxAlpha)), 0.0f);
-  const Floats weight = alpha * block.transmittance;
+  const Floats weight =
+      capped_alpha(log2_alpha_of(s, px - s.u, py - s.v)) * block.transmittance;
   block.red = block.red + weight * s.color[0];
   block.green = block.green + weight * s.color[1];
   block.blue = block.blue + weight * s.color[2];
   block.depth = block.depth + weight * s.z;
   block.transmittance = block.transmittance - weight;
   // Splats come by increasing z: the least behind which less than half is left is the first.
-  block.median_depth =
-      select(block.transmittance < 0.5f, min(block.median_depth, s.z), block.median_depth);
+  if constexpr (WithMedian)
+    block.median_depth =
+        select(block.transmittance < 0.5f, min(block.median_depth, s.z), block.median_depth);
 }
+
+// What the forward pass over a tile leaves for the backward pass.
+struct TileRecord {
+  uint32_t* touched;  // per splat of the tile's list, as far as it was looked at
+  uint32_t* blended;  // [kBlocks] how many splats each block blended
+};
 
 class Tile {
  public:
@@ -67,12 +119,18 @@ class Tile {
       if (x_ + b % 4 * 4 < view.width && y_ + b / 4 * 4 < view.height) open_ |= 1u << b;
   }
 
+  template <bool WithMedian>
   void blend(const Splat* splats, const uint32_t* list, int64_t n) {
-    for (int64_t first = 0; first < n && open_ != 0; first += kBatch) {
-      gather(splats, list + first, static_cast<int>(std::min<int64_t>(kBatch, n - first)));
-      for (int b = 0; b < kBlocks; ++b)
-        if (open_ >> b & 1) blend_block(b);
-    }
+    for (int64_t first = 0; first < n && open_ != 0; first += kBatch)
+      blend_batch<WithMedian>(splats, list + first, std::min<int64_t>(kBatch, n - first),
+                              touched_);
+  }
+
+  void blend(const Splat* splats, const uint32_t* list, int64_t n, const TileRecord& record) {
+    for (int64_t first = 0; first < n && open_ != 0; first += kBatch)
+      blend_batch<false>(splats, list + first, std::min<int64_t>(kBatch, n - first),
+                         record.touched + first);
+    std::copy(blended_, blended_ + kBlocks, record.blended);
   }
 
   void store(const Images& out) const {
@@ -90,28 +148,58 @@ class Tile {
     }
   }
 
+  void store_planes(float* planes) const {
+    const int64_t size = static_cast<int64_t>(view_.width) * view_.height;
+    for (int b = 0; b < kBlocks; ++b) {
+      const Block& block = blocks_[b];
+      const PixelBlock pixels(x_ + b % 4 * 4, y_ + b / 4 * 4, view_);
+      pixels.store(block.red, planes + kRed * size);
+      pixels.store(block.green, planes + kGreen * size);
+      pixels.store(block.blue, planes + kBlue * size);
+      pixels.store(block.depth, planes + kDepth * size);
+      pixels.store(Floats(1.0f) - block.transmittance, planes + kPlaneOpacity * size);
+    }
+  }
+
  private:
-  void gather(const Splat* splats, const uint32_t* list, int n) {
-    batch_size_ = n;
+  template <bool WithMedian>
+  void blend_batch(const Splat* splats, const uint32_t* list, int64_t n, uint32_t* touched) {
+    gather(splats, list, static_cast<int>(n), touched);
+    for (int b = 0; b < kBlocks; ++b)
+      if (open_ >> b & 1) blend_block<WithMedian>(b, static_cast<int>(n), touched);
+  }
+
+  void gather(const Splat* splats, const uint32_t* list, int n, uint32_t* touched) {
     const float x = static_cast<float>(x_), y = static_cast<float>(y_);
     for (int i = 0; i < n; ++i) {
       __builtin_prefetch(&splats[list[i + kPrefetchAhead]]);
       batch_[i] = splats[list[i]];
-      touched_[i] = touched_blocks(batch_[i], lanes_, x, y);
+      touched[i] = touched_blocks(batch_[i], lanes_, x, y);
     }
   }
 
-  void blend_block(int b) {
+  template <bool WithMedian>
+  void blend_block(int b, int n, const uint32_t* touched) {
     const Floats px = lanes_.x + static_cast<float>(x_ + b % 4 * 4);
     const Floats py = lanes_.y + static_cast<float>(y_ + b / 4 * 4);
     alignas(64) uint32_t list[kBatch + kLanes];
-    const int n = indices_with_bit(touched_, batch_size_, b, list);
+    n = indices_with_bit(touched, n, b, list);
     Block block = blocks_[b];
-    for (int i = 0; i < n; ++i) {
-      blend_splat(batch_[list[i]], px, py, block);
-      if (i % 4 == 3 && !any(block.transmittance >= kStop)) break;
+    int i = 0;
+    bool is_open = true;
+    const auto blend_while = [&](auto with_median, float least) {
+      while (i < n) {
+        blend_splat<with_median>(batch_[list[i]], px, py, block);
+        if (++i % 4 == 0 && !any(block.transmittance >= least)) break;
+      }
+    };
+    if (WithMedian && any(block.transmittance >= 0.5f)) {
+      blend_while(std::true_type{}, 0.5f);  // then no pixel's median changes any more
+      is_open = any(block.transmittance >= kStop);
     }
+    if (is_open) blend_while(std::false_type{}, kStop);
     blocks_[b] = block;
+    blended_[b] += i;
     if (!any(block.transmittance >= kStop)) open_ &= ~(1u << b);
   }
 
@@ -138,8 +226,8 @@ class Tile {
   uint32_t open_ = 0;  // blocks in the image with a pixel that light still passes
   Block blocks_[kBlocks];
   Splat batch_[kBatch];
-  alignas(64) uint32_t touched_[kBatch + kLanes];  // bit b: this splat of the batch reaches block b
-  int batch_size_ = 0;
+  uint32_t touched_[kBatch];  // bit b: this splat of the batch reaches block b
+  uint32_t blended_[kBlocks] = {};
 };
 
 }  // namespace ldo::LDO_ISA

@@ -12,8 +12,18 @@ class Buffer {
   static_assert(std::is_trivially_copyable_v<T>);
 
  public:
-  explicit Buffer(size_t size)
-      : data_(static_cast<T*>(::operator new(size * sizeof(T) + 1, kAlignment))), size_(size) {}
+  Buffer() = default;
+  explicit Buffer(size_t size) { resize(size); }
+
+  // Room for `size` items, whose values are then undefined. Only growth asks for memory: it is
+  // worth keeping, because the first touch of every fresh page costs more than its use.
+  void resize(size_t size) {
+    size_ = size;
+    if (size <= capacity_) return;
+    data_.reset();
+    capacity_ = capacity_ == 0 ? size : size + size / 4;
+    data_.reset(static_cast<T*>(::operator new(capacity_ * sizeof(T), kAlignment)));
+  }
 
   T* data() { return data_.get(); }
   const T* data() const { return data_.get(); }
@@ -27,7 +37,7 @@ class Buffer {
     void operator()(T* p) const { ::operator delete(p, kAlignment); }
   };
   std::unique_ptr<T[], Free> data_;
-  size_t size_;
+  size_t size_ = 0, capacity_ = 0;
 };
 
 }  // namespace ldo::LDO_ISA

@@ -4,7 +4,7 @@
 #include <algorithm>
 
 #include "rasterise.hpp"
-#include "simd.hpp"
+#include "transpose.hpp"
 
 namespace ldo::LDO_ISA {
 
@@ -31,9 +31,11 @@ struct TileRange {
 
 // Rows [0, count) as columns of sixteen; missing ones are zero.
 inline void transpose_rows(const float* rows, int count, float (&columns)[kRowFloats][kLanes]) {
-  if (count < kLanes) std::memset(columns, 0, sizeof columns);
-  for (int i = 0; i < count; ++i)
-    for (int j = 0; j < kRowFloats; ++j) columns[j][i] = rows[i * kRowFloats + j];
+  Floats matrix[kLanes];
+  for (int i = 0; i < kLanes; ++i)
+    matrix[i] = i < count ? Floats::load(rows + i * kRowFloats) : Floats(0.0f);
+  transpose(matrix);
+  for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
 }
 
 // NaN and infinity times zero are NaN, and NaN fails every comparison.

@@ -35,9 +35,9 @@ inline uint32_t to_offsets(uint32_t* counts, int64_t pieces, int64_t bins) {
   return sum;
 }
 
-inline void sort_digit(const Keyed* from, Keyed* to, const Pieces& pieces, int shift, int threads,
-                       Buffer<uint32_t>& places) {
-  const auto digit = [shift](const Keyed& k) { return k.key >> shift & (kDigits - 1); };
+inline void sort_digit(const Keyed* from, Keyed* to, const Pieces& pieces, uint32_t lowest,
+                       int shift, int threads, Buffer<uint32_t>& places) {
+  const auto digit = [=](const Keyed& k) { return (k.key - lowest) >> shift & (kDigits - 1); };
   parallel_for(pieces.count(), threads, [&](int64_t piece) {
     uint32_t* counts = &places[piece * kDigits];
     std::fill(counts, counts + kDigits, 0u);
@@ -51,13 +51,14 @@ inline void sort_digit(const Keyed* from, Keyed* to, const Pieces& pieces, int s
   });
 }
 
-// Sorts items[0, n) by key; equal keys keep their order. `spare` is as large and is overwritten.
-// Returns the one of the two that holds the result.
-inline Keyed* radix_sort(Keyed* items, Keyed* spare, int64_t n, uint32_t max_key, int threads) {
+// Sorts items[0, n) by key, all in [lowest, highest]; equal keys keep their order. `spare` is as
+// large and is overwritten. Returns the one of the two that holds the result.
+inline Keyed* radix_sort(Keyed* items, Keyed* spare, int64_t n, uint32_t lowest, uint32_t highest,
+                         int threads) {
   const Pieces pieces(n);
   Buffer<uint32_t> places(pieces.count() * kDigits);
-  for (int shift = 0; shift < 32 && max_key >> shift != 0; shift += kDigitBits) {
-    sort_digit(items, spare, pieces, shift, threads, places);
+  for (int shift = 0; shift < 32 && (highest - lowest) >> shift != 0; shift += kDigitBits) {
+    sort_digit(items, spare, pieces, lowest, shift, threads, places);
     std::swap(items, spare);
   }
   return items;

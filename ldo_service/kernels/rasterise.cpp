@@ -1,19 +1,129 @@
 // Compiled once per instruction set, LDO_ISA.
 #include "rasterise.hpp"
 
-#include "blend.hpp"
+#include "projection_gradient.hpp"
 
 namespace ldo::LDO_ISA {
+namespace {
+
+struct RecordedPass final : Pass {
+  VisibleSplats splats;
+  TileLists lists;
+  Buffer<uint32_t> touched;  // [lists.splats] per splat of a tile: the blocks that it reaches
+  Buffer<uint32_t> blended;  // [tiles, kBlocks] splats
+  Buffer<float> sums;        // [lists.splats, kSumFloats]
+
+  TileRecord record(int64_t tile) {
+    return {touched.data() + lists.start[tile], blended.data() + tile * kBlocks};
+  }
+};
+
+template <class F>
+void each_tile(const TileLists& lists, int threads, const F& f) {
+  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, threads, [&](int64_t tile) {
+    const uint32_t start = lists.start[tile];
+    f(tile, static_cast<int>(tile % lists.columns), static_cast<int>(tile / lists.columns),
+      lists.splats.data() + start, static_cast<int64_t>(lists.start[tile + 1] - start));
+  });
+}
+
+// Sums over the tiles of a splat, in the order of the tiles.
+Floats sum_over_tiles(const RecordedPass& pass, int64_t splat) {
+  const uint32_t* slot = &pass.lists.slots[pass.lists.first[splat]];
+  Floats sum = 0.0f;
+  for (int64_t left = area(pass.splats.tiles[splat]); left > 0; --left)
+    sum = sum + Floats::load(&pass.sums[static_cast<int64_t>(*slot++) * kSumFloats]);
+  return sum;
+}
+
+// The splats of one piece of the Gaussians, sixteen at a time.
+void differentiate_piece(const float* rows, const RecordedPass& pass,
+                         const ProjectionGradient& differentiate, int64_t piece, int64_t to,
+                         const Gradients& out, PoseSums& pose) {
+  const int64_t begin = piece * kProjectionPiece, end = begin + pass.splats.counts[piece];
+  for (int64_t i = begin; i < end; i += kLanes, to += kLanes) {
+    const int count = static_cast<int>(std::min<int64_t>(kLanes, end - i));
+    Floats matrix[kLanes], sums[kLanes], gradient[kLanes];
+    const uint32_t* gaussians = &pass.splats.gaussians[i];
+    for (int k = 0; k < kLanes; ++k) {  // the last is repeated, with no gradient
+      matrix[k] = Floats::load(rows + static_cast<int64_t>(gaussians[std::min(k, count - 1)]) *
+                                          kRowFloats);
+      sums[k] = k < count ? sum_over_tiles(pass, i + k) : Floats(0.0f);
+    }
+    transpose(matrix);
+    transpose(sums);
+    alignas(64) float columns[kRowFloats][kLanes];
+    for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
+    differentiate(columns, sums, gradient, pose);
+    transpose(gradient);
+    for (int k = 0; k < count; ++k) gradient[k].store(out.rows + (to + k) * kRowFloats);
+    std::copy(gaussians, gaussians + count, out.indices + to);
+  }
+}
+
+}  // namespace
 
 void rasterise(const float* rows, int64_t n, const View& view, int threads, Images out) {
-  const VisibleSplats visible = project(rows, n, view, threads);
-  const TileLists lists = list_by_tile(visible, view, threads);
-  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, threads, [&](int64_t t) {
-    Tile tile(static_cast<int>(t % lists.columns), static_cast<int>(t / lists.columns), view);
-    const uint32_t start = lists.start[t];
-    tile.blend(visible.splats.data(), lists.splats.data() + start, lists.start[t + 1] - start);
+  VisibleSplats visible;
+  TileLists lists;
+  project(rows, n, view, threads, visible);
+  list_by_tile(visible, view, threads, lists);
+  each_tile(lists, threads, [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {
+    Tile tile(column, row, view);
+    tile.blend<true>(visible.splats.data(), list, size);
     tile.store(out);
   });
+}
+
+std::unique_ptr<Pass> new_pass() { return std::make_unique<RecordedPass>(); }
+
+void rasterise_planes(const float* rows, int64_t n, const View& view, int threads, Pass& opaque,
+                      float* planes) {
+  auto& pass = static_cast<RecordedPass&>(opaque);
+  project(rows, n, view, threads, pass.splats);
+  list_by_tile(pass.splats, view, threads, pass.lists);
+  pass.touched.resize(pass.lists.splats.size());
+  pass.blended.resize(static_cast<size_t>(pass.lists.columns) * pass.lists.rows * kBlocks);
+  each_tile(pass.lists, threads,
+            [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
+              Tile tile(column, row, view);
+              tile.blend(pass.splats.splats.data(), list, size, pass.record(t));
+              tile.store_planes(planes);
+            });
+  pass.gaussians = n;
+  pass.visible = pass.splats.count;
+  pass.view = view;
+}
+
+void backpropagate(const float* rows, Pass& opaque, const float* planes, const float* gradients,
+                   NeedlePenalty penalty, int threads, Gradients out) {
+  auto& pass = static_cast<RecordedPass&>(opaque);
+  pass.sums.resize(pass.lists.splats.size() * kSumFloats);
+  each_tile(pass.lists, threads,
+            [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
+              TileGradient differentiate(column, row, pass.view, planes, gradients);
+              differentiate(pass.splats.splats.data(), list, size, pass.record(t),
+                            pass.sums.data() + pass.lists.start[t] * int64_t{kSumFloats});
+            });
+
+  const int64_t pieces = pass.splats.counts.size();
+  Buffer<int64_t> first(pieces);
+  for (int64_t piece = 0, sum = 0; piece < pieces; sum += pass.splats.counts[piece++])
+    first[piece] = sum;
+  Buffer<PoseSums> poses(pieces);
+  const ProjectionGradient differentiate(pass.view, penalty);
+  parallel_for(pieces, threads, [&](int64_t piece) {
+    PoseSums pose;
+    differentiate_piece(rows, pass, differentiate, piece, first[piece], out, pose);
+    poses[piece] = pose;
+  });
+  std::fill(out.pose, out.pose + 6, 0.0);
+  for (int64_t piece = 0; piece < pieces; ++piece) {
+    const auto& [rotation, translation] = poses[piece];
+    const Floats lanes[6] = {rotation.x,    rotation.y,    rotation.z,
+                             translation.x, translation.y, translation.z};
+    for (int k = 0; k < 6; ++k) out.pose[k] += sum(lanes[k]);
+  }
 }
 
 }  // namespace ldo::LDO_ISA

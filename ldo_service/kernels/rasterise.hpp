@@ -1,6 +1,7 @@
 // Images of a map of 3D Gaussians, seen by a pinhole camera. Interface; no instruction set here.
 #pragma once
 #include <cstdint>
+#include <memory>
 
 namespace ldo {
 
@@ -28,9 +29,40 @@ struct Images {         // row-major, height x width
   float* opacity;       // 1 - transmittance
 };
 
-#define LDO_DECLARE_RASTERISE(isa)                                                         \
-  namespace isa {                                                                          \
-  void rasterise(const float* rows, int64_t n, const View& view, int threads, Images out); \
+// The images that gradients flow through, one after the other, row-major height x width each.
+enum Plane { kRed, kGreen, kBlue, kDepth, kPlaneOpacity, kPlanes };
+
+// A row of gradients has the fields of a row of Gaussians, and where the unused ones begin:
+constexpr int kWeight = kFields;  // no gradient: the Gaussian's weights summed over the pixels
+
+// What the gradients of one rendering need, and memory that the next rendering uses again.
+class Pass {
+ public:
+  virtual ~Pass() = default;
+  int64_t gaussians = 0, visible = 0;
+  View view{};
+};
+
+// Adds weight * mean over the pixels of sum_i w_i max(0, log(longest / middle axis) - log_ratio)
+// to what is differentiated, with the w_i held fixed: needles become discs.
+struct NeedlePenalty {
+  float weight, log_ratio;
+};
+
+struct Gradients {
+  uint32_t* indices;  // [visible] rows that the view reaches, ascending
+  float* rows;        // [visible, kRowFloats] their gradients
+  double* pose;       // [6] by xi in T_map_camera exp(xi): rotation, then translation
+};
+
+#define LDO_DECLARE_RASTERISE(isa)                                                          \
+  namespace isa {                                                                           \
+  void rasterise(const float* rows, int64_t n, const View& view, int threads, Images out);  \
+  std::unique_ptr<Pass> new_pass();                                                         \
+  void rasterise_planes(const float* rows, int64_t n, const View& view, int threads, Pass&, \
+                        float* planes);                                                     \
+  void backpropagate(const float* rows, Pass&, const float* planes, const float* gradients, \
+                     NeedlePenalty, int threads, Gradients out);                            \
   }
 LDO_DECLARE_RASTERISE(baseline)
 LDO_DECLARE_RASTERISE(avx2)

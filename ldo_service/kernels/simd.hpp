@@ -178,16 +178,38 @@ inline Floats log2(Floats x) {
   return out;
 }
 
+inline FloatRegister square_root(FloatRegister x) {
+#if defined(__AVX512F__)
+  return _mm512_sqrt_ps(x);
+#elif defined(__AVX2__)
+  return _mm256_sqrt_ps(x);
+#elif defined(__SSE2__)
+  return _mm_sqrt_ps(x);
+#else
+  for (int i = 0; i < kLanes / kRegisters; ++i) x[i] = __builtin_sqrtf(x[i]);
+  return x;
+#endif
+}
+
 inline Floats sqrt(Floats x) {
   Floats out;
-  each_register([&](int k) {
-    for (int i = 0; i < kLanes / kRegisters; ++i) out.v[k][i] = __builtin_sqrtf(x.v[k][i]);
-  });
+  each_register([&](int k) { out.v[k] = square_root(x.v[k]); });
   return out;
 }
 
+// Sum of the lanes, in an order that is the same on every machine.
+inline float sum(Floats x) {
+  alignas(64) float lanes[kLanes];
+  x.store(lanes);
+  for (int half = kLanes / 2; half > 0; half /= 2)
+    for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
+  return lanes[0];
+}
+
+inline Floats abs(Floats x) { return max(x, Floats(0.0f) - x); }
+
 // Writes the i in [0, n) whose words[i] has the bit set, in order; returns how many. Without
-// branches, as the bits follow no pattern. `words` and `out` have room for kLanes beyond n.
+// branches, as the bits follow no pattern. `out` has room for kLanes beyond n.
 inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out) {
   int count = 0;
 #if defined(__AVX512F__)
@@ -196,7 +218,7 @@ inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out
   for (int i = 0; i < n; i += kLanes, index = _mm512_add_epi32(index, _mm512_set1_epi32(kLanes))) {
     const __mmask16 inside = n - i < kLanes ? (1u << (n - i)) - 1 : 0xffff;
     const __mmask16 set =
-        _mm512_mask_test_epi32_mask(inside, _mm512_loadu_si512(words + i), wanted);
+        _mm512_test_epi32_mask(_mm512_maskz_loadu_epi32(inside, words + i), wanted);
     _mm512_storeu_si512(out + count, _mm512_maskz_compress_epi32(set, index));
     count += __builtin_popcount(set);
   }

@@ -1,0 +1,79 @@
+"""How far a rendering is from a frame. The kernel is `kernels/loss.cpp`, its plain twin
+`loss_reference.py`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.kernels import _loss
+
+from .exposure import Exposure
+
+
+@dataclass(frozen=True, slots=True)
+class LossWeights:
+    l1: float = 0.8  # Kerbl et al. 2023, eq. 7: (1 - lambda) L1 + lambda D-SSIM,
+    d_ssim: float = 0.2  # lambda = 0.2
+    depth: float = 0.5  # per metre of mean depth error
+
+    def __post_init__(self) -> None:
+        if not min(self.l1, self.d_ssim, self.depth) >= 0:
+            raise ConfigError(f"{self}: weights must not be negative.")
+
+
+@dataclass(frozen=True, slots=True)
+class ImageLoss:
+    """total = weighted sum of l1, d_ssim and depth_m, which are means over the image."""
+
+    total: float
+    l1: float  # of colours in 0..1
+    d_ssim: float  # 1 - SSIM
+    depth_m: float  # over the pixels whose depth was measured
+    psnr_db: float
+    by_exposure: np.ndarray  # [2, 3] derivative of the total by gains and biases
+
+
+def image_loss(
+    planes: np.ndarray,
+    color: np.ndarray,
+    depth_m: np.ndarray,
+    exposure: Exposure,
+    weights: LossWeights,
+    by_planes: np.ndarray,
+    *,
+    mask: np.ndarray | None = None,
+    threads: int = 1,
+) -> ImageLoss:
+    """Compare a rendering with a frame, and write dL/dplanes to `by_planes` [5, H, W] float32.
+
+        L = l1 mean|x - y| + d_ssim (1 - mean SSIM(x, y)) + depth mean|D - d|,  x = gain C + bias
+
+    planes   [5, H, W] float32: colours C, weighted depth D in metres, opacity (unused)
+    color    [3, H, W] uint8, y = color / 255
+    depth_m  [H, W] float32, d; 0 where not measured, which does not count
+    mask     [H, W] uint8: where it is 0 both images are taken as black and depth does not count
+    SSIM has an 11x11 Gaussian window of sigma 1.5 px and sees zeros beyond the image, as in 3DGS
+    (Wang et al. 2004; Kerbl et al. 2023). Raises ValueError for arrays that do not fit. Bitwise
+    equal for any number of threads.
+    """
+    (l1, d_ssim, depth, squared), by_exposure = _loss.image_loss(
+        planes,
+        color,
+        depth_m,
+        mask,
+        exposure.matrix,
+        weights.l1,
+        weights.d_ssim,
+        weights.depth,
+        by_planes,
+        threads,
+    )
+    return ImageLoss(
+        weights.l1 * l1 + weights.d_ssim * d_ssim + weights.depth * depth,
+        l1,
+        d_ssim,
+        depth,
+        float(-10 * np.log10(max(squared, 1e-20))),
+        np.reshape(by_exposure, (2, 3)),
+    )

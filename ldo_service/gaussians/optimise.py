@@ -1,0 +1,167 @@
+"""The map fitted to a window of keyframes: Gaussians, exposures, and poses if wanted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+
+from .adam import Adam, AdamConfig
+from .exposure import Exposure
+from .loss import ImageLoss, LossWeights, image_loss
+from .model import GaussianMap
+from .rasteriser import Rasteriser
+from .view_state import ViewMoments
+from .views import View, schedule
+
+
+@dataclass(frozen=True, slots=True)
+class OptimiserConfig:
+    adam: AdamConfig = field(default_factory=AdamConfig)
+    loss: LossWeights = field(default_factory=LossWeights)
+    needle_weight: float = 0.01  # of mean log(longest / middle axis) beyond max_needle_ratio
+    max_needle_ratio: float = 4.0  # what insertion gives to surfaces seen at a grazing angle
+
+    # Which keyframes. Random ones keep what was learnt: +4.2 dB, covisible ones +1.1 dB in the
+    # ablations of others (ALGORITHMS, The map).
+    newest_share: float = 0.3
+    covisible_share: float = 0.3
+
+    # Per frame. 0 switches off.
+    exposure_rate: float = 0.005  # step of gains and biases per iteration
+    exposure_prior: float = 0.01  # pull to gain 1, bias 0: else the map's brightness may drift
+    rotation_rate_rad: float = 0.0  # step of keyframe poses per iteration
+    translation_rate_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        shares = (self.newest_share, self.covisible_share)
+        if not (min(shares) >= 0 and sum(shares) <= 1):
+            raise ConfigError(f"newest_share and covisible_share {shares} must not exceed 1.")
+        rates = (self.exposure_rate, self.rotation_rate_rad, self.translation_rate_m)
+        if not (min(rates) >= 0 and self.exposure_prior >= 0 and self.needle_weight >= 0):
+            raise ConfigError(f"{self}: rates and weights must not be negative.")
+        if not self.max_needle_ratio >= 1:
+            raise ConfigError(f"max_needle_ratio={self.max_needle_ratio} must be at least 1.")
+
+    @property
+    def refines_poses(self) -> bool:
+        return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Optimised:
+    """views     as given, with the exposures and poses after optimisation
+    taken     per iteration the place in `views` of the one it took
+    losses    per iteration, before its step
+    """
+
+    views: list[View]
+    taken: list[int]
+    losses: list[ImageLoss]
+
+
+class Optimiser:
+    """Moments of everything that is optimised, from one keyframe to the next.
+
+    Deterministic: the same map, views and generator give the same bits for any number of
+    threads. Not for two threads at once.
+    """
+
+    def __init__(self, config: OptimiserConfig | None = None, *, threads: int = 1) -> None:
+        self.config = config or OptimiserConfig()
+        self.threads = threads
+        self._adam = Adam(self.config.adam)
+        self._views = ViewMoments()
+        self._rasteriser = Rasteriser(threads=threads)
+        self._by_planes = np.empty((5, 0, 0), np.float32)
+
+    def optimise(
+        self,
+        gaussians: GaussianMap,
+        views: Sequence[View],
+        iterations: int,
+        rng: np.random.Generator,
+    ) -> Optimised:
+        """Make `iterations` steps, each against one view, the last of which is the newest.
+
+        Changes `gaussians` in place. The pose and the exposure of the first view stay: they fix
+        the place and the brightness of the map.
+        """
+        config = self.config
+        views = list(views)
+        taken = schedule(
+            views,
+            iterations if views else 0,
+            rng,
+            newest_share=config.newest_share,
+            covisible_share=config.covisible_share,
+        )
+        losses = []
+        for i in taken:
+            loss, views[i] = self.step(gaussians, views[i], is_fixed=i == 0)
+            losses.append(loss)
+        return Optimised(views, taken, losses)
+
+    def step(
+        self, gaussians: GaussianMap, view: View, *, is_fixed: bool = False
+    ) -> tuple[ImageLoss, View]:
+        """One iteration against one view; returns it with a new exposure and pose."""
+        config = self.config
+        # how it looks, and what is wrong
+        T_camera_map = se3.inverse(view.T_map_camera)
+        planes = self._rasteriser.render(gaussians.rows, view.camera, T_camera_map)
+        by_planes = self._room_for(planes)
+        loss = image_loss(
+            planes,
+            view.color,
+            view.depth_m,
+            view.exposure,
+            config.loss,
+            by_planes,
+            mask=view.mask,
+            threads=self.threads,
+        )
+        # who is to blame
+        gradients = self._rasteriser.gradients(
+            by_planes, needle_weight=config.needle_weight, needle_ratio=config.max_needle_ratio
+        )
+        # steps
+        self._adam.step(gaussians, gradients, threads=self.threads)
+        if not is_fixed:
+            view = self._exposed(view, loss.by_exposure)
+            view = self._placed(view, gradients.xi)
+        return loss, view
+
+    def _room_for(self, planes: np.ndarray) -> np.ndarray:
+        if self._by_planes.shape != planes.shape:
+            self._by_planes = np.empty_like(planes)
+        return self._by_planes
+
+    def _exposed(self, view: View, by_exposure: np.ndarray) -> View:
+        config = self.config
+        if config.exposure_rate == 0:
+            return view
+        matrix = view.exposure.matrix.astype(float)
+        pull = config.exposure_prior * (matrix - Exposure().matrix)
+        direction = self._views.direction(view.keyframe, "exposure", by_exposure + pull)
+        return replace(view, exposure=Exposure.of(matrix - config.exposure_rate * direction))
+
+    def _placed(self, view: View, by_xi: np.ndarray) -> View:
+        config = self.config
+        if not config.refines_poses:
+            return view
+        rates = np.repeat([config.rotation_rate_rad, config.translation_rate_m], 3)
+        step = -rates * self._views.direction(view.keyframe, "pose", by_xi)
+        T_map_camera = se3.orthonormalised(view.T_map_camera @ se3.exp(step))
+        return replace(view, T_map_camera=T_map_camera)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """A copy of all moments, as named arrays."""
+        return self._adam.snapshot() | self._views.snapshot()
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue as the optimiser of which `state` is the snapshot, exactly."""
+        self._adam.restore(state)
+        self._views.restore(state)

@@ -1,0 +1,45 @@
+"""Which Gaussians the map is better without."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+
+from .model import GaussianMap
+
+
+@dataclass(frozen=True, slots=True)
+class PruningConfig:
+    min_opacity: float = 0.005  # Kerbl et al. 2023, sec. 5.2
+    max_relative_scale: float = 10.0  # longest axis, in means of its neighbourhood (paper, III.A)
+    neighbourhood_m: float = 0.25  # edge of the cubes that are neighbourhoods
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_opacity < 1:
+            raise ConfigError(f"min_opacity={self.min_opacity} must be in [0, 1).")
+        if not (self.max_relative_scale > 1 and self.neighbourhood_m > 0):
+            raise ConfigError(f"{self}: max_relative_scale above 1, neighbourhood_m positive.")
+
+
+def superfluous(gaussians: GaussianMap, config: PruningConfig | None = None) -> np.ndarray:
+    """Mask [N] bool of Gaussians that are nearly transparent, far larger than those around them,
+    or not finite; for `GaussianMap.remove`."""
+    config = config or PruningConfig()
+    longest_m = np.exp(gaussians.log_scales.max(axis=1).astype(float))
+    transparent = gaussians.opacity_logits < np.log(config.min_opacity / (1 - config.min_opacity))
+    finite = np.isfinite(gaussians.rows[:, :14]).all(axis=1)
+    mean_m = _mean_around(gaussians.means, np.where(finite, longest_m, 0), config.neighbourhood_m)
+    return transparent | ~finite | (longest_m > config.max_relative_scale * mean_m)
+
+
+def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.ndarray:
+    """Mean [N] of the values of the other Gaussians in the same cube; infinite for a lone one."""
+    cube = np.floor(np.nan_to_num(means.astype(float)) / edge_m).astype(np.int64)
+    cube -= cube.min(axis=0, initial=0)
+    sizes = cube.max(axis=0, initial=0) + 1
+    key = (cube[:, 0] * sizes[1] + cube[:, 1]) * sizes[2] + cube[:, 2]
+    _, group = np.unique(key, return_inverse=True)
+    others = np.bincount(group)[group] - 1
+    total = np.bincount(group, values)[group] - values
+    return np.where(others > 0, total / np.maximum(others, 1), np.inf)

@@ -1,0 +1,90 @@
+"""Renderings that can be differentiated. The kernel is `kernels/blend_gradient.hpp` and
+`kernels/projection_gradient.hpp`; its judge is the derivative of `render_reference`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera
+from ldo_service.kernels import _rasterise
+
+from .model import aligned_rows
+
+PLANES = 5  # red, green, blue, weighted depth, opacity
+WEIGHT = 14  # field of a row of gradients
+
+
+@dataclass(frozen=True, slots=True)
+class RowGradients:
+    """Derivatives of a scalar L by what was rendered. Views: valid until the next rendering.
+
+    indices  [V] uint32, ascending: the rows that may touch the image
+    rows     [V, 16] float32, dL/drow; field 14 holds the Gaussian's weights summed over the
+             pixels (px), field 15 zero. A Gaussian that is hidden has zeros only.
+    xi       [6] float64, dL/dxi at xi = 0 of T_map_camera exp(xi): rotation rad, translation m
+    """
+
+    indices: np.ndarray
+    rows: np.ndarray
+    xi: np.ndarray
+
+
+class Rasteriser:
+    """Renders one view after the other for the optimiser, and keeps the memory for the next.
+
+    Not for two threads at once. Its images have no median depth; otherwise they are `render`'s.
+    """
+
+    def __init__(self, *, threads: int = 1) -> None:
+        self.threads = threads
+        self._pass = _rasterise.Pass()
+        self._planes = np.empty((PLANES, 0, 0), np.float32)
+        self._rows = aligned_rows(0)
+        self._visible = 0
+        self._indices = np.empty(0, np.uint32)
+        self._gradients = aligned_rows(0)
+
+    def render(self, rows: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
+        """Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity.
+
+        Arguments as those of `render`; the result is overwritten by the next rendering.
+        """
+        if camera.distortion:
+            raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
+        size = (PLANES, camera.height, camera.width)
+        if self._planes.shape != size:
+            self._planes = np.empty(size, np.float32)
+        T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        self._visible = _rasterise.rasterise_planes(
+            self._pass, rows, T, *intrinsics, self._planes, self.threads
+        )
+        self._rows = rows
+        return self._planes
+
+    def gradients(
+        self, by_planes: np.ndarray, *, needle_weight: float = 0.0, needle_ratio: float = 1.0
+    ) -> RowGradients:
+        """Derivatives of L, given dL/dplanes [5, H, W], at the last rendering.
+
+        To L is added needle_weight * mean over pixels of sum_i w_i max(0, log(longest / middle
+        axis of i) - log needle_ratio), with w_i held fixed. The rows must still be as they were
+        rendered. Bitwise equal for any number of threads.
+        """
+        if len(self._indices) < self._visible:
+            self._indices = np.empty(self._visible * 5 // 4, np.uint32)
+            self._gradients = aligned_rows(self._visible * 5 // 4)
+        seen = slice(self._visible)
+        xi = _rasterise.backpropagate(
+            self._pass,
+            self._rows,
+            self._planes,
+            by_planes,
+            self._indices[seen],
+            self._gradients[seen],
+            needle_weight,
+            float(np.log(needle_ratio)),
+            self.threads,
+        )
+        return RowGradients(self._indices[seen], self._gradients[seen], xi)

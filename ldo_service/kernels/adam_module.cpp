@@ -1,0 +1,66 @@
+// Python binding of Adam: checks what comes in, picks the instruction set.
+#include <cmath>
+
+#include "adam.hpp"
+#include "arrays.hpp"
+#include "isa.hpp"
+
+namespace ldo {
+namespace {
+
+decltype(&baseline::adam_step) adam_step_for(Isa isa) {
+#if LDO_X86
+  if (isa == Isa::avx512) return avx512::adam_step;
+  if (isa == Isa::avx2) return avx2::adam_step;
+#endif
+  (void)isa;
+  return baseline::adam_step;
+}
+
+decltype(&baseline::adam_step) chosen = nullptr;  // when the module is imported
+
+void require_indices(const uint32_t* indices, size_t m, size_t n) {
+  for (size_t i = 0; i < m; ++i)
+    require(indices[i] < n && (i == 0 || indices[i - 1] < indices[i]),
+            "indices must ascend and be below the number of rows.");
+}
+
+void adam_step(const WritableArray& rows, const WritableArray& mean, const WritableArray& square,
+               const WritableArray& steps, const Array& indices, const Array& gradients,
+               const Array& rates, float beta1, float beta2, float epsilon, int threads) {
+  require_threads(threads);
+  require(rows.ndim() == 2 && rows.shape(1) == kAdamFloats, "rows must have shape [N, 16].");
+  require(indices.ndim() == 1, "indices must have shape [M].");
+  const size_t n = rows.shape(0), m = indices.shape(0);
+  require_shape(mean, "mean", {n, kAdamFloats});
+  require_shape(square, "square", {n, kAdamFloats});
+  require_shape(steps, "steps", {n});
+  require_shape(gradients, "gradients", {m, kAdamFloats});
+  require_shape(rates, "rates", {kAdamFloats});
+  require(beta1 >= 0 && beta1 < 1 && beta2 >= 0 && beta2 < 1, "beta1, beta2 must be in [0, 1).");
+  require(epsilon > 0, "epsilon must be positive.");
+  const uint32_t* which = values_of<uint32_t>(indices, "indices");
+  require_indices(which, m, n);
+  const AdamRows state{values_of<float>(rows, "rows"), values_of<float>(mean, "mean"),
+                       values_of<float>(square, "square"), values_of<int32_t>(steps, "steps")};
+  const float* by_rows = values_of<float>(gradients, "gradients");
+  AdamRates hyper{{}, beta1, beta2, epsilon};
+  const float* rate = values_of<float>(rates, "rates");
+  for (int j = 0; j < kAdamFloats; ++j) {
+    require(std::isfinite(rate[j]) && rate[j] >= 0, "rates must be finite and not negative.");
+    hyper.rate[j] = rate[j];
+  }
+  nb::gil_scoped_release release;
+  chosen(state, which, by_rows, m, hyper, threads);
+}
+
+}  // namespace
+
+NB_MODULE(_adam, m) {
+  using namespace nb::literals;
+  chosen = adam_step_for(chosen_isa());
+  m.def("adam_step", &adam_step, "rows"_a, "mean"_a, "square"_a, "steps"_a, "indices"_a,
+        "gradients"_a, "rates"_a, "beta1"_a, "beta2"_a, "epsilon"_a, "threads"_a = 1);
+}
+
+}  // namespace ldo

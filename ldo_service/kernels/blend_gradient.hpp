@@ -1,0 +1,172 @@
+// Derivative of the blending of one tile, front to back as the blending itself.
+//
+// With w_i = alpha_i T_i and q_i = dL/dC . c_i + dL/dD z_i + dL/dO, the part of L that a pixel
+// owes to splat i is w_i q_i, and
+//   dL/d ln(alpha_i) = w_i q_i - alpha_i / (1 - alpha_i) sum_{j > i} w_j q_j.
+// The sum over all j is known from the images; what is in front is taken off on the way.
+#pragma once
+#include "blend.hpp"
+
+namespace ldo::LDO_ISA {
+
+// Sums over the pixels of a tile for one splat, with v = dL/d ln(alpha) and d = pixel - (u, v).
+enum SplatSum {
+  kV, kVx, kVy, kVxx, kVxy, kVyy,           // v, v dx, v dy, v dx^2, v dx dy, v dy^2
+  kWeightRed, kWeightGreen, kWeightBlue,    // w dL/dC
+  kWeightDepth,                             // w dL/dD
+  kWeightSum,                               // w
+  kSplatSums,
+};
+constexpr int kSumFloats = 16;  // one cache line
+
+// Sums over columns x of f, f x and f x^2, for x = -1.5, -0.5, 0.5, 1.5.
+struct Moments {
+  Moments(Floats f0, Floats f1, Floats f2, Floats f3) {
+    const Floats outer = f0 + f3, inner = f1 + f2;
+    zeroth = outer + inner;
+    first = (f3 - f0) * 1.5f + (f2 - f1) * 0.5f;
+    second = outer * 2.25f + inner * 0.25f;
+  }
+  Floats zeroth, first, second;
+};
+
+// Sixteen pixels on the way from front to back.
+struct BlockGradient {
+  Floats px, py;              // pixels
+  Floats gradient[kPlanes];   // of L by the images
+  Floats behind;              // sum of w q over the splats that are still to come
+  Floats transmittance = 1.0f;
+
+  // Weights and v of the next splat.
+  [[gnu::always_inline]] inline void differentiate(const Splat& s, Floats& weight, Floats& v) {
+    const Floats log2_alpha = log2_alpha_of(s, px - s.u, py - s.v);
+    const Floats alpha = capped_alpha(log2_alpha);
+    weight = alpha * transmittance;
+    const Floats q =
+        gradient[kRed] * s.color[0] +
+        (gradient[kGreen] * s.color[1] +
+         (gradient[kBlue] * s.color[2] + (gradient[kDepth] * s.z + gradient[kPlaneOpacity])));
+    const Floats own = weight * q;
+    behind = behind - own;
+    v = select(log2_alpha < kLog2MaxAlpha, own - alpha * behind / (Floats(1.0f) - alpha), 0.0f);
+    transmittance = transmittance - weight;
+  }
+};
+
+// Moments of v, by pixel with a lane per splat, about the splats' means (mx, my) as seen from the
+// centre of the block.
+[[gnu::always_inline]] inline void moments_about_mean(const Floats (&v)[kLanes], Floats mx,
+                                                      Floats my, Floats* out) {
+  const Moments r0(v[0], v[1], v[2], v[3]), r1(v[4], v[5], v[6], v[7]),
+      r2(v[8], v[9], v[10], v[11]), r3(v[12], v[13], v[14], v[15]);
+  const Moments by_y(r0.zeroth, r1.zeroth, r2.zeroth, r3.zeroth);
+  const Moments x_by_y(r0.first, r1.first, r2.first, r3.first);
+  const Floats xx = r0.second + r1.second + (r2.second + r3.second);
+  const Floats x = x_by_y.zeroth, y = by_y.first;
+  out[kV] = by_y.zeroth;
+  out[kVx] = x - mx * out[kV];
+  out[kVy] = y - my * out[kV];
+  out[kVxx] = xx - mx * (x + out[kVx]);
+  out[kVxy] = x_by_y.first - my * x - mx * out[kVy];
+  out[kVyy] = by_y.second - my * (y + out[kVy]);
+}
+
+class TileGradient {
+ public:
+  TileGradient(int column, int row, const View& view, const float* planes, const float* gradients)
+      : x_(column * kTile), y_(row * kTile), view_(view), planes_(planes), gradients_(gradients) {}
+
+  // Writes kSumFloats for each of the n splats of the list.
+  void operator()(const Splat* splats, const uint32_t* list, int64_t n, const TileRecord& record,
+                  float* sums) {
+    std::memset(sums, 0, n * kSumFloats * sizeof(float));
+    for (int64_t i = 0; i < n; ++i) __builtin_prefetch(&splats[list[i]]);
+    for (int b = 0; b < kBlocks; ++b)
+      if (record.blended[b] > 0) differentiate_block(b, splats, list, n, record, sums);
+  }
+
+ private:
+  static constexpr int kBatch = 2048;  // splats of the list that are looked at together
+  static constexpr int kFactors = 5;   // what weights are summed with: dL/dC, dL/dD and one
+
+  void differentiate_block(int b, const Splat* splats, const uint32_t* list, int64_t n,
+                           const TileRecord& record, float* sums) {
+    const float x = static_cast<float>(x_ + b % 4 * 4), y = static_cast<float>(y_ + b / 4 * 4);
+    BlockGradient block = open_block(b);
+    int64_t left = record.blended[b];
+    for (int64_t first = 0; left > 0; first += kBatch) {
+      alignas(64) uint32_t places[kBatch + kLanes];
+      const int size = static_cast<int>(std::min<int64_t>(kBatch, n - first));
+      const int64_t found = indices_with_bit(record.touched + first, size, b, places);
+      const int count = static_cast<int>(std::min(left, found));
+      for (int i = 0; i < count; i += kLanes)
+        add_sixteen(block, x + 1.5f, y + 1.5f, splats, list + first, places + i,
+                    std::min(kLanes, count - i), sums + first * kSumFloats);
+      left -= count;
+    }
+  }
+
+  BlockGradient open_block(int b) {
+    const int x = x_ + b % 4 * 4, y = y_ + b / 4 * 4;
+    const int64_t size = static_cast<int64_t>(view_.width) * view_.height;
+    const PixelBlock pixels(x, y, view_);
+    BlockGradient block;
+    block.px = lanes_.x + static_cast<float>(x);
+    block.py = lanes_.y + static_cast<float>(y);
+    block.behind = 0.0f;
+    for (int k = 0; k < kPlanes; ++k) {
+      block.gradient[k] = pixels.load(gradients_ + k * size);
+      block.behind = block.behind + block.gradient[k] * pixels.load(planes_ + k * size);
+    }
+    for (int k = 0; k < kFactors - 1; ++k) block.gradient[k].store(factors_[k]);
+    const Mask inside = (block.px < static_cast<float>(view_.width)) &
+                        (block.py < static_cast<float>(view_.height));
+    select(inside, 1.0f, 0.0f).store(factors_[kFactors - 1]);
+    return block;
+  }
+
+  [[gnu::always_inline]] inline void add_sixteen(BlockGradient& state, float center_x,
+                                                 float center_y, const Splat* splats,
+                                                 const uint32_t* list, const uint32_t* places,
+                                                 int count, float* sums) {
+    Floats weights[kLanes], v[kLanes], out[kLanes];
+    alignas(64) float mean_x[kLanes] = {}, mean_y[kLanes] = {};
+    BlockGradient block = state;  // a copy that nothing else can point to stays in registers
+    for (int i = 0; i < count; ++i) {
+      const Splat& s = splats[list[places[i]]];
+      block.differentiate(s, weights[i], v[i]);
+      mean_x[i] = s.u - center_x;
+      mean_y[i] = s.v - center_y;
+    }
+    state = block;
+    for (int i = count; i < kLanes; ++i) weights[i] = v[i] = 0.0f;
+    transpose(v);
+    moments_about_mean(v, Floats::load(mean_x), Floats::load(mean_y), out);
+    transpose(weights);
+    sum_weights(weights, out + kWeightRed);
+    for (int k = kSplatSums; k < kSumFloats; ++k) out[k] = 0.0f;
+    transpose(out);
+    for (int i = 0; i < count; ++i) {
+      float* row = sums + static_cast<int64_t>(places[i]) * kSumFloats;
+      (Floats::load(row) + out[i]).store(row);
+    }
+  }
+
+  // Weights by pixel, a lane per splat.
+  [[gnu::always_inline]] inline void sum_weights(const Floats (&weights)[kLanes],
+                                                 Floats* out) const {
+    Floats sums[kFactors] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
+#pragma GCC unroll 16
+    for (int pixel = 0; pixel < kLanes; ++pixel)
+      for (int k = 0; k < kFactors; ++k) sums[k] = sums[k] + weights[pixel] * factors_[k][pixel];
+    for (int k = 0; k < kFactors; ++k) out[k] = sums[k];
+  }
+
+  const int x_, y_;
+  const View& view_;
+  const float *planes_, *gradients_;
+  const Lanes lanes_;
+  alignas(64) float factors_[kFactors][kLanes];  // of the open block
+};
+
+}  // namespace ldo::LDO_ISA

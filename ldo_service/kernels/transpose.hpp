@@ -1,0 +1,78 @@
+// A 16x16 matrix of floats turned about its diagonal, in registers.
+#pragma once
+#include <utility>
+
+#include "simd.hpp"
+
+namespace ldo::LDO_ISA {
+
+// The lanes of two registers, of which there are kPerRegister each, in a new order.
+constexpr int kPerRegister = kLanes / kRegisters;
+template <class Pattern, int... Lane>
+FloatRegister shuffle(FloatRegister a, FloatRegister b, std::integer_sequence<int, Lane...>) {
+  return __builtin_shufflevector(a, b, Pattern::source(Lane)...);
+}
+template <class Pattern>
+FloatRegister shuffle(FloatRegister a, FloatRegister b) {
+  return shuffle<Pattern>(a, b, std::make_integer_sequence<int, kPerRegister>());
+}
+
+// In each group of four lanes, a's and b's in turn, pieces of `Width`; from the low or high half.
+template <int Width, bool High>
+struct Interleave {
+  static constexpr int source(int lane) {
+    const int group = lane & ~3, place = lane & 3;
+    const int piece = place / Width, within = place % Width;
+    return group + (High ? 2 : 0) + piece / 2 * Width + within + (piece % 2 ? kPerRegister : 0);
+  }
+};
+
+// Swaps what lies off the diagonal of a 2x2 matrix of pieces of `Width` lanes, rows a and b.
+template <int Width, bool Second>
+struct Swap {
+  static constexpr int source(int lane) {
+    const bool from_b = lane & Width;
+    return (lane & ~Width) + (Second ? Width : 0) + (from_b ? kPerRegister : 0);
+  }
+};
+
+// Swaps the blocks of Width x Width that lie off the diagonals of blocks twice as large.
+template <int Width>
+void transpose_blocks(Floats (&rows)[kLanes]) {
+  for (int i = 0; i < kLanes; ++i) {
+    if (i & Width) continue;
+    Floats &a = rows[i], &b = rows[i + Width];
+    if constexpr (Width < kPerRegister) {
+      each_register([&](int k) {
+        const FloatRegister first = shuffle<Swap<Width, false>>(a.v[k], b.v[k]);
+        b.v[k] = shuffle<Swap<Width, true>>(a.v[k], b.v[k]);
+        a.v[k] = first;
+      });
+    } else {  // whole registers change places
+      constexpr int step = Width / kPerRegister;
+      for (int k = 0; k < kRegisters; ++k)
+        if (!(k & step)) std::swap(a.v[k + step], b.v[k]);
+    }
+  }
+}
+
+// rows[i] lane j <-> rows[j] lane i.
+inline void transpose(Floats (&rows)[kLanes]) {
+  for (int i = 0; i < kLanes; i += 4)  // blocks of 4x4
+    each_register([&](int k) {
+      FloatRegister &a = rows[i].v[k], &b = rows[i + 1].v[k], &c = rows[i + 2].v[k],
+                    &d = rows[i + 3].v[k];
+      const FloatRegister ab0 = shuffle<Interleave<1, false>>(a, b),
+                          ab1 = shuffle<Interleave<1, true>>(a, b),
+                          cd0 = shuffle<Interleave<1, false>>(c, d),
+                          cd1 = shuffle<Interleave<1, true>>(c, d);
+      a = shuffle<Interleave<2, false>>(ab0, cd0);
+      b = shuffle<Interleave<2, true>>(ab0, cd0);
+      c = shuffle<Interleave<2, false>>(ab1, cd1);
+      d = shuffle<Interleave<2, true>>(ab1, cd1);
+    });
+  transpose_blocks<4>(rows);
+  transpose_blocks<8>(rows);
+}
+
+}  // namespace ldo::LDO_ISA
