@@ -37,6 +37,7 @@ class PixelBlock {
         rows_(std::min(4, view.height - y)) {}
 
   Floats load(const float* plane) const {  // zero outside
+    if (columns_ == 4 && rows_ == 4) return Floats::load_rows(plane + first_, stride_);
     alignas(64) float pixels[kLanes] = {};
     each_row([&](int row, auto columns) {
       std::memcpy(pixels + 4 * row, plane + first_ + row * stride_, columns * sizeof(float));

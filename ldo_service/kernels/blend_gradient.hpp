@@ -48,7 +48,8 @@ struct BlockGradient {
          (gradient[kBlue] * s.color[2] + (gradient[kDepth] * s.z + gradient[kPlaneOpacity])));
     const Floats own = weight * q;
     behind = behind - own;
-    v = select(log2_alpha < kLog2MaxAlpha, own - alpha * behind / (Floats(1.0f) - alpha), 0.0f);
+    v = select(log2_alpha < kLog2MaxAlpha, own - alpha * behind * reciprocal(Floats(1.0f) - alpha),
+               0.0f);
     transmittance = transmittance - weight;
   }
 };
@@ -106,7 +107,7 @@ class TileGradient {
     }
   }
 
-  BlockGradient open_block(int b) {
+  [[gnu::always_inline]] inline BlockGradient open_block(int b) {
     const int x = x_ + b % 4 * 4, y = y_ + b / 4 * 4;
     const int64_t size = static_cast<int64_t>(view_.width) * view_.height;
     const PixelBlock pixels(x, y, view_);
@@ -125,20 +126,18 @@ class TileGradient {
     return block;
   }
 
-  [[gnu::always_inline]] inline void add_sixteen(BlockGradient& state, float center_x,
+  [[gnu::always_inline]] inline void add_sixteen(BlockGradient& block, float center_x,
                                                  float center_y, const Splat* splats,
                                                  const uint32_t* list, const uint32_t* places,
                                                  int count, float* sums) {
     Floats weights[kLanes], v[kLanes], out[kLanes];
     alignas(64) float mean_x[kLanes] = {}, mean_y[kLanes] = {};
-    BlockGradient block = state;  // a copy that nothing else can point to stays in registers
     for (int i = 0; i < count; ++i) {
       const Splat& s = splats[list[places[i]]];
       block.differentiate(s, weights[i], v[i]);
       mean_x[i] = s.u - center_x;
       mean_y[i] = s.v - center_y;
     }
-    state = block;
     for (int i = count; i < kLanes; ++i) weights[i] = v[i] = 0.0f;
     transpose(v);
     moments_about_mean(v, Floats::load(mean_x), Floats::load(mean_y), out);

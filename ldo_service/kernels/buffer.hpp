@@ -1,11 +1,30 @@
 // Uninitialised memory for scratch, aligned to a cache line and freed with its scope.
 #pragma once
 #include <cstddef>
+#include <cstdlib>
 #include <memory>
 #include <new>
 #include <type_traits>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 namespace ldo::LDO_ISA {
+
+constexpr size_t kCacheLine = 64, kHugePage = size_t{1} << 21;
+
+// Large blocks get huge pages where the system has them: what is read in random order then misses
+// the cache only, and not the page table as well.
+inline void* allocate(size_t bytes) {
+  const size_t alignment = bytes < kHugePage ? kCacheLine : kHugePage;
+  const size_t size = (bytes + alignment - 1) / alignment * alignment;
+  void* memory = std::aligned_alloc(alignment, size);
+  if (memory == nullptr && size > 0) throw std::bad_alloc();
+#if defined(__linux__)
+  if (alignment == kHugePage) madvise(memory, size, MADV_HUGEPAGE);  // advice: may fail
+#endif
+  return memory;
+}
 
 template <class T>
 class Buffer {
@@ -22,7 +41,7 @@ class Buffer {
     if (size <= capacity_) return;
     data_.reset();
     capacity_ = capacity_ == 0 ? size : size + size / 4;
-    data_.reset(static_cast<T*>(::operator new(capacity_ * sizeof(T), kAlignment)));
+    data_.reset(static_cast<T*>(allocate(capacity_ * sizeof(T))));
   }
 
   T* data() { return data_.get(); }
@@ -32,9 +51,8 @@ class Buffer {
   const T& operator[](size_t i) const { return data_[i]; }
 
  private:
-  static constexpr std::align_val_t kAlignment{64};
   struct Free {
-    void operator()(T* p) const { ::operator delete(p, kAlignment); }
+    void operator()(T* p) const { std::free(p); }
   };
   std::unique_ptr<T[], Free> data_;
   size_t size_ = 0, capacity_ = 0;

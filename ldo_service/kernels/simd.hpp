@@ -52,6 +52,32 @@ struct Floats {
     return out;
   }
   void store(float* p) const { std::memcpy(p, v, sizeof v); }
+
+  // Four lanes from each of four rows that lie `stride` floats apart.
+  static Floats load_rows(const float* p, int64_t stride) {
+#if defined(__AVX512F__)
+    const auto row = [&](int i) { return _mm_loadu_ps(p + i * stride); };
+    const __m512 two = _mm512_insertf32x4(_mm512_castps128_ps512(row(0)), row(1), 1);
+    return of(_mm512_insertf32x4(_mm512_insertf32x4(two, row(2), 2), row(3), 3));
+#elif defined(__AVX2__)
+    const auto row = [&](int i) { return _mm_loadu_ps(p + i * stride); };
+    return of(_mm256_insertf128_ps(_mm256_castps128_ps256(row(0)), row(1), 1),
+              _mm256_insertf128_ps(_mm256_castps128_ps256(row(2)), row(3), 1));
+#else
+    Floats out;
+    for (int i = 0; i < 4; ++i) std::memcpy(&out.v[i], p + i * stride, sizeof out.v[i]);
+    return out;
+#endif
+  }
+
+ private:
+  template <class... Registers>
+  static Floats of(Registers... registers) {
+    Floats out;
+    int k = 0;
+    ((out.v[k++] = registers), ...);
+    return out;
+  }
 };
 
 #define LDO_OPERATOR(Result, op)                                \
@@ -204,6 +230,18 @@ inline float sum(Floats x) {
   for (int half = kLanes / 2; half > 0; half /= 2)
     for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
   return lanes[0];
+}
+
+// 1 / x for normal x, relative error below 1e-6.
+inline Floats reciprocal(Floats x) {
+#if defined(__AVX512F__)
+  Floats out;
+  const __m512 guess = _mm512_rcp14_ps(x.v[0]);
+  out.v[0] = guess * (2.0f - x.v[0] * guess);
+  return out;
+#else  // the narrower guess differs between makers of processors
+  return Floats(1.0f) / x;
+#endif
 }
 
 inline Floats abs(Floats x) { return max(x, Floats(0.0f) - x); }

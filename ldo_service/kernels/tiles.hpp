@@ -130,6 +130,7 @@ inline void write_pairs(const VisibleSplats& visible, int64_t begin, int64_t end
   const int columns = out.columns;
   Keyed* pair = &out.pairs[from];
   for (int64_t i = begin; i < end; ++i) {
+    __builtin_prefetch(&visible.tiles[visible.depths[std::min(i + kPrefetchAhead, end - 1)].value]);
     const uint32_t splat = visible.depths[i].value;
     out.first[splat] = static_cast<uint32_t>(pair - out.pairs.data());
     const TileRange& range = visible.tiles[splat];

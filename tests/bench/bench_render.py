@@ -179,15 +179,17 @@ def prototype(
     return {"render": render, "forward": forward, "loss": loss, "backward": backward}
 
 
-def medians_ms(runs: list[Steps], repeats: int) -> list[dict[str, float]]:
+def medians_ms(
+    runs: list[Steps], repeats: int, clock: Callable[[], float]
+) -> list[dict[str, float]]:
     """Of each step, run in turns, after one turn to warm up."""
     times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
     for _ in range(repeats + 1):
         for steps, lists in zip(runs, times, strict=True):
             for name, step in steps.items():
-                start = time.perf_counter()
+                start = clock()
                 step()
-                lists[name].append(time.perf_counter() - start)
+                lists[name].append(clock() - start)
     out = []
     for lists in times:
         whole = sum(np.array(lists[name][1:]) for name in lists if name != "render")
@@ -200,7 +202,8 @@ def check_agreement(mine: Steps, theirs: Steps) -> None:
     """Leave if the two compute something else: then the times mean nothing."""
     for name, tolerance in (("render", 1e-3), ("forward", 2e-3), ("loss", 1e-8)):
         a, b = mine[name](), theirs[name]()
-        assert isinstance(a, np.ndarray) and isinstance(b, np.ndarray)
+        assert isinstance(a, np.ndarray)
+        assert isinstance(b, np.ndarray)
         if name == "forward":  # the prototype's last plane is the transmittance
             a, b = a[:4], b[:4]
         if name == "loss":  # its depth loss counts the pixels without depth
@@ -221,9 +224,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many of the scenes")
+    parser.add_argument("--cpu", action="store_true", help="CPU time, for a busy machine")
     parser.add_argument("--json", action="store_true", help="one line of JSON per scene")
     arguments = parser.parse_args()
     isa, threads = _rasterise.isa(), arguments.threads
+    clock = time.process_time if arguments.cpu else time.perf_counter
     if not arguments.json:
         print(f"isa {isa}, {threads} thread(s), median of {arguments.repeats}")
         print(
@@ -237,7 +242,7 @@ def main() -> None:
             if library is not None:
                 runs.append(prototype(library, rows, width, height, threads))
                 check_agreement(*runs)
-            mine, *theirs = medians_ms(runs, arguments.repeats)
+            mine, *theirs = medians_ms(runs, arguments.repeats, clock)
             if arguments.json:
                 facts = {"gaussians": n, "width": width, "height": height, "isa": isa}
                 times = {f"{name}_ms": time_ms for name, time_ms in mine.items()}
