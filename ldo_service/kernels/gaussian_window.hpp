@@ -4,7 +4,7 @@
 
 namespace ldo::LDO_ISA {
 
-constexpr int kReach = 5;               // taps on each side of the middle one
+constexpr int kReach = 5;  // taps on each side of the middle one
 constexpr int kTaps = 2 * kReach + 1;
 // exp(-k^2 / (2 1.5^2)) / sum, for k = 0 .. 5
 constexpr float kTap[kReach + 1] = {0.26601171f, 0.21300553f, 0.10936069f,
@@ -19,31 +19,39 @@ template <class At>
   return sum;
 }
 
-// A row with room for what windows and whole vectors read beyond its ends: zeros.
-class PaddedRow {
- public:
-  static size_t floats(int width) { return (width + 2 * kLanes + kLanes - 1) / kLanes * kLanes; }
-  PaddedRow(float* memory, int width) : first_(memory + kLanes) {
-    std::memset(memory, 0, floats(width) * sizeof(float));
-  }
-  float* first() const { return first_; }
+// Columns of an image that are worked on together, and as many more on each side as windows of
+// windows read, in whole vectors. A constant, so that rows lie at known distances.
+constexpr int kMargin = kLanes;
+constexpr int kStrip = 224;
+constexpr int kColumns = kStrip + 2 * kMargin;
+static_assert(kMargin >= 2 * kReach && kStrip % kLanes == 0);
 
- private:
-  float* first_;
-};
-
-// The last eleven rows of an image, found by their row number, which may be negative.
+// The last rows of a few images of one strip, found by their row number, which may be negative.
+template <int Images>
 class RowRing {
  public:
-  static size_t floats(int width) { return kTaps * stride(width); }
-  RowRing() = default;
-  RowRing(float* memory, int width) : memory_(memory), stride_(stride(width)) {}
-  float* row(int y) const { return memory_ + (y + kTaps) % kTaps * stride_; }
+  float* row(int y, int image) { return rows_[(y + kTaps) % kTaps][image]; }
+
+  void clear(int y) { std::memset(rows_[(y + kTaps) % kTaps], 0, sizeof rows_[0]); }
+
+  // The rows about y, to be windowed downwards.
+  class Around {
+   public:
+    Around(RowRing& ring, int y) {
+      for (int k = 0; k < kTaps; ++k) row_[k] = ring.row(y + k - kReach, 0);
+    }
+    Floats operator()(int image, int column) const {
+      return window([&](int k) {
+        return Floats::load(row_[kReach + k] + image * kColumns + column);
+      });
+    }
+
+   private:
+    const float* row_[kTaps];
+  };
 
  private:
-  static size_t stride(int width) { return (width + kLanes - 1) / kLanes * kLanes; }
-  float* memory_ = nullptr;
-  size_t stride_ = 0;
+  alignas(64) float rows_[kTaps][Images][kColumns];
 };
 
 }  // namespace ldo::LDO_ISA

@@ -5,6 +5,7 @@
 // SSIM by three of them, which the same window carries back to the pixels.
 #include "loss.hpp"
 
+#include <algorithm>
 #include <cmath>
 
 #include "buffer.hpp"
@@ -15,260 +16,261 @@ namespace ldo::LDO_ISA {
 namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // of SSIM, for values in 0..1
-constexpr int kBandRows = 120;  // of one job; more lose less at the seams, fewer share better
-
-struct RowSums {  // of one channel of one row
-  float l1 = 0, ssim = 0, squares = 0, gain = 0, bias = 0;
-};
+constexpr int kBand = 240;  // rows of one job; more lose less at the seams, fewer share better
 
 inline Floats sign(Floats x) {
   return select(x < 0.0f, -1.0f, select(Floats(0.0f) < x, 1.0f, 0.0f));
 }
 
-// f(x) for the first pixel of each vector of a row; the last may reach beyond its end.
-template <class F>
-void each_vector(int width, F f) {
-  for (int x = 0; x < width; x += kLanes) f(x);
-}
+struct RowSums {  // of one channel of one row of a strip
+  float l1 = 0, ssim = 0, squares = 0, gain = 0, bias = 0;
+};
 
-class ChannelBand {
+struct Part {  // of the image: what one job works on
+  int channel, left, right, top, bottom;
+};
+
+// One part of the image; `sums` has one entry for each of its rows.
+class PartLoss {
  public:
-  ChannelBand(const LossInput& in, int channel, int first_row, int end_row, LossOutput& out,
-              RowSums* sums)
+  PartLoss(const LossInput& in, const Part& part, float* gradients, RowSums* sums)
       : in_(in),
-        first_(first_row),
-        end_(end_row),
-        size_(static_cast<int64_t>(in.width) * in.height),
-        rendered_(in.planes + channel * size_),
-        target_(in.color + channel * size_),
-        gradients_(out.gradients + channel * size_),
-        gain_(in.exposure[channel]),
-        bias_(in.exposure[3 + channel]),
-        sums_(sums),
-        memory_(5 * PaddedRow::floats(in.width) + 7 * RowRing::floats(in.width)) {
-    float* next = memory_.data();
-    for (float*& row : padded_) {
-      row = PaddedRow(next, in.width).first();
-      next += PaddedRow::floats(in.width);
-    }
-    for (RowRing& ring : rings_) {
-      ring = RowRing(next, in.width);
-      next += RowRing::floats(in.width);
-    }
+        part_(part),
+        first_column_(part.left - kMargin),
+        end_((part.right - part.left + kLanes - 1) / kLanes * kLanes + kMargin),
+        rendered_(in.planes + part.channel * size()),
+        target_(in.color + part.channel * size()),
+        gradients_(gradients + part.channel * size()),
+        gain_(in.exposure[part.channel]),
+        bias_(in.exposure[3 + part.channel]),
+        sums_(sums) {
+    std::memset(pixels_, 0, sizeof pixels_);
   }
 
   void run() {
-    for (int y = first_ - 2 * kReach; y < end_ + 2 * kReach; ++y) {
+    for (int y = part_.top - 2 * kReach; y < part_.bottom + 2 * kReach; ++y) {
       push_means(y);
-      if (y >= first_) push_derivatives(y - kReach);
-      if (y >= first_ + 2 * kReach) finish(y - 2 * kReach);
+      if (y >= part_.top) push_derivatives(y - kReach);
+      if (y >= part_.top + 2 * kReach) finish(y - 2 * kReach);
     }
   }
 
  private:
-  enum { kX, kY, kSquares, kProduct, kDx, kDSquares, kDProduct };  // rings
-  bool is_inside(int y) const { return y >= 0 && y < in_.height; }
+  enum Mean { kX, kY, kSquares, kProduct, kMeans };
+  enum Derivative { kByX, kBySquares, kByProduct, kDerivatives };
 
-  // x and y of a row of pixels, exposure and mask applied, zero beyond its end.
-  void load(int row, float* x, float* y) const {
-    const int64_t at = static_cast<int64_t>(row) * in_.width;
-    for (int i = 0; i < in_.width; ++i) {
+  int64_t size() const { return static_cast<int64_t>(in_.width) * in_.height; }
+  bool is_inside(int y) const { return y >= 0 && y < in_.height; }
+  float* pixels(int image) { return pixels_[image] + kLanes; }
+
+  // f(column) for the first column of each vector in [begin, end).
+  template <class F>
+  static void each_vector(int begin, int end, F f) {
+    for (int i = begin; i < end; i += kLanes) f(i);
+  }
+
+  // x and y of a row of pixels, exposure and mask applied; zero outside the image.
+  void load(int row) {
+    const int begin = std::max(0, -first_column_),
+              end = std::min(end_ + kMargin, in_.width - first_column_);
+    const int64_t at = static_cast<int64_t>(row) * in_.width + first_column_;
+    float *x = pixels(kX), *y = pixels(kY);
+    for (int i = begin; i < end; ++i) {
       x[i] = gain_ * rendered_[at + i] + bias_;
       y[i] = static_cast<float>(target_[at + i]) * (1.0f / 255.0f);
     }
+    std::fill(x + end, x + kColumns, 0.0f);
     if (in_.mask == nullptr) return;
-    for (int i = 0; i < in_.width; ++i)
+    for (int i = begin; i < end; ++i)
       if (in_.mask[at + i] == 0) x[i] = y[i] = 0.0f;
   }
 
-  void across(const float* padded, float* out) const {
-    each_vector(in_.width, [&](int i) {
-      window([&](int k) { return Floats::load(padded + i + k); }).store(out + i);
+  void push_means(int row) {
+    if (!is_inside(row)) return means_.clear(row);
+    load(row);
+    const float *x = pixels(kX), *y = pixels(kY);
+    each_vector(0, end_ + kMargin, [&](int i) {
+      const Floats a = Floats::load(x + i), b = Floats::load(y + i);
+      (a * a + b * b).store(pixels(kSquares) + i);
+      (a * b).store(pixels(kProduct) + i);
     });
+    for (int image = 0; image < kMeans; ++image)
+      across(pixels(image), means_.row(row, image), 0, end_ + kMargin);
   }
 
-  void push_means(int row) {
-    if (!is_inside(row)) return clear(row, kX, kProduct);
-    float *x = padded_[0], *y = padded_[1], *squares = padded_[2], *product = padded_[3];
-    load(row, x, y);
-    each_vector(in_.width, [&](int i) {
-      const Floats a = Floats::load(x + i), b = Floats::load(y + i);
-      (a * a + b * b).store(squares + i);
-      (a * b).store(product + i);
+  static void across(const float* from, float* to, int begin, int end) {
+    each_vector(begin, end, [&](int i) {
+      window([&](int k) { return Floats::load(from + i + k); }).store(to + i);
     });
-    for (int k = 0; k < 4; ++k) across(padded_[k], rings_[kX + k].row(row));
   }
 
   void push_derivatives(int row) {
-    if (!is_inside(row)) return clear(row, kDx, kDProduct);
+    if (!is_inside(row)) return derivatives_.clear(row);
+    const RowRing<kMeans>::Around mean(means_, row);
     Floats sum = 0.0f;
-    const Floats lanes = lane_numbers();
-    Rows means[4];
-    for (int k = 0; k < 4; ++k) means[k] = rows_about(rings_[kX + k], row);
-    each_vector(in_.width, [&](int i) {
-      const Floats mx = down(means[kX], i), my = down(means[kY], i);
-      const Floats covariance = down(means[kProduct], i) - mx * my;
-      const Floats squares = mx * mx + my * my, variances = down(means[kSquares], i) - squares;
+    each_vector(0, end_ + kMargin, [&](int i) {
+      const Floats mx = mean(kX, i), my = mean(kY, i);
+      const Floats covariance = mean(kProduct, i) - mx * my;
+      const Floats squares = mx * mx + my * my, variances = mean(kSquares, i) - squares;
       const Floats a1 = mx * my * 2.0f + kC1, a2 = covariance * 2.0f + kC2;
       const Floats b1 = squares + kC1, b2 = variances + kC2;
-      const Floats inverse = Floats(1.0f) / (b1 * b2);
-      const Floats ssim = a1 * a2 * inverse, by_b1 = ssim * inverse * b2,
-                   by_b2 = ssim * inverse * b1;
+      const Floats inverse = reciprocal(b1 * b2);
+      const Floats ssim = a1 * a2 * inverse;
+      const Floats by_b1 = ssim * inverse * b2, by_b2 = ssim * inverse * b1;
       const Floats by_product = a1 * inverse * 2.0f;
       const Floats by_x = my * (a2 * inverse * 2.0f - by_product) - mx * (by_b1 - by_b2) * 2.0f;
-      const Mask inside = lanes < static_cast<float>(in_.width - i);
-      sum = sum + select(inside, ssim, 0.0f);
-      select(inside, by_x, 0.0f).store(padded_[0] + i);
-      select(inside, Floats(0.0f) - by_b2, 0.0f).store(padded_[2] + i);
-      select(inside, by_product, 0.0f).store(padded_[3] + i);
+      const Mask in_image = is_between(i, 0, in_.width);
+      select(in_image, by_x, 0.0f).store(pixels(kByX) + i);
+      select(in_image, Floats(0.0f) - by_b2, 0.0f).store(pixels(kBySquares) + i);
+      select(in_image, by_product, 0.0f).store(pixels(kByProduct) + i);
+      if (i >= kMargin && i < end_)
+        sum = sum + select(is_between(i, part_.left, part_.right), ssim, 0.0f);
     });
-    if (row >= first_ && row < end_) sums_[row].ssim = LDO_ISA::sum(sum);
-    across(padded_[0], rings_[kDx].row(row));
-    across(padded_[2], rings_[kDSquares].row(row));
-    across(padded_[3], rings_[kDProduct].row(row));
+    if (row >= part_.top && row < part_.bottom) sums_[row].ssim = LDO_ISA::sum(sum);
+    for (int image = 0; image < kDerivatives; ++image)
+      across(pixels(image), derivatives_.row(row, image), kMargin, end_);
+  }
+
+  // Lanes of the vector at a column that show columns [left, right) of the image.
+  Mask is_between(int column, int left, int right) const {
+    const Floats x = lanes_ + static_cast<float>(first_column_ + column);
+    return (x >= static_cast<float>(left)) & (x < static_cast<float>(right));
   }
 
   // L1 and all derivatives of a row whose SSIM windows are complete.
   void finish(int row) {
-    float *x = padded_[0], *y = padded_[1], *out = padded_[4];
-    load(row, x, y);
-    const float per_value = 1.0f / (3.0f * static_cast<float>(size_));
+    load(row);
+    const RowRing<kDerivatives>::Around derivative(derivatives_, row);
+    const float per_value = 1.0f / (3.0f * static_cast<float>(size()));
     const float l1 = in_.weights.l1 * per_value, d_ssim = -in_.weights.d_ssim * per_value;
     Floats absolute = 0.0f, squares = 0.0f;
-    const Rows dx = rows_about(rings_[kDx], row), ds = rows_about(rings_[kDSquares], row),
-               dp = rows_about(rings_[kDProduct], row);
-    each_vector(in_.width, [&](int i) {
-      const Floats a = Floats::load(x + i), b = Floats::load(y + i), difference = a - b;
+    each_vector(kMargin, end_, [&](int i) {
+      const Floats x = Floats::load(pixels(kX) + i), y = Floats::load(pixels(kY) + i);
+      const Mask here = is_between(i, part_.left, part_.right);
+      const Floats difference = select(here, x - y, 0.0f);
       absolute = absolute + abs(difference);
       squares = squares + difference * difference;
-      const Floats ssim = down(dx, i) + a * 2.0f * down(ds, i) + b * down(dp, i);
-      (sign(difference) * l1 + ssim * d_ssim).store(out + i);
+      const Floats by_ssim =
+          derivative(kByX, i) + x * 2.0f * derivative(kBySquares, i) + y * derivative(kByProduct, i);
+      (sign(difference) * l1 + by_ssim * d_ssim).store(pixels(kProduct) + i);
     });
-    store_gradients(row, out);
-    RowSums& sums = sums_[row];
-    sums.l1 = LDO_ISA::sum(absolute);
-    sums.squares = LDO_ISA::sum(squares);
+    sums_[row].l1 = LDO_ISA::sum(absolute);
+    sums_[row].squares = LDO_ISA::sum(squares);
+    store_gradients(row, pixels(kProduct));
   }
 
   void store_gradients(int row, float* by_exposed) {
-    const int64_t at = static_cast<int64_t>(row) * in_.width;
+    const int64_t at = static_cast<int64_t>(row) * in_.width + first_column_;
+    const int end = part_.right - first_column_;
     if (in_.mask != nullptr)
-      for (int i = 0; i < in_.width; ++i)
+      for (int i = kMargin; i < end; ++i)
         if (in_.mask[at + i] == 0) by_exposed[i] = 0.0f;
     Floats gain = 0.0f, bias = 0.0f;
-    std::memset(by_exposed + in_.width, 0, kLanes * sizeof(float));
-    int i = 0;
-    for (; i + kLanes <= in_.width; i += kLanes) {
+    int i = kMargin;
+    for (; i + kLanes <= end; i += kLanes) {
       const Floats g = Floats::load(by_exposed + i);
       gain = gain + g * Floats::load(rendered_ + at + i);
       bias = bias + g;
       (g * gain_).store(gradients_ + at + i);
     }
-    RowSums& sums = sums_[row];
-    sums.gain = LDO_ISA::sum(gain);
-    sums.bias = LDO_ISA::sum(bias);
-    for (; i < in_.width; ++i) {
-      sums.gain += by_exposed[i] * rendered_[at + i];
-      sums.bias += by_exposed[i];
+    sums_[row].gain = LDO_ISA::sum(gain);
+    sums_[row].bias = LDO_ISA::sum(bias);
+    for (; i < end; ++i) {
+      sums_[row].gain += by_exposed[i] * rendered_[at + i];
+      sums_[row].bias += by_exposed[i];
       gradients_[at + i] = by_exposed[i] * gain_;
     }
   }
 
-  struct Rows {  // eleven about one, of which the middle is [kReach]
-    const float* row[kTaps];
-  };
-  static Rows rows_about(const RowRing& ring, int row) {
-    Rows out;
-    for (int k = 0; k < kTaps; ++k) out.row[k] = ring.row(row + k - kReach);
-    return out;
-  }
-  static Floats down(const Rows& rows, int i) {
-    return window([&](int k) { return Floats::load(rows.row[kReach + k] + i); });
-  }
-  static Floats lane_numbers() {
-    alignas(64) float numbers[kLanes];
-    for (int i = 0; i < kLanes; ++i) numbers[i] = static_cast<float>(i);
-    return Floats::load(numbers);
-  }
-  void clear(int row, int first, int last) {
-    for (int k = first; k <= last; ++k)
-      std::memset(rings_[k].row(row), 0, in_.width * sizeof(float));
-  }
-
   const LossInput& in_;
-  const int first_, end_;
-  const int64_t size_;
+  const Part part_;
+  const int first_column_;  // of the image, where column 0 of the rows below lies
+  const int end_;           // column behind the last vector with pixels of this part
   const float* rendered_;
   const uint8_t* target_;
   float* gradients_;
   const float gain_, bias_;
   RowSums* sums_;
-  Buffer<float> memory_;
-  float* padded_[5];
-  RowRing rings_[7];
+  const Floats lanes_ = Floats::ramp();
+  alignas(64) float pixels_[kMeans][kColumns + 2 * kLanes];  // one row, zeros on both sides
+  RowRing<kMeans> means_;
+  RowRing<kDerivatives> derivatives_;
 };
 
 struct DepthSums {  // of one row
-  float absolute = 0;
-  int64_t count = 0;
+  float absolute = 0, count = 0;
 };
 
-bool counts(const LossInput& in, int64_t pixel) {
-  return in.depth[pixel] > 0.0f && (in.mask == nullptr || in.mask[pixel] != 0);
+// The depths that count, sixteen at a time; zero: not measured, or masked.
+template <class F>
+void each_depth(const LossInput& in, int64_t row, F f) {
+  const int64_t begin = row * in.width;
+  for (int i = 0; i < in.width; i += kLanes) {
+    const int n = std::min(kLanes, in.width - i);
+    alignas(64) float depth[kLanes] = {};
+    std::memcpy(depth, in.depth + begin + i, n * sizeof(float));
+    for (int k = 0; in.mask != nullptr && k < n; ++k)
+      if (in.mask[begin + i + k] == 0) depth[k] = 0.0f;
+    f(begin + i, n, Floats::load(depth));
+  }
 }
 
-// The depths that were measured, row by row; a derivative needs their number first.
+// The derivative needs the number of depths that count, so that is found first.
 void depth_loss(const LossInput& in, int threads, LossOutput& out) {
   Buffer<DepthSums> rows(in.height);
   const int64_t size = static_cast<int64_t>(in.width) * in.height;
   const float* rendered = in.planes + 3 * size;
   float *by_depth = out.gradients + 3 * size, *by_opacity = out.gradients + 4 * size;
   parallel_for(in.height, threads, [&](int64_t y) {
-    DepthSums sums;
-    for (int64_t i = y * in.width; i < (y + 1) * in.width; ++i) sums.count += counts(in, i);
-    rows[y] = sums;
+    Floats count = 0.0f;
+    each_depth(in, y, [&](int64_t, int, Floats depth) {
+      count = count + select(Floats(0.0f) < depth, 1.0f, 0.0f);
+    });
+    rows[y].count = sum(count);
   });
-  int64_t count = 0;
+  double count = 0;
   for (int y = 0; y < in.height; ++y) count += rows[y].count;
   const float step = count > 0 ? in.weights.depth / static_cast<float>(count) : 0.0f;
   parallel_for(in.height, threads, [&](int64_t y) {
-    float absolute = 0.0f;
-    for (int64_t i = y * in.width; i < (y + 1) * in.width; ++i) {
-      const float difference = counts(in, i) ? rendered[i] - in.depth[i] : 0.0f;
-      absolute += std::fabs(difference);
-      by_depth[i] = difference > 0.0f ? step : difference < 0.0f ? -step : 0.0f;
-      by_opacity[i] = 0.0f;
-    }
-    rows[y].absolute = absolute;
+    Floats absolute = 0.0f;
+    each_depth(in, y, [&](int64_t pixel, int n, Floats depth) {
+      const Floats error = Floats::load_first(rendered + pixel, n) - depth;
+      const Floats difference = select(Floats(0.0f) < depth, error, 0.0f);
+      absolute = absolute + abs(difference);
+      (sign(difference) * step).store_first(by_depth + pixel, n);
+      Floats(0.0f).store_first(by_opacity + pixel, n);
+    });
+    rows[y].absolute = sum(absolute);
   });
   out.depth = 0.0;
   for (int y = 0; y < in.height; ++y) out.depth += rows[y].absolute;
-  if (count > 0) out.depth /= static_cast<double>(count);
+  if (count > 0) out.depth /= count;
 }
 
 }  // namespace
 
 void image_loss(const LossInput& in, int threads, LossOutput& out) {
-  Buffer<RowSums> rows(3 * static_cast<size_t>(in.height));
-  const int bands = (in.height + kBandRows - 1) / kBandRows;
-  parallel_for(3 * bands, threads, [&](int64_t job) {
-    const int channel = static_cast<int>(job / bands), band = static_cast<int>(job % bands);
-    const int first = band * kBandRows, end = std::min(in.height, first + kBandRows);
-    ChannelBand(in, channel, first, end, out, &rows[static_cast<size_t>(channel) * in.height])
-        .run();
+  const int bands = (in.height + kBand - 1) / kBand, strips = (in.width + kStrip - 1) / kStrip;
+  Buffer<RowSums> sums(static_cast<size_t>(3) * strips * in.height);
+  parallel_for(3 * bands * strips, threads, [&](int64_t job) {
+    const int column = static_cast<int>(job / bands), band = static_cast<int>(job % bands);
+    const int channel = column / strips, left = column % strips * kStrip, top = band * kBand;
+    const Part part{channel, left, std::min(in.width, left + kStrip), top,
+                    std::min(in.height, top + kBand)};
+    PartLoss(in, part, out.gradients, &sums[static_cast<size_t>(column) * in.height]).run();
   });
   const double values = 3.0 * in.width * in.height;
   double ssim = 0.0;
   out.l1 = out.squared_error = 0.0;
   std::fill(out.exposure, out.exposure + 6, 0.0);
-  for (int channel = 0; channel < 3; ++channel)
+  for (int column = 0; column < 3 * strips; ++column)
     for (int y = 0; y < in.height; ++y) {
-      const RowSums& sums = rows[static_cast<size_t>(channel) * in.height + y];
-      out.l1 += sums.l1 / values;
-      ssim += sums.ssim / values;
-      out.squared_error += sums.squares / values;
-      out.exposure[channel] += sums.gain;
-      out.exposure[3 + channel] += sums.bias;
+      const RowSums& row = sums[static_cast<size_t>(column) * in.height + y];
+      out.l1 += row.l1 / values;
+      ssim += row.ssim / values;
+      out.squared_error += row.squares / values;
+      out.exposure[column / strips] += row.gain;
+      out.exposure[3 + column / strips] += row.bias;
     }
   out.d_ssim = 1.0 - ssim;
   depth_loss(in, threads, out);

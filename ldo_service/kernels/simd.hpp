@@ -53,6 +53,24 @@ struct Floats {
   }
   void store(float* p) const { std::memcpy(p, v, sizeof v); }
 
+  static Floats load_first(const float* p, int n) {  // the others are zero
+    if (n == kLanes) return load(p);
+    alignas(64) float lanes[kLanes] = {};
+    std::memcpy(lanes, p, n * sizeof(float));
+    return load(lanes);
+  }
+  void store_first(float* p, int n) const {
+    if (n == kLanes) return store(p);
+    alignas(64) float lanes[kLanes];
+    store(lanes);
+    std::memcpy(p, lanes, n * sizeof(float));
+  }
+  static Floats ramp() {  // 0, 1, 2, ...
+    alignas(64) float lanes[kLanes];
+    for (int i = 0; i < kLanes; ++i) lanes[i] = static_cast<float>(i);
+    return load(lanes);
+  }
+
   // Four lanes from each of four rows that lie `stride` floats apart.
   static Floats load_rows(const float* p, int64_t stride) {
 #if defined(__AVX512F__)
