@@ -13,6 +13,10 @@ struct RecordedPass final : Pass {
   Buffer<uint32_t> blended;  // [tiles, kBlocks] splats
   Buffer<float> sums;        // [lists.splats, kSumFloats]
 
+  int64_t size_of_tile(int64_t tile) const {
+    const bool exists = tile < static_cast<int64_t>(lists.columns) * lists.rows;
+    return exists ? lists.start[tile + 1] - lists.start[tile] : 0;
+  }
   TileRecord record(int64_t tile) {
     return {touched.data() + lists.start[tile], blended.data() + tile * kBlocks};
   }
@@ -114,7 +118,8 @@ void backpropagate(const float* rows, Pass& opaque, const float* planes, const f
   each_tile(pass.lists, threads,
             [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
               TileGradient differentiate(column, row, pass.view, planes, gradients);
-              differentiate(pass.splats.splats.data(), list, size, pass.record(t),
+              const int64_t ahead = pass.size_of_tile(t + 1);
+              differentiate(pass.splats.splats.data(), list, size, ahead, pass.record(t),
                             pass.sums.data() + pass.lists.start[t] * int64_t{kSumFloats});
             });
 

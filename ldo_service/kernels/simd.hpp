@@ -23,6 +23,7 @@ constexpr int kRegisterBytes = 32;
 constexpr int kRegisterBytes = 16;
 #endif
 constexpr int kRegisters = kLanes * 4 / kRegisterBytes;
+constexpr int kPerRegister = kLanes / kRegisters;  // lanes
 
 typedef float FloatRegister __attribute__((vector_size(kRegisterBytes)));
 typedef int32_t IntRegister __attribute__((vector_size(kRegisterBytes)));
@@ -47,11 +48,13 @@ struct Floats {
     each_register([&](int k) { v[k] = x - FloatRegister{}; });  // x - 0 folds, 0 + x does not
   }
   static Floats load(const float* p) {
-    Floats out;
-    std::memcpy(out.v, p, sizeof out.v);
+    Floats out;  // register by register: GCC copies 64 bytes at once through the stack
+    each_register([&](int k) { std::memcpy(&out.v[k], p + k * kPerRegister, kRegisterBytes); });
     return out;
   }
-  void store(float* p) const { std::memcpy(p, v, sizeof v); }
+  void store(float* p) const {
+    each_register([&](int k) { std::memcpy(p + k * kPerRegister, &v[k], kRegisterBytes); });
+  }
 
   static Floats load_first(const float* p, int n) {  // the others are zero
     if (n == kLanes) return load(p);
@@ -230,7 +233,7 @@ inline FloatRegister square_root(FloatRegister x) {
 #elif defined(__SSE2__)
   return _mm_sqrt_ps(x);
 #else
-  for (int i = 0; i < kLanes / kRegisters; ++i) x[i] = __builtin_sqrtf(x[i]);
+  for (int i = 0; i < kPerRegister; ++i) x[i] = __builtin_sqrtf(x[i]);
   return x;
 #endif
 }

@@ -7,7 +7,6 @@
 namespace ldo::LDO_ISA {
 
 // The lanes of two registers, of which there are kPerRegister each, in a new order.
-constexpr int kPerRegister = kLanes / kRegisters;
 template <class Pattern, int... Lane>
 FloatRegister shuffle(FloatRegister a, FloatRegister b, std::integer_sequence<int, Lane...>) {
   return __builtin_shufflevector(a, b, Pattern::source(Lane)...);
