@@ -45,8 +45,8 @@ void adam_step(AdamRows rows, const uint32_t* indices, const float* gradients, i
       const int64_t at = static_cast<int64_t>(indices[i]) * kAdamFloats;
       const int32_t steps = std::min(++rows.steps[indices[i]], kCorrections - 1);
       const Floats mean = Floats::load(rows.mean + at) * rates.beta1 + gradient * (1 - rates.beta1);
-      const Floats square = Floats::load(rows.square + at) * rates.beta2 +
-                            gradient * gradient * (1 - rates.beta2);
+      const Floats square =
+          Floats::load(rows.square + at) * rates.beta2 + gradient * gradient * (1 - rates.beta2);
       const Floats size = sqrt(square * correction[steps].square) + rates.epsilon;
       const Floats step = rate * correction[steps].mean * mean / size;
       mean.store(rows.mean + at);

@@ -11,17 +11,17 @@ struct AdamRates {
   float beta1, beta2, epsilon;
 };
 
-struct AdamRows {     // N rows of 16 floats each
+struct AdamRows {  // N rows of 16 floats each
   float* parameters;
-  float* mean;        // of the gradient
-  float* square;      // mean of its square
-  int32_t* steps;     // [N] that each row has made
+  float* mean;     // of the gradient
+  float* square;   // mean of its square
+  int32_t* steps;  // [N] that each row has made
 };
 
-#define LDO_DECLARE_ADAM(isa)                                                                \
-  namespace isa {                                                                            \
-  void adam_step(AdamRows rows, const uint32_t* indices, const float* gradients, int64_t m,  \
-                 const AdamRates& rates, int threads);                                       \
+#define LDO_DECLARE_ADAM(isa)                                                               \
+  namespace isa {                                                                           \
+  void adam_step(AdamRows rows, const uint32_t* indices, const float* gradients, int64_t m, \
+                 const AdamRates& rates, int threads);                                      \
   }
 LDO_DECLARE_ADAM(baseline)
 LDO_DECLARE_ADAM(avx2)

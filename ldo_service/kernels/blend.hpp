@@ -94,8 +94,7 @@ inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, floa
 // Adds one splat to sixteen pixels at (px, py).
 template <bool WithMedian>
 [[gnu::always_inline]] inline void blend_splat(const Splat& s, Floats px, Floats py, Block& block) {
-  const Floats weight =
-      capped_alpha(log2_alpha_of(s, px - s.u, py - s.v)) * block.transmittance;
+  const Floats weight = capped_alpha(log2_alpha_of(s, px - s.u, py - s.v)) * block.transmittance;
   block.red = block.red + weight * s.color[0];
   block.green = block.green + weight * s.color[1];
   block.blue = block.blue + weight * s.color[2];
@@ -123,8 +122,7 @@ class Tile {
   template <bool WithMedian>
   void blend(const Splat* splats, const uint32_t* list, int64_t n) {
     for (int64_t first = 0; first < n && open_ != 0; first += kBatch)
-      blend_batch<WithMedian>(splats, list + first, std::min<int64_t>(kBatch, n - first),
-                              touched_);
+      blend_batch<WithMedian>(splats, list + first, std::min<int64_t>(kBatch, n - first), touched_);
   }
 
   void blend(const Splat* splats, const uint32_t* list, int64_t n, const TileRecord& record) {

@@ -11,10 +11,17 @@ namespace ldo::LDO_ISA {
 
 // Sums over the pixels of a tile for one splat, with v = dL/d ln(alpha) and d = pixel - (u, v).
 enum SplatSum {
-  kV, kVx, kVy, kVxx, kVxy, kVyy,           // v, v dx, v dy, v dx^2, v dx dy, v dy^2
-  kWeightRed, kWeightGreen, kWeightBlue,    // w dL/dC
-  kWeightDepth,                             // w dL/dD
-  kWeightSum,                               // w
+  kV,
+  kVx,
+  kVy,
+  kVxx,
+  kVxy,
+  kVyy,  // v, v dx, v dy, v dx^2, v dx dy, v dy^2
+  kWeightRed,
+  kWeightGreen,
+  kWeightBlue,   // w dL/dC
+  kWeightDepth,  // w dL/dD
+  kWeightSum,    // w
   kSplatSums,
 };
 constexpr int kSumFloats = 16;  // one cache line
@@ -32,9 +39,9 @@ struct Moments {
 
 // Sixteen pixels on the way from front to back.
 struct BlockGradient {
-  Floats px, py;              // pixels
-  Floats gradient[kPlanes];   // of L by the images
-  Floats behind;              // sum of w q over the splats that are still to come
+  Floats px, py;             // pixels
+  Floats gradient[kPlanes];  // of L by the images
+  Floats behind;             // sum of w q over the splats that are still to come
   Floats transmittance = 1.0f;
 
   // Weights and v of the next splat.

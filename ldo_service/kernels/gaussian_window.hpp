@@ -41,9 +41,8 @@ class RowRing {
       for (int k = 0; k < kTaps; ++k) row_[k] = ring.row(y + k - kReach, 0);
     }
     Floats operator()(int image, int column) const {
-      return window([&](int k) {
-        return Floats::load(row_[kReach + k] + image * kColumns + column);
-      });
+      return window(
+          [&](int k) { return Floats::load(row_[kReach + k] + image * kColumns + column); });
     }
 
    private:

@@ -150,8 +150,8 @@ class PartLoss {
       const Floats difference = select(here, x - y, 0.0f);
       absolute = absolute + abs(difference);
       squares = squares + difference * difference;
-      const Floats by_ssim =
-          derivative(kByX, i) + x * 2.0f * derivative(kBySquares, i) + y * derivative(kByProduct, i);
+      const Floats by_ssim = derivative(kByX, i) + x * 2.0f * derivative(kBySquares, i) +
+                             y * derivative(kByProduct, i);
       (sign(difference) * l1 + by_ssim * d_ssim).store(pixels(kProduct) + i);
     });
     sums_[row].l1 = LDO_ISA::sum(absolute);

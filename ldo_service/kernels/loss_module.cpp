@@ -67,8 +67,8 @@ std::tuple<Terms, std::array<double, 6>> image_loss(const Array& planes, const A
 NB_MODULE(_loss, m) {
   using namespace nb::literals;
   chosen = image_loss_for(chosen_isa());
-  m.def("image_loss", &image_loss, "planes"_a, "color"_a, "depth"_a, "mask"_a.none(),
-        "exposure"_a, "l1"_a, "d_ssim"_a, "depth_weight"_a, "gradients"_a, "threads"_a = 1);
+  m.def("image_loss", &image_loss, "planes"_a, "color"_a, "depth"_a, "mask"_a.none(), "exposure"_a,
+        "l1"_a, "d_ssim"_a, "depth_weight"_a, "gradients"_a, "threads"_a = 1);
 }
 
 }  // namespace ldo

@@ -94,8 +94,7 @@ struct ProjectionGradient {
 
     // T_camera_map' = exp(-xi) T_camera_map turns and moves both the point and the rows of J R
     const Vector3 row_u{ju, 0.0f, Floats(0.0f) - ku}, row_v{0.0f, jv, Floats(0.0f) - kv};
-    pose.rotation =
-        pose.rotation - cross(p, g) - cross(g_row_u, row_u) - cross(g_row_v, row_v);
+    pose.rotation = pose.rotation - cross(p, g) - cross(g_row_u, row_u) - cross(g_row_v, row_v);
     pose.translation = pose.translation - g;
   }
 
@@ -105,7 +104,9 @@ struct ProjectionGradient {
   }
   Vector3 to_camera_axes(const Vector3& v) const {
     const float* T = projection.view.T_camera_map;
-    const auto row = [&](int i) { return v.x * T[4 * i] + v.y * T[4 * i + 1] + v.z * T[4 * i + 2]; };
+    const auto row = [&](int i) {
+      return v.x * T[4 * i] + v.y * T[4 * i + 1] + v.z * T[4 * i + 2];
+    };
     return {row(0), row(1), row(2)};
   }
   Vector3 to_map_axes(const Vector3& v) const {
@@ -124,12 +125,12 @@ struct ProjectionGradient {
     for (int k = 0; k < 3; ++k) g_axis[k] = g_axis[k] * exp(column(kLogScale + k));
     const auto& [c0, c1, c2] = g_axis;  // dL/dR by columns
     const Floats g_w = x * (c1.z - c2.y) + y * (c2.x - c0.z) + z * (c0.y - c1.x);
-    const Floats g_x = w * (c1.z - c2.y) + y * (c1.x + c0.y) + z * (c2.x + c0.z) -
-                       x * 2.0f * (c1.y + c2.z);
-    const Floats g_y = w * (c2.x - c0.z) + x * (c1.x + c0.y) + z * (c2.y + c1.z) -
-                       y * 2.0f * (c0.x + c2.z);
-    const Floats g_z = w * (c0.y - c1.x) + x * (c2.x + c0.z) + y * (c2.y + c1.z) -
-                       z * 2.0f * (c0.x + c1.y);
+    const Floats g_x =
+        w * (c1.z - c2.y) + y * (c1.x + c0.y) + z * (c2.x + c0.z) - x * 2.0f * (c1.y + c2.z);
+    const Floats g_y =
+        w * (c2.x - c0.z) + x * (c1.x + c0.y) + z * (c2.y + c1.z) - y * 2.0f * (c0.x + c2.z);
+    const Floats g_z =
+        w * (c0.y - c1.x) + x * (c2.x + c0.z) + y * (c2.y + c1.z) - z * 2.0f * (c0.x + c1.y);
     const Floats radial = w * g_w + x * g_x + y * g_y + z * g_z;  // the length changes nothing
     const Floats twice = shorten * 2.0f;
     out[0] = (g_w - w * radial) * twice;
@@ -142,8 +143,8 @@ struct ProjectionGradient {
                         Floats* out) const {
     const auto log_scale = [&](int k) { return Floats::load(columns[kLogScale + k]); };
     const Floats longest = max(log_scale(0), max(log_scale(1), log_scale(2)));
-    const Floats middle = max(min(log_scale(0), log_scale(1)),
-                              min(max(log_scale(0), log_scale(1)), log_scale(2)));
+    const Floats middle =
+        max(min(log_scale(0), log_scale(1)), min(max(log_scale(0), log_scale(1)), log_scale(2)));
     const Floats push = select(longest - middle >= log_ratio, weight * per_weight, 0.0f);
     for (int k = 0; k < 3; ++k) {
       const Floats is_longest = select(log_scale(k) >= longest, push, 0.0f);

@@ -42,7 +42,8 @@ Floats sum_over_tiles(const RecordedPass& pass, int64_t splat) {
 
 // The sums lie in the order of the tiles: asked for early, they are there when they are added.
 // Inlined by force: GCC drops calls of a function that does nothing but prefetch.
-[[gnu::always_inline]] inline void prefetch_sums(const RecordedPass& pass, int64_t splat, int64_t end) {
+[[gnu::always_inline]] inline void prefetch_sums(const RecordedPass& pass, int64_t splat,
+                                                 int64_t end) {
   const TileLists& lists = pass.lists;
   if (splat + 64 < end) __builtin_prefetch(&lists.slots[lists.first[splat + 64]]);
   if (splat + 24 >= end) return;
@@ -62,8 +63,8 @@ void differentiate_piece(const float* rows, const RecordedPass& pass,
     const uint32_t* gaussians = &pass.splats.gaussians[i];
     for (int k = 0; k < kLanes; ++k) {  // the last is repeated, with no gradient
       prefetch_sums(pass, i + k, end);
-      matrix[k] = Floats::load(rows + static_cast<int64_t>(gaussians[std::min(k, count - 1)]) *
-                                          kRowFloats);
+      matrix[k] =
+          Floats::load(rows + static_cast<int64_t>(gaussians[std::min(k, count - 1)]) * kRowFloats);
       sums[k] = k < count ? sum_over_tiles(pass, i + k) : Floats(0.0f);
     }
     transpose(matrix);

@@ -107,7 +107,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
   {
     nb::gil_scoped_release release;
     kernels.rasterise(data, rows.shape(0), view, threads,
-                       {color.get(), depth.get(), median_depth.get(), opacity.get()});
+                      {color.get(), depth.get(), median_depth.get(), opacity.get()});
   }
   return {image(color.release(), {h, w, 3}), image(depth.release(), {h, w}),
           image(median_depth.release(), {h, w}), image(opacity.release(), {h, w})};

@@ -31,15 +31,15 @@ inline int64_t project_piece(const float* rows, int64_t begin, int64_t end,
       const int k = __builtin_ctz(rest);
       if (!tiles_of(s, k, project.view, out.tiles[place])) continue;
       out.splats[place] = {s.u[k],
-                             s.v[k],
-                             s.a[k],
-                             s.b[k],
-                             s.c[k],
-                             s.log2_opacity[k],
-                             s.x_slope[k],
-                             s.y_slope[k],
-                             {columns[kColor][k], columns[kColor + 1][k], columns[kColor + 2][k]},
-                             s.z[k]};
+                           s.v[k],
+                           s.a[k],
+                           s.b[k],
+                           s.c[k],
+                           s.log2_opacity[k],
+                           s.x_slope[k],
+                           s.y_slope[k],
+                           {columns[kColor][k], columns[kColor + 1][k], columns[kColor + 2][k]},
+                           s.z[k]};
       out.gaussians[place++] = static_cast<uint32_t>(i + k);
     }
   }

@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.gaussians import Adam, AdamConfig, GaussianMap, RowGradients
+
+
+def map_of(n: int) -> GaussianMap:
+    gaussians = GaussianMap(capacity=1)
+    gaussians.add(np.random.default_rng(n).normal(size=(n, 16)).astype(np.float32), 0)
+    return gaussians
+
+
+def gradients(gaussians: GaussianMap, ids: list[int], seed: int = 0) -> RowGradients:
+    """The same gradient for an id wherever its row is."""
+    rows = [np.random.default_rng(100 * seed + i).normal(size=16) for i in ids]
+    indices = np.searchsorted(gaussians.ids, ids).astype(np.uint32)
+    return RowGradients(indices, np.array(rows, np.float32), np.zeros(6))
+
+
+def test_moments_follow_the_gaussians_when_others_come_and_go() -> None:
+    changed, still = map_of(6), map_of(6)
+    adams = Adam(), Adam()
+    for adam, gaussians in zip(adams, (changed, still), strict=True):
+        adam.step(gaussians, gradients(gaussians, [1, 2, 4, 5]))
+    changed.remove(np.array([1, 0, 0, 1, 0, 0], bool))
+    changed.add(map_of(3).rows.copy(), 1)
+    for adam, gaussians in zip(adams, (changed, still), strict=True):
+        adam.step(gaussians, gradients(gaussians, [1, 4], seed=1))
+    shared = np.isin(still.ids, changed.ids)
+    assert changed.rows[:4].tobytes() == still.rows[shared].tobytes()
+
+
+def test_new_gaussian_begins_with_a_full_step() -> None:
+    gaussians, adam = map_of(2), Adam()
+    for seed in range(5):
+        adam.step(gaussians, gradients(gaussians, [0, 1], seed))
+    (new,) = gaussians.add(np.zeros((1, 16), np.float32), 1)
+    step = gradients(gaussians, [int(new)])
+    adam.step(gaussians, step)
+    expected = -AdamConfig().rates() * np.sign(step.rows[0])
+    np.testing.assert_allclose(gaussians.rows[-1], expected, rtol=1e-5)
+
+
+def test_restored_moments_continue_as_the_original() -> None:
+    one, other = map_of(4), map_of(4)
+    original, copy = Adam(), Adam()
+    original.step(one, gradients(one, [0, 2]))
+    original.step(other, gradients(other, [0, 2]))
+    copy.restore(original.snapshot())
+    state = original.snapshot()
+    original.step(one, gradients(one, [0, 1], seed=2))
+    assert copy.snapshot()["steps"].tobytes() == state["steps"].tobytes()
+    other.rows[:] = map_of(4).rows
+    again = Adam()
+    again.restore(state)
+    again.step(other, gradients(other, [0, 1], seed=2))
+    assert again.snapshot()["mean"].tobytes() == original.snapshot()["mean"].tobytes()
+
+
+def test_rates_reach_the_fields_they_are_named_after() -> None:
+    rates = AdamConfig(1, 2, 3, 4, 5).rates()
+    np.testing.assert_array_equal(rates, [1, 1, 1, 2, 2, 2, 3, 3, 3, 3, 4, 5, 5, 5, 0, 0])
+
+
+@pytest.mark.parametrize("change", [{"color": -1.0}, {"beta2": 1.0}, {"epsilon": 0.0}])
+def test_senseless_configuration_is_refused(change: dict) -> None:
+    with pytest.raises(ConfigError):
+        AdamConfig(**change)
