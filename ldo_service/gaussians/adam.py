@@ -52,8 +52,15 @@ class Adam:
         self._moments = [aligned_rows(0), aligned_rows(0)]  # with room to grow
         self._steps = np.zeros(0, np.int32)
 
-    def step(self, gaussians: GaussianMap, gradients: RowGradients, *, threads: int = 1) -> None:
-        """One step against the gradients, in place.
+    def step(
+        self,
+        gaussians: GaussianMap,
+        gradients: RowGradients,
+        *,
+        rate: float = 1.0,
+        threads: int = 1,
+    ) -> None:
+        """One step against the gradients, in place, `rate` times as long as configured.
 
             m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2
             row <- row - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + epsilon)
@@ -71,7 +78,7 @@ class Adam:
             self._steps,
             gradients.indices,
             gradients.rows,
-            config.rates(),
+            config.rates() * np.float32(rate),
             config.beta1,
             config.beta2,
             config.epsilon,

@@ -83,11 +83,14 @@ class Optimiser:
         views: Sequence[View],
         iterations: int,
         rng: np.random.Generator,
+        *,
+        final_rate: float = 1.0,
     ) -> Optimised:
         """Make `iterations` steps, each against one view, the last of which is the newest.
 
-        Changes `gaussians` in place. The pose and the exposure of the first view stay: they fix
-        the place and the brightness of the map.
+        Changes `gaussians` in place. Steps shrink geometrically to `final_rate` of their length:
+        1 while the map grows, less to settle at the end. The pose and the exposure of the first
+        view stay: they fix the place and the brightness of the map.
         """
         config = self.config
         views = list(views)
@@ -99,15 +102,19 @@ class Optimiser:
             covisible_share=config.covisible_share,
         )
         losses = []
-        for i in taken:
-            loss, views[i] = self.step(gaussians, views[i], is_fixed=i == 0)
+        for rate, i in zip(np.geomspace(1, final_rate, len(taken)), taken, strict=True):
+            loss, views[i] = self.step(gaussians, views[i], rate=float(rate), is_fixed=i == 0)
             losses.append(loss)
         return Optimised(views, taken, losses)
 
     def step(
-        self, gaussians: GaussianMap, view: View, *, is_fixed: bool = False
+        self, gaussians: GaussianMap, view: View, *, rate: float = 1.0, is_fixed: bool = False
     ) -> tuple[ImageLoss, View]:
-        """One iteration against one view; returns it with a new exposure and pose."""
+        """One iteration against one view; returns it with a new exposure and pose.
+
+        rate      factor on all steps
+        is_fixed  keep exposure and pose
+        """
         config = self.config
         # how it looks, and what is wrong
         T_camera_map = se3.inverse(view.T_map_camera)
@@ -128,10 +135,10 @@ class Optimiser:
             by_planes, needle_weight=config.needle_weight, needle_ratio=config.max_needle_ratio
         )
         # steps
-        self._adam.step(gaussians, gradients, threads=self.threads)
+        self._adam.step(gaussians, gradients, rate=rate, threads=self.threads)
         if not is_fixed:
-            view = self._exposed(view, loss.by_exposure)
-            view = self._placed(view, gradients.xi)
+            view = self._exposed(view, loss.by_exposure, rate)
+            view = self._placed(view, gradients.xi, rate)
         return loss, view
 
     def _room_for(self, planes: np.ndarray) -> np.ndarray:
@@ -139,21 +146,22 @@ class Optimiser:
             self._by_planes = np.empty_like(planes)
         return self._by_planes
 
-    def _exposed(self, view: View, by_exposure: np.ndarray) -> View:
+    def _exposed(self, view: View, by_exposure: np.ndarray, rate: float) -> View:
         config = self.config
         if config.exposure_rate == 0:
             return view
         matrix = view.exposure.matrix.astype(float)
         pull = config.exposure_prior * (matrix - Exposure().matrix)
         direction = self._views.direction(view.keyframe, "exposure", by_exposure + pull)
-        return replace(view, exposure=Exposure.of(matrix - config.exposure_rate * direction))
+        step = rate * config.exposure_rate * direction
+        return replace(view, exposure=Exposure.of(matrix - step))
 
-    def _placed(self, view: View, by_xi: np.ndarray) -> View:
+    def _placed(self, view: View, by_xi: np.ndarray, rate: float) -> View:
         config = self.config
         if not config.refines_poses:
             return view
         rates = np.repeat([config.rotation_rate_rad, config.translation_rate_m], 3)
-        step = -rates * self._views.direction(view.keyframe, "pose", by_xi)
+        step = -rate * rates * self._views.direction(view.keyframe, "pose", by_xi)
         T_map_camera = se3.orthonormalised(view.T_map_camera @ se3.exp(step))
         return replace(view, T_map_camera=T_map_camera)
 

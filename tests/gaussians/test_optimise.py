@@ -125,6 +125,18 @@ def test_wrong_pose_comes_back_to_the_true_one(start: tuple) -> None:
     assert se3.rotation_angle(left) < 0.15 * se3.rotation_angle(off)
 
 
+def test_steps_shrink_to_the_final_rate(start: tuple) -> None:
+    gaussians, views = copied(start[0]), start[1]
+    before = gaussians.colors.copy()
+    Optimiser().optimise(gaussians, views, 1, np.random.default_rng(0))
+    first = np.abs(gaussians.colors - before).max()
+    optimiser, rng = Optimiser(), np.random.default_rng(0)
+    optimiser.optimise(gaussians, views, 20, rng, final_rate=0.01)
+    before = gaussians.colors.copy()
+    optimiser.step(gaussians, views[2], rate=0.01)
+    assert np.abs(gaussians.colors - before).max() < 0.05 * first
+
+
 def test_poses_stay_unless_they_are_to_be_refined(start: tuple) -> None:
     _, result = optimised(start, iterations=4)
     for before, after in zip(start[1], result.views, strict=True):
