@@ -81,8 +81,8 @@ def test_the_renderer_uses_the_threads_it_is_given(
         whole_s, own_s = time.process_time() - whole_s, time.thread_time() - own_s
         return 1 - own_s / whole_s
 
-    assert share_of_helpers(1) < 0.02
-    assert share_of_helpers(8) > 0.1
+    assert share_of_helpers(1) == pytest.approx(0, abs=0.01)  # the clock's own error
+    assert share_of_helpers(8) > 0.02  # eight threads cannot hide; how fast they are is no matter
 
 
 def test_nothing_readable_is_bad_data(room: Sequence) -> None:
