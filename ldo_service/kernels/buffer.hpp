@@ -13,15 +13,16 @@ namespace ldo::LDO_ISA {
 
 constexpr size_t kCacheLine = 64, kHugePage = size_t{1} << 21;
 
-// Large blocks get huge pages where the system has them: what is read in random order then misses
-// the cache only, and not the page table as well.
-inline void* allocate(size_t bytes) {
-  const size_t alignment = bytes < kHugePage ? kCacheLine : kHugePage;
+// Memory that is kept is worth huge pages, where the system has them: what is read in random order
+// then misses the cache only, and not the page table as well.
+inline void* allocate(size_t bytes, bool kept) {
+  const bool huge = kept && bytes >= kHugePage;
+  const size_t alignment = huge ? kHugePage : kCacheLine;
   const size_t size = (bytes + alignment - 1) / alignment * alignment;
   void* memory = std::aligned_alloc(alignment, size);
   if (memory == nullptr && size > 0) throw std::bad_alloc();
 #if defined(__linux__)
-  if (alignment == kHugePage) madvise(memory, size, MADV_HUGEPAGE);  // advice: may fail
+  if (huge) madvise(memory, size, MADV_HUGEPAGE);  // advice: may fail
 #endif
   return memory;
 }
@@ -34,6 +35,9 @@ class Buffer {
   Buffer() = default;
   explicit Buffer(size_t size) { resize(size); }
 
+  // Say before the first `resize` that the buffer will be used again and again.
+  void keep() { kept_ = true; }
+
   // Room for `size` items, whose values are then undefined. Only growth asks for memory: it is
   // worth keeping, because the first touch of every fresh page costs more than its use.
   void resize(size_t size) {
@@ -41,7 +45,7 @@ class Buffer {
     if (size <= capacity_) return;
     data_.reset();
     capacity_ = capacity_ == 0 ? size : size + size / 4;
-    data_.reset(static_cast<T*>(allocate(capacity_ * sizeof(T))));
+    data_.reset(static_cast<T*>(allocate(capacity_ * sizeof(T), kept_)));
   }
 
   T* data() { return data_.get(); }
@@ -56,6 +60,7 @@ class Buffer {
   };
   std::unique_ptr<T[], Free> data_;
   size_t size_ = 0, capacity_ = 0;
+  bool kept_ = false;
 };
 
 }  // namespace ldo::LDO_ISA

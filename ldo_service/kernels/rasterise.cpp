@@ -7,6 +7,14 @@ namespace ldo::LDO_ISA {
 namespace {
 
 struct RecordedPass final : Pass {
+  RecordedPass() {
+    splats.splats.keep();
+    lists.splats.keep();
+    lists.slots.keep();
+    lists.pairs.keep();
+    touched.keep();
+    sums.keep();
+  }
   VisibleSplats splats;
   TileLists lists;
   Buffer<uint32_t> touched;  // [lists.splats] per splat of a tile: the blocks that it reaches
