@@ -14,12 +14,14 @@ def rasterise(
     width: int,
     height: int,
     threads: int = 1,
+    memory: Pass | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Colour [H, W, 3], weighted depth [H, W], median depth [H, W] and opacity [H, W].
 
     `rows` [N, 16] and `T_camera_map` [3, 4] are contiguous; `ldo_service.gaussians.render` says
     what they hold. Releases the GIL. Raises ValueError for wrong shapes, types, strides, sizes
-    and cameras. Bitwise equal for any number of threads.
+    and cameras. Bitwise equal for any number of threads. With `memory`, scratch is kept in it for
+    the next call, and what it held of a rendering is lost: fresh pages cost up to half a rendering.
     """
 
 class Pass:

@@ -88,9 +88,11 @@ void differentiate_piece(const float* rows, const RecordedPass& pass,
 
 }  // namespace
 
-void rasterise(const float* rows, int64_t n, const View& view, int threads, Images out) {
-  VisibleSplats visible;
-  TileLists lists;
+void rasterise(const float* rows, int64_t n, const View& view, int threads, Pass& memory,
+               Images out) {
+  auto& pass = static_cast<RecordedPass&>(memory);
+  VisibleSplats& visible = pass.splats;
+  TileLists& lists = pass.lists;
   project(rows, n, view, threads, visible);
   list_by_tile(visible, view, threads, lists);
   each_tile(lists, threads, [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {

@@ -57,7 +57,8 @@ struct Gradients {
 
 #define LDO_DECLARE_RASTERISE(isa)                                                          \
   namespace isa {                                                                           \
-  void rasterise(const float* rows, int64_t n, const View& view, int threads, Images out);  \
+  void rasterise(const float* rows, int64_t n, const View& view, int threads, Pass& memory, \
+                 Images out);                                                               \
   std::unique_ptr<Pass> new_pass();                                                         \
   void rasterise_planes(const float* rows, int64_t n, const View& view, int threads, Pass&, \
                         float* planes);                                                     \

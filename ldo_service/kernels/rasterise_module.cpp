@@ -97,16 +97,20 @@ Image image(float* data, std::initializer_list<size_t> shape) {
 
 std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array& T_camera_map,
                                                  float fx, float fy, float cx, float cy, int width,
-                                                 int height, int threads) {
+                                                 int height, int threads, PassOfPython* memory) {
   require_threads(threads);
   const float* data = rows_of(rows, "rows");
   const View view = view_of(T_camera_map, fx, fy, cx, cy, width, height);
   const size_t h = height, w = width, pixels = h * w;
   std::unique_ptr<float[]> color(new float[3 * pixels]), depth(new float[pixels]),
       median_depth(new float[pixels]), opacity(new float[pixels]);
+  std::unique_ptr<PassOfPython> own(memory == nullptr ? new PassOfPython : nullptr);
+  PassOfPython& held = memory == nullptr ? *own : *memory;
+  const PassOfPython::Use pass(held);
+  held.is_rendered = false;
   {
     nb::gil_scoped_release release;
-    kernels.rasterise(data, rows.shape(0), view, threads,
+    kernels.rasterise(data, rows.shape(0), view, threads, *pass,
                       {color.get(), depth.get(), median_depth.get(), opacity.get()});
   }
   return {image(color.release(), {h, w, 3}), image(depth.release(), {h, w}),
@@ -170,10 +174,10 @@ NB_MODULE(_rasterise, m) {
   using namespace nb::literals;
   isa = chosen_isa();
   kernels = kernels_for(isa);
+  nb::class_<PassOfPython>(m, "Pass").def(nb::init<>());
   m.def("isa", [] { return std::string(name(isa)); });
   m.def("rasterise", &rasterise, "rows"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
-        "width"_a, "height"_a, "threads"_a = 1);
-  nb::class_<PassOfPython>(m, "Pass").def(nb::init<>());
+        "width"_a, "height"_a, "threads"_a = 1, "memory"_a = nb::none());
   m.def("rasterise_planes", &rasterise_planes, "forward"_a, "rows"_a, "T_camera_map"_a, "fx"_a,
         "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1);
   m.def("backpropagate", &backpropagate, "forward"_a, "rows"_a, "planes"_a, "gradients"_a,

@@ -78,10 +78,10 @@ def ours(rows: np.ndarray, width: int, height: int, threads: int) -> Steps:
     exposure = np.array([[1, 1, 1], [0, 0, 0]], np.float32)
     moments, steps = [aligned(rows.shape) for _ in "ab"], np.zeros(len(rows), np.int32)
     indices, by_row = np.zeros(len(rows), np.uint32), aligned(rows.shape)
-    seen = slice(0, 0)
+    seen, memory = slice(0, 0), _rasterise.Pass()
 
     def render() -> np.ndarray:
-        return _rasterise.rasterise(rows, T_CAMERA_MAP, *camera, width, height, threads)[0]
+        return _rasterise.rasterise(rows, T_CAMERA_MAP, *camera, width, height, threads, memory)[0]
 
     def rasterise() -> np.ndarray:
         nonlocal seen
