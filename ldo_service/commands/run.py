@@ -58,7 +58,13 @@ def run(
     prepare(out, overwrite)
     with progress("run", len(selection.indices(sequence)), console) as advance:
         go = run_in_real_time if realtime else run_over_file
-        record = go(sequence, out, settings, selection, console.print, advance)
+        try:
+            record = go(sequence, out, settings, selection, console.print, advance)
+        except OSError as error:
+            raise ConfigError(
+                f"{out} cannot be written: {error.strerror}. Free some space, or choose another "
+                "folder; what is there is incomplete."
+            ) from error
     Console().print(summary_table(record.summary, out))
 
 

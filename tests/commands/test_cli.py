@@ -1,5 +1,6 @@
 """The command line: one clear paragraph and the right exit code."""
 
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -92,6 +93,21 @@ def test_an_unwritable_folder_is_said(capsys) -> None:
     assert code == 2
     assert_one_paragraph(err)
     assert "cannot be written" in err
+
+
+def test_a_full_disk_is_said(capsys, tmp_path: Path) -> None:
+    """A limit on the size of files fails a write as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, hard))
+    try:
+        code, _, err = ldo(
+            capsys, "run", "synthetic:room", "--out", str(tmp_path / "out"), "--max-frames", "5"
+        )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert code == 2
+    assert "cannot be written" in err
+    assert "Traceback" not in err
 
 
 def test_evaluating_something_else_than_a_run_is_said(capsys, tmp_path: Path) -> None:
