@@ -37,11 +37,6 @@ class MapFollower:
         self._apply(message)
         return True
 
-    def restart(self) -> None:
-        """The mapper was started anew: only a snapshot can be trusted."""
-        self.is_behind, self.version = True, 0
-        self._parts.clear()
-
     def _apply(self, delta: MapDelta) -> None:
         if delta.motions:
             self.map.move_anchors({m.keyframe: transform(m.T_new_old) for m in delta.motions})

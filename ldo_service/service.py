@@ -28,7 +28,6 @@ from ldo_service.runtime import check_graph
 from ldo_service.runtime.graph import lossless_consumers
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
-    PARENT_VARIABLE,
     ChildProcess,
     leave_with_parent,
     python_command,
@@ -233,11 +232,6 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
 
 def _is_fed_from_outside(box: Box) -> bool:
     return any(port.topic in FROM_OUTSIDE for port in box.inputs)
-
-
-def is_child() -> bool:
-    """Whether this process was started by a service for one of its actors."""
-    return PARENT_VARIABLE in os.environ
 
 
 def _leave(error: StageStalled) -> None:
