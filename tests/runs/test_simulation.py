@@ -46,14 +46,18 @@ def test_digests_do_not_depend_on_threads(
 
 
 class OnePixel(Cached):
-    """A sequence with one colour value of one frame changed by one."""
+    """A sequence with some bits of one pixel of one frame flipped."""
+
+    def __init__(self, sequence: Sequence, frame: int = FRAMES // 2, bits: int = 1) -> None:
+        super().__init__(sequence)
+        self._frame, self._bits = frame, bits
 
     def read(self, index: int) -> RawFrame:
         raw = super().read(index)
-        if index != FRAMES // 2:
+        if index != self._frame:
             return raw
         color = np.array(raw.color)
-        color[100, 100, 1] ^= 1
+        color[100, 100, 1] ^= self._bits
         return replace(raw, color=color)
 
 
@@ -61,6 +65,14 @@ def test_one_pixel_changes_the_digests(room: Sequence, made: dict[str, Made]) ->
     changed = simulated(OnePixel(room))
     assert changed["frame_source"].digest != made["frame_source"].digest
     assert changed["frame_source"].messages == made["frame_source"].messages
+
+
+def test_one_inverted_pixel_of_a_keyframe_reaches_tracker_and_map(
+    room: Sequence, made: dict[str, Made]
+) -> None:
+    changed = simulated(OnePixel(room, frame=0, bits=255))
+    for actor in ("frame_source", "tracker", "mapper"):
+        assert changed[actor].digest != made[actor].digest, actor
 
 
 def test_the_latency_is_an_input(room: Sequence, made: dict[str, Made]) -> None:
