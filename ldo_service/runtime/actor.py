@@ -1,6 +1,7 @@
 """What an actor is: ports, a handler, and state that can be put away and taken up again."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from ldo_service.schemas import Message
@@ -15,12 +16,20 @@ UNLIMITED = 1 << 30
 State = Mapping[str, Any]
 
 
-class Actor:
-    """One box of the design card.
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """What an actor sees of the traffic around it; with the message, all that a step depends on.
 
-    `room` says, for each output that never waits, how many messages may be sent now; it is set
-    before each step and is, with the message, all that a step depends on.
+    room     for each output that never waits: how many messages may be sent now
+    waiting  for each lossless input: how many messages wait behind the one that is handled
     """
+
+    room: Mapping[Topic, int] = field(default_factory=dict)
+    waiting: Mapping[Topic, int] = field(default_factory=dict)
+
+
+class Actor:
+    """One box of the design card. `situation` is set before each step."""
 
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
@@ -28,10 +37,10 @@ class Actor:
     talks_outside: ClassVar[bool] = False  # asks what no journal records: a replay leaves it out
 
     def __init__(self) -> None:
-        self.room: Mapping[Topic, int] = {}
+        self.situation = Situation()
 
     def has_room(self, topic: Topic) -> bool:
-        return self.room.get(topic, UNLIMITED) > 0
+        return self.situation.room.get(topic, UNLIMITED) > 0
 
     def handle(self, message: Any) -> Iterator[Message]:
         """What the actor makes of one message of its inputs."""

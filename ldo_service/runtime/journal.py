@@ -1,7 +1,7 @@
 """What determined every step of an actor, and what came of it.
 
     journal/start   Started   an actor is in place: new, or restored from its predecessor's state
-    journal/step    Step      it handled the message taken last, with the room it saw
+    journal/step    Step      it handled the message taken last, in the situation it saw
     journal/gap     Gap       from here on something is missing
 
 The messages taken lie between these, each on the channel of its topic, as they were decoded. Steps
@@ -16,9 +16,7 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
-from ldo_service.schemas.topics import Topic
-
-from .actor import State
+from .actor import Situation, State
 from .inlet import Delivery
 from .step import Produced
 
@@ -53,6 +51,7 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     outputs: tuple[Output, ...] = ()
     digest: str = ""  # of all outputs in order
     error: str = ""  # of a step that failed
+    waiting: dict[str, int] = {}  # by topic: what waited behind the message
 
 
 class Gap(msgspec.Struct, frozen=True, kw_only=True):
@@ -104,7 +103,7 @@ class Journal:
     def stepped(
         self,
         kind: Kind,
-        room: Mapping[Topic, int],
+        situation: Situation,
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:

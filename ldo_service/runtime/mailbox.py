@@ -8,6 +8,7 @@ from threading import Lock
 import msgspec
 
 from ldo_service.schemas import InputCount, decode
+from ldo_service.schemas.topics import Topic
 
 from .inlet import Delivery, Inlet, LosslessInlet
 from .links import (
@@ -203,6 +204,15 @@ class Mailbox:
     def disconnect(self) -> None:
         for publisher in self._grants.values():
             publisher.close()
+
+    def waiting(self) -> dict[Topic, int]:
+        """Messages of each lossless input that were not taken yet."""
+        with self._lock:
+            return {
+                inlet.port.topic: len(inlet.waiting)
+                for inlet in self._inlets.values()
+                if isinstance(inlet, LosslessInlet)
+            }
 
     def statistics(self) -> tuple[InputCount, ...]:
         with self._lock:

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from ldo_service.schemas.topics import Topic
 
-from .actor import State
+from .actor import Situation, State
 from .inlet import Delivery
 from .journal import Gap, Journal, Kind, Started, Step, checksum, digest_of, outputs_of
 from .recording_file import RecordConfig, RecordingFile
@@ -77,7 +77,7 @@ class Recorder(Journal):
     def stepped(
         self,
         kind: Kind,
-        room: Mapping[Topic, int],
+        situation: Situation,
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
@@ -89,7 +89,8 @@ class Recorder(Journal):
             step=self._steps,
             kind=kind,
             taken=-1 if taken is None else taken.number,
-            room={topic.name: count for topic, count in room.items()},
+            room=_by_name(situation.room),
+            waiting=_by_name(situation.waiting),
             error=error,
         )
         self._steps += 1
@@ -178,3 +179,7 @@ class Recorder(Journal):
             "here; the robot goes on",
             self._file.path,
         )
+
+
+def _by_name(counts: Mapping[Topic, int]) -> dict[str, int]:
+    return {topic.name: count for topic, count in counts.items()}

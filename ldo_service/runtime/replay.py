@@ -1,4 +1,4 @@
-"""An actor lives its recorded life again: the same messages, the same room, the same restarts.
+"""An actor lives its recorded life again: the same messages, situations and restarts.
 
 What it makes must have the digests of the recording. A step that failed leaves nothing behind, so
 whether it fails again is counted and not judged.
@@ -12,8 +12,9 @@ import msgspec
 
 from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.schemas import Message, decode
+from ldo_service.schemas.topics import Topic
 
-from .actor import Actor
+from .actor import Actor, Situation
 from .journal import Gap, Output, Started, Step, checksum, digest_of, outputs_of
 from .recording import JournalFile
 from .state_store import decode_state
@@ -132,11 +133,10 @@ class Life:
     def _step(self, actor: Actor, step: Step) -> None:
         if actor.talks_outside:
             return
-        actor.room = {
-            out.topic: step.room[out.topic.name]
-            for out in actor.outputs
-            if out.topic.name in step.room
-        }
+        actor.situation = Situation(
+            room=_by_topic(step.room, (out.topic for out in actor.outputs)),
+            waiting=_by_topic(step.waiting, (port.topic for port in actor.inputs)),
+        )
         match step.kind:
             case "done":
                 message = self._message(actor, step)
@@ -200,3 +200,7 @@ def first_difference(recorded: tuple[Output, ...], replayed: tuple[Output, ...])
             topics = old.topic if old.topic == new.topic else f"{old.topic}, now {new.topic}"
             return f"output {place} of {len(recorded)} differs: {topics}"
     return f"{len(recorded)} outputs, now {len(replayed)}"
+
+
+def _by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[Topic, int]:
+    return {topic: counts[topic.name] for topic in topics if topic.name in counts}

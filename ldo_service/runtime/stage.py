@@ -13,7 +13,7 @@ from ldo_service.schemas import Health, Message, decode, encode
 from ldo_service.schemas.topics import HEALTH, Topic
 
 from . import links
-from .actor import Actor
+from .actor import Actor, Situation
 from .inlet import Delivery
 from .journal import Journal
 from .mailbox import Mailbox
@@ -200,7 +200,7 @@ class Stage:
             if await self._try(message):
                 return
         self._vitals.set_aside += 1
-        self._journal.stepped("set_aside", {})
+        self._journal.stepped("set_aside", Situation())
         log.error(
             "%s: %s of stamp %d failed twice and is set aside",
             self.name, type(message).__name__, message.stamp_ns,
@@ -208,16 +208,16 @@ class Stage:
 
     async def _try(self, message: Message) -> bool:
         """Handle, send, save; False when the handler failed and a successor is in place."""
-        self._look_at_room()
+        self._look_around()
         try:
             with self._vitals.step():
                 produced = await self._worker.run(self._handle, message)
         except Exception as error:
             log.exception("%s failed on %s", self.name, type(message).__name__)
-            self._journal.stepped("failed", self._actor.room, error=repr(error))
+            self._journal.stepped("failed", self._actor.situation, error=repr(error))
             await self._restart()
             return False
-        self._journal.stepped("done", self._actor.room, produced)
+        self._journal.stepped("done", self._actor.situation, produced)
         for out in produced:
             await self._send(out)
         await self._worker.run(self._save)
@@ -227,19 +227,22 @@ class Stage:
     async def _send(self, out: Produced) -> None:
         await self._outlets[type(out.message)].send(out.message, out.body)
 
-    def _look_at_room(self) -> None:
+    def _look_around(self) -> None:
         never_wait = [outlet for outlet in self._outlets.values() if outlet.port.never_wait]
-        self._actor.room = {outlet.topic: outlet.room() for outlet in never_wait}
+        self._actor.situation = Situation(
+            room={outlet.topic: outlet.room() for outlet in never_wait},
+            waiting=self._mailbox.waiting() if self._mailbox else {},
+        )
 
     async def _say_last_words(self) -> None:
-        self._look_at_room()
+        self._look_around()
         try:
             last_words = await self._worker.run(self._finish)
         except Exception:
             self._vitals.failures += 1
             log.exception("%s failed on its last words", self.name)
             return
-        self._journal.stepped("finished", self._actor.room, last_words)
+        self._journal.stepped("finished", self._actor.situation, last_words)
         for out in last_words:
             await self._send(out)
         await self._worker.run(self._save, True)

@@ -19,7 +19,7 @@ class Produced:
 def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
     """Raises when a message is none of the outputs, or has no room where none may wait."""
     topics = {out.topic.message: out.topic for out in actor.outputs}
-    room = dict(actor.room)
+    room = dict(actor.situation.room)
     produced: list[Produced] = []
     for message in messages:
         topic = topics.get(type(message))

@@ -8,6 +8,7 @@ from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.runtime.actor import Situation
 from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
@@ -59,7 +60,7 @@ def test_without_room_no_keyframe_is_made_and_tracking_goes_on(frames, keyframes
     tracker = Tracker()
     first = handled(tracker, frames[:1])
     assert any(isinstance(out, Keyframe) for out in first)
-    tracker.room = {KEYFRAME_NEW: 0}
+    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
     blocked = handled(tracker, frames[1:15])
     assert not any(isinstance(out, Keyframe) for out in blocked)
     assert all(pose.status == "OK" and pose.reference == 0 for pose in poses_of(blocked))
@@ -69,9 +70,9 @@ def test_without_room_no_keyframe_is_made_and_tracking_goes_on(frames, keyframes
 
 def test_nothing_is_said_before_somebody_can_map_the_first_keyframe(frames) -> None:
     tracker = Tracker()
-    tracker.room = {KEYFRAME_NEW: 0}
+    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
     assert handled(tracker, frames[:3]) == []
-    tracker.room = {KEYFRAME_NEW: 8}
+    tracker.situation = Situation(room={KEYFRAME_NEW: 8})
     keyframe, pose = handled(tracker, frames[3:4])
     assert isinstance(keyframe, Keyframe)
     assert keyframe.frame == 3

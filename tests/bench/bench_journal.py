@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.runtime import In, Latest
+from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.inlet import Delivery
 from ldo_service.runtime.links import Header
 from ldo_service.runtime.recorder import Recorder
@@ -46,7 +47,7 @@ def main(folder: Path) -> None:
         delivery = Delivery(In(FRAME_RGBD, Latest(1)), Header("camera", 1, i, i), memoryview(body))
         started_s = time.perf_counter()
         recorder.took(delivery, i)
-        recorder.stepped("done", {}, [Produced(FRAME_RGBD, messages[i % 8], body)])
+        recorder.stepped("done", Situation(), [Produced(FRAME_RGBD, messages[i % 8], body)])
         loop_s += time.perf_counter() - started_s
         time.sleep(1 / 60)  # the loop has other work, at twice the rate of a camera
     recorder.close().result()

@@ -11,6 +11,7 @@ from mcap.writer import CompressionType, Writer
 from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.runtime import recording_file
 from ldo_service.runtime.actor import State
+from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.runtime.mcap_index import McapIndex
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.schemas import Message
@@ -37,6 +38,23 @@ def test_the_room_of_the_time_is_what_the_actor_sees(tmp_path: Path) -> None:
     result = replayed(tmp_path)
     result.verify()
     assert result.made == {DOUBLES.name: len(VALUES) + 1}
+
+
+class Counting(Tally):
+    """Says how many numbers wait."""
+
+    def handle(self, message: Message) -> Iterator[Message]:
+        yield Double(stamp_ns=message.stamp_ns, value=self.situation.waiting.get(NUMBERS, -1))
+
+
+def test_what_waited_at_the_time_is_what_the_actor_sees(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    counts = iter(range(100))
+    monkeypatch.setattr(Mailbox, "waiting", lambda _self: {NUMBERS: next(counts)})
+    recorded(tmp_path, VALUES, make=Counting)
+    assert next(counts) > len(VALUES)
+    replayed(tmp_path, Counting).verify()
 
 
 def test_failures_and_the_states_after_them_are_lived_again(tmp_path: Path) -> None:

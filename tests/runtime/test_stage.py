@@ -374,3 +374,35 @@ async def test_a_declared_topic_without_a_format_is_left_out() -> None:
 def test_an_impossible_configuration_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         StageConfig(**options)
+
+
+class Queued(Actor):
+    """Doubles how many numbers wait behind the one it handles."""
+
+    name = "queued"
+    inputs = (In(NUMBERS, Lossless(4)),)
+    outputs = (Out(DOUBLES),)
+
+    def __init__(self, stuck: Event) -> None:
+        super().__init__()
+        self._stuck, self.seen = stuck, []
+
+    def handle(self, message: Message) -> Iterator[Message]:
+        self.seen.append(self.situation.waiting[NUMBERS])
+        self._stuck.wait(10)
+        yield Double(stamp_ns=message.stamp_ns, value=0)
+
+
+async def test_an_actor_sees_how_many_messages_wait() -> None:
+    transport, stuck = MemoryTransport(), Event()
+    actor = Queued(stuck)
+    stage = Stage(lambda: actor, transport, config=QUICK)
+    feed = Outlet(Out(NUMBERS), "feed", 1, transport, (stage.name,))
+    async with running(stage):
+        await send(feed, number(0))
+        await eventually(lambda: actor.seen)
+        for value in (1, 2, 3):
+            await send(feed, number(value))
+        stuck.set()
+        await eventually(lambda: stage.health().steps == 4)
+    assert actor.seen == [0, 2, 1, 0]
