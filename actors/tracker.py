@@ -106,7 +106,7 @@ class Tracker(Actor):
     # --- keyframes --------------------------------------------------------------------------------
     def _may_map(self, frame: RgbdFrame, tracked: Tracked) -> bool:
         """Whether the frame becomes a keyframe: wanted, not held out, and everyone has room."""
-        if not tracked.wants_keyframe or tracked.status is not Status.OK:
+        if not tracked.wants_mapping or tracked.status is not Status.OK:
             return False
         hold_out = self.config.hold_out
         if hold_out and frame.index % hold_out == hold_out - 1:
@@ -116,7 +116,11 @@ class Tracker(Actor):
         return has_room
 
     def _make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> Keyframe:
-        keyframe = self._odometry.make_keyframe(frame, tracked)
+        """A new reference for tracking, or one that supports the map between two of these."""
+        if tracked.wants_keyframe:
+            keyframe = self._odometry.make_keyframe(frame, tracked)
+        else:
+            keyframe = self._odometry.make_supporting(tracked)
         self._poses.chain(
             keyframe, tracked.keyframe, tracked.T_keyframe_camera, tracked.T_odom_camera
         )

@@ -23,10 +23,16 @@ class KeyframeConfig:
     max_frames: int = 30  # at least every 30th, if the camera moved at all
     still_overlap: float = 0.97  # of the visible surface: above, and
     still_motion: float = 0.01  # rad, and fraction of the median depth: below, it stands still
+    # Share of max_rotation_rad and max_translation after which a frame is mapped although tracking
+    # goes on against the same keyframe: the map gains by more views, tracking by fewer references.
+    # Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1: none.
+    supporting: float = 0.33
 
     def __post_init__(self) -> None:
         if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
             raise ConfigError("still_overlap must be within 0..1, still_motion at least 0.")
+        if not self.supporting > 0:
+            raise ConfigError(f"supporting={self.supporting:g} must be positive.")
         if not 0 <= self.min_overlap <= 1:
             raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
         if not 1 <= self.min_frames <= self.max_frames:
@@ -74,4 +80,19 @@ def is_due(
         or overlap < config.min_overlap
         or translation > config.max_translation
         or rotation_rad > config.max_rotation_rad
+    )
+
+
+def is_worth_mapping(
+    T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
+) -> bool:
+    """Whether a view has left the last one that was mapped far enough to support it."""
+    translation = float(np.linalg.norm(T_mapped_camera[:3, 3])) / median_depth_m
+    rotation_rad = se3.rotation_angle(T_mapped_camera)
+    return bool(
+        config.supporting <= 1
+        and (
+            translation > config.supporting * config.max_translation
+            or rotation_rad > config.supporting * config.max_rotation_rad
+        )
     )

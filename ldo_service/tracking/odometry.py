@@ -4,6 +4,8 @@
         tracked = odometry.track(frame)
         if tracked.wants_keyframe:
             odometry.make_keyframe(frame, tracked)
+        elif tracked.wants_mapping:
+            odometry.make_supporting(tracked)
 
 The caller decides whether there is room for a keyframe; without one, tracking goes on against the
 last. Conventions: `ldo_service.geometry`.
@@ -22,7 +24,7 @@ from .align import AlignConfig, Alignment
 from .candidates import Candidate, CandidateConfig, attempt, best
 from .features import FeatureConfig, detect, estimate_pose
 from .judgement import History, JudgementConfig, Status, judge
-from .keyframes import Keyframe, KeyframeConfig, is_due
+from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion, extent
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, relocalise
@@ -61,6 +63,7 @@ class Tracked:
     status: Status
     method: str  # "first", "direct", "features", "relocalised", "none"
     wants_keyframe: bool
+    wants_mapping: bool = False  # as a supporting keyframe: mapped, and not tracked against
     information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     inlier_fraction: float = 0.0  # smaller of the photometric and the geometric
     intensity_sigma: float = 0.0  # photometric residual, grey levels
@@ -107,8 +110,15 @@ class Odometry:
             keyframe=keyframe,
             frames_since_keyframe=0,
             next_id=before.next_id + 1,
+            T_odom_mapped=tracked.T_odom_camera,
         )
         return keyframe.id
+
+    def make_supporting(self, tracked: Tracked) -> int:
+        """Go on against the same keyframe; the id of this frame as one that is only mapped."""
+        number = self._state.next_id
+        self._state = replace(self._state, next_id=number + 1, T_odom_mapped=tracked.T_odom_camera)
+        return number
 
     def skip_keyframe_id(self) -> None:
         """Leave an id unused, for one that may have been given and forgotten."""
@@ -139,7 +149,7 @@ class Odometry:
         usable = measured >= self.config.judgement.min_paired
         self._state = replace(self._state, motion=Motion(stamp_ns=frame.stamp_ns))
         status, method = (Status.OK, "first") if usable else (Status.LOST, "none")
-        return Tracked(np.eye(4), np.eye(4), None, status, method, wants_keyframe=usable)
+        return Tracked(np.eye(4), np.eye(4), None, status, method, usable, usable)
 
     def _followed(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
         """Alignment from the predicted pose; from every other guess too, where that is not sure."""
@@ -193,28 +203,37 @@ class Odometry:
             keyframe,
             Status.LOST,
             "none",
-            wants_keyframe=False,
         )
 
     def _accepted(
         self, frame: RgbdFrame, keyframe: Keyframe, candidate: Candidate, status: Status
     ) -> Tracked:
-        alignment, history = candidate.alignment, self._state.history
+        alignment, history, config = candidate.alignment, self._state.history, self.config
         T_odom_camera = se3.orthonormalised(keyframe.T_odom_keyframe @ alignment.T_reference_camera)
         motion = self._state.motion.moved_to(T_odom_camera, frame.stamp_ns)
         is_steady = status is Status.OK and self._state.status is Status.OK
         if status is Status.OK:
-            history = history.extended(alignment, self.config.judgement)
+            history = history.extended(alignment, config.judgement)
         self._remember(keyframe, motion if is_steady else motion.stopped(), history, status)
         due = is_due(
             alignment.T_reference_camera,
             alignment.overlap,
             candidate.median_depth_m,
             self._state.frames_since_keyframe,
-            self.config.keyframes,
+            config.keyframes,
         )
-        wanted = due and status is Status.OK
-        return _report(alignment, T_odom_camera, keyframe, status, candidate.method, wanted)
+        T_mapped_camera = se3.inverse(self._state.T_odom_mapped) @ T_odom_camera
+        supports = is_worth_mapping(T_mapped_camera, candidate.median_depth_m, config.keyframes)
+        is_sure = status is Status.OK
+        return _report(
+            alignment,
+            T_odom_camera,
+            keyframe,
+            status,
+            candidate.method,
+            wants_keyframe=due and is_sure,
+            wants_mapping=(due or supports) and is_sure,
+        )
 
     def _remember(
         self, keyframe: Keyframe, motion: Motion, history: History, status: Status
@@ -238,7 +257,9 @@ def _report(
     keyframe: Keyframe,
     status: Status,
     method: str,
-    wants_keyframe: bool,
+    *,
+    wants_keyframe: bool = False,
+    wants_mapping: bool = False,
 ) -> Tracked:
     return Tracked(
         T_odom_camera,
@@ -247,6 +268,7 @@ def _report(
         status,
         method,
         wants_keyframe,
+        wants_mapping,
         information=alignment.information,
         inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
         intensity_sigma=alignment.intensity_sigma,

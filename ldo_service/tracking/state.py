@@ -3,6 +3,8 @@
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ldo_service.geometry import Camera
 
 from .judgement import History, Status
@@ -20,6 +22,7 @@ class State:
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
+    T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
 
 
 def packed(state: State) -> dict[str, Any]:
@@ -36,6 +39,7 @@ def packed(state: State) -> dict[str, Any]:
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
+        "T_odom_mapped": state.T_odom_mapped,
     }
 
 
@@ -50,6 +54,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
+        T_odom_mapped=values["T_odom_mapped"],
     )
 
 
