@@ -14,8 +14,7 @@ class GaussianMap:
     """Gaussians in the map frame, in order of insertion.
 
     `rows`, its columns (`means`, ...), `ids` and `anchors` are views without a copy, valid until
-    the next `add` or `remove`. Who writes through them calls `touch`. `version` grows with every
-    change.
+    Gaussians come or go. Who writes through them calls `touch`. `version` grows with every change.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
@@ -85,10 +84,7 @@ class GaussianMap:
     def append(self, ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
         """Append Gaussians that another map gave their ids [M], above all in this one, to follow
         it. Raises ValueError for other shapes, ids that do not ascend, NaN and infinity."""
-        if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
-            raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids.")
-        if not np.all(np.isfinite(rows)):
-            raise ValueError("rows hold NaN or infinity.")
+        _require_rows(ids, rows, anchors)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
             raise ValueError(f"ids must ascend from {self._next_id}.")
         start, stop = self._size, self._size + len(rows)
@@ -104,15 +100,52 @@ class GaussianMap:
 
         Returns how many went. Raises ValueError for a mask of another size or type.
         """
-        if mask.shape != (self._size,) or mask.dtype != np.bool_:
-            raise ValueError(f"mask is {mask.dtype}{mask.shape}, must be bool({self._size},).")
-        keep = ~mask
-        size = int(np.count_nonzero(keep))
+        self._require_mask(mask)
+        first = int(np.argmax(mask)) if len(mask) else 0  # what comes before stays in place
+        keep = ~mask[first:]
+        size = first + int(np.count_nonzero(keep))
         for array in (self._rows, self._ids, self._anchors):
-            array[:size] = array[: self._size][keep]
+            array[first:size] = array[first : self._size][keep]
         removed, self._size = self._size - size, size
         self.touch()
         return removed
+
+    def take_out(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Remove the Gaussians where mask [N] is true, to keep them elsewhere for a while.
+
+        Returns copies of their ids [M], rows [M, 16] and anchors [M], in order. Raises ValueError
+        as `remove`.
+        """
+        self._require_mask(mask)
+        taken = self.ids[mask], self.rows[mask], self.anchors[mask]
+        self.remove(mask)
+        return taken
+
+    def bring_back(self, ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
+        """Put Gaussians that this map gave their ids [M], and that are absent now, where they
+        were among the others: `ids` ascend again. They may come in any order.
+
+        Raises ValueError for other shapes, NaN and infinity, an id that is present, given twice
+        or never was this map's. Linear in N.
+        """
+        _require_rows(ids, rows, anchors)
+        order = np.argsort(ids, kind="stable")
+        ids, rows, anchors = ids[order], rows[order], anchors[order]
+        before = np.searchsorted(self.ids, ids)  # how many of those here come before each
+        self._require_absent(ids, before)
+        if len(ids) == 0:
+            return
+        places, old_size = before + np.arange(len(ids)), self._size
+        self._reserve(old_size + len(ids))
+        self._size = old_size + len(ids)
+        first = int(places[0])
+        stay = np.ones(self._size - first, bool)
+        stay[places - first] = False
+        arrays = self._rows, self._ids, self._anchors
+        for array, returned in zip(arrays, (rows, ids, anchors), strict=True):
+            array[first : self._size][stay] = array[first:old_size].copy()
+            array[places] = returned
+        self.touch()
 
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move what hangs on each keyframe: mean <- T mean, quat <- q(T) quat.
@@ -153,6 +186,20 @@ class GaussianMap:
         out.version = int(state["version"])
         return out
 
+    def _require_mask(self, mask: np.ndarray) -> None:
+        if mask.shape != (self._size,) or mask.dtype != np.bool_:
+            raise ValueError(f"mask is {mask.dtype}{mask.shape}, must be bool({self._size},).")
+
+    def _require_absent(self, ids: np.ndarray, before: np.ndarray) -> None:
+        if np.any(np.diff(ids) <= 0):
+            raise ValueError("an id comes back twice.")
+        if len(ids) and not (ids[0] >= 0 and ids[-1] < self._next_id):
+            raise ValueError(f"ids {ids[0]} to {ids[-1]}: this map gave 0 to {self._next_id - 1}.")
+        inside = before < self._size
+        present = self.ids[before[inside]] == ids[inside]
+        if np.any(present):
+            raise ValueError(f"id {ids[inside][present][0]} is in the map already.")
+
     def _reserve(self, size: int) -> None:
         if size <= len(self._rows):
             return
@@ -168,6 +215,22 @@ def aligned_rows(capacity: int) -> np.ndarray:
     memory = np.zeros(capacity * ROW + 16, np.float32)
     skip = (-memory.ctypes.data % 64) // 4
     return memory[skip : skip + capacity * ROW].reshape(capacity, ROW)
+
+
+def moved_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
+    """Copies of rows [M, 16] moved by T_new_old [4, 4], as `move_anchors` moves them."""
+    out = aligned_rows(len(rows))
+    out[:] = rows
+    T = np.asarray(T_new_old, float)[None]
+    _move(out, np.zeros(len(rows), np.int32), np.zeros(1, np.int64), T)
+    return out
+
+
+def _require_rows(ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
+    if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
+        raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids.")
+    if not np.all(np.isfinite(rows)):
+        raise ValueError("rows hold NaN or infinity.")
 
 
 def _move(rows: np.ndarray, anchors: np.ndarray, keyframes: np.ndarray, T: np.ndarray) -> None:

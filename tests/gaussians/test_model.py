@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ldo_service.gaussians import GaussianMap, render
 from ldo_service.geometry import Camera, se3
@@ -48,6 +50,58 @@ def test_removal_keeps_order_and_never_gives_an_id_twice() -> None:
     np.testing.assert_array_equal(gaussians.add(rows_of(2), 7), [8, 9])
 
 
+def test_what_was_taken_out_comes_back_bit_for_bit() -> None:
+    gaussians, untouched = map_of(4, 5, 6), map_of(4, 5, 6)
+    ids, rows, anchors = gaussians.take_out(gaussians.anchors == 1)
+    np.testing.assert_array_equal(ids, np.arange(4, 9))
+    np.testing.assert_array_equal(anchors, 1)
+    assert rows.tobytes() == rows_of(5, 1).tobytes()
+    np.testing.assert_array_equal(gaussians.ids, [*range(4), *range(9, 15)])
+    gaussians.bring_back(ids, rows, anchors)
+    for name in ("rows", "ids", "anchors"):
+        assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
+
+
+def test_those_taken_out_are_copies() -> None:
+    gaussians = map_of(3, 3)
+    _, rows, _ = gaussians.take_out(np.ones(6, bool))
+    gaussians.add(rows_of(6, 9), 2)
+    assert rows.tobytes() == np.concatenate([rows_of(3, 0), rows_of(3, 1)]).tobytes()
+
+
+@given(masks=st.lists(st.integers(1, 2**12 - 1), min_size=1, max_size=4), data=st.data())
+@settings(deadline=None)
+def test_any_order_of_leaving_and_returning_ends_with_the_same_map(masks, data) -> None:
+    gaussians, untouched = map_of(5, 7), map_of(5, 7)
+    away = []
+    for bits in masks:
+        mask = (bits >> gaussians.ids) & 1 == 1
+        away.append(gaussians.take_out(mask))
+        assert np.all(np.diff(gaussians.ids) > 0)
+    for each in (gaussians, untouched):
+        each.add(rows_of(2, 9), 2)
+    for k in data.draw(st.permutations(range(len(away)))):
+        shuffled = data.draw(st.permutations(range(len(away[k][0]))))
+        gaussians.bring_back(*(part[list(shuffled)] for part in away[k]))
+    for name in ("rows", "ids", "anchors"):
+        assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
+
+
+def test_only_absent_gaussians_of_this_map_come_back() -> None:
+    gaussians = map_of(6)
+    ids, rows, anchors = gaussians.take_out(np.array([0, 1, 1, 0, 0, 0], bool))
+    before = gaussians.snapshot()
+    for wrong, reason in (([1, 3], "id 3 is in"), ([1, 6], "gave 0 to 5"), ([2, 2], "twice")):
+        with pytest.raises(ValueError, match=reason):
+            gaussians.bring_back(np.array(wrong), rows, anchors)
+    with pytest.raises(ValueError, match="NaN"):
+        gaussians.bring_back(ids, np.full_like(rows, np.nan), anchors)
+    with pytest.raises(ValueError, match="shape"):
+        gaussians.bring_back(ids, rows[:1], anchors)
+    after = gaussians.snapshot()
+    assert all(before[name].tobytes() == after[name].tobytes() for name in before)
+
+
 def test_every_row_fills_one_cache_line() -> None:
     gaussians = map_of(3, 500)
     assert gaussians.rows.ctypes.data % 64 == 0
@@ -68,6 +122,10 @@ def test_version_grows_with_every_change() -> None:
     gaussians.add(rows_of(3), 0)
     seen.append(gaussians.version)
     gaussians.remove(np.array([True, False, False]))
+    seen.append(gaussians.version)
+    taken = gaussians.take_out(np.array([True, False]))
+    seen.append(gaussians.version)
+    gaussians.bring_back(*taken)
     seen.append(gaussians.version)
     gaussians.move_anchors({0: se3.exp(np.full(6, 0.1))})
     seen.append(gaussians.version)
