@@ -104,20 +104,30 @@ class Adam:
             moment[: len(saved)], moment[len(saved) :] = saved, 0
 
     def _follow(self, ids: np.ndarray) -> None:
-        """Forget the Gaussians that went; those that came begin with zeros."""
-        if np.array_equal(ids, self._ids):
+        """Forget the Gaussians that went; those that came, or came back, begin with zeros."""
+        n = len(self._ids)
+        if not np.array_equal(ids[:n], self._ids):
+            self._sort_out(ids)
+        elif len(ids) == n:
             return
-        stayed = np.isin(self._ids, ids, assume_unique=True, kind="sort")
-        n = int(np.count_nonzero(stayed))
-        if n < len(self._ids):
-            for moment in self._moments:
-                moment[:n] = moment[: len(self._ids)][stayed]
-                moment[n:] = 0
-            self._steps = self._steps[stayed]
-        if len(ids) > n:  # new ones come last, as ids ascend
-            self._reserve(len(ids))
-            self._steps = np.concatenate([self._steps, np.zeros(len(ids) - n, np.int32)])
+        self._reserve(len(ids))
+        grown = np.zeros(len(ids) - len(self._steps), np.int32)
+        self._steps = np.concatenate([self._steps, grown])
         self._ids = ids.copy()
+
+    def _sort_out(self, ids: np.ndarray) -> None:
+        """Bring the state of the Gaussians that stay to their new places; zeros elsewhere."""
+        n = len(self._ids)
+        old_places = np.searchsorted(self._ids, ids)
+        stays = np.append(self._ids, -1)[old_places] == ids
+        old_places, places = old_places[stays], np.flatnonzero(stays)
+        steps, self._steps = self._steps, np.zeros(len(ids), np.int32)
+        self._steps[places] = steps[old_places]
+        self._reserve(len(ids))
+        for moment in self._moments:
+            kept = moment[old_places]
+            moment[: max(n, len(ids))] = 0
+            moment[places] = kept
 
     def _reserve(self, n: int) -> None:
         for k, moment in enumerate(self._moments):

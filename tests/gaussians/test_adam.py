@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians import Adam, AdamConfig, GaussianMap, RowGradients
@@ -29,6 +31,47 @@ def test_moments_follow_the_gaussians_when_others_come_and_go() -> None:
         adam.step(gaussians, gradients(gaussians, [1, 4], seed=1))
     shared = np.isin(still.ids, changed.ids)
     assert changed.rows[:4].tobytes() == still.rows[shared].tobytes()
+
+
+def test_gaussians_that_come_back_begin_anew_and_the_others_go_on() -> None:
+    changed, still = map_of(6), map_of(6)
+    adams = Adam(), Adam()
+    for adam, gaussians in zip(adams, (changed, still), strict=True):
+        adam.step(gaussians, gradients(gaussians, [0, 1, 2, 3, 5]))
+    away = changed.take_out(np.array([0, 1, 1, 0, 0, 0], bool))
+    adams[0].step(changed, gradients(changed, [0], seed=1))
+    adams[1].step(still, gradients(still, [0], seed=1))
+    changed.bring_back(*away)
+    changed.add(map_of(2).rows.copy(), 1)
+    adams[0].step(changed, gradients(changed, [3, 5], seed=2))
+    adams[1].step(still, gradients(still, [3, 5], seed=2))
+    assert changed.rows[:6].tobytes() == still.rows.tobytes()
+    a, b = (adam.snapshot() for adam in adams)
+    stayed = [0, 3, 4, 5]
+    for name in ("mean", "square", "steps"):
+        assert a[name][stayed].tobytes() == b[name][stayed].tobytes()
+        assert not np.any(a[name][[1, 2, 6, 7]])
+    np.testing.assert_array_equal(a["ids"], np.arange(8))
+
+
+@given(st.lists(st.sets(st.integers(0, 11), min_size=1), min_size=1, max_size=6))
+@settings(deadline=None)
+def test_moments_of_any_set_of_gaussians_are_found_by_their_ids(present) -> None:
+    gaussians, adam = map_of(12), Adam()
+    rows, anchors = gaussians.rows.copy(), gaussians.anchors.copy()
+    taken: dict[int, int] = {}  # steps since the Gaussian last came
+    for ids in present:
+        gaussians.take_out(np.ones(len(gaussians), bool))
+        where = np.array(sorted(ids), int)
+        gaussians.bring_back(where, rows[where], anchors[where])
+        adam.step(gaussians, gradients(gaussians, sorted(ids)))
+        taken = {i: taken.get(i, 0) + 1 for i in ids}
+        steps = np.array([taken[i] for i in where])
+        np.testing.assert_array_equal(adam.snapshot()["steps"], steps)
+        g = gradients(gaussians, sorted(ids)).rows
+        expected = g * (1 - 0.9 ** steps[:, None]), g**2 * (1 - 0.95 ** steps[:, None])
+        np.testing.assert_allclose(adam.snapshot()["mean"], expected[0], rtol=1e-4)
+        np.testing.assert_allclose(adam.snapshot()["square"], expected[1], rtol=1e-4)
 
 
 def test_new_gaussian_begins_with_a_full_step() -> None:
