@@ -1,0 +1,164 @@
+"""What a keyframe saw, as arrays and as bytes."""
+
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import zstandard
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import Camera
+
+from .exposure import Exposure
+from .views import View
+
+_LEVEL = 1  # of zstd
+_QUANTISED = 0.25  # depth that shrinks to less is: sensors count in steps, so bytes repeat
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class KeyframeImages:
+    """The part of a view that never changes.
+
+    keyframe  its id
+    camera    without distortion
+    color     [3, H, W] uint8
+    depth_m   [H, W] float32, 0 where not measured
+    mask      [H, W] uint8, 0 where the pixel does not count; None: all do
+    Raises DataError when the images do not fit the camera.
+    """
+
+    keyframe: int
+    camera: Camera
+    color: np.ndarray
+    depth_m: np.ndarray
+    mask: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        size = (self.camera.height, self.camera.width)
+        self._require("color", self.color, np.uint8, (3, *size))
+        self._require("depth_m", self.depth_m, np.float32, size)
+        if self.mask is not None:
+            self._require("mask", self.mask, np.uint8, size)
+
+    def _require(self, name: str, image: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
+        if image.dtype != dtype or image.shape != shape:
+            raise DataError(
+                f"keyframe {self.keyframe}: {name} is {image.dtype}{image.shape}, its camera "
+                f"says {np.dtype(dtype)}{shape}."
+            )
+
+    @classmethod
+    def of(cls, view: View) -> "KeyframeImages":
+        return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
+
+    def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> View:
+        """The keyframe as the loss reads it, at a pose [4, 4] and with an exposure."""
+        return View(
+            self.keyframe,
+            self.camera,
+            self.color,
+            self.depth_m,
+            T_map_camera,
+            exposure or Exposure(),
+            self.mask,
+        )
+
+    @property
+    def nbytes(self) -> int:
+        images = (self.color, self.depth_m, self.mask)
+        return sum(image.nbytes for image in images if image is not None)
+
+    def owned(self) -> "KeyframeImages":
+        """With read-only copies of the images, which keep no message alive."""
+        mask = None if self.mask is None else _own(self.mask)
+        return replace(self, color=_own(self.color), depth_m=_own(self.depth_m), mask=mask)
+
+
+def _own(image: np.ndarray) -> np.ndarray:
+    out = image.copy()
+    out.flags.writeable = False
+    return out
+
+
+# --- bytes ------------------------------------------------------------------------------------
+class _Stored(msgspec.Struct, frozen=True):
+    keyframe: int
+    camera: Camera
+    color: bytes  # this and all other bytes: zstd
+    depth: bytes
+    is_depth_differences: bool
+    mask: bytes | None
+
+
+def packed(images: KeyframeImages) -> bytes:
+    """The images without loss, about a quarter of their size (tests/bench/RESULTS.md)."""
+    depth, is_differences = _packed_depth(images.depth_m)
+    stored = _Stored(
+        images.keyframe,
+        images.camera,
+        _compressed(_color_differences(images.color)),
+        depth,
+        is_differences,
+        None if images.mask is None else _compressed(images.mask),
+    )
+    return msgspec.msgpack.encode(stored)
+
+
+def unpacked(body: bytes | memoryview) -> KeyframeImages:
+    """The images of which `body` is the packed form. Raises DataError for other bytes."""
+    try:
+        stored = msgspec.msgpack.decode(body, type=_Stored)
+        camera = stored.camera
+        size = (camera.height, camera.width)
+        color = _color_of(_expanded(stored.color, np.uint8, (3, *size)))
+        depth_m = _depth_of(stored.depth, stored.is_depth_differences, size)
+        mask = None if stored.mask is None else _expanded(stored.mask, np.uint8, size)
+    except (msgspec.DecodeError, zstandard.ZstdError, ValueError) as error:
+        raise DataError(f"{len(body)} bytes hold no images of a keyframe: {error}.") from error
+    for image in (color, depth_m, mask):
+        if image is not None:
+            image.flags.writeable = False
+    return KeyframeImages(stored.keyframe, camera, color, depth_m, mask)
+
+
+def _color_differences(color: np.ndarray) -> np.ndarray:
+    """Red and blue beside green, each row beside the one above it; modulo 256."""
+    out = color.copy()
+    out[0::2] -= color[1]
+    out[:, 1:] = np.subtract(out[:, 1:], out[:, :-1])
+    return out
+
+
+def _color_of(differences: np.ndarray) -> np.ndarray:
+    out = np.add.accumulate(differences, axis=1, dtype=np.uint8)
+    out[0::2] += out[1]
+    return out
+
+
+def _packed_depth(depth_m: np.ndarray) -> tuple[bytes, bool]:
+    """Quantised depth as it is; other depth as differences of rows, byte by byte, which halves
+    it. Whether it is differences."""
+    plain = _compressed(depth_m)
+    if len(plain) < _QUANTISED * depth_m.nbytes:
+        return plain, False
+    bits = depth_m.view(np.uint32)
+    differences = bits.copy()
+    differences[1:] -= bits[:-1]
+    return _compressed(differences.reshape(-1, 1).view(np.uint8).T), True
+
+
+def _depth_of(data: bytes, is_differences: bool, size: tuple[int, int]) -> np.ndarray:
+    if not is_differences:
+        return _expanded(data, np.float32, size)
+    planes = _expanded(data, np.uint8, (4, size[0] * size[1]))
+    differences = np.ascontiguousarray(planes.T).view(np.uint32).reshape(size)
+    return np.add.accumulate(differences, axis=0, dtype=np.uint32).view(np.float32)
+
+
+def _compressed(array: np.ndarray) -> bytes:
+    return zstandard.ZstdCompressor(level=_LEVEL).compress(np.ascontiguousarray(array))
+
+
+def _expanded(data: bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
+    return np.frombuffer(zstandard.ZstdDecompressor().decompress(data), dtype).reshape(shape)

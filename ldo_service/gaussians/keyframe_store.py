@@ -1,0 +1,200 @@
+"""The images of all keyframes, on disk, with the last used ones in memory."""
+
+import logging
+import shutil
+import tempfile
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.errors import ConfigError, DataError
+
+from .keyframe_images import KeyframeImages, packed, unpacked
+from .sealed_file import UNFINISHED, read_sealed, write_sealed
+
+log = logging.getLogger(__name__)
+
+_SUFFIX = ".keyframe"
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeStoreConfig:
+    cache_mb: float = 256.0  # in memory: 119 keyframes of 640x480 with 2.15 MB each
+    quota_mb: float = 4096.0  # on disk: some 8,000 keyframes of 640x480 with 0.5 MB each
+    newest_kept: int = 8  # that the quota never touches: they are worked on
+
+    def __post_init__(self) -> None:
+        if not (self.cache_mb >= 0 and self.quota_mb > 0 and self.newest_kept >= 1):
+            raise ConfigError(
+                f"{self}: cache_mb must be at least 0, quota_mb positive, newest_kept at least 1."
+            )
+
+
+class KeyframeStore:
+    """Finds in `folder` what an earlier store left there. Without a folder a temporary one is
+    used, which goes when the store does.
+
+    Over the quota, keyframes are forgotten as described at `_most_redundant`. Where the disk takes
+    no more, a new keyframe lives as long as the cache holds it. What the store holds depends only
+    on what it was given, not on time. Not for two threads at once. Raises ConfigError for a folder
+    that cannot be used.
+    """
+
+    def __init__(self, folder: Path | None, config: KeyframeStoreConfig | None = None) -> None:
+        self.config = config or KeyframeStoreConfig()
+        self._folder = folder or _temporary_folder(self)
+        self._sizes = _found(self._folder)  # bytes of each file, by keyframe
+        self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # last used last
+        self._is_disk_refusing = False
+        self._reads = self._forgotten = self._damaged = self._not_written = 0
+        self._make_room()
+
+    def put(self, images: KeyframeImages) -> None:
+        """Keep copies. A keyframe that is there already is replaced."""
+        images = images.owned()
+        self._remember(images)
+        self._write(images)
+        self._make_room()
+
+    def get(self, keyframe: int) -> KeyframeImages | None:
+        """The images, read-only, bit for bit; None when they are not, or no longer, there."""
+        images = self._cache.get(keyframe)
+        if images is not None:
+            self._cache.move_to_end(keyframe)
+        elif keyframe in self._sizes:
+            images = self._read(keyframe)
+        return images
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._sizes or keyframe in self._cache
+
+    def __len__(self) -> int:
+        return len(self._sizes.keys() | self._cache.keys())
+
+    def keyframes(self) -> list[int]:
+        """Ids of all that are there, ascending."""
+        return sorted(self._sizes.keys() | self._cache.keys())
+
+    def keep_only(self, keyframes: Iterable[int]) -> None:
+        """Drop all others: those that a restored checkpoint does not know."""
+        kept = set(keyframes)
+        for keyframe in self.keyframes():
+            if keyframe not in kept:
+                self._drop(keyframe)
+
+    def statistics(self) -> dict[str, float]:
+        return {
+            "keyframes_stored": len(self),
+            "keyframes_disk_mb": sum(self._sizes.values()) / 1e6,
+            "keyframes_cache_mb": self._cached_bytes() / 1e6,
+            "keyframes_read": self._reads,
+            "keyframes_forgotten": self._forgotten,
+            "keyframes_damaged": self._damaged,
+            "keyframes_not_written": self._not_written,
+        }
+
+    # --- memory -----------------------------------------------------------------------------------
+    def _remember(self, images: KeyframeImages) -> None:
+        self._cache[images.keyframe] = images
+        self._cache.move_to_end(images.keyframe)
+        while self._cached_bytes() > 1e6 * self.config.cache_mb:
+            self._cache.popitem(last=False)
+
+    def _cached_bytes(self) -> int:
+        return sum(images.nbytes for images in self._cache.values())
+
+    # --- disk -------------------------------------------------------------------------------------
+    def _path(self, keyframe: int) -> Path:
+        return self._folder / f"{keyframe:08d}{_SUFFIX}"
+
+    def _write(self, images: KeyframeImages) -> None:
+        try:
+            size = write_sealed(self._path(images.keyframe), packed(images))
+        except OSError as error:
+            self._refused(error)
+        else:
+            self._sizes[images.keyframe] = size
+            self._is_disk_refusing = False
+
+    def _refused(self, error: OSError) -> None:
+        """Count every keyframe, and tell once until the disk takes one again."""
+        self._not_written += 1
+        if not self._is_disk_refusing:
+            log.error(
+                "keyframes cannot be written to %s: %s. The newest stay in memory "
+                "(cache_mb=%g), older ones will be missing; free some disk space, or lower "
+                "quota_mb=%g.",
+                self._folder,
+                error,
+                self.config.cache_mb,
+                self.config.quota_mb,
+            )
+        self._is_disk_refusing = True
+
+    def _read(self, keyframe: int) -> KeyframeImages | None:
+        self._reads += 1
+        try:
+            images = unpacked(read_sealed(self._path(keyframe)))
+            if images.keyframe != keyframe:
+                raise DataError(f"{self._path(keyframe)} holds keyframe {images.keyframe}.")
+        except (OSError, DataError) as error:
+            log.warning("keyframe %d is dropped, its images cannot be read: %s", keyframe, error)
+            self._damaged += 1
+            self._drop(keyframe)
+            return None
+        self._remember(images)
+        return images
+
+    def _drop(self, keyframe: int) -> None:
+        self._cache.pop(keyframe, None)
+        if self._sizes.pop(keyframe, None) is not None:
+            _unlink(self._path(keyframe))
+
+    # --- quota ------------------------------------------------------------------------------------
+    def _make_room(self) -> None:
+        while sum(self._sizes.values()) > 1e6 * self.config.quota_mb:
+            keyframe = self._most_redundant()
+            if keyframe is None:
+                return
+            self._drop(keyframe)
+            self._forgotten += 1
+
+    def _most_redundant(self) -> int | None:
+        """The keyframe on disk whose neighbours there have the closest ids, the oldest of several:
+        it saw least that they did not, and keyframes stay spread over the whole run. Never the
+        first, which fixes the map's place and brightness, nor the newest. None: nobody else."""
+        kept = np.array(sorted(self._sizes), np.int64)
+        gaps = (kept[2:] - kept[:-2])[: max(0, len(kept) - 1 - self.config.newest_kept)]
+        return int(kept[1 + np.argmin(gaps)]) if len(gaps) else None
+
+
+def _temporary_folder(owner: object) -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="ldo-keyframes-"))
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _found(folder: Path) -> dict[int, int]:
+    """Size in bytes of the keyframes in a folder, which is made; unfinished files are removed."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for unfinished in folder.glob(f"*{_SUFFIX}{UNFINISHED}"):
+            unfinished.unlink()
+        files = {file.stem: file.stat().st_size for file in folder.glob(f"*{_SUFFIX}")}
+    except OSError as error:
+        raise ConfigError(
+            f"keyframes cannot be kept in {folder}: {error}. Choose a folder that can be written."
+        ) from error
+    return {int(stem): size for stem, size in files.items() if stem.isdecimal()}
+
+
+def _unlink(path: Path) -> None:
+    """A file that stays for now costs disk space only."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        log.warning("%s cannot be removed: %s", path, error)

@@ -1,0 +1,302 @@
+import errno
+import gc
+import logging
+import resource
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.gaussians import Exposure
+from ldo_service.gaussians.keyframe_images import KeyframeImages, packed, unpacked
+from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
+from ldo_service.geometry import Camera
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+MB_EACH = 64 * 48 * 7 / 1e6  # in memory
+
+
+def images_of(keyframe: int, *, step_m: float = 0.0, mask: bool = False) -> KeyframeImages:
+    """Noise in colour, a slope in depth; `step_m` of the depth sensor."""
+    rng = np.random.default_rng(keyframe)
+    color = rng.integers(0, 256, (3, 48, 64), np.uint8)
+    depth = np.linspace(1, 3, 48 * 64).reshape(48, 64) + rng.uniform(0, 0.01, (48, 64))
+    depth = np.round(depth / step_m) * step_m if step_m else depth
+    depth[:10, :10] = 0
+    seen = rng.integers(0, 2, (48, 64), np.uint8) if mask else None
+    return KeyframeImages(keyframe, CAMERA, color, depth.astype(np.float32), seen)
+
+
+def assert_same(a: KeyframeImages | None, b: KeyframeImages) -> None:
+    assert a is not None
+    assert (a.keyframe, a.camera) == (b.keyframe, b.camera)
+    assert a.color.tobytes() == b.color.tobytes()
+    assert a.depth_m.tobytes() == b.depth_m.tobytes()
+    assert (a.mask is None) == (b.mask is None)
+    assert a.mask is None or b.mask is None or a.mask.tobytes() == b.mask.tobytes()
+
+
+def store_on_disk(folder: Path, keyframes: list[int], **config: float) -> KeyframeStore:
+    """Without a cache, so that all is read from the disk."""
+    store = KeyframeStore(folder, KeyframeStoreConfig(cache_mb=0, **config))  # type: ignore[arg-type]
+    for keyframe in keyframes:
+        store.put(images_of(keyframe))
+    return store
+
+
+def file_of(folder: Path, keyframe: int) -> Path:
+    (path,) = folder.glob(f"*{keyframe}.keyframe")
+    return path
+
+
+# --- bytes ------------------------------------------------------------------------------------
+@pytest.mark.parametrize("step_m", [0.0, 0.001, 1 / 5000])
+@pytest.mark.parametrize("mask", [False, True])
+def test_images_come_back_bit_for_bit(step_m: float, mask: bool) -> None:
+    images = images_of(3, step_m=step_m, mask=mask)
+    assert_same(unpacked(packed(images)), images)
+
+
+def test_depth_of_any_bits_comes_back_bit_for_bit() -> None:
+    bits = np.random.default_rng(0).integers(
+        0, 2**32, (48, 64), np.uint32
+    )  # with NaN, -0, denormals
+    images = KeyframeImages(0, CAMERA, images_of(0).color, bits.view(np.float32))
+    assert unpacked(packed(images)).depth_m.tobytes() == bits.tobytes()
+
+
+def test_a_smooth_picture_takes_less_room_than_noise() -> None:
+    ramp = np.add.outer(np.arange(48), 2 * np.arange(64)).astype(np.uint8)
+    smooth = KeyframeImages(0, CAMERA, np.stack([ramp] * 3), np.ones((48, 64), np.float32))
+    assert 20 * len(packed(smooth)) < smooth.nbytes < 4 * len(packed(images_of(0)))
+
+
+def test_images_that_do_not_fit_their_camera_are_refused() -> None:
+    good = images_of(0)
+    with pytest.raises(DataError, match=r"depth_m is float32\(48, 63\)"):
+        KeyframeImages(0, CAMERA, good.color, good.depth_m[:, 1:])
+    with pytest.raises(DataError, match="color"):
+        KeyframeImages(0, CAMERA, good.color.transpose(1, 2, 0), good.depth_m)
+
+
+@pytest.mark.parametrize("body", [b"", b"\x93\x01\x02\x03", b"\xff" * 100])
+def test_other_bytes_are_refused(body: bytes) -> None:
+    with pytest.raises(DataError, match="no images of a keyframe"):
+        unpacked(body)
+
+
+def test_a_view_is_the_images_at_a_pose() -> None:
+    images, T = images_of(5, mask=True), np.diag([1.0, -1, -1, 1])
+    view = images.view(T, Exposure(np.full(3, 2, np.float32)))
+    assert_same(KeyframeImages.of(view), images)
+    assert view.T_map_camera is T
+    np.testing.assert_array_equal(view.exposure.gain, 2)
+
+
+# --- the store --------------------------------------------------------------------------------
+def test_what_was_put_is_there_and_nothing_else(tmp_path: Path) -> None:
+    store = store_on_disk(tmp_path, [7, 3, 12])
+    assert store.keyframes() == [3, 7, 12]
+    assert len(store) == 3
+    assert 7 in store
+    assert 8 not in store
+    assert store.get(8) is None
+    for keyframe in (12, 3, 7, 7):
+        assert_same(store.get(keyframe), images_of(keyframe))
+
+
+def test_the_store_keeps_no_array_of_its_callers_and_gives_none_to_write(tmp_path: Path) -> None:
+    store, images = KeyframeStore(tmp_path), images_of(1)
+    store.put(images)
+    images.color[...] = 0
+    images.depth_m[...] = 0
+    assert_same(store.get(1), images_of(1))
+    for other in (store, store_on_disk(tmp_path, [])):
+        got = other.get(1)
+        assert got is not None
+        with pytest.raises(ValueError, match="read-only"):
+            got.color[...] = 0
+        with pytest.raises(ValueError, match="read-only"):
+            got.depth_m[...] = 0
+
+
+def test_cache_holds_the_last_used_and_no_more_than_its_megabytes(tmp_path: Path) -> None:
+    store = KeyframeStore(tmp_path, KeyframeStoreConfig(cache_mb=3.5 * MB_EACH))
+    for keyframe in range(4):
+        store.put(images_of(keyframe))
+        assert store.statistics()["keyframes_cache_mb"] <= 3.5 * MB_EACH
+    store.get(1)
+    store.put(images_of(4))  # 2 goes, 1 was used
+    assert store.statistics()["keyframes_read"] == 0
+    for keyframe in (1, 3, 4):
+        store.get(keyframe)
+    assert store.statistics()["keyframes_read"] == 0
+    for keyframe in (0, 2):
+        assert_same(store.get(keyframe), images_of(keyframe))
+    assert store.statistics()["keyframes_read"] == 2
+    assert store.statistics()["keyframes_cache_mb"] == pytest.approx(3 * MB_EACH)
+
+
+def test_a_successor_finds_what_is_there(tmp_path: Path) -> None:
+    store_on_disk(tmp_path, [1, 2, 3])
+    (tmp_path / "00000009.keyframe.new").write_bytes(b"half")
+    (tmp_path / "notes.txt").write_text("not ours")
+    successor = store_on_disk(tmp_path, [4])
+    assert successor.keyframes() == [1, 2, 3, 4]
+    assert_same(successor.get(2), images_of(2))
+    assert not (tmp_path / "00000009.keyframe.new").exists()
+    assert (tmp_path / "notes.txt").exists()
+
+
+def test_keyframes_that_a_checkpoint_does_not_know_are_dropped(tmp_path: Path) -> None:
+    store = KeyframeStore(tmp_path)
+    for keyframe in (1, 2, 3, 4):
+        store.put(images_of(keyframe))
+    store.keep_only([1, 3, 99])
+    assert store.keyframes() == [1, 3]
+    assert store.get(4) is None
+    assert store_on_disk(tmp_path, []).keyframes() == [1, 3]
+
+
+def test_a_temporary_folder_goes_with_the_store() -> None:
+    store = KeyframeStore(None, KeyframeStoreConfig(cache_mb=0))
+    store.put(images_of(1))
+    folder = store._folder
+    assert_same(store.get(1), images_of(1))
+    del store
+    gc.collect()
+    assert not folder.exists()
+
+
+def test_a_folder_that_cannot_be_used_is_a_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="Choose a folder"):
+        KeyframeStore(tmp_path / "file")
+
+
+@pytest.mark.parametrize("change", [{"cache_mb": -1}, {"quota_mb": 0}, {"newest_kept": 0}])
+def test_senseless_configuration_is_refused(change: dict) -> None:
+    with pytest.raises(ConfigError):
+        KeyframeStoreConfig(**change)
+
+
+# --- quota ------------------------------------------------------------------------------------
+def quota_for(folder: Path, count: int) -> float:
+    """MB that `count` keyframes need, and half of one."""
+    store = store_on_disk(folder, [0])
+    return (count + 0.5) * store.statistics()["keyframes_disk_mb"]
+
+
+def test_over_the_quota_the_one_with_the_nearest_neighbours_goes_first(tmp_path: Path) -> None:
+    quota_mb = quota_for(tmp_path / "one", 5)
+    store = store_on_disk(tmp_path / "many", [0, 10, 13, 20, 30], quota_mb=quota_mb, newest_kept=2)
+    store.put(images_of(31))  # gaps: 10 has 13, 13 has 10, 20 has 17, the two newest are safe
+    assert store.keyframes() == [0, 10, 20, 30, 31]
+    store.put(images_of(40))  # 10 and 20 have 20, 30 has 11
+    assert store.keyframes() == [0, 10, 20, 31, 40]
+    store.put(images_of(50))  # 10 has 20, 20 has 21, 31 has 20: the older of two
+    assert store.keyframes() == [0, 20, 31, 40, 50]
+    assert store.statistics()["keyframes_forgotten"] == 3
+    assert len(list((tmp_path / "many").iterdir())) == 5
+
+
+def test_a_long_run_stays_within_the_quota_and_keeps_keyframes_of_all_times(tmp_path: Path) -> None:
+    quota_mb = quota_for(tmp_path / "one", 8)
+    store = store_on_disk(tmp_path / "many", list(range(60)), quota_mb=quota_mb, newest_kept=3)
+    assert store.statistics()["keyframes_disk_mb"] <= quota_mb
+    kept = store.keyframes()
+    assert (len(kept), kept[0], kept[-3:]) == (8, 0, [57, 58, 59])
+    assert max(np.diff(kept)) <= 4 * 60 / 8
+
+
+def test_the_newest_stay_even_over_the_quota(tmp_path: Path) -> None:
+    store = store_on_disk(tmp_path, list(range(9)), quota_mb=1e-6, newest_kept=4)
+    assert store.keyframes() == [0, 5, 6, 7, 8]
+
+
+def test_a_forgotten_keyframe_is_not_in_the_cache_either(tmp_path: Path) -> None:
+    config = KeyframeStoreConfig(quota_mb=1e-6, newest_kept=1)
+    store = KeyframeStore(tmp_path, config)
+    for keyframe in range(4):
+        store.put(images_of(keyframe))
+    assert store.keyframes() == [0, 3]
+    assert store.get(1) is None
+
+
+# --- damage -----------------------------------------------------------------------------------
+def cut(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def flipped(data: bytes) -> bytes:
+    return data[:-7] + bytes([data[-7] ^ 1]) + data[-6:]
+
+
+def emptied(_: bytes) -> bytes:
+    return b""
+
+
+@pytest.mark.parametrize("spoil", [cut, flipped, emptied])
+def test_a_damaged_keyframe_is_dropped_with_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[bytes], bytes]
+) -> None:
+    store = store_on_disk(tmp_path, [1, 2])
+    path = file_of(tmp_path, 1)
+    path.write_bytes(spoil(path.read_bytes()))
+    with caplog.at_level(logging.WARNING):
+        assert [store.get(1), store.get(1)] == [None, None]
+    assert len(caplog.records) == 1
+    assert "keyframe 1 is dropped" in caplog.text
+    assert store.keyframes() == [2]
+    assert not path.exists()
+    assert store.statistics()["keyframes_damaged"] == 1
+
+
+def test_a_file_that_is_gone_or_under_another_name_is_dropped(tmp_path: Path) -> None:
+    store = store_on_disk(tmp_path, [1, 2, 3])
+    file_of(tmp_path, 1).rename(file_of(tmp_path, 2))
+    assert store.get(1) is None
+    assert store.get(2) is None
+    assert store.keyframes() == [3]
+
+
+def test_a_full_disk_leaves_the_newest_in_memory_and_is_told_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = KeyframeStore(tmp_path, KeyframeStoreConfig(cache_mb=2.5 * MB_EACH))
+    store.put(images_of(0))
+
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
+        patch.setattr("ldo_service.gaussians.keyframe_store.write_sealed", full)
+        for keyframe in (1, 2, 3):
+            store.put(images_of(keyframe))
+    assert store.keyframes() == [0, 2, 3]
+    assert_same(store.get(3), images_of(3))
+    assert_same(store.get(0), images_of(0))
+    assert store.statistics()["keyframes_not_written"] == 3
+    assert len(caplog.records) == 1
+    assert "free some disk space" in caplog.text
+    store.put(images_of(4))
+    assert 4 in store_on_disk(tmp_path, [])
+
+
+def test_a_file_that_the_system_cuts_leaves_nothing_behind(tmp_path: Path) -> None:
+    """RLIMIT_FSIZE makes the write itself fail half way."""
+    store = store_on_disk(tmp_path, [1])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+        store.put(images_of(2))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert store.statistics()["keyframes_not_written"] == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["00000001.keyframe"]
+    assert_same(store.get(1), images_of(1))
