@@ -1,11 +1,11 @@
 """The map of 3D Gaussians: what it holds, how it is seen, how it grows and how it is optimised."""
 
 from .adam import Adam, AdamConfig
-from .exposure import Exposure, fitted_exposure
+from .exposure import Exposure, estimated_exposure, fitted_exposure
 from .insertion import InsertionConfig, insert
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
-from .optimise import Optimised, Optimiser, OptimiserConfig
+from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
 from .rasteriser import Rasteriser, RowGradients
 from .render import Rendering, render
@@ -19,7 +19,6 @@ __all__ = [
     "ImageLoss",
     "InsertionConfig",
     "LossWeights",
-    "Optimised",
     "Optimiser",
     "OptimiserConfig",
     "PruningConfig",
@@ -27,6 +26,7 @@ __all__ = [
     "Rendering",
     "RowGradients",
     "View",
+    "estimated_exposure",
     "fitted_exposure",
     "image_loss",
     "insert",

@@ -18,7 +18,7 @@ class AdamConfig:
     iterations and not thousands (ALGORITHMS: 4.5 s of the usual rates are reached in 0.35 s)."""
 
     mean_m: float = 5e-4
-    log_scale: float = 0.02
+    log_scale: float = 0.06
     quat: float = 0.01
     opacity_logit: float = 0.1
     color: float = 0.01
@@ -85,6 +85,11 @@ class Adam:
             threads,
         )
         gaussians.touch()
+
+    def steps(self, gaussians: GaussianMap) -> np.ndarray:
+        """[N] int32, how many steps each Gaussian has made. A view."""
+        self._follow(gaussians.ids)
+        return self._steps
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of everything, as named arrays."""

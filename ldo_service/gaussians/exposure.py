@@ -2,7 +2,16 @@
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
+
+LEAST_GAIN = 0.1  # below, nothing of the map's brightness can be told from the image
+BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of brightness
+SATURATED = 0.97  # of the range: beyond, the sensor says no more
+FEWEST_BLOCKS = 100
+OUTLIER_SIGMAS = 2.5
+ROUNDS = 3
+GAIN_PRIOR = 1e-4  # variance of colour below which gain 1 is believed more than the images
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -26,6 +35,10 @@ class Exposure:
         """The image [H, W, 3] as this camera would have exposed it, in 0..1."""
         return (self.gain * color + self.bias).clip(0, 1)
 
+    def removed(self, color: np.ndarray) -> np.ndarray:
+        """An image [H, W, 3] of this camera at the brightness of the map, in 0..1."""
+        return ((color - self.bias) / np.maximum(self.gain, LEAST_GAIN)).clip(0, 1)
+
 
 def fitted_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
     """Least squares fit of gain and bias that take `rendered` to `seen`, both [H, W, 3] in 0..1.
@@ -37,3 +50,41 @@ def fitted_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
     covariance = ((x - x.mean(axis=0)) * (y - y.mean(axis=0))).mean(axis=0)
     gain = np.where(variance > 1e-6, covariance / np.maximum(variance, 1e-6), 1.0)
     return Exposure.of(np.stack([gain, y.mean(axis=0) - gain * x.mean(axis=0)]))
+
+
+def estimated_exposure(
+    rendered: np.ndarray, opacity: np.ndarray, seen: np.ndarray
+) -> Exposure | None:
+    """Gain and bias of a new image against what the map shows at its pose, where it shows enough.
+
+    rendered, seen [H, W, 3] in 0..1, opacity [H, W]. Least squares over averages of 8x8 pixels that
+    are opaque and not saturated, without outliers (moved things, new surface). None where these are
+    too few.
+    """
+    x, y = _averaged(rendered), _averaged(seen)
+    usable = (_averaged(opacity) > 0.95) & (y.max(axis=-1) < SATURATED)
+    if np.count_nonzero(usable) < FEWEST_BLOCKS:
+        return None
+    channels = [_robust_line(x[usable, c], y[usable, c]) for c in range(3)]
+    return Exposure.of(np.array(channels).T)
+
+
+def _averaged(image: np.ndarray) -> np.ndarray:
+    height, width = (n // BLOCK_PX for n in image.shape[:2])
+    image = np.ascontiguousarray(image[: height * BLOCK_PX, : width * BLOCK_PX], np.float32)
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
+    """Slope and offset of y over x, both [M]; the slope is drawn to one where x hardly varies."""
+    inlier = np.ones(len(x), bool)
+    slope, offset = 1.0, 0.0
+    for _ in range(ROUNDS):
+        a, b = x[inlier].astype(float), y[inlier].astype(float)
+        covariance = float(np.mean((a - a.mean()) * (b - b.mean())))
+        slope = (covariance + GAIN_PRIOR) / (float(a.var()) + GAIN_PRIOR)
+        offset = float(b.mean()) - slope * float(a.mean())
+        residual = np.abs(y - slope * x - offset)
+        sigma = 1.4826 * float(np.median(residual[inlier]))
+        inlier = residual <= max(OUTLIER_SIGMAS * sigma, 0.01)
+    return slope, offset

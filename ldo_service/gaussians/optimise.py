@@ -1,7 +1,8 @@
-"""The map fitted to a window of keyframes: Gaussians, exposures, and poses if wanted."""
+"""The map fitted to keyframes: Gaussians, exposures, and poses if wanted."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
 from .rasteriser import Rasteriser
 from .view_state import ViewMoments
-from .views import View, schedule
+from .views import View
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +25,6 @@ class OptimiserConfig:
     needle_weight: float = 0.01  # of mean log(longest / middle axis) beyond max_needle_ratio
     max_needle_ratio: float = 4.0  # what insertion gives to surfaces seen at a grazing angle
 
-    # Which keyframes. Random ones keep what was learnt: +4.2 dB, covisible ones +1.1 dB in the
-    # ablations of others (ALGORITHMS, The map).
-    newest_share: float = 0.3
-    covisible_share: float = 0.3
-
     # Per frame. 0 switches off.
     exposure_rate: float = 0.005  # step of gains and biases per iteration
     exposure_prior: float = 0.01  # pull to gain 1, bias 0: else the map's brightness may drift
@@ -36,9 +32,6 @@ class OptimiserConfig:
     translation_rate_m: float = 0.0
 
     def __post_init__(self) -> None:
-        shares = (self.newest_share, self.covisible_share)
-        if not (min(shares) >= 0 and sum(shares) <= 1):
-            raise ConfigError(f"newest_share and covisible_share {shares} must not exceed 1.")
         rates = (self.exposure_rate, self.rotation_rate_rad, self.translation_rate_m)
         if not (min(rates) >= 0 and self.exposure_prior >= 0 and self.needle_weight >= 0):
             raise ConfigError(f"{self}: rates and weights must not be negative.")
@@ -50,16 +43,12 @@ class OptimiserConfig:
         return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Optimised:
-    """views     as given, with the exposures and poses after optimisation
-    taken     per iteration the place in `views` of the one it took
-    losses    per iteration, before its step
-    """
+class Views(Protocol):
+    """Where the optimiser finds a keyframe's view, and puts it with a new exposure and pose."""
 
-    views: list[View]
-    taken: list[int]
-    losses: list[ImageLoss]
+    def __getitem__(self, keyframe: int) -> View: ...
+
+    def __setitem__(self, keyframe: int, view: View) -> None: ...
 
 
 class Optimiser:
@@ -80,32 +69,28 @@ class Optimiser:
     def optimise(
         self,
         gaussians: GaussianMap,
-        views: Sequence[View],
-        iterations: int,
-        rng: np.random.Generator,
+        views: Views,
+        plan: Sequence[int],
         *,
-        final_rate: float = 1.0,
-    ) -> Optimised:
-        """Make `iterations` steps, each against one view, the last of which is the newest.
+        rates: tuple[float, float] = (1.0, 1.0),
+        fixed: int | None = None,
+    ) -> list[ImageLoss]:
+        """One step against each view that `plan` names; their losses before the step.
 
-        Changes `gaussians` in place. Steps shrink geometrically to `final_rate` of their length:
-        1 while the map grows, less to settle at the end. The pose and the exposure of the first
-        view stay: they fix the place and the brightness of the map.
+        Changes `gaussians` in place and puts views back with new exposures and poses.
+        rates  factor on all steps of the first and the last iteration, geometric between: 1 while
+               the map grows, less to settle at the end
+        fixed  the view whose pose and exposure stay, which fix the place and the brightness of
+               the map
         """
-        config = self.config
-        views = list(views)
-        taken = schedule(
-            views,
-            iterations if views else 0,
-            rng,
-            newest_share=config.newest_share,
-            covisible_share=config.covisible_share,
-        )
         losses = []
-        for rate, i in zip(np.geomspace(1, final_rate, len(taken)), taken, strict=True):
-            loss, views[i] = self.step(gaussians, views[i], rate=float(rate), is_fixed=i == 0)
+        for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
+            view = views[keyframe]
+            loss, moved = self.step(gaussians, view, rate=rate, is_fixed=keyframe == fixed)
+            if moved is not view:
+                views[keyframe] = moved
             losses.append(loss)
-        return Optimised(views, taken, losses)
+        return losses
 
     def step(
         self, gaussians: GaussianMap, view: View, *, rate: float = 1.0, is_fixed: bool = False
@@ -164,6 +149,10 @@ class Optimiser:
         step = -rate * rates * self._views.direction(view.keyframe, "pose", by_xi)
         T_map_camera = se3.orthonormalised(view.T_map_camera @ se3.exp(step))
         return replace(view, T_map_camera=T_map_camera)
+
+    def steps(self, gaussians: GaussianMap) -> np.ndarray:
+        """[N] int32, how many steps each Gaussian has made: those whose count grew have changed."""
+        return self._adam.steps(gaussians)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of all moments, as named arrays."""

@@ -6,8 +6,6 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 
-from .model import GaussianMap
-
 
 @dataclass(frozen=True, slots=True)
 class PruningConfig:
@@ -22,14 +20,14 @@ class PruningConfig:
             raise ConfigError(f"{self}: max_relative_scale above 1, neighbourhood_m positive.")
 
 
-def superfluous(gaussians: GaussianMap, config: PruningConfig | None = None) -> np.ndarray:
-    """Mask [N] bool of Gaussians that are nearly transparent, far larger than those around them,
-    or not finite; for `GaussianMap.remove`."""
+def superfluous(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
+    """Mask [N] bool of rows [N, 16] that are nearly transparent, far larger than those around
+    them, or not finite."""
     config = config or PruningConfig()
-    longest_m = np.exp(gaussians.log_scales.max(axis=1).astype(float))
-    transparent = gaussians.opacity_logits < np.log(config.min_opacity / (1 - config.min_opacity))
-    finite = np.isfinite(gaussians.rows[:, :14]).all(axis=1)
-    mean_m = _mean_around(gaussians.means, np.where(finite, longest_m, 0), config.neighbourhood_m)
+    finite = np.isfinite(rows[:, :14]).all(axis=1)
+    longest_m = np.exp(rows[:, 3:6].max(axis=1).astype(float))
+    transparent = rows[:, 10] < np.log(config.min_opacity / (1 - config.min_opacity))
+    mean_m = _mean_around(rows[:, :3], np.where(finite, longest_m, 0), config.neighbourhood_m)
     return transparent | ~finite | (longest_m > config.max_relative_scale * mean_m)
 
 

@@ -36,49 +36,48 @@ class View:
         return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
 
 
-def shared_surface(newest: View, other: View, *, step_px: int = 32) -> float:
-    """Share of the surface measured in `newest` that lies in the image of `other`, in front of
-    it; of every `step_px`-th pixel. Occlusion is not looked at."""
+def shared_surface(
+    newest: View, camera: Camera, T_map_camera: np.ndarray, *, step_px: int = 32
+) -> float:
+    """Share of the surface measured in `newest` that lies in the image of another camera, in
+    front of it; of every `step_px`-th pixel. Occlusion is not looked at."""
     coarse = slice(step_px // 2, None, step_px)
     z = newest.depth_m[coarse, coarse]
     points = newest.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
     if len(points) == 0:
         return 0.0
-    T_other_newest = se3.inverse(other.T_map_camera) @ newest.T_map_camera
-    points = se3.transform(T_other_newest, points)
+    points = se3.transform(se3.inverse(T_map_camera) @ newest.T_map_camera, points)
     points = points[points[:, 2] > 0.05]
-    u, v = other.camera.project(points).T
-    inside = (u >= 0) & (v >= 0) & (u <= other.camera.width - 1) & (v <= other.camera.height - 1)
+    u, v = camera.project(points).T
+    inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
     return float(np.count_nonzero(inside)) / np.count_nonzero(z > 0)
 
 
 def schedule(
-    views: Sequence[View],
+    newest: int,
+    covisible: Sequence[int],
+    others: Sequence[int],
     iterations: int,
     rng: np.random.Generator,
     *,
     newest_share: float,
     covisible_share: float,
-    min_shared: float = 0.3,
 ) -> list[int]:
-    """Which view each iteration takes: places in `views`, whose last is the newest keyframe.
+    """Which keyframe each iteration takes.
 
-    About `newest_share` of the iterations take the newest, `covisible_share` one of those that
-    see at least `min_shared` of its surface, the others any; the newest comes first.
+    About `newest_share` of the iterations take the newest, the first among them, and
+    `covisible_share` one of `covisible`; the rest take one of `others`. The newest stands in where
+    a list is empty.
     """
-    last = len(views) - 1
-    covisible = [last]
-    if covisible_share > 0:
-        near = [i for i in range(last) if shared_surface(views[last], views[i]) >= min_shared]
-        covisible = near or covisible
-    draws = rng.random(iterations)
-    draws[:1] = 0 if newest_share > 0 else draws[:1]
     out = []
+    draws = rng.random(iterations)
+    draws[: newest_share > 0] = 0
     for draw in draws:
         if draw < newest_share:
-            out.append(last)
+            choice: Sequence[int] = ()
         elif draw < newest_share + covisible_share:
-            out.append(covisible[int(rng.integers(len(covisible)))])
+            choice = covisible
         else:
-            out.append(int(rng.integers(len(views))))
+            choice = others
+        out.append(choice[int(rng.integers(len(choice)))] if choice else newest)
     return out
