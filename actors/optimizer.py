@@ -1,6 +1,7 @@
 """Keyframe poses that agree with every measurement.                       actors/optimizer.py
 
-in   keyframe/new       Keyframe     Lossless(8)   a missing link would break the chain
+in   keyframe/new          Keyframe             Lossless(8)   a missing link would break the chain
+in   keyframe/refinement   KeyframeRefinement   Lossless(8)   the better measurement
 out  graph/correction   Correction
 
 gtsam holds the GIL during every call: by default this actor runs in a process of its own.
@@ -11,13 +12,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig, RelativePose
 from ldo_service.runtime import Actor, In, Lossless, Out
-from ldo_service.schemas import Correction, Keyframe
-from ldo_service.schemas.topics import GRAPH_CORRECTION, KEYFRAME_NEW
+from ldo_service.schemas import Correction, Keyframe, KeyframeRefinement, MeasuredPose
+from ldo_service.schemas.topics import GRAPH_CORRECTION, KEYFRAME_NEW, KEYFRAME_REFINEMENT
 from ldo_service.wire import correction_message, transform
 
 log = logging.getLogger(__name__)
@@ -32,7 +34,7 @@ class Optimizer(Actor):
     """The one owner of keyframe poses in the map."""
 
     name = "optimizer"
-    inputs = (In(KEYFRAME_NEW, Lossless(8)),)
+    inputs = (In(KEYFRAME_NEW, Lossless(8)), In(KEYFRAME_REFINEMENT, Lossless(8)))
     outputs = (Out(GRAPH_CORRECTION),)
 
     def __init__(self, config: OptimizerConfig | None = None) -> None:
@@ -41,16 +43,31 @@ class Optimizer(Actor):
         self._graph = KeyframeGraph(self.config.graph)
         self._version = 0
         self._T_odom_newest = np.eye(4)
-        self._repeated = self._bridged = 0
+        self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
+        self._repeated = self._bridged = self._refined = 0
         self._saved: dict[str, Any] = {}
 
-    def handle(self, message: Keyframe) -> Iterator[Correction]:
-        if message.keyframe in self._graph:
+    def handle(self, message: Keyframe | KeyframeRefinement) -> Iterator[Correction]:
+        if isinstance(message, KeyframeRefinement):
+            self._refine(message.poses)
+        elif message.keyframe in self._graph:
             self._repeated += 1  # sent again after a restart
             return
-        self._add(message)
+        else:
+            self._add(message)
+            self._refine(())
         self._version += 1
         yield correction_message(message.stamp_ns, self._version, self._graph.poses())
+
+    def _refine(self, poses: tuple[MeasuredPose, ...]) -> None:
+        """Replace measurements; those of a keyframe that is still under way wait for it."""
+        asked = self._early | {(p.reference, p.keyframe): p for p in poses}
+        known = {pair: p for pair, p in asked.items() if set(pair) <= self._graph.keyframes}
+        newest = max(self._graph.keyframes, default=-1)
+        self._early = {pair: p for pair, p in asked.items() if p.keyframe > newest}
+        if known:
+            self._refined += len(known)
+            self._graph.replace([_measured(pose) for pose in known.values()])
 
     def _add(self, message: Keyframe) -> None:
         T_odom_keyframe = transform(message.T_odom_keyframe)
@@ -80,6 +97,7 @@ class Optimizer(Actor):
                 "version": self._version,
                 "T_odom_newest": self._T_odom_newest,
                 "graph": self._graph.snapshot(),
+                "early": [msgspec.msgpack.encode(pose) for pose in self._early.values()],
             }
         return {"graph": self._saved}
 
@@ -88,6 +106,8 @@ class Optimizer(Actor):
         self._version = saved["version"] + 1  # one more may have been sent and not saved
         self._T_odom_newest = saved["T_odom_newest"]
         self._graph.restore(saved["graph"])
+        early = [msgspec.msgpack.decode(body, type=MeasuredPose) for body in saved["early"]]
+        self._early = {(pose.reference, pose.keyframe): pose for pose in early}
 
     def facts(self) -> dict[str, float]:
         return {
@@ -95,4 +115,12 @@ class Optimizer(Actor):
             "optimizations": self._version,
             "keyframes_repeated": self._repeated,
             "keyframes_bridged": self._bridged,
+            "keyframes_refined": self._refined,
         }
+
+
+def _measured(pose: MeasuredPose) -> RelativePose:
+    information = np.array(pose.information).reshape(6, 6)
+    return RelativePose(
+        pose.reference, pose.keyframe, transform(pose.T_reference_keyframe), information
+    )

@@ -18,8 +18,15 @@ from ldo_service.schemas.frames import (
 )
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health, InputCount, OutputCount
-from ldo_service.schemas.keyframe import Keyframe
-from ldo_service.schemas.map import AnchorMotion, Gaussians, MapDelta, MapSnapshot, ModelView
+from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement, MeasuredPose
+from ldo_service.schemas.map import (
+    AnchorMotion,
+    Gaussians,
+    MapDelta,
+    MapRefine,
+    MapSnapshot,
+    ModelView,
+)
 from ldo_service.schemas.message import Message, decode, encode
 from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 
@@ -39,8 +46,11 @@ __all__ = [
     "Image",
     "InputCount",
     "Keyframe",
+    "KeyframeRefinement",
     "MapDelta",
+    "MapRefine",
     "MapSnapshot",
+    "MeasuredPose",
     "Message",
     "ModelView",
     "OutputCount",

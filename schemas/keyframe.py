@@ -1,4 +1,6 @@
-"""Keyframes, as the tracker makes them."""
+"""Keyframes, as the tracker makes them and the mapper places them better."""
+
+import msgspec
 
 from ldo_service.schemas.array import Array
 from ldo_service.schemas.frames import CameraModel, require_rgbd
@@ -34,3 +36,25 @@ class Keyframe(Message, frozen=True, kw_only=True):
             raise ValueError(
                 f"keyframe {self.keyframe} refers to {self.reference}, not an older one"
             )
+
+
+class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
+    """A measured pose of one keyframe in another."""
+
+    reference: int
+    keyframe: int
+    T_reference_keyframe: Pose
+    information: Matrix6  # perturbed on the right
+
+    def __post_init__(self) -> None:
+        require_count("reference", self.reference)
+        require_count("keyframe", self.keyframe)
+        require_matrix6("information", self.information)
+        if self.reference == self.keyframe:
+            raise ValueError(f"keyframe {self.keyframe} is measured against itself")
+
+
+class KeyframeRefinement(Message, frozen=True, kw_only=True):
+    """keyframe/refinement: measurements that replace earlier ones between the same keyframes."""
+
+    poses: tuple[MeasuredPose, ...]

@@ -7,10 +7,11 @@ missed: take a snapshot again.
 """
 
 import msgspec
+import numpy as np
 
 from ldo_service.schemas.array import Array
 from ldo_service.schemas.frames import CameraModel
-from ldo_service.schemas.message import Message, require_count
+from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Pose
 
 
@@ -63,17 +64,31 @@ class MapDelta(Message, frozen=True, kw_only=True):
             raise ValueError(f"delta from version {self.since} to {self.version} goes back")
 
 
+NO_KEYFRAMES = Array.of(np.zeros(0, np.int64))
+NO_EXPOSURES = Array.of(np.zeros((0, 2, 3), np.float32))
+
+
 class MapSnapshot(Message, frozen=True, kw_only=True):
-    """map/snapshot: one part of the whole map at `version`; parts 0 .. parts-1 make it complete."""
+    """map/snapshot: one part of the whole map at `version`; parts 0 .. parts-1 make it complete.
+
+    Part 0 names the exposure of each keyframe: its camera saw gain * color + bias, per channel, of
+    the map's colours in 0..1.
+    """
 
     version: int
     graph_version: int
     part: int
     parts: int
     gaussians: Gaussians
+    keyframes: Array = NO_KEYFRAMES  # i8 [K], ids, ascending
+    exposures: Array = NO_EXPOSURES  # f4 [K, 2, 3], gains, then biases
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
+        self.keyframes.require("keyframes", "i8", (None,))
+        self.keyframes.require_ascending("keyframes")
+        self.exposures.require("exposures", "f4", (self.keyframes.shape[0], 2, 3))
+        self.exposures.require_finite("exposures")
         if not 0 <= self.part < self.parts:
             raise ValueError(f"part {self.part} of {self.parts} does not exist")
 
@@ -98,6 +113,20 @@ class ModelView(Message, frozen=True, kw_only=True):
         self.depth_m.require("depth_m", "f4", size)
         self.depth_m.require_finite("depth_m")
         self.opacity.require("opacity", "u1", size)
+
+
+class MapRefine(Message, frozen=True, kw_only=True):
+    """map/refine: asked of the mapper, to fit the map further to the keyframes it has."""
+
+    iterations: int
+    first_rate: float = 1.0  # factor on the length of the first step
+    last_rate: float = 1.0  # and of the last one; geometric between
+
+    def check(self) -> None:
+        require_count("iterations", self.iterations)
+        require_finite("rates", (self.first_rate, self.last_rate))
+        if not min(self.first_rate, self.last_rate) > 0:
+            raise ValueError(f"rates {self.first_rate} and {self.last_rate} must be positive")
 
 
 def require_version(version: int, graph_version: int) -> None:

@@ -10,8 +10,8 @@ from ldo_service.schemas.control import ControlAnswer, ControlRequest
 from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health
-from ldo_service.schemas.keyframe import Keyframe
-from ldo_service.schemas.map import MapDelta, MapSnapshot, ModelView
+from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
+from ldo_service.schemas.map import MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.message import Message
 from ldo_service.schemas.pose import TrackedPose
 
@@ -38,9 +38,13 @@ CAMERA_DEPTH = Topic("camera/depth", CameraDepth, "its depth half; paired with c
 FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "the frame, rectified, depth in metres")
 POSE_TRACKED = Topic("pose/tracked", TrackedPose, "where the camera is", is_state=True)
 KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "a frame that the map is made from")
+KEYFRAME_REFINEMENT = Topic(
+    "keyframe/refinement", KeyframeRefinement, "better poses between keyframes"
+)
 MAP_VIEW = Topic("map/view", ModelView, "the map rendered at the newest keyframe")
 MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last version")
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
+MAP_REFINE = Topic("map/refine", MapRefine, "asked: so many iterations more")
 GRAPH_CORRECTION = Topic("graph/correction", Correction, "all keyframe poses", is_state=True)
 HEALTH = Topic("health", Health, "counters and latency of an actor (health/<actor>)")
 CONTROL = Topic(
@@ -52,7 +56,6 @@ LABEL_REQUEST = Topic("label/request", None, "image crops of a region to be name
 LABEL_OPEN = Topic("label/open", None, "the name of a region, late by design", key="region")
 MAP_OBJECTS = Topic("map/objects", None, "the named objects", is_state=True)
 OBJECT_OBSERVATION = Topic("object/observation", None, "an object seen from a keyframe")
-KEYFRAME_REFINEMENT = Topic("keyframe/refinement", None, "a better pose between two keyframes")
 LOOP_CLOSURE = Topic("loop/closure", None, "a verified pose between two distant keyframes")
 LOOP_CANDIDATE = Topic("loop/candidate", None, "every candidate, and why it was refused")
 
@@ -69,6 +72,7 @@ TOPICS: tuple[Topic, ...] = (
     MAP_VIEW,
     MAP_DELTA,
     MAP_SNAPSHOT,
+    MAP_REFINE,
     MAP_OBJECTS,
     OBJECT_OBSERVATION,
     KEYFRAME_REFINEMENT,
@@ -80,3 +84,4 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs
+FROM_OPERATORS = (MAP_REFINE,)

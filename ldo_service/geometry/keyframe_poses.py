@@ -1,7 +1,7 @@
 """Where keyframes are in the map, as one receiver knows it. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,14 @@ class KeyframePoses:
         self._T_map[keyframe] = self._placed(link, newest=max(self._T_map, default=None))
         self._links[keyframe] = link
         return self._T_map[keyframe]
+
+    def place(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
+        """Put a known keyframe elsewhere, and its link with it, until a correction says more."""
+        self._T_map[keyframe] = T_map_keyframe
+        link = self._links[keyframe]
+        if link.reference is not None and link.reference in self._T_map:
+            T_reference_keyframe = se3.inverse(self._T_map[link.reference]) @ T_map_keyframe
+            self._links[keyframe] = replace(link, T_reference_keyframe=T_reference_keyframe)
 
     def correct(self, version: int, T_map: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
         """Take over a correction; T_new_old of every known keyframe that it places anew.

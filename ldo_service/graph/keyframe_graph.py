@@ -1,5 +1,6 @@
 """Keyframe poses from relative measurements, by incremental smoothing (iSAM2)."""
 
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 
 import gtsam
@@ -45,7 +46,8 @@ class KeyframeGraph:
             [config.sigma_rotation_max_rad**-2] * 3 + [config.sigma_translation_max_m**-2] * 3
         )
         self._initial: dict[int, np.ndarray] = {}  # the value each keyframe was inserted with
-        self._measured: list[RelativePose] = []
+        self._measured: dict[tuple[int, int], RelativePose] = {}
+        self._places: dict[tuple[int, int], int] = {}  # of their factors in the solver
         self._isam = self._new_isam()
 
     def __contains__(self, keyframe: int) -> bool:
@@ -55,21 +57,37 @@ class KeyframeGraph:
         return len(self._initial)
 
     @property
+    def keyframes(self) -> Set[int]:
+        return self._initial.keys()
+
+    @property
     def newest(self) -> int | None:
         return max(self._initial, default=None)
 
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
         """The keyframe that fixes the map's frame."""
         self._initial[keyframe] = np.array(T_map_keyframe, float)
-        self._update(self._first_factor(keyframe), [keyframe])
+        self._update([], [keyframe])
 
     def add(self, measured: RelativePose) -> None:
         """A new keyframe `b`, measured from a known one. Raises KeyError when `a` is not known."""
         if measured.a not in self:
             raise KeyError(measured.a)
         self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
-        self._measured.append(measured)
-        self._update([self._factor(measured)], [measured.b])
+        self._measured[measured.a, measured.b] = measured
+        self._update([measured], [measured.b])
+
+    def replace(self, measured: Sequence[RelativePose]) -> None:
+        """Believe these in place of what was measured between the same keyframes before.
+
+        Raises KeyError for a keyframe that is not known.
+        """
+        for m in measured:
+            if m.a not in self or m.b not in self:
+                raise KeyError((m.a, m.b))
+        old = [self._places[m.a, m.b] for m in measured if (m.a, m.b) in self._places]
+        self._measured.update({(m.a, m.b): m for m in measured})
+        self._update(measured, [], old)
 
     def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
         """Odometry between keyframes of which those between were missed: believed less."""
@@ -92,30 +110,42 @@ class KeyframeGraph:
         parameters.relinearizeSkip = 1
         return gtsam.ISAM2(parameters)
 
-    def _update(self, factors: list[gtsam.NonlinearFactor], keyframes: list[int]) -> None:
+    def _update(
+        self,
+        measured: Sequence[RelativePose],
+        keyframes: Sequence[int],
+        old_places: Sequence[int] = (),
+    ) -> None:
         try:
-            self._apply(factors, keyframes)
+            self._apply(measured, keyframes, old_places)
         except RuntimeError:
             self._rebuild()
 
-    def _apply(self, factors: list[gtsam.NonlinearFactor], keyframes: list[int]) -> None:
+    def _apply(
+        self,
+        measured: Sequence[RelativePose],
+        keyframes: Sequence[int],
+        old_places: Sequence[int] = (),
+    ) -> None:
+        """New factors and keyframes in, the factors at `old_places` out."""
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for factor in factors:
-            graph.add(factor)
+        for m in measured:
+            graph.add(self._factor(m))
         for keyframe in keyframes:
             values.insert(keyframe, gtsam.Pose3(self._initial[keyframe]))
-        self._isam.update(graph, values)
+        if keyframes and keyframes[0] == next(iter(self._initial)):
+            graph.add(self._first_factor(keyframes[0]))
+        places = self._isam.update(graph, values, list(old_places)).getNewFactorsIndices()
+        self._places.update({(m.a, m.b): place for m, place in zip(measured, places, strict=False)})
 
     def _rebuild(self) -> None:
         """All measurements into a new object. Raises RuntimeError when they cannot be solved."""
         self._isam = self._new_isam()
-        keyframes = sorted(self._initial)
-        factors = [self._factor(measured) for measured in self._measured]
-        self._apply(self._first_factor(keyframes[0]) + factors, keyframes)
+        self._apply(list(self._measured.values()), list(self._initial))
 
-    def _first_factor(self, keyframe: int) -> list[gtsam.NonlinearFactor]:
+    def _first_factor(self, keyframe: int) -> gtsam.NonlinearFactor:
         noise = gtsam.noiseModel.Isotropic.Sigma(6, self._config.first_sigma)
-        return [gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(self._initial[keyframe]), noise)]
+        return gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(self._initial[keyframe]), noise)
 
     def _factor(self, measured: RelativePose) -> gtsam.NonlinearFactor:
         information = 0.5 * (measured.information + measured.information.T) + self._floor
@@ -129,7 +159,7 @@ class KeyframeGraph:
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, np.ndarray]:
         keyframes = sorted(self._initial)
-        measured = self._measured
+        measured = self._measured.values()
         return {
             "keyframes": np.array(keyframes, np.int64),
             "initial": np.array([self._initial[k] for k in keyframes]).reshape(-1, 4, 4),
@@ -141,11 +171,11 @@ class KeyframeGraph:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         keyframes = [int(k) for k in state["keyframes"]]
         self._initial = dict(zip(keyframes, state["initial"], strict=True))
-        self._measured = [
-            RelativePose(int(a), int(b), T_a_b, information)
+        self._measured = {
+            (int(a), int(b)): RelativePose(int(a), int(b), T_a_b, information)
             for (a, b), T_a_b, information in zip(
                 state["pairs"], state["T_a_b"], state["information"], strict=True
             )
-        ]
+        }
         if keyframes:
             self._rebuild()

@@ -28,8 +28,11 @@ from ldo_service.schemas import (
     Image,
     InputCount,
     Keyframe,
+    KeyframeRefinement,
     MapDelta,
+    MapRefine,
     MapSnapshot,
+    MeasuredPose,
     Message,
     ModelView,
     OutputCount,
@@ -157,6 +160,25 @@ EXAMPLES: dict[str, Message] = {
     ),
     "map_snapshot": MapSnapshot(
         stamp_ns=8, version=5, graph_version=3, part=1, parts=2, gaussians=gaussians([1, 8])
+    ),
+    "map_snapshot_with_exposures": MapSnapshot(
+        stamp_ns=8,
+        version=5,
+        graph_version=3,
+        part=0,
+        parts=2,
+        gaussians=gaussians([1, 8]),
+        keyframes=Array.of(np.array([0, 3], np.int64)),
+        exposures=Array.of(np.arange(12, dtype=np.float32).reshape(2, 2, 3)),
+    ),
+    "map_refine": MapRefine(stamp_ns=12, iterations=50, first_rate=1.0, last_rate=0.5),
+    "keyframe_refinement": KeyframeRefinement(
+        stamp_ns=13,
+        poses=(
+            MeasuredPose(
+                reference=3, keyframe=4, T_reference_keyframe=POSE, information=INFORMATION
+            ),
+        ),
     ),
     "health": Health(
         stamp_ns=9,
