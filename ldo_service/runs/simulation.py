@@ -11,7 +11,7 @@ from ldo_service.runtime.journal import digest
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Message, encode
 
-from .over_file import Advance
+from .job import Advance
 from .source import Reader, Selection, Warn
 
 
@@ -50,14 +50,14 @@ def simulate_graph(
     reader = Reader(sequence, selection.indices(sequence), warn)
     actors = make_actors(config)
     digests = Digests([actor.name for actor in actors])
-    clock = LogicalClock(
+    with LogicalClock(
         actors,
         config.run.latency_frames(),
         lambda actor, message, _step_ms: digests.observe(actor, message),
-    )
-    done = 0
-    for done in clock.run(reader):
-        advance(done + 1 + reader.rejected)
+    ) as clock:
+        for done in clock.run(reader):
+            advance(done + 1 + reader.rejected)
+        clock.finish()
     made = digests.made()
     if not any(entry.messages for entry in made.values()):
         raise DataError(f"{sequence.name}: no frame of the selection could be used.")

@@ -64,7 +64,12 @@ def _timed(messages: Iterator[Message]) -> Answer:
 
 
 class LogicalClock:
-    """Feeds a graph of actors from one source; see the module."""
+    """Feeds a graph of actors from a source, or one after the other; see the module.
+
+    with LogicalClock(actors, latencies) as clock:
+        for tick in clock.run(source): ...
+        clock.finish()
+    """
 
     def __init__(
         self,
@@ -87,22 +92,32 @@ class LogicalClock:
         self._observe = observe
         self._due: list[Due] = []
         self._started = 0
+        self._tick = -1
+
+    def __enter__(self) -> "LogicalClock":
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        for thread in self._threads:
+            thread.thread.shutdown(cancel_futures=True)
 
     def run(self, source: Iterable[Message]) -> Iterator[int]:
-        """Yield the tick after each message of the source; then everything due is settled.
+        """Yield the tick after each message of the source; then everything under way is settled.
 
         Raises StageError, naming the actor, when a handler raises.
         """
-        tick = -1
-        try:
-            for tick, message in enumerate(source):
-                self._deliver(message, tick)
-                self._settle(tick)
-                yield tick
-            self._finish(tick)
-        finally:
-            for thread in self._threads:
-                thread.thread.shutdown(cancel_futures=True)
+        for message in source:
+            self._tick += 1
+            self._deliver(message, self._tick)
+            self._settle(self._tick)
+            yield self._tick
+        self._settle_all()
+
+    def finish(self) -> None:
+        """Let each actor say its last words, producers first. A run may still follow."""
+        for thread in self._threads:
+            self._expect(thread, self._tick, thread.finish())
+            self._settle_all()
 
     def step_ms(self) -> dict[str, list[float]]:
         """Wall time of every step so far, by actor."""
@@ -126,14 +141,9 @@ class LogicalClock:
                 self._observe(thread.actor.name, message, answer.step_ms)
                 self._deliver(message, due.tick)
 
-    def _finish(self, tick: int) -> None:
-        """Settle what is under way, then let each actor say its last words, producers first."""
+    def _settle_all(self) -> None:
         while self._due:
             self._settle(self._due[0].tick)
-        for thread in self._threads:
-            self._expect(thread, tick, thread.finish())
-            while self._due:
-                self._settle(self._due[0].tick)
 
 
 def _answer(due: Due, actor: str) -> Answer:

@@ -49,10 +49,11 @@ def run(
     actors: list[Actor], latency_ticks: dict[str, int], count: int
 ) -> list[tuple[str, Message]]:
     made: list[tuple[str, Message]] = []
-    clock = LogicalClock(
+    with LogicalClock(
         actors, latency_ticks, lambda actor, message, _step_ms: made.append((actor, message))
-    )
-    assert list(clock.run(source(count))) == list(range(count))
+    ) as clock:
+        assert list(clock.run(source(count))) == list(range(count))
+        clock.finish()
     return made
 
 
@@ -143,15 +144,25 @@ def test_a_failure_names_the_actor_and_ends_the_threads(latency: int) -> None:
 
 
 def test_a_run_that_is_broken_off_ends_its_threads() -> None:
-    ticks = LogicalClock([Doubler()], {}).run(source(5))
-    assert next(ticks) == 0
-    ticks.close()  # type: ignore[attr-defined]
+    with pytest.raises(KeyboardInterrupt), LogicalClock([Doubler()], {}) as clock:
+        for _tick in clock.run(source(5)):
+            raise KeyboardInterrupt
     assert not [thread for thread in threading.enumerate() if "doubler" in thread.name]
 
 
+def test_a_second_source_goes_on_where_the_first_ended() -> None:
+    mixer = Mixer()
+    with LogicalClock([Doubler(), mixer], {"doubler": 2}) as clock:
+        assert list(clock.run(source(2))) == [0, 1]
+        assert mixer.seen == ["N0", "N1", "D0", "D2"], "nothing is left under way"
+        clock.finish()
+        assert list(clock.run(source(1))) == [2]
+    assert mixer.seen[4:] == ["N0", "D0"]
+
+
 def test_step_times_are_kept_by_actor() -> None:
-    clock = LogicalClock([Doubler(), Mixer()], {})
-    list(clock.run(source(4)))
+    with LogicalClock([Doubler(), Mixer()], {}) as clock:
+        list(clock.run(source(4)))
     assert {name: len(times) for name, times in clock.step_ms().items()} == {
         "doubler": 4,
         "mixer": 8,
