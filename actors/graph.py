@@ -79,7 +79,6 @@ GRAPH: tuple[Box, ...] = (
             Out(t.LABEL_REQUEST),
             Out(t.MAP_OBJECTS),
             Out(t.OBJECT_OBSERVATION),
-            Out(t.KEYFRAME_REFINEMENT),
         ),
     ),
     Box(
@@ -100,7 +99,6 @@ GRAPH: tuple[Box, ...] = (
         later=(
             In(t.LOOP_CLOSURE, Lossless(8)),
             In(t.OBJECT_OBSERVATION, Lossless(8)),
-            In(t.KEYFRAME_REFINEMENT, Lossless(8)),
         ),
     ),
 )
@@ -135,7 +133,7 @@ def producer_of(topic: t.Topic) -> str:
         return "every stage"
     if topic is t.CONTROL:
         return "outside"
-    return "outside" if topic in t.FROM_OUTSIDE else "nobody yet"
+    return "outside" if topic in (*t.FROM_OUTSIDE, *t.FROM_OPERATORS) else "nobody yet"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:

@@ -1,24 +1,28 @@
 """The map of Gaussians.                                                        actors/mapper.py
 
-in   keyframe/new       Keyframe      Lossless(8)   a missing keyframe is a hole in the map
-in   graph/correction   Correction    Latest(1)     a versioned absolute state
-out  map/view           ModelView     the map as rendered at the newest keyframe
-out  map/delta          MapDelta      what changed
-out  map/snapshot       MapSnapshot   the whole of it, in parts, now and then
+in   keyframe/new          Keyframe             Lossless(8)   a missing one is a hole in the map
+in   graph/correction      Correction           Latest(1)     a versioned absolute state
+in   map/refine            MapRefine            Latest(1)     what was asked last
+out  map/view              ModelView            the map as rendered at the newest keyframe
+out  map/delta             MapDelta             what changed
+out  map/snapshot          MapSnapshot          the whole of it, in parts, now and then
+out  keyframe/refinement   KeyframeRefinement   where the renderer wants the keyframes
 """
 
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.insertion import InsertionConfig, insert
-from ldo_service.gaussians.model import ROW, GaussianMap
+from ldo_service.gaussians.changes import Changes
+from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
+from ldo_service.gaussians.model import ROW
 from ldo_service.gaussians.render import render
-from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
@@ -27,26 +31,30 @@ from ldo_service.schemas import (
     Correction,
     Gaussians,
     Keyframe,
+    KeyframeRefinement,
     MapDelta,
+    MapRefine,
     MapSnapshot,
+    MeasuredPose,
     ModelView,
 )
 from ldo_service.schemas.topics import (
     GRAPH_CORRECTION,
     KEYFRAME_NEW,
+    KEYFRAME_REFINEMENT,
     MAP_DELTA,
+    MAP_REFINE,
     MAP_SNAPSHOT,
     MAP_VIEW,
 )
 from ldo_service.wire import (
-    camera_message,
     keyframe_poses_of,
     pose_message,
     rgbd_of,
     transform,
 )
 
-Output = ModelView | MapDelta | MapSnapshot
+Output = ModelView | MapDelta | MapSnapshot | KeyframeRefinement
 
 
 # A successor starts from a checkpoint and must not use a version again that followers may hold:
@@ -54,20 +62,38 @@ Output = ModelView | MapDelta | MapSnapshot
 VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 
+NO_IDS = np.zeros(0, np.int64)
+NO_GAUSSIANS = Gaussians(
+    ids=Array.of(np.zeros(0, np.int64)),
+    params=Array.of(np.zeros((0, ROW), np.float32)),
+    anchors=Array.of(np.zeros(0, np.int32)),
+)
+
+
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
-    insertion: InsertionConfig = field(default_factory=InsertionConfig)
+    builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
+    iterations: int = 12  # of the optimiser per keyframe; TUNED
+    least_iterations: int = 3  # however many keyframes wait: none is left as it was inserted
+    folder: str = ""  # for the images of keyframes; empty: a temporary one, or within the state
     threads: int = 0  # of the renderer; 0: all cores but one, which the tracker needs
     snapshot_keyframes: int = 10  # between snapshots on the network
     snapshot_growth: float = 0.25  # and at least this share of new Gaussians: a large map is sent
     # seldom, so that snapshots never cost more than a few times the deltas
     part_gaussians: int = 16_384  # in one message: 1.2 MB, so that none blocks the others long
+    changed_keyframes: int = 5  # between telling how old Gaussians changed: the optimiser touches
+    # all that is in view at every keyframe
     checkpoint_keyframes: int = 5  # between saved states; a crash costs at most so many of the map
-    motion_min_m: float = 1e-6  # a correction that moves a keyframe less changes no pixel
-    motion_min_rad: float = 1e-6
+    motion_min_m: float = 1e-4  # a correction that moves a keyframe less shows nowhere: 0.05 px
+    motion_min_rad: float = 1e-4
 
     def __post_init__(self) -> None:
-        counts = (self.snapshot_keyframes, self.part_gaussians, self.checkpoint_keyframes)
+        counts = (
+            *(self.snapshot_keyframes, self.part_gaussians, self.checkpoint_keyframes),
+            self.changed_keyframes,
+        )
+        if min(self.iterations, self.least_iterations) < 0:
+            raise ConfigError("mapper.iterations and least_iterations must not be negative.")
         if min(counts) < 1 or self.threads < 0 or self.snapshot_growth < 0:
             raise ConfigError(
                 f"mapper: counts {counts} must be at least 1, threads {self.threads} and "
@@ -82,34 +108,44 @@ class Mapper(Actor):
     """Maps a keyframe at once; corrections move each Gaussian with the keyframe that made it."""
 
     name = "mapper"
-    inputs = (In(KEYFRAME_NEW, Lossless(8)), In(GRAPH_CORRECTION, Latest(1)))
-    outputs = (Out(MAP_VIEW), Out(MAP_DELTA), Out(MAP_SNAPSHOT))
+    inputs = (
+        In(KEYFRAME_NEW, Lossless(8)),
+        In(GRAPH_CORRECTION, Latest(1)),
+        In(MAP_REFINE, Latest(1)),
+    )
+    outputs = (Out(MAP_VIEW), Out(MAP_DELTA), Out(MAP_SNAPSHOT), Out(KEYFRAME_REFINEMENT))
 
     def __init__(self, config: MapperConfig | None = None) -> None:
         super().__init__()
         self.config = config or MapperConfig()
         self._threads = self.config.thread_count()
-        self._map = GaussianMap()
+        folder = Path(self.config.folder) if self.config.folder else None
+        self._map = MapBuilder(self.config.builder, folder=folder, threads=self._threads)
         self._poses = KeyframePoses()
-        self._applied: dict[int, np.ndarray] = {}  # T_map_keyframe that the Gaussians stand at
+        self._links: dict[int, tuple[int, tuple[float, ...]]] = {}  # reference and information
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
+        self._version = 0  # of the map, as followers know it
         self._since_snapshot = (
             self.config.snapshot_keyframes
         )  # so that the first keyframe sends one
+        self._since_changed = 0
         self._in_snapshot = 0  # Gaussians in the last one
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
-    def handle(self, message: Keyframe | Correction) -> Iterator[Output]:
-        if isinstance(message, Correction):
-            yield from self._correct(message)
-        elif message.keyframe in self._poses:
-            self._repeated += 1  # sent again after a restart
-        else:
-            yield from self._insert(message)
+    def handle(self, message: Keyframe | Correction | MapRefine) -> Iterator[Output]:
+        match message:
+            case Correction():
+                yield from self._correct(message)
+            case MapRefine():
+                yield from self._refine(message)
+            case Keyframe() if message.keyframe in self._poses:
+                self._repeated += 1  # sent again after a restart
+            case Keyframe():
+                yield from self._add(message)
 
     # --- keyframes --------------------------------------------------------------------------------
-    def _insert(self, message: Keyframe) -> Iterator[Output]:
+    def _add(self, message: Keyframe) -> Iterator[Output]:
         # place it
         T_map_keyframe = self._poses.chain(
             message.keyframe,
@@ -117,116 +153,176 @@ class Mapper(Actor):
             transform(message.T_reference_keyframe),
             transform(message.T_odom_keyframe),
         )
-        self._applied[message.keyframe] = T_map_keyframe
+        if message.reference is not None:
+            self._links[message.keyframe] = (message.reference, message.information)
         self._newest = (message.stamp_ns, message.keyframe)
+        # map it
         frame = rgbd_of(message)
-        # add what the map does not explain
-        since = self._map.version
-        ids = insert(
-            self._map,
-            frame,
-            T_map_keyframe,
-            message.keyframe,
-            self.config.insertion,
-            threads=self._threads,
-        )
+        self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations())
         # tell
-        if len(ids):
-            newest = slice(len(self._map) - len(ids), None)
-            yield self._delta(since, added=self._gaussians(newest))
-        yield self._view(frame, T_map_keyframe)
+        yield from self._refinement()
+        yield from self._deltas(self._is_time_for_changed())
+        yield self._view(message)
         yield from self._snapshot_when_due()
+
+    def _iterations(self) -> int:
+        """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
+        the neighbour of the next."""
+        waiting = self.situation.waiting.get(KEYFRAME_NEW, 0)
+        config = self.config
+        return max(
+            config.iterations // (1 + waiting), min(config.least_iterations, config.iterations)
+        )
+
+    def _refine(self, message: MapRefine) -> Iterator[Output]:
+        self._map.refine(message.iterations, (message.first_rate, message.last_rate))
+        yield from self._refinement()
+        yield from self._deltas(with_changed=True)
+
+    def _refinement(self) -> Iterator[KeyframeRefinement]:
+        """Keyframes that the optimiser moved, measured anew against their references; and those
+        that refer to them, against where they are now."""
+        moved = self._map.refined()
+        for keyframe, T_map_keyframe in moved.items():
+            self._poses.place(keyframe, T_map_keyframe)
+        poses = tuple(
+            self._measured(keyframe, reference, information)
+            for keyframe, (reference, information) in self._links.items()
+            if reference in self._poses and (keyframe in moved or reference in moved)
+        )
+        if poses:
+            yield KeyframeRefinement(stamp_ns=self._newest[0], poses=poses)
+
+    def _measured(
+        self, keyframe: int, reference: int, information: tuple[float, ...]
+    ) -> MeasuredPose:
+        """The loss tells no information: the tracker's stands."""
+        T_reference_keyframe = se3.inverse(self._poses[reference]) @ self._poses[keyframe]
+        return MeasuredPose(
+            reference=reference,
+            keyframe=keyframe,
+            T_reference_keyframe=pose_message(T_reference_keyframe),
+            information=information,
+        )
 
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> Iterator[MapDelta]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         moved = self._poses.correct(message.graph_version, keyframe_poses_of(message))
         motions = tuple(filter(None, map(self._motion, moved)))
-        if motions and len(self._map):
-            since = self._map.version
-            self._map.move_anchors({m.keyframe: transform(m.T_new_old) for m in motions})
-            yield self._delta(since, motions=motions)
+        if motions:
+            self._map.move({m.keyframe: transform(m.T_new_old) for m in motions})
+            yield self._delta(motions=motions)
 
     def _motion(self, keyframe: int) -> AnchorMotion | None:
         """From where its Gaussians are to where the keyframe is; None while it is too little, which
         adds up until it is enough."""
-        T_new_old = pose_message(self._poses[keyframe] @ se3.inverse(self._applied[keyframe]))
+        T_map_gaussians = self._map.views.stands[keyframe].T_map_camera
+        T_new_old = pose_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
         motion = transform(T_new_old)
         if (
             float(np.linalg.norm(motion[:3, 3])) <= self.config.motion_min_m
             and se3.rotation_angle(motion) <= self.config.motion_min_rad
         ):
             return None
-        self._applied[keyframe] = motion @ self._applied[keyframe]
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
 
     # --- messages ---------------------------------------------------------------------------------
+    def _is_time_for_changed(self) -> bool:
+        self._since_changed += 1
+        return self._since_changed >= self.config.changed_keyframes
+
+    def _deltas(self, with_changed: bool) -> Iterator[MapDelta]:
+        """What followers do not know, in messages of a bounded size."""
+        if with_changed:
+            self._since_changed = 0
+        changes = self._map.changes(with_changed=with_changed)
+        for part in parts_of(changes, self.config.part_gaussians):
+            yield self._delta(
+                removed=part.removed,
+                changed=self._gaussians(part.changed),
+                added=self._gaussians(part.added),
+            )
+
     def _delta(
         self,
-        since: int,
         motions: tuple[AnchorMotion, ...] = (),
-        added: Gaussians | None = None,
+        removed: np.ndarray = NO_IDS,
+        changed: Gaussians = NO_GAUSSIANS,
+        added: Gaussians = NO_GAUSSIANS,
     ) -> MapDelta:
+        self._version += 1
         return MapDelta(
             stamp_ns=self._newest[0],
-            since=since,
-            version=self._map.version,
+            since=self._version - 1,
+            version=self._version,
             graph_version=self._poses.version,
             motions=motions,
-            removed=Array.of(np.zeros(0, np.int64)),
-            changed=NO_GAUSSIANS,
-            added=added or NO_GAUSSIANS,
+            removed=Array.of(removed),
+            changed=changed,
+            added=added,
         )
 
-    def _view(self, frame: RgbdFrame, T_map_camera: np.ndarray) -> ModelView:
-        T_camera_map = se3.inverse(T_map_camera)
-        rendering = render(self._map.rows, frame.camera, T_camera_map, threads=self._threads)
+    def _view(self, keyframe: Keyframe) -> ModelView:
+        stand = self._map.views.stands[keyframe.keyframe]
+        rendering = render(
+            self._map.gaussians.rows,
+            stand.camera,
+            se3.inverse(stand.T_map_camera),
+            threads=self._threads,
+        )
         return ModelView(
-            stamp_ns=frame.stamp_ns,
-            keyframe=self._newest[1],
-            version=self._map.version,
+            stamp_ns=keyframe.stamp_ns,
+            keyframe=keyframe.keyframe,
+            version=self._version,
             graph_version=self._poses.version,
-            camera=camera_message(frame.camera),
-            T_map_camera=pose_message(T_map_camera),
-            color=Array.of(to_bytes(rendering.color)),
+            camera=keyframe.camera,
+            T_map_camera=pose_message(stand.T_map_camera),
+            color=Array.of(to_bytes(stand.exposure.applied(rendering.color))),
             depth_m=Array.of(rendering.median_depth_m),
             opacity=Array.of(to_bytes(rendering.opacity)),
         )
 
-    def _snapshot_when_due(self) -> Iterator[MapSnapshot]:
+    def _snapshot_when_due(self) -> Iterator[MapDelta | MapSnapshot]:
         self._since_snapshot += 1
-        grown = len(self._map) - self._in_snapshot
+        grown = len(self._map.gaussians) - self._in_snapshot
         if (
             self._since_snapshot >= self.config.snapshot_keyframes
             and grown >= self.config.snapshot_growth * self._in_snapshot
         ):
             yield from self._snapshot()
 
-    def _snapshot(self) -> Iterator[MapSnapshot]:
-        self._since_snapshot, self._in_snapshot = 0, len(self._map)
+    def _snapshot(self) -> Iterator[MapDelta | MapSnapshot]:
+        """First all that is new, so that followers and late joiners hold the same."""
+        yield from self._deltas(with_changed=True)
+        gaussians, stands = self._map.gaussians, self._map.views.stands
+        self._since_snapshot, self._in_snapshot = 0, len(gaussians)
         size = self.config.part_gaussians
-        starts = range(0, max(len(self._map), 1), size)
+        starts = range(0, max(len(gaussians), 1), size)
+        exposures = np.array([stand.exposure.matrix for stand in stands.values()], np.float32)
         for part, start in enumerate(starts):
-            chosen = slice(start, start + size)
             yield MapSnapshot(
                 stamp_ns=self._newest[0],
-                version=self._map.version,
+                version=self._version,
                 graph_version=self._poses.version,
                 part=part,
                 parts=len(starts),
-                gaussians=self._gaussians(chosen),
+                gaussians=self._gaussians(slice(start, start + size)),
+                keyframes=Array.of(np.array(list(stands) if part == 0 else [], np.int64)),
+                exposures=Array.of(exposures.reshape(-1, 2, 3)[: None if part == 0 else 0]),
             )
 
-    def _gaussians(self, chosen: slice) -> Gaussians:
+    def _gaussians(self, chosen: slice | np.ndarray) -> Gaussians:
+        gaussians = self._map.gaussians
         return Gaussians(
-            ids=Array.of(self._map.ids[chosen]),
-            params=Array.of(self._map.rows[chosen]),
-            anchors=Array.of(self._map.anchors[chosen]),
+            ids=Array.of(gaussians.ids[chosen]),
+            params=Array.of(gaussians.rows[chosen]),
+            anchors=Array.of(gaussians.anchors[chosen]),
         )
 
-    def finish(self) -> Iterator[MapSnapshot]:
+    def finish(self) -> Iterator[MapDelta | MapSnapshot]:
         """The whole map, so that whoever listens ends with it."""
-        if len(self._map):
+        if len(self._map.gaussians):
             yield from self._snapshot()
 
     # --- state ------------------------------------------------------------------------------------
@@ -247,35 +343,41 @@ class Mapper(Actor):
     def _put_away(self) -> None:
         self._checkpoint = {
             "newest": self._newest,
+            "version": self._version,
             "map": self._map.snapshot(),
             "poses": self._poses.snapshot(),
-            "applied": np.array(list(self._applied.values())).reshape(-1, 4, 4),
+            "links": [(k, reference, info) for k, (reference, info) in self._links.items()],
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["map"]
         stamp_ns, keyframe = saved["newest"]
         self._newest = (int(stamp_ns), int(keyframe))
-        self._map = GaussianMap.restore(saved["map"])
-        self._map.version += VERSIONS_IN_A_CHECKPOINT
+        self._version = int(saved["version"]) + VERSIONS_IN_A_CHECKPOINT
+        self._map.restore(saved["map"])
         self._poses.restore(saved["poses"])
-        self._applied = dict(zip(self._poses, saved["applied"], strict=True))
+        self._links = {k: (reference, tuple(info)) for k, reference, info in saved["links"]}
 
     def facts(self) -> dict[str, float]:
         return {
-            "gaussians": len(self._map),
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
+            **self._map.statistics(),
         }
-
-
-NO_GAUSSIANS = Gaussians(
-    ids=Array.of(np.zeros(0, np.int64)),
-    params=Array.of(np.zeros((0, ROW), np.float32)),
-    anchors=Array.of(np.zeros(0, np.int32)),
-)
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """0..1 float to 0..255 uint8."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def parts_of(changes: Changes, size: int) -> Iterator[Changes]:
+    """The same in pieces of at most `size` Gaussians: first what goes, then what changed, then
+    what came. Nothing for no change."""
+    nothing = np.zeros(0, np.int64)
+    if len(changes.removed):
+        yield Changes(changes.removed, nothing, nothing)
+    for start in range(0, len(changes.changed), size):
+        yield Changes(nothing, changes.changed[start : start + size], nothing)
+    for start in range(0, len(changes.added), size):
+        yield Changes(nothing, nothing, changes.added[start : start + size])

@@ -6,6 +6,8 @@ from ldo_service.gaussians.model import GaussianMap
 from ldo_service.schemas import Gaussians, MapDelta, MapSnapshot
 from ldo_service.wire import transform
 
+NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)
+
 
 class MapFollower:
     """Feed it every map/delta and map/snapshot; `map` is equal to the mapper's at `version`.
@@ -21,7 +23,13 @@ class MapFollower:
         self.map = GaussianMap()
         self.version = 0
         self.is_behind = False
+        self._exposures: dict[int, np.ndarray] = {}
         self._parts.clear()
+
+    def exposure(self, keyframe: int) -> np.ndarray:
+        """Gains and biases [2, 3] of a keyframe's camera, as of the last snapshot; 1 and 0 for one
+        that it did not name."""
+        return self._exposures.get(keyframe, NEUTRAL)
 
     def take(self, message: MapDelta | MapSnapshot) -> bool:
         """Whether `map` changed."""
@@ -52,6 +60,9 @@ class MapFollower:
         self.map.append(gaussians.ids.numpy(), gaussians.params.numpy(), gaussians.anchors.numpy())
 
     def _take_part(self, part: MapSnapshot) -> bool:
+        if part.part == 0 and part.version >= self.version:
+            exposures = part.exposures.numpy().copy()
+            self._exposures = dict(zip(part.keyframes.numpy().tolist(), exposures, strict=True))
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
         if any(other.version != part.version for other in self._parts.values()):

@@ -23,6 +23,7 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.gaussians.render import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.runs.folder import RunFolder, prepare
+from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
 
@@ -70,8 +71,9 @@ def demo(
             sequence.read(index)
             advance(index + 1)
     config = with_options(load_config(), hold_out=HOLD_OUT, threads=None)
-    with progress("tracking and mapping", len(sequence), console) as advance:
-        record = run_over_file(sequence, out, config, Selection(), console.print, advance)
+    job = Job(sequence, out, config, Selection(), console.print)
+    with progress("tracking and mapping", job.work, console) as advance:
+        record = run_over_file(job, advance)
     views = list(held_out_views(record, sequence, config.mapper.thread_count()))
     save_pictures(out, record, sequence, views)
     Console(highlight=False).print(table(record, sequence, views, out))

@@ -13,6 +13,7 @@ from ldo_service.config import Config, load_config
 from ldo_service.errors import ConfigError
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.folder import prepare
+from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
 from ldo_service.runs.source import Selection
@@ -35,8 +36,18 @@ def run(
         tyro.conf.arg(metavar="N", help="track every n-th frame and never map it; 0: map all"),
     ] = None,
     threads: Annotated[
-        int | None, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
+        int | None,
+        tyro.conf.arg(
+            metavar="T",
+            help="of the renderer; 0: all cores, but one for the tracker where frames do not wait",
+        ),
     ] = None,
+    refine: Annotated[
+        int,
+        tyro.conf.arg(
+            metavar="N", help="fit the map for N more iterations at the end, into DIR/refined"
+        ),
+    ] = 0,
     realtime: Annotated[
         bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
     ] = False,
@@ -55,11 +66,12 @@ def run(
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.data.options())
+    job = Job(sequence, out, settings, selection, console.print, refine)
     prepare(out, overwrite)
-    with progress("run", len(selection.indices(sequence)), console) as advance:
+    with progress("run", job.work, console) as advance:
         go = run_in_real_time if realtime else run_over_file
         try:
-            record = go(sequence, out, settings, selection, console.print, advance)
+            record = go(job, advance)
         except OSError as error:
             raise ConfigError(
                 f"{out} cannot be written: {error.strerror}. Free some space, or choose another "

@@ -7,6 +7,7 @@ keyframes.json          id, frame, stamp and pose of every keyframe
 map.ply                 the Gaussians
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
+refined/                trajectory, keyframes and map after more iterations, if they were asked for
 """
 
 import csv
@@ -32,11 +33,13 @@ from ldo_service.schemas import (
 )
 from ldo_service.wire import keyframe_poses_of, transform
 
+REFINED = "refined"
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "trajectory.txt", "frames.csv", "keyframes.json", "map.ply"),
         *("config.yaml", "summary.json"),
         *("trajectory.png", "views.png"),  # by `ldo eval` and `ldo demo`
+        *(f"{REFINED}/{name}" for name in ("trajectory.txt", "keyframes.json", "map.ply")),
     }
 )
 COLUMNS = (
@@ -52,10 +55,11 @@ def prepare(folder: Path, overwrite: bool) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        found = sorted(folder.iterdir())
+        found = sorted(path for path in folder.rglob("*") if not path.is_dir())
         if found and not overwrite:
             raise ConfigError(f"{folder} is not empty. Choose another, or add --overwrite.")
-        foreign = [path.name for path in found if path.name not in WRITTEN or path.is_dir()]
+        names = [path.relative_to(folder).as_posix() for path in found]
+        foreign = [name for name in names if name not in WRITTEN]
         if foreign:
             raise ConfigError(
                 f"{folder} holds {foreign[0]}, which no run wrote, so --overwrite leaves all of it "
@@ -92,6 +96,7 @@ class RunFolder:
         self.follower = MapFollower()
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.corrections = 0
+        self.newest_stamp_ns = 0
         self.summary: dict[str, Any] = {}
 
     @property
@@ -138,6 +143,7 @@ class RunFolder:
             transform(keyframe.T_reference_keyframe),
             transform(keyframe.T_odom_keyframe),
         )
+        self.newest_stamp_ns = keyframe.stamp_ns
         self._keyframes[keyframe.keyframe] = {
             "keyframe": keyframe.keyframe,
             "frame_index": keyframe.frame,
@@ -149,10 +155,21 @@ class RunFolder:
         self._csv_file.close()
         self.summary = summary
         self.online().save(self.folder / "trajectory_online.txt")
-        self.final().save(self.folder / "trajectory.txt")
-        self._write_json("keyframes.json", self._placed_keyframes())
-        write_ply(self.folder / "map.ply", self.follower.map.rows)
-        self._write_json("summary.json", summary)
+        self._write_map(self.folder)
+        write_json(self.folder / "summary.json", summary)
+
+    def write_refined(self, iterations: int) -> None:
+        """The map as it is now, and where its keyframes are."""
+        folder = self.folder / REFINED
+        folder.mkdir(exist_ok=True)
+        self._write_map(folder)
+        self.summary["refine_iterations"] = iterations
+        write_json(self.folder / "summary.json", self.summary)
+
+    def _write_map(self, folder: Path) -> None:
+        self.final().save(folder / "trajectory.txt")
+        write_json(folder / "keyframes.json", self._placed_keyframes())
+        write_ply(folder / "map.ply", self.follower.map.rows)
 
     def online(self) -> Trajectory:
         """T_map_camera as published at the time."""
@@ -175,9 +192,14 @@ class RunFolder:
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:
         return [
-            {**facts, "T_map_camera": self._poses[keyframe].tolist()}
+            {
+                **facts,
+                "T_map_camera": self._poses[keyframe].tolist(),
+                "exposure": self.follower.exposure(keyframe).tolist(),
+            }
             for keyframe, facts in self._keyframes.items()
         ]
 
-    def _write_json(self, name: str, value: object) -> None:
-        (self.folder / name).write_text(json.dumps(value, indent=1) + "\n")
+
+def write_json(path: Path, value: object) -> None:
+    path.write_text(json.dumps(value, indent=1) + "\n")

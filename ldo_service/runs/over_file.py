@@ -1,58 +1,84 @@
 """A run over a sequence, on the logical clock."""
 
-from collections.abc import Callable
-from pathlib import Path
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
 
 from ldo_service.actors.graph import make_actors
 from ldo_service.config import Config, config_yaml
-from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.runtime.logical_clock import LogicalClock
+from ldo_service.schemas import MapRefine
 
 from .folder import RunFolder
-from .source import Reader, Selection, Warn
+from .job import REFINE_ITERATIONS, Advance, Job
+from .source import Reader
 from .summary import Usage, percentiles, summarise
 
-Advance = Callable[[int], None]  # called with the number of frames done
+LAST_RATE = 0.05  # of the steps when the map is refined: they shrink so far, to settle
 
 
-def run_over_file(
-    sequence: Sequence,
-    folder: Path,
-    config: Config,
-    selection: Selection,
-    warn: Warn,
-    advance: Advance,
-) -> RunFolder:
-    """Run every actor over the chosen frames and write the folder.
+def run_over_file(job: Job, advance: Advance) -> RunFolder:
+    """Run every actor over the chosen frames and write the folder; then refine the map, if asked.
 
     Independent of the machine's load: see `runtime.logical_clock`. A run that is interrupted or
     fails leaves what it has done, and its summary says so. Raises DataError when nothing or too
     little can be read, and StageError when an actor fails.
     """
-    indices = selection.indices(sequence)
+    indices = job.selection.indices(job.sequence)
+    config = with_all_cores(job.config)
     actors = {actor.name: actor for actor in make_actors(config)}
-    reader = Reader(sequence, indices, warn)
-    record = RunFolder(folder, config_yaml(config), config.tracker.hold_out)
-    clock = LogicalClock(
+    reader = Reader(job.sequence, indices, job.warn)
+    record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker.hold_out)
+    started = Usage.now()
+    is_finished = False
+    with LogicalClock(
         list(actors.values()),
         config.run.latency_frames(),
         lambda _actor, message, step_ms: record.observe(message, step_ms),
-    )
-    started = Usage.now()
-    is_finished = False
-    try:
-        for done in clock.run(reader):
-            advance(done + 1 + reader.rejected)
-        is_finished = True
-    finally:
-        used = Usage.now().since(started)
-        rejected = reader.rejected + int(actors["frame_source"].facts()["frames_rejected"])
-        stage_ms = {name: percentiles(steps) for name, steps in clock.step_ms().items() if steps}
-        summary = summarise(record, used, len(indices), rejected, stage_ms, drops={})
-        record.close({**summary, "interrupted": not is_finished})
-    require_usable(record, config.run.max_rejected)
+    ) as clock:
+        try:
+            for done in clock.run(reader):
+                advance(done + 1 + reader.rejected)
+            clock.finish()
+            is_finished = True
+        finally:
+            used = Usage.now().since(started)
+            rejected = reader.rejected + int(actors["frame_source"].facts()["frames_rejected"])
+            stage_ms = {
+                name: percentiles(steps) for name, steps in clock.step_ms().items() if steps
+            }
+            summary = summarise(record, used, len(indices), rejected, stage_ms, drops={})
+            record.close({**summary, "interrupted": not is_finished})
+        require_usable(record, config.run.max_rejected)
+        if job.refine:
+            for done in clock.run(refinements(job.refine, record.newest_stamp_ns)):
+                advance(done + 1 + reader.rejected)
+            clock.finish()
+            record.write_refined(job.refine)
     return record
+
+
+def with_all_cores(config: Config) -> Config:
+    """Nobody is kept waiting by a run over a file: the renderer may use every core."""
+    threads = config.mapper.threads or os.cpu_count() or 1
+    return replace(config, mapper=replace(config.mapper, threads=threads))
+
+
+def refinements(iterations: int, stamp_ns: int) -> Iterator[MapRefine]:
+    """Requests of a bounded size, with steps that shrink from the first to the last."""
+    starts = range(0, iterations, REFINE_ITERATIONS)
+    ends = [min(start + REFINE_ITERATIONS, iterations) for start in starts]
+    rates = LAST_RATE ** (np.array([0, *ends]) / iterations)
+    for start, end, first, last in zip(starts, ends, rates[:-1], rates[1:], strict=True):
+        yield MapRefine(
+            stamp_ns=stamp_ns,
+            iterations=end - start,
+            first_rate=float(first),
+            last_rate=float(last),
+        )
 
 
 def require_usable(record: RunFolder, max_rejected: float) -> None:

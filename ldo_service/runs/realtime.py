@@ -3,11 +3,10 @@
 import asyncio
 import time
 from collections.abc import Sequence as Ordered
-from pathlib import Path
 
 from ldo_service.actors.graph import RUNNING, Box
-from ldo_service.config import Config, config_yaml
-from ldo_service.datasets import Sequence
+from ldo_service.config import config_yaml
+from ldo_service.errors import ConfigError
 from ldo_service.runtime.graph import lossless_consumers
 from ldo_service.runtime.links import Header, data_key
 from ldo_service.runtime.links import encode as encode_header
@@ -18,42 +17,30 @@ from ldo_service.schemas import Health, decode, encode
 from ldo_service.schemas.topics import CAMERA_RGBD, Topic
 
 from .folder import RunFolder
-from .over_file import Advance, require_usable
-from .source import Reader, Selection, Warn
+from .job import Advance, Job
+from .over_file import require_usable
+from .source import Reader
 from .summary import Usage, summarise
 
 
-def run_in_real_time(
-    sequence: Sequence,
-    folder: Path,
-    config: Config,
-    selection: Selection,
-    warn: Warn,
-    advance: Advance,
-) -> RunFolder:
+def run_in_real_time(job: Job, advance: Advance) -> RunFolder:
     """Like `run_over_file`, with the stages and policies of the service, all in this process.
 
     A frame that comes before the tracker is done with the last one is dropped and counted, so the
-    result depends on the machine's speed and load. Raises what `run_over_file` raises.
+    result depends on the machine's speed and load. Raises what `run_over_file` raises, and
+    ConfigError when the map is to be refined: live, `map/refine` asks for that.
     """
-    run = _RealTimeRun(sequence, folder, config, selection, warn, advance)
-    return asyncio.run(run.go())
+    if job.refine:
+        raise ConfigError("--refine needs a run over a file: leave out --realtime.")
+    return asyncio.run(_RealTimeRun(job, advance).go())
 
 
 class _RealTimeRun:
-    def __init__(
-        self,
-        sequence: Sequence,
-        folder: Path,
-        config: Config,
-        selection: Selection,
-        warn: Warn,
-        advance: Advance,
-    ) -> None:
-        self._sequence, self._config, self._advance = sequence, config, advance
-        self._indices = selection.indices(sequence)
-        self._reader = Reader(sequence, self._indices, warn)
-        self._record = RunFolder(folder, config_yaml(config), config.tracker.hold_out)
+    def __init__(self, job: Job, advance: Advance) -> None:
+        self._sequence, self._config, self._advance = job.sequence, job.config, advance
+        self._indices = job.selection.indices(job.sequence)
+        self._reader = Reader(job.sequence, self._indices, job.warn)
+        self._record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker.hold_out)
         self._step_ms: dict[str, float] = {}
 
     async def go(self) -> RunFolder:

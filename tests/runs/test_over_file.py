@@ -12,7 +12,8 @@ from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RawFrame, Trajectory
-from ldo_service.runs.folder import prepare
+from ldo_service.runs.folder import RunFolder, prepare
+from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
 
@@ -32,12 +33,18 @@ class Spoilt(Cached):
         return super().read(index)
 
 
-def run(sequence: Sequence, folder: Path, *settings: str, frames: int = FRAMES, warn=print):
+def run(
+    sequence: Sequence,
+    folder: Path,
+    *settings: str,
+    frames: int = FRAMES,
+    warn=print,
+    refine: int = 0,
+) -> RunFolder:
     prepare(folder, overwrite=False)
     config = load_config(settings=settings)
-    return run_over_file(
-        sequence, folder, config, Selection(max_frames=frames), warn, lambda _done: None
-    )
+    job = Job(sequence, folder, config, Selection(max_frames=frames), warn, refine)
+    return run_over_file(job, lambda _done: None)
 
 
 @pytest.fixture(scope="module")

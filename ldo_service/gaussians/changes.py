@@ -1,0 +1,69 @@
+"""What of a map its followers do not know yet."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .model import GaussianMap
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Changes:
+    """removed  [R] int64, ids, ascending
+    changed  [C] rows of the map whose parameters are other than was told
+    added    [A] rows of the map that were never told of
+    """
+
+    removed: np.ndarray
+    changed: np.ndarray
+    added: np.ndarray
+
+
+class ChangeLog:
+    """Beside a map: who changes the map says so here.
+
+    Followers get new Gaussians at once and the parameters of old ones now and then, because the
+    optimiser touches most of what is in view at every keyframe. Motions by anchor are theirs to
+    apply: they change no row here.
+    """
+
+    def __init__(self) -> None:
+        self._next_untold = 0  # ids from here on were never told
+        self._is_changed = np.zeros(0, bool)  # per row of the map, as it was last seen
+        self._removed: list[np.ndarray] = []
+
+    def grown(self, gaussians: GaussianMap) -> None:
+        """Rows were appended."""
+        new = len(gaussians) - len(self._is_changed)
+        self._is_changed = np.concatenate([self._is_changed, np.zeros(new, bool)])
+
+    def changed(self, mask: np.ndarray) -> None:
+        """The rows where `mask` [N] is true were written to."""
+        self._is_changed |= mask
+
+    def removing(self, gaussians: GaussianMap, mask: np.ndarray) -> None:
+        """The rows where `mask` [N] is true are about to go."""
+        ids = gaussians.ids[mask]
+        self._removed.append(ids[ids < self._next_untold])
+        self._is_changed = self._is_changed[~mask]
+
+    def take(self, gaussians: GaussianMap, *, with_changed: bool) -> Changes:
+        """What is to be told now; it counts as told. Without `with_changed` the rows that changed
+        wait for another time."""
+        first_new = int(np.searchsorted(gaussians.ids, self._next_untold))
+        changed = np.zeros(0, np.int64)
+        if with_changed:
+            changed = np.flatnonzero(self._is_changed[:first_new])
+            self._is_changed[:] = False
+        self._is_changed[first_new:] = False  # told with what they are now
+        removed = np.sort(np.concatenate([np.zeros(0, np.int64), *self._removed]))
+        self._removed.clear()
+        if len(gaussians) > first_new:
+            self._next_untold = int(gaussians.ids[-1]) + 1
+        return Changes(removed, changed, np.arange(first_new, len(gaussians)))
+
+    def all_told(self, gaussians: GaussianMap) -> None:
+        """Begin with followers that know the whole map."""
+        self._next_untold = int(gaussians.ids[-1]) + 1 if len(gaussians) else 0
+        self._is_changed = np.zeros(len(gaussians), bool)
+        self._removed.clear()
