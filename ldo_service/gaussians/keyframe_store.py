@@ -1,9 +1,6 @@
 """The images of all keyframes, on disk, with the last used ones in memory."""
 
 import logging
-import shutil
-import tempfile
-import weakref
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,11 +11,14 @@ import numpy as np
 from ldo_service.errors import ConfigError, DataError
 
 from .keyframe_images import KeyframeImages, packed, unpacked
-from .sealed_file import UNFINISHED, read_sealed, write_sealed
+from .sealed_folder import SealedFolder
 
 log = logging.getLogger(__name__)
 
-_SUFFIX = ".keyframe"
+_DISK_FULL = (
+    "The newest keyframes stay in memory (cache_mb), older ones will be missing; free some disk "
+    "space, or lower quota_mb."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +46,16 @@ class KeyframeStore:
 
     def __init__(self, folder: Path | None, config: KeyframeStoreConfig | None = None) -> None:
         self.config = config or KeyframeStoreConfig()
-        self._folder = folder or _temporary_folder(self)
-        self._sizes = _found(self._folder)  # bytes of each file, by keyframe
+        self._files = SealedFolder(folder, "keyframe", _DISK_FULL)
         self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # last used last
-        self._is_disk_refusing = False
-        self._reads = self._forgotten = self._damaged = self._not_written = 0
+        self._reads = self._forgotten = self._damaged = 0
         self._make_room()
 
     def put(self, images: KeyframeImages) -> None:
         """Keep copies. A keyframe that is there already is replaced."""
         images = images.owned()
         self._remember(images)
-        self._write(images)
+        self._files.write(images.keyframe, packed(images))
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
@@ -65,19 +63,19 @@ class KeyframeStore:
         images = self._cache.get(keyframe)
         if images is not None:
             self._cache.move_to_end(keyframe)
-        elif keyframe in self._sizes:
+        elif keyframe in self._files.sizes:
             images = self._read(keyframe)
         return images
 
     def __contains__(self, keyframe: int) -> bool:
-        return keyframe in self._sizes or keyframe in self._cache
+        return keyframe in self._files.sizes or keyframe in self._cache
 
     def __len__(self) -> int:
-        return len(self._sizes.keys() | self._cache.keys())
+        return len(self._files.sizes.keys() | self._cache.keys())
 
     def keyframes(self) -> list[int]:
         """Ids of all that are there, ascending."""
-        return sorted(self._sizes.keys() | self._cache.keys())
+        return sorted(self._files.sizes.keys() | self._cache.keys())
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
         """Drop all others: those that a restored checkpoint does not know."""
@@ -89,12 +87,12 @@ class KeyframeStore:
     def statistics(self) -> dict[str, float]:
         return {
             "keyframes_stored": len(self),
-            "keyframes_disk_mb": sum(self._sizes.values()) / 1e6,
+            "keyframes_disk_mb": sum(self._files.sizes.values()) / 1e6,
             "keyframes_cache_mb": self._cached_bytes() / 1e6,
             "keyframes_read": self._reads,
             "keyframes_forgotten": self._forgotten,
             "keyframes_damaged": self._damaged,
-            "keyframes_not_written": self._not_written,
+            "keyframes_not_written": self._files.not_written,
         }
 
     # --- memory -----------------------------------------------------------------------------------
@@ -108,40 +106,13 @@ class KeyframeStore:
         return sum(images.nbytes for images in self._cache.values())
 
     # --- disk -------------------------------------------------------------------------------------
-    def _path(self, keyframe: int) -> Path:
-        return self._folder / f"{keyframe:08d}{_SUFFIX}"
-
-    def _write(self, images: KeyframeImages) -> None:
-        try:
-            size = write_sealed(self._path(images.keyframe), packed(images))
-        except OSError as error:
-            self._refused(error)
-        else:
-            self._sizes[images.keyframe] = size
-            self._is_disk_refusing = False
-
-    def _refused(self, error: OSError) -> None:
-        """Count every keyframe, and tell once until the disk takes one again."""
-        self._not_written += 1
-        if not self._is_disk_refusing:
-            log.error(
-                "keyframes cannot be written to %s: %s. The newest stay in memory "
-                "(cache_mb=%g), older ones will be missing; free some disk space, or lower "
-                "quota_mb=%g.",
-                self._folder,
-                error,
-                self.config.cache_mb,
-                self.config.quota_mb,
-            )
-        self._is_disk_refusing = True
-
     def _read(self, keyframe: int) -> KeyframeImages | None:
         self._reads += 1
         try:
-            images = unpacked(read_sealed(self._path(keyframe)))
+            images = unpacked(self._files.read(keyframe))
             if images.keyframe != keyframe:
-                raise DataError(f"{self._path(keyframe)} holds keyframe {images.keyframe}.")
-        except (OSError, DataError) as error:
+                raise DataError(f"the file holds keyframe {images.keyframe}")
+        except DataError as error:
             log.warning("keyframe %d is dropped, its images cannot be read: %s", keyframe, error)
             self._damaged += 1
             self._drop(keyframe)
@@ -151,12 +122,11 @@ class KeyframeStore:
 
     def _drop(self, keyframe: int) -> None:
         self._cache.pop(keyframe, None)
-        if self._sizes.pop(keyframe, None) is not None:
-            _unlink(self._path(keyframe))
+        self._files.remove(keyframe)
 
     # --- quota ------------------------------------------------------------------------------------
     def _make_room(self) -> None:
-        while sum(self._sizes.values()) > 1e6 * self.config.quota_mb:
+        while sum(self._files.sizes.values()) > 1e6 * self.config.quota_mb:
             keyframe = self._most_redundant()
             if keyframe is None:
                 return
@@ -167,34 +137,6 @@ class KeyframeStore:
         """The keyframe on disk whose neighbours there have the closest ids, the oldest of several:
         it saw least that they did not, and keyframes stay spread over the whole run. Never the
         first, which fixes the map's place and brightness, nor the newest. None: nobody else."""
-        kept = np.array(sorted(self._sizes), np.int64)
+        kept = np.array(sorted(self._files.sizes), np.int64)
         gaps = (kept[2:] - kept[:-2])[: max(0, len(kept) - 1 - self.config.newest_kept)]
         return int(kept[1 + np.argmin(gaps)]) if len(gaps) else None
-
-
-def _temporary_folder(owner: object) -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="ldo-keyframes-"))
-    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-def _found(folder: Path) -> dict[int, int]:
-    """Size in bytes of the keyframes in a folder, which is made; unfinished files are removed."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for unfinished in folder.glob(f"*{_SUFFIX}{UNFINISHED}"):
-            unfinished.unlink()
-        files = {file.stem: file.stat().st_size for file in folder.glob(f"*{_SUFFIX}")}
-    except OSError as error:
-        raise ConfigError(
-            f"keyframes cannot be kept in {folder}: {error}. Choose a folder that can be written."
-        ) from error
-    return {int(stem): size for stem, size in files.items() if stem.isdecimal()}
-
-
-def _unlink(path: Path) -> None:
-    """A file that stays for now costs disk space only."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        log.warning("%s cannot be removed: %s", path, error)

@@ -164,7 +164,7 @@ def test_keyframes_that_a_checkpoint_does_not_know_are_dropped(tmp_path: Path) -
 def test_a_temporary_folder_goes_with_the_store() -> None:
     store = KeyframeStore(None, KeyframeStoreConfig(cache_mb=0))
     store.put(images_of(1))
-    folder = store._folder
+    folder = store._files._folder
     assert_same(store.get(1), images_of(1))
     del store
     gc.collect()
@@ -273,7 +273,7 @@ def test_a_full_disk_leaves_the_newest_in_memory_and_is_told_once(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
-        patch.setattr("ldo_service.gaussians.keyframe_store.write_sealed", full)
+        patch.setattr(Path, "replace", full)
         for keyframe in (1, 2, 3):
             store.put(images_of(keyframe))
     assert store.keyframes() == [0, 2, 3]

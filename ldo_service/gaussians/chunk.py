@@ -1,0 +1,57 @@
+"""The Gaussians of one anchor, as arrays and as bytes."""
+
+import struct
+from dataclasses import dataclass, replace
+
+import numpy as np
+import zstandard
+
+from ldo_service.errors import DataError
+from ldo_service.geometry import se3
+
+from .model import ROW, moved_rows
+
+_HEADER = struct.Struct("<qq")  # anchor, Gaussians
+_LEVEL = 1  # of zstd
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Chunk:
+    """ids [M] int64 ascending, rows [M, 16] float32 in the map."""
+
+    anchor: int
+    ids: np.ndarray
+    rows: np.ndarray
+
+    @property
+    def anchors(self) -> np.ndarray:
+        """[M] int32, as GaussianMap keeps them."""
+        return np.full(len(self.ids), self.anchor, np.int32)
+
+    def carried(self, T_then: np.ndarray, T_now: np.ndarray) -> "Chunk":
+        """Moved with the anchor from one pose in the map [4, 4] to another: by
+        T_now @ inverse(T_then). Itself when they are equal."""
+        if np.array_equal(T_then, T_now):
+            return self
+        return replace(self, rows=moved_rows(self.rows, T_now @ se3.inverse(T_then)))
+
+
+def packed(chunk: Chunk) -> bytes:
+    """Ids as differences and rows byte by byte, as the same byte of neighbours is often equal."""
+    steps = np.diff(chunk.ids, prepend=0).astype("<i8")
+    planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T
+    body = _HEADER.pack(chunk.anchor, len(steps)) + steps.tobytes() + planes.tobytes()
+    return zstandard.ZstdCompressor(level=_LEVEL).compress(body)
+
+
+def unpacked(data: bytes | memoryview) -> Chunk:
+    """The chunk of which `data` is the packed form. Raises DataError for other bytes."""
+    try:
+        body = zstandard.ZstdDecompressor().decompress(data)
+        anchor, count = _HEADER.unpack_from(body)
+        steps = np.frombuffer(body, "<i8", count, _HEADER.size)
+        planes = np.frombuffer(body, np.uint8, offset=_HEADER.size + steps.nbytes)
+        rows = np.ascontiguousarray(planes.reshape(4 * ROW, count).T).view("<f4")
+    except (zstandard.ZstdError, struct.error, ValueError) as error:
+        raise DataError(f"{len(data)} bytes hold no Gaussians: {error}") from error
+    return Chunk(anchor, np.cumsum(steps), rows)

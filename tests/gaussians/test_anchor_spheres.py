@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+
+from ldo_service.gaussians import render
+from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
+from ldo_service.geometry import Camera, se3
+
+CAMERA = Camera(64, 48, 50.0, 40.0, 28.0, 27.0)
+POSES = {k: se3.exp(np.array([0.3 * k, -0.2, 0.1 * k, k, 1.0, -k])) for k in range(400)}
+
+
+def clusters(count: int, each: int, seed: int, *, around_m: float = 4.0) -> tuple:
+    """Rows and anchors of small and large Gaussians, some on top of the camera at the origin."""
+    rng = np.random.default_rng(seed)
+    rows = np.zeros((count * each, 16), np.float32)
+    middles = rng.uniform(-around_m, around_m, (count, 3))
+    rows[:, 0:3] = np.repeat(middles, each, axis=0) + rng.normal(0, 0.1, (count * each, 3))
+    rows[:, 3:6] = np.repeat(rng.uniform(-6, -1, (count, 1)), each, axis=0)
+    rows[:, 3:6] += rng.uniform(-1, 1, (count * each, 3))
+    rows[:, 6:10] = rng.normal(size=(count * each, 4))
+    rows[:, 10] = rng.uniform(-2, 8, count * each)
+    rows[:, 11:14] = rng.uniform(0, 1, (count * each, 3))
+    return rows, np.repeat(np.arange(count, dtype=np.int32), each)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_what_a_camera_may_not_see_changes_no_bit_of_its_picture(seed: int) -> None:
+    rows, anchors = clusters(400, 3, seed)
+    camera = PlacedCamera(CAMERA, se3.exp(np.array([0.2, seed, -0.1, 0.3, -0.2, 0.1])))
+    spheres = AnchorSpheres.around(rows, anchors, POSES)
+    seen = camera.may_see(spheres.centers_map(POSES), spheres.radii_m)
+    assert 0.05 < seen.mean() < 0.7
+    T_camera_map = se3.inverse(camera.T_map_camera)
+    whole = render(rows, CAMERA, T_camera_map)
+    part = render(np.ascontiguousarray(rows[seen[anchors]]), CAMERA, T_camera_map)
+    assert whole.opacity.max() > 0.5
+    for name in ("color", "opacity", "median_depth_m", "weighted_depth_m"):
+        assert getattr(whole, name).tobytes() == getattr(part, name).tobytes()
+
+
+def test_spheres_hold_the_gaussians_of_their_anchor_in_any_order() -> None:
+    rows, anchors = clusters(30, 5, 1)
+    shuffled = np.random.default_rng(0).permutation(len(rows))
+    spheres = AnchorSpheres.around(rows[shuffled], anchors[shuffled], POSES)
+    np.testing.assert_array_equal(spheres.anchors, np.arange(30))
+    np.testing.assert_array_equal(spheres.counts, 5)
+    distances = np.linalg.norm(rows[:, :3] - spheres.centers_map(POSES)[anchors], axis=1)
+    sigmas = np.exp(rows[:, 3:6].max(axis=1))
+    assert np.all(distances + 3 * sigmas < spheres.radii_m[anchors])
+
+
+def test_spheres_move_with_their_anchors() -> None:
+    rows, anchors = clusters(3, 5, 1)
+    spheres = AnchorSpheres.around(rows, anchors, POSES)
+    T_new_old = se3.exp(np.array([0.5, 0.8, -0.3, 1, -0.5, 0.7]))
+    before = spheres.centers_map(POSES)
+    after = spheres.centers_map(POSES | {1: T_new_old @ POSES[1]})
+    np.testing.assert_allclose(after[1], se3.transform(T_new_old, before[1]))
+    np.testing.assert_array_equal(after[[0, 2]], before[[0, 2]])
+
+
+@pytest.mark.parametrize(
+    ("center", "is_seen"),
+    [
+        ((0, 0, 3), True),
+        ((0, 0, -0.2), False),
+        ((0, 0, -0.05), True),  # reaches past the near plane
+        ((3 * 36 / 50, 0, 3), True),  # on the right rim of the image
+        ((3 * 36 / 50 + 0.6, 0, 3), False),
+        ((0, -3 * 28 / 40 - 0.6, 3), False),
+        ((0, 0, 10.05), True),
+        ((0, 0, 10.2), False),  # too far
+        ((np.nan, 0, 3), True),
+    ],
+)
+def test_a_sphere_of_ten_centimetres(center: tuple[float, ...], is_seen: bool) -> None:
+    camera = PlacedCamera(CAMERA, np.eye(4))
+    seen = camera.may_see(np.array([center], float), np.array([0.1]), reach_m=10)
+    assert seen.tolist() == [is_seen]
+
+
+def test_a_map_without_gaussians_has_no_spheres() -> None:
+    spheres = AnchorSpheres.around(np.zeros((0, 16), np.float32), np.zeros(0, np.int32), POSES)
+    assert len(spheres) == 0
+    assert (
+        PlacedCamera(CAMERA, np.eye(4)).may_see(spheres.centers_map({}), spheres.radii_m).size == 0
+    )
+
+
+def test_a_gaussian_as_large_as_the_world_is_seen_from_everywhere() -> None:
+    rows, anchors = clusters(1, 2, 1)
+    rows[1, 3] = 1e4
+    spheres = AnchorSpheres.around(rows, anchors, POSES)
+    away = PlacedCamera(CAMERA, se3.exp(np.array([0, 0, 0, 0, 0, 1e6])))
+    assert away.may_see(spheres.centers_map(POSES), spheres.radii_m, reach_m=20).all()
