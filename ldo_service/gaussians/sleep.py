@@ -37,9 +37,10 @@ class SleepingGaussians:
     """Chunks of Gaussians in `folder`, as if they had never left the map.
 
     A chunk is moved when it wakes, by all that its anchor moved while it slept: an anchor that
-    stands where it stood gets it back bit for bit, another to float32 rounding of one motion.
-    0.3 kB of memory per chunk. Without a folder a temporary one is used, which goes with this
-    object. Not for two threads at once. Raises ConfigError for a folder that cannot be used.
+    stands where it stood gets it back bit for bit, another to float32 rounding and the sign of
+    quaternions. A chunk takes below 1 kB of memory. Without a folder a temporary one is used, which
+    goes with this object. Not for two threads at once. Raises ConfigError for a folder that cannot
+    be used.
 
     The folder belongs to one state: `restore` and, without it, the first `put` remove the chunks
     that the state does not know. Files of chunks that woke stay until the second `snapshot` after,
