@@ -38,6 +38,29 @@ def test_what_a_camera_may_not_see_changes_no_bit_of_its_picture(seed: int) -> N
         assert getattr(whole, name).tobytes() == getattr(part, name).tobytes()
 
 
+@pytest.mark.parametrize("sigma_px", [0.05, 1, 8])
+def test_single_gaussians_just_outside_the_image_are_judged_as_the_renderer_does(
+    sigma_px: float,
+) -> None:
+    rng = np.random.default_rng(int(sigma_px))
+    n, reach_px = 3000, 5 * sigma_px + 4
+    z = rng.uniform(0.1, 4, n)
+    u, v = rng.uniform(-reach_px, 63 + reach_px, n), rng.uniform(-reach_px, 47 + reach_px, n)
+    beside = (u < 0) | (u > 63) | (v < 0) | (v > 47)
+    rows = np.zeros((np.count_nonzero(beside), 16), np.float32)
+    rows[:, 0:3] = np.stack([(u - 28) * z / 50, (v - 27) * z / 40, z], axis=-1)[beside]
+    rows[:, 3:6] = np.log(sigma_px * z[beside, None] / 50)
+    rows[:, 6], rows[:, 10] = 1, 8
+    anchors = np.arange(len(rows), dtype=np.int32)
+    here = {int(k): np.eye(4) for k in anchors}
+    spheres = AnchorSpheres.around(rows, anchors, here)
+    seen = PlacedCamera(CAMERA, np.eye(4)).may_see(spheres.centers, spheres.radii_m)
+    drawn = np.array([render(row[None], CAMERA, np.eye(4)).opacity.any() for row in rows])
+    assert np.count_nonzero(drawn) > 50
+    assert not np.any(drawn & ~seen)
+    assert np.count_nonzero(~seen) > 0.1 * len(rows)
+
+
 def test_spheres_hold_the_gaussians_of_their_anchor_in_any_order() -> None:
     rows, anchors = clusters(30, 5, 1)
     shuffled = np.random.default_rng(0).permutation(len(rows))
