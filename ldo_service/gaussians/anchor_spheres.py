@@ -15,6 +15,7 @@ REACH_SIGMA = 1.3 * 3.33
 LOW_PASS_PX = 2.0  # 3.33 times the square root of the 0.3 px^2 that every splat is widened by
 NEAR_M = 0.05  # the renderer draws nothing nearer
 _MAX_LOG_SCALE = 50.0  # as good as infinite, and no overflow
+_ROUNDING = 1.000_01  # of sums in float32
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -79,20 +80,13 @@ class AnchorSpheres:
     ) -> "AnchorSpheres":
         """Of Gaussians rows [N, 16] in the map that hang on anchors [N], by anchor T_map_anchor
         [4, 4]. Raises KeyError for an anchor without a pose. Linear in N."""
-        order = np.argsort(anchors, kind="stable")  # most often in order already
-        found, starts, counts = np.unique(anchors[order], return_index=True, return_counts=True)
-        if len(found) == 0:
-            return cls(found, counts, np.zeros((0, 3)), np.zeros(0))
-        means = rows[order, 0:3].astype(float)
-        low, high = (each.reduceat(means, starts) for each in (np.minimum, np.maximum))
-        centers_map = (low + high) / 2
-        reach = REACH_SIGMA * np.exp(
-            rows[order, 3:6].max(axis=1).astype(float).clip(max=_MAX_LOG_SCALE)
-        )
-        distance = np.linalg.norm(means - np.repeat(centers_map, counts, axis=0), axis=1)
-        radii_m = np.maximum.reduceat(distance + reach, starts)
-        T_anchor_map = se3.inverse(_stacked(found, T_map_anchor))
-        return cls(found, counts, _applied(T_anchor_map, centers_map), radii_m)
+        rows, anchors = _grouped(rows, anchors)
+        starts = np.flatnonzero(np.diff(anchors, prepend=anchors[:1] - 1))
+        found, counts = anchors[starts], np.diff(starts, append=len(anchors))
+        spheres = [_sphere(rows[i : i + n]) for i, n in zip(starts, counts, strict=True)]
+        centers_map = np.array([center for center, _ in spheres]).reshape(-1, 3)
+        centers = _applied(se3.inverse(_stacked(found, T_map_anchor)), centers_map)
+        return cls(found, counts, centers, np.array([radius for _, radius in spheres]))
 
     def __len__(self) -> int:
         return len(self.anchors)
@@ -100,6 +94,24 @@ class AnchorSpheres:
     def centers_map(self, T_map_anchor: Mapping[int, np.ndarray]) -> np.ndarray:
         """[K, 3] with the anchors at these poses."""
         return _applied(_stacked(self.anchors, T_map_anchor), self.centers)
+
+
+def _grouped(rows: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Anchors ascend: as they do in a map whose keyframes were inserted one after the other."""
+    if np.all(anchors[1:] >= anchors[:-1]):
+        return rows, anchors
+    order = np.argsort(anchors, kind="stable")
+    return rows[order], anchors[order]
+
+
+def _sphere(rows: np.ndarray) -> tuple[np.ndarray, float]:
+    """Center [3] in the map and radius in metres of what is drawn of rows [M, 16]."""
+    columns = np.ascontiguousarray(rows[:, :6].T)
+    means, log_scales = columns[:3], columns[3:].max(axis=0)
+    center = (means.min(axis=1) + means.max(axis=1)) / 2
+    distances_m = np.sqrt(np.square(means - center[:, None]).sum(axis=0))
+    reach_m = REACH_SIGMA * np.exp(np.minimum(log_scales, _MAX_LOG_SCALE))
+    return center, _ROUNDING * float(np.max(distances_m + reach_m))
 
 
 def _stacked(anchors: np.ndarray, T_map_anchor: Mapping[int, np.ndarray]) -> np.ndarray:

@@ -13,7 +13,7 @@ from .anchor_spheres import AnchorSpheres, PlacedCamera
 @dataclass(frozen=True, slots=True)
 class SleepConfig:
     max_active: int = 1_500_000  # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments
-    low_water: float = 0.8  # share of max_active that stays: they go in batches, not at each step
+    low_water: float = 0.9  # share of max_active that stays: a batch of 0.1 s now and then
     reach_m: float = 20.0  # beyond, nothing counts as seen: depth cameras measure less far, so
     # nothing is inserted a second time where Gaussians sleep
 

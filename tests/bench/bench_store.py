@@ -1,6 +1,6 @@
-"""Milliseconds and bytes of a keyframe, and of a chunk of sleeping Gaussians, on disk.
+"""Milliseconds and bytes of keyframes, and of anchors' Gaussians that sleep, on disk.
 
-python tests/bench/bench_store.py SOURCE [--keyframes 50] [--stride 10] [--folder FOLDER]
+python tests/bench/bench_store.py SOURCE [--keyframes 50] [--stride 10] [--active N] [--folder F]
 
 CPU milliseconds of one thread, medians; the disk's own time shows in the wall column.
 """
@@ -15,9 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.datasets import open_sequence
-from ldo_service.gaussians import View
+from ldo_service.gaussians import GaussianMap, View, insert
+from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
 from ldo_service.gaussians.keyframe_images import KeyframeImages
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
+from ldo_service.gaussians.sleep import Poses, SleepingGaussians
 
 
 def timed_ms(do: Callable[[], object]) -> tuple[float, float]:
@@ -54,17 +56,63 @@ def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
     )
 
 
+def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path) -> None:
+    """A map of `active` Gaussians: those of the first keyframes, at true poses, over and over."""
+    rows, anchors, poses = mapped(source, count, stride)
+    times = -(-active // len(rows))
+    gaussians = GaussianMap(active)
+    for anchor in range(times * count):
+        poses[anchor] = poses[anchor % count]
+        gaussians.add(rows[anchors == anchor % count], anchor)
+    print(f"{source}: {len(gaussians)} Gaussians on {len(poses)} anchors")
+    sleeping, before = SleepingGaussians(folder), gaussians.rows.copy()
+    asleep = list(range(0, len(poses), 2))
+
+    def spheres() -> AnchorSpheres:
+        return AnchorSpheres.around(gaussians.rows, gaussians.anchors, poses)
+
+    report("spheres", [timed_ms(spheres)])
+    report("all sleep", [timed_ms(lambda: sleeping.take_from(gaussians, asleep, poses))])
+    chunks, memory_mb = len(sleeping.anchors()), len(sleeping) * 64 / 1e6
+    disk_mb = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
+    camera = PlacedCamera(open_sequence(source).camera, poses[0])
+    sleeping.seen_from(camera, poses)
+    report("who is seen", [timed_ms(lambda: sleeping.seen_from(camera, poses)) for _ in range(9)])
+    report("all wake", [timed_ms(lambda: sleeping.return_to(gaussians, asleep, poses))])
+    if gaussians.rows.tobytes() != before.tobytes():
+        sys.exit("the Gaussians did not come back: the times mean nothing.")
+    print(
+        f"{chunks} chunks of {1e3 * memory_mb / chunks:.0f} kB in memory, "
+        f"{memory_mb / disk_mb:.2f} to 1 on disk"
+    )
+
+
+def mapped(source: str, count: int, stride: int) -> tuple[np.ndarray, np.ndarray, Poses]:
+    """Rows and anchors of the Gaussians of the first keyframes, and where those stood."""
+    sequence = open_sequence(source)
+    truth, gaussians, poses = sequence.truth(), GaussianMap(), {}
+    if truth is None:
+        sys.exit(f"{source} has no true poses.")
+    for keyframe in range(count):
+        frame = sequence[keyframe * stride]
+        nearest = int(np.argmin(np.abs(truth.stamps_s - 1e-9 * frame.stamp_ns)))
+        poses[keyframe] = truth.T_world_camera[nearest]
+        insert(gaussians, frame, poses[keyframe], keyframe)
+    return gaussians.rows, gaussians.anchors, poses
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("source")
     parser.add_argument("--keyframes", type=int, default=50)
     parser.add_argument("--stride", type=int, default=10, help="frames between two keyframes")
+    parser.add_argument("--active", type=int, default=1_500_000, help="Gaussians in the map")
     parser.add_argument("--folder", type=Path, help="on the disk to measure")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
-        bench_keyframes(
-            arguments.source, arguments.keyframes, arguments.stride, Path(folder) / "keyframes"
-        )
+        chosen = arguments.source, arguments.keyframes, arguments.stride
+        bench_keyframes(*chosen, Path(folder) / "keyframes")
+        bench_sleep(*chosen, arguments.active, Path(folder) / "sleep")
 
 
 if __name__ == "__main__":
