@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.gaussians import GaussianMap
+from ldo_service.gaussians import GaussianMap, render
 from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
 from ldo_service.gaussians.chunk import Chunk, packed, unpacked
 from ldo_service.gaussians.sleep import SleepingGaussians, whole_map
+from ldo_service.gaussians.sleep_choice import SleepConfig, choose_sleepers
 from ldo_service.geometry import Camera, se3
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -240,6 +241,59 @@ def test_sleeping_and_waking_spheres_agree(tmp_path: Path) -> None:
         assert sleeping.seen_from(camera, moved, reach_m=9) == np.flatnonzero(seen).tolist()
     assert max(counts) > 2
     assert min(counts) < 12
+
+
+def wall_at(z_m: float, seed: int) -> np.ndarray:
+    """A slice of a corridor: Gaussians to be seen from before and behind."""
+    rows = rows_of(40, seed)
+    rows[:, :3] = rows[:, :3].clip(-1, 1) * np.array([1, 1, 0.3]) + np.array([0, 0, z_m])
+    rows[:, 3:6] = -3
+    rows[:, 11:14] = rows[:, 11:14].clip(0, 1)
+    return rows
+
+
+def test_a_walk_and_back_shows_every_camera_the_whole_map_and_keeps_few_in_memory() -> None:
+    """Out along a corridor, mapped 2 m ahead, turn, and home. What is over 8 m away was not seen
+    by anybody, and is left out of the pictures of the map that never sleeps, too."""
+    config = SleepConfig(max_active=1600, low_water=0.6, reach_m=8)
+    gaussians, plain, sleeping = GaussianMap(), GaussianMap(), SleepingGaussians(None)
+    poses: dict[int, np.ndarray] = {}
+    recent: list[PlacedCamera] = []
+    turned = se3.exp(np.array([0, np.pi, 0, 0, 0, 0]))
+    most = 0
+    path = [(0.5 * k, False) for k in range(80)] + [(0.5 * k, True) for k in range(79, -1, -4)]
+    for z_m, is_homeward in path:
+        T_map_camera = turned.copy() if is_homeward else np.eye(4)
+        T_map_camera[:3, 3] = 0.1, 0, z_m
+        recent = [*recent[-3:], PlacedCamera(CAMERA, T_map_camera)]
+        # wake
+        seen = sleeping.seen_from(recent[-1], poses, config.reach_m)
+        sleeping.return_to(gaussians, seen, poses)
+        # see
+        near = np.isin(plain.anchors, [k for k in poses if abs(poses[k][2, 3] + 2 - z_m) < 7])
+        awake = np.isin(gaussians.anchors, plain.anchors[near])
+        pictures = [
+            render(np.ascontiguousarray(rows), CAMERA, se3.inverse(T_map_camera)).color
+            for rows in (gaussians.rows[awake], plain.rows[near])
+        ]
+        assert pictures[0].tobytes() == pictures[1].tobytes()
+        # map
+        if not is_homeward:
+            anchor = len(poses)
+            poses[anchor] = T_map_camera
+            for each in (gaussians, plain):
+                each.add(wall_at(z_m + 2, anchor), anchor)
+        # sleep
+        spheres = AnchorSpheres.around(gaussians.rows, gaussians.anchors, poses)
+        choice = choose_sleepers(spheres, poses, recent, config)
+        sleeping.take_from(gaussians, choice.anchors, poses)
+        assert choice.excess == 0
+        assert len(gaussians) + len(sleeping) == len(plain)
+        most = max(most, len(gaussians))
+    assert len(plain) == 3200
+    assert most <= config.max_active
+    assert sleeping.statistics()["gaussians_woken"] > 1000
+    assert pieces_of(gaussians, sleeping, poses)[1].tobytes() == plain.rows.tobytes()
 
 
 # --- files ------------------------------------------------------------------------------------
