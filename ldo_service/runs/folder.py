@@ -3,7 +3,7 @@
 trajectory_online.txt   what was published at the time, a line per frame that is not LOST
 trajectory.txt          the same frames after the last correction
 frames.csv              every frame: status, residuals, milliseconds
-keyframes.json          id, frame, stamp and pose of every keyframe
+keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
@@ -42,6 +42,7 @@ WRITTEN = frozenset(
         *(f"{REFINED}/{name}" for name in ("trajectory.txt", "keyframes.json", "map.ply")),
     }
 )
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # of a keyframe, in pixels, rectified
 COLUMNS = (
     *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
@@ -92,7 +93,7 @@ class RunFolder:
         self._csv.writerow(COLUMNS)
         self._tracked: list[TrackedFrame] = []
         self._poses = KeyframePoses()
-        self._keyframes: dict[int, dict[str, int]] = {}
+        self._keyframes: dict[int, dict[str, Any]] = {}
         self.follower = MapFollower()
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.corrections = 0
@@ -148,6 +149,7 @@ class RunFolder:
             "keyframe": keyframe.keyframe,
             "frame_index": keyframe.frame,
             "stamp_ns": keyframe.stamp_ns,
+            "camera": {name: getattr(keyframe.camera, name) for name in CAMERA},
         }
 
     # --- at the end -------------------------------------------------------------------------------
