@@ -1,27 +1,174 @@
-"""The PLY file of 3D Gaussian splatting, as its viewers read it."""
+"""The PLY file of 3D Gaussian splatting, as its viewers read it and other programs write it."""
 
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+
+from ldo_service.errors import DataError
+
+from .model import aligned_rows
+
+log = logging.getLogger(__name__)
 
 SH_C0 = 0.28209479177387814  # of the constant spherical harmonic, 1 / (2 sqrt(pi))
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
+COLUMNS = {  # of a row, by property; colours are harmonics in the file
+    **{name: column for column, name in enumerate(("x", "y", "z"))},
+    **{name: 3 + column for column, name in enumerate(("scale_0", "scale_1", "scale_2"))},
+    **{name: 6 + column for column, name in enumerate(("rot_0", "rot_1", "rot_2", "rot_3"))},
+    "opacity": 10,
+    **{name: 11 + column for column, name in enumerate(("f_dc_0", "f_dc_1", "f_dc_2"))},
+}
+FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
+    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+}
+LONGEST_LINE = 4096  # bytes of a header line; more is no header
 
 
 def write_ply(path: Path, rows: np.ndarray) -> None:
     """Write Gaussian rows [N, 16] (see `gaussians.model`): means in metres, log scales,
     quaternion wxyz, logit of the opacity, colour as the constant spherical harmonic."""
     table = np.zeros((len(rows), len(PROPERTIES)), "<f4")
-    table[:, 0:3] = rows[:, 0:3]
-    table[:, 6:9] = (rows[:, 11:14] - 0.5) / SH_C0
-    table[:, 9] = rows[:, 10]
-    table[:, 10:13] = rows[:, 3:6]
-    table[:, 13:17] = rows[:, 6:10]
+    for name, column in COLUMNS.items():
+        table[:, PROPERTIES.index(name)] = rows[:, column]
+    table[:, 6:9] = harmonics(rows[:, 11:14])
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property float {name}" for name in PROPERTIES] + ["end_header", ""]
     with path.open("wb") as file:
         file.write("\n".join(header).encode())
         file.write(table.tobytes())
+
+
+def read_ply(path: Path) -> np.ndarray:
+    """Gaussian rows [N, 16] float32 (see `gaussians.model`) of a PLY file of any program.
+
+    Properties may come in any order and of any type, in text or binary. Normals and whatever else
+    is beside the Gaussians are ignored; so is view-dependent colour (`f_rest_*`), with a warning.
+    Raises DataError for a file that is cut off or too long, lacks a property, or holds NaN,
+    infinity or a quaternion of length zero.
+    """
+    try:
+        with path.open("rb") as file:
+            header = _read_header(path, file)
+            vertices = _read_vertices(path, header, file.read())
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    if any(name.startswith("f_rest_") for name in header.properties):
+        log.warning("%s: colour that depends on the view (f_rest_*) is left out", path)
+    return _rows(path, vertices)
+
+
+def harmonics(colors: np.ndarray) -> np.ndarray:
+    """Coefficients [N, 3] of the constant spherical harmonic of RGB [N, 3], 0..1."""
+    return (colors - 0.5) / SH_C0
+
+
+# --- reading --------------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True)
+class _Header:
+    byte_order: str  # of numpy; empty: text
+    count: int
+    properties: dict[str, str]  # of a vertex: numpy type by name, in order of the file
+    is_last: bool  # no other element follows the vertices
+
+
+def _read_header(path: Path, file: BinaryIO) -> _Header:
+    byte_order, elements = None, {}
+    for words in _header_lines(path, file):
+        match words:
+            case ["format", name, _] if name in FORMATS:
+                byte_order = FORMATS[name]
+            case ["element", name, count] if count.isdecimal():
+                elements[name] = (int(count), {})
+            case ["property", kind, name] if kind in TYPES and elements:
+                elements[list(elements)[-1]][1][name] = TYPES[kind]
+            case ["property", "list", _, _, _] if elements and list(elements)[-1] != "vertex":
+                pass
+            case _:
+                raise DataError(f"{path}: cannot make sense of {' '.join(words)!r} in its header.")
+    if byte_order is None:
+        raise DataError(f"{path}: its header names no format, so it is no PLY file.")
+    if next(iter(elements), None) != "vertex":
+        raise DataError(f"{path}: its first element is not `vertex`: is it a map of Gaussians?")
+    return _Header(byte_order, *elements["vertex"], is_last=len(elements) == 1)
+
+
+def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
+    """The words of each line between `ply` and `end_header`, without comments."""
+    if file.readline(LONGEST_LINE).rstrip() != b"ply":
+        raise DataError(f"{path} is no PLY file: it does not start with `ply`.")
+    while line := file.readline(LONGEST_LINE):
+        words = line.decode("ascii", "replace").split()
+        if words == ["end_header"]:
+            return
+        if words and words[0] not in ("comment", "obj_info"):
+            yield words
+    raise DataError(f"{path} is cut off: its header has no end.")
+
+
+def _read_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.ndarray]:
+    missing = [name for name in COLUMNS if name not in header.properties]
+    if missing:
+        raise DataError(
+            f"{path} has no property {missing[0]}: it is no map of Gaussians as 3D Gaussian "
+            "splatting writes them."
+        )
+    if header.byte_order:
+        return _binary_vertices(path, header, body)
+    return _text_vertices(path, header, body)
+
+
+def _binary_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.ndarray]:
+    dtype = np.dtype([(n, header.byte_order + kind) for n, kind in header.properties.items()])
+    _require_size(path, header, len(body), dtype.itemsize, "bytes")
+    table = np.frombuffer(body, dtype, header.count)
+    return {name: table[name] for name in COLUMNS}
+
+
+def _text_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.ndarray]:
+    words, width = body.split(), len(header.properties)
+    _require_size(path, header, len(words), width, "numbers")
+    try:
+        table = np.array(words[: header.count * width], float).reshape(header.count, width)
+    except ValueError as error:
+        raise DataError(f"{path}: {error}.") from error
+    return {name: table[:, list(header.properties).index(name)] for name in COLUMNS}
+
+
+def _require_size(path: Path, header: _Header, found: int, each: int, unit: str) -> None:
+    expected = header.count * each
+    if found < expected:
+        raise DataError(
+            f"{path} is cut off: {header.count} Gaussians are {expected} {unit}, {found} are there."
+        )
+    if found > expected and header.is_last:
+        raise DataError(
+            f"{path} holds {found - expected} {unit} beyond the {header.count} Gaussians that its "
+            "header counts: header and content do not belong together."
+        )
+
+
+def _rows(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray:
+    rows = aligned_rows(len(vertices["x"]))
+    with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
+        for name, column in COLUMNS.items():
+            rows[:, column] = vertices[name]
+    rows[:, 11:14] = rows[:, 11:14] * np.float32(SH_C0) + np.float32(0.5)
+    bad = ~np.isfinite(rows).all(axis=1) | ~rows[:, 6:10].any(axis=1)
+    if bad.any():
+        raise DataError(
+            f"{path}: {bad.sum()} of {len(rows)} Gaussians, the first of them number "
+            f"{np.argmax(bad)}, hold NaN, infinity or a quaternion of length zero. Write the file "
+            "again without them."
+        )
+    return rows
