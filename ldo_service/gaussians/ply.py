@@ -19,18 +19,25 @@ PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-COLUMNS = {  # of a row, by property; colours are harmonics in the file
-    **{name: column for column, name in enumerate(("x", "y", "z"))},
-    **{name: 3 + column for column, name in enumerate(("scale_0", "scale_1", "scale_2"))},
-    **{name: 6 + column for column, name in enumerate(("rot_0", "rot_1", "rot_2", "rot_3"))},
-    "opacity": 10,
-    **{name: 11 + column for column, name in enumerate(("f_dc_0", "f_dc_1", "f_dc_2"))},
-}
-FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+OF_A_ROW = (
+    *("x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    *("opacity", "f_dc_0", "f_dc_1", "f_dc_2"),  # where the row has RGB
+)
+COLUMNS = {name: column for column, name in enumerate(OF_A_ROW)}
+FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}  # byte orders
 TYPES = {
-    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
-    **{"float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2"},
-    **{"int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8"},
+    name: kind
+    for kind, names in (
+        ("i1", ("char", "int8")),
+        ("u1", ("uchar", "uint8")),
+        ("i2", ("short", "int16")),
+        ("u2", ("ushort", "uint16")),
+        ("i4", ("int", "int32")),
+        ("u4", ("uint", "uint32")),
+        ("f4", ("float", "float32")),
+        ("f8", ("double", "float64")),
+    )
+    for name in names
 }
 LONGEST_LINE = 4096  # bytes of a header line; more is no header
 

@@ -2,8 +2,8 @@
 
     position 3 float32 | scale 3 float32, metres | RGBA 4 uint8 | quaternion wxyz 4 uint8
 
-A byte of the quaternion is 128 (1 + q), so a rotation is good to about half a degree. Axes are those
-of the map. Format: https://github.com/antimatter15/splat
+A byte of the quaternion is 128 (1 + q), so a rotation is good to about half a degree. Axes are
+those of the map. Format: https://github.com/antimatter15/splat
 """
 
 from pathlib import Path

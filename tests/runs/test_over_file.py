@@ -11,7 +11,7 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.geometry import RawFrame, Trajectory
+from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.runs.folder import RunFolder, prepare
 from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
@@ -74,6 +74,7 @@ def test_keyframes_are_placed(finished: Path) -> None:
     for keyframe in keyframes:
         R = np.array(keyframe["T_map_camera"])[:3, :3]
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-9)
+        assert Camera(**keyframe["camera"]).width == 320
 
 
 def test_the_summary_has_what_tools_rely_on(finished: Path) -> None:
