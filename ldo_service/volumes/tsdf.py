@@ -1,0 +1,228 @@
+"""Depth images fused into a truncated signed distance: a running mean in sparse blocks of voxels.
+
+Curless and Levoy, A volumetric method for building complex models from range images, 1996; blocks
+as in Niessner et al., Real-time 3D reconstruction at scale using voxel hashing, 2013.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+
+from .marching_cubes import CORNERS, marching_cubes, packed
+from .mesh import Mesh
+from .viewpoints import Viewpoint, surface_depth_m
+
+SIDE = 8  # voxels of a block
+BLOCK = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)  # [512, 3]
+VOXEL_BYTES = 4 + 4 + 3 * 4  # distance, weight, colour
+# Mean and median depth of one surface agree within this. In the synthetic room 2 voxels of 2 cm
+# leave 0.3 % of the vertices 4 cm off and 1 % of the surface out; 4 voxels: 1.1 %; 1 voxel: 0.06 %
+# and 3.5 % left out.
+SURE_VOXELS = 2.0
+CHUNK = 512  # blocks worked on at a time: a quarter of a million voxels
+
+
+@dataclass(frozen=True, slots=True)
+class TsdfConfig:
+    voxel_m: float = 0.02
+    truncation_voxels: float = 4.0  # more rounds off thin things, less tears noisy walls
+    max_memory_mb: int = 1024  # of the voxels: 1000 m2 of surface at 2 cm
+
+    def __post_init__(self) -> None:
+        if not 0.001 <= self.voxel_m <= 10:
+            raise ConfigError(f"a voxel of {self.voxel_m} m: choose one between 0.001 and 10 m.")
+        if not self.truncation_voxels >= 1:
+            raise ConfigError(f"truncation_voxels={self.truncation_voxels} must be at least 1.")
+        if self.max_memory_mb < 1:
+            raise ConfigError(f"max_memory_mb={self.max_memory_mb} must be at least 1.")
+
+    @property
+    def truncation_m(self) -> float:
+        return self.truncation_voxels * self.voxel_m
+
+    @property
+    def max_blocks(self) -> int:
+        return self.max_memory_mb * 2**20 // (SIDE**3 * VOXEL_BYTES)
+
+
+def fuse(
+    rows: np.ndarray,
+    viewpoints: Sequence[Viewpoint],
+    config: TsdfConfig | None = None,
+    *,
+    threads: int = 1,
+    advance: Callable[[int], None] = lambda _done: None,
+) -> "Tsdf":
+    """Fuse what the Gaussians rows [N, 16] look like from each viewpoint.
+
+    `advance` is called with how many are done. Raises ConfigError when memory does not suffice.
+    """
+    tsdf = Tsdf(config)
+    for done, viewpoint in enumerate(viewpoints, 1):
+        rendering = viewpoint.render(rows, threads)
+        depth_m = surface_depth_m(rendering, SURE_VOXELS * tsdf.config.voxel_m)
+        tsdf.integrate(depth_m, rendering.color, viewpoint)
+        advance(done)
+    return tsdf
+
+
+class Tsdf:
+    """Distances to the nearest surface, in metres along the viewing axis, positive in front of it.
+
+    Voxel (i, j, k) has its centre at `voxel_m (i, j, k)` in the map. Only blocks of 8x8x8 voxels
+    that a surface came near hold memory.
+    """
+
+    def __init__(self, config: TsdfConfig | None = None) -> None:
+        self.config = config or TsdfConfig()
+        self._blocks = np.zeros((0, 3), np.int64)  # coordinates, in blocks, in order of creation
+        self._keys = np.zeros(0, np.int64)  # of the blocks, sorted
+        self._slots = np.zeros(0, np.int64)  # where each key's block is
+        self._distance_m = np.zeros((0, SIDE**3), np.float32)
+        self._weight = np.zeros((0, SIDE**3), np.float32)
+        self._color = np.zeros((0, SIDE**3, 3), np.float32)
+
+    @property
+    def blocks(self) -> int:
+        return len(self._blocks)
+
+    @property
+    def memory_mb(self) -> float:
+        """What the voxels hold."""
+        return (self._distance_m.nbytes + self._weight.nbytes + self._color.nbytes) / 2**20
+
+    # --- in ---------------------------------------------------------------------------------------
+    def integrate(self, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint) -> None:
+        """Take a depth image [H, W], 0 where unknown, and its colours [H, W, 3], 0..1.
+
+        Each voxel near the surface takes the mean of what all images say of it, weighted by the
+        inverse square of depth, as the density of a camera's pixels is. Raises ConfigError when the
+        blocks would exceed `max_memory_mb`; what was fused before stays.
+        """
+        touched = self._touched(depth_m, viewpoint)
+        self._allocate(touched)
+        slots = self._find(touched)
+        for start in range(0, len(slots), CHUNK):
+            self._update(slots[start : start + CHUNK], depth_m, color, viewpoint)
+
+    def _touched(self, depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
+        """Blocks [B, 3] within the truncation of the surface, along each ray."""
+        seen, reach = depth_m > 0, self.config.truncation_m
+        rays, depths_m = viewpoint.camera.rays()[seen], depth_m[seen]
+        block_m = SIDE * self.config.voxel_m
+        near = [
+            _unique(np.floor(se3.transform(viewpoint.T_map_camera, rays * z_m[:, None]) / block_m))
+            for z_m in depths_m + np.linspace(-reach, reach, 3)[:, None]
+        ]
+        return _unique(np.concatenate(near))
+
+    def _allocate(self, blocks: np.ndarray) -> None:
+        new = blocks[self._find(blocks) < 0]
+        total = len(self._blocks) + len(new)
+        if total > self.config.max_blocks:
+            raise ConfigError(
+                f"voxels of {self.config.voxel_m} m need more than "
+                f"{self.config.max_memory_mb} MB for this map. Choose larger voxels or allow more."
+            )
+        self._blocks = np.concatenate([self._blocks, new])
+        keys = packed(self._blocks)
+        self._slots = np.argsort(keys)
+        self._keys = keys[self._slots]
+        self._distance_m = _grown(self._distance_m, total)
+        self._weight = _grown(self._weight, total)
+        self._color = _grown(self._color, total)
+
+    def _find(self, blocks: np.ndarray) -> np.ndarray:
+        """Slots [B] of blocks [B, 3], -1 where there is none."""
+        if not len(self._keys):
+            return np.full(len(blocks), -1)
+        keys = packed(blocks)
+        at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+        return np.where(self._keys[at] == keys, self._slots[at], -1)
+
+    def _update(
+        self, slots: np.ndarray, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint
+    ) -> None:
+        voxels = self._blocks[slots, None] * SIDE + BLOCK  # [B, 512, 3]
+        p_camera = se3.transform(se3.inverse(viewpoint.T_map_camera), voxels * self.config.voxel_m)
+        z_m, (row, column, inside) = p_camera[..., 2], _pixels(p_camera, viewpoint)
+        seen_m = np.where(inside, depth_m[row, column], 0)
+        reach_m = self.config.truncation_m
+        told = (seen_m > 0) & (seen_m - z_m >= -reach_m)  # what lies far behind is hidden
+        slot, voxel = slots[np.nonzero(told)[0]], np.nonzero(told)[1]
+        weight = (1 / z_m[told] ** 2).astype(np.float32)
+        total = self._weight[slot, voxel] + weight
+        share = weight / total
+        distance_m = np.minimum(seen_m - z_m, reach_m)[told]
+        self._distance_m[slot, voxel] += share * (distance_m - self._distance_m[slot, voxel])
+        seen_color = color[row[told], column[told]]
+        self._color[slot, voxel] += share[:, None] * (seen_color - self._color[slot, voxel])
+        self._weight[slot, voxel] = total
+
+    # --- out --------------------------------------------------------------------------------------
+    def mesh(self) -> Mesh:
+        """The surface as triangles, where all corners of a cell have been seen.
+
+        Distances that jump by more than the truncation are no surface but the outline of one: in
+        front of what is behind it, and within itself, a voxel apart.
+        """
+        cells, values, colors = map(np.concatenate, zip(*self._crossed_cells(), strict=True))
+        surface = marching_cubes(cells, values, colors)
+        return Mesh(
+            (surface.points * self.config.voxel_m).astype(np.float32),
+            np.rint(255 * np.clip(surface.attributes, 0, 1)).astype(np.uint8),
+            surface.triangles.astype(np.int32),
+        )
+
+    def _crossed_cells(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Lower corners [A, 3], distances [A, 8] and colours [A, 8, 3] of cells with a surface."""
+        yield np.zeros((0, 3), np.int64), np.zeros((0, 8), np.float32), np.zeros((0, 8, 3))
+        for start in range(0, len(self._blocks), CHUNK):
+            chunk = np.arange(start, min(start + CHUNK, len(self._blocks)))
+            slots, voxels = self._corners(chunk)
+            values = self._distance_m[slots, voxels]
+            known = (slots >= 0) & (self._weight[slots, voxels] > 0)
+            lowest_m, highest_m = values.min(-1), values.max(-1)
+            is_smooth = highest_m - lowest_m <= self.config.truncation_m
+            crossed = known.all(-1) & (lowest_m < 0) & (highest_m >= 0) & is_smooth
+            cells = (self._blocks[chunk, None] * SIDE + BLOCK)[crossed]
+            slots, voxels = slots[crossed], np.broadcast_to(voxels, known.shape)[crossed]
+            yield cells, values[crossed], self._color[slots, voxels]
+
+    def _corners(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For each voxel of these blocks, where the 8 corners x + 2 y + 4 z of its cell are: slots
+        [B, 512, 8], -1 for none, and voxels [512, 8] in them."""
+        corners = BLOCK[:, None] + CORNERS  # [512, 8, 3]
+        neighbours = np.stack([self._find(self._blocks[slots] + step) for step in CORNERS], -1)
+        over = corners // SIDE @ [1, 2, 4]
+        inner = corners % SIDE @ [SIDE * SIDE, SIDE, 1]
+        return neighbours[:, over], inner
+
+
+def _pixels(
+    p_camera: np.ndarray, viewpoint: Viewpoint
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nearest row and column of camera points [..., 3], and whether they lie in the image."""
+    camera = viewpoint.camera
+    in_front = p_camera[..., 2] > 1e-3
+    u, v = np.moveaxis(
+        camera.project(np.where(in_front[..., None], p_camera, (0.0, 0.0, 1.0))), -1, 0
+    )
+    row, column = np.rint(v), np.rint(u)
+    inside = in_front & (row >= 0) & (column >= 0) & (row < camera.height) & (column < camera.width)
+    row, column = (np.where(inside, index, 0).astype(np.int64) for index in (row, column))
+    return row, column, inside
+
+
+def _unique(lattice: np.ndarray) -> np.ndarray:
+    """The distinct integer triples of [..., 3], as [B, 3], in a fixed order."""
+    flat = lattice.reshape(-1, 3).astype(np.int64)
+    return flat[np.unique(packed(flat), return_index=True)[1]]
+
+
+def _grown(array: np.ndarray, length: int) -> np.ndarray:
+    return np.concatenate([array, np.zeros((length - len(array), *array.shape[1:]), array.dtype)])
