@@ -18,6 +18,7 @@ NUMERICS = (
     "loops",
     "semantics",
     "tracking",
+    "volumes",
 )
 OUR_ROOMS = (*NUMERICS, "runtime", "schemas", "actors")
 

@@ -1,0 +1,155 @@
+"""Where there is room: voxels that are free, occupied or unknown."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import se3
+
+from .marching_cubes import packed
+from .viewpoints import Viewpoint, surface_depth_m
+
+UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancyConfig:
+    voxel_m: float = 0.1
+    min_opacity: float = 0.5  # of a Gaussian that counts as matter
+    # Area of the Gaussians in an occupied voxel, as a share of a side of it: a wall through its
+    # middle has 1, single stray Gaussians have less than a hundredth.
+    min_cover: float = 0.1
+    max_sigma_voxels: float = 10.0  # larger Gaussians are backdrop, not matter
+    max_voxels: int = 200_000_000  # a byte each
+
+    def __post_init__(self) -> None:
+        if not 0.005 <= self.voxel_m <= 10:
+            raise ConfigError(f"a voxel of {self.voxel_m} m: choose one between 0.005 and 10 m.")
+        for name in ("min_opacity", "min_cover"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ConfigError(f"{name}={getattr(self, name)} must lie between 0 and 1.")
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancyGrid:
+    """Axes are those of the map.
+
+    origin_m   [3] lower corner of voxel (0, 0, 0), in the map
+    voxel_m    side of a voxel
+    states     [X, Y, Z] uint8: 0 unknown, 1 free, 2 occupied
+    """
+
+    origin_m: np.ndarray
+    voxel_m: float
+    states: np.ndarray
+
+    def save(self, path: Path) -> None:
+        """Write a compressed .npz with `origin_m`, `voxel_m` and `states`."""
+        with path.open("wb") as file:  # savez would add a suffix to a path
+            np.savez_compressed(
+                file, origin_m=self.origin_m, voxel_m=self.voxel_m, states=self.states
+            )
+
+
+def occupancy(
+    rows: np.ndarray,
+    viewpoints: Sequence[Viewpoint],
+    config: OccupancyConfig | None = None,
+    *,
+    threads: int = 1,
+    advance: Callable[[int], None] = lambda _done: None,
+) -> OccupancyGrid:
+    """Occupied where opaque Gaussians of rows [N, 16] are; free where, from a viewpoint, something
+    is seen behind; unknown elsewhere. What is occupied stays so, whatever was seen through it.
+
+    The grid holds all that is occupied, and every viewpoint. Raises DataError when nothing is
+    opaque, ConfigError when the grid would be too large.
+    """
+    config = config or OccupancyConfig()
+    occupied = occupied_voxels(rows, config)
+    if not len(occupied):
+        raise DataError("no voxel is occupied: the map holds no opaque surface.")
+    stood = [np.floor(v.T_map_camera[:3, 3] / config.voxel_m).astype(int) for v in viewpoints]
+    lowest, states = _grid(np.concatenate([occupied, np.reshape(stood, (-1, 3))]), config)
+    for done, viewpoint in enumerate(viewpoints, 1):
+        depth_m = surface_depth_m(viewpoint.render(rows, threads), config.voxel_m)
+        for p_map in _points_in_front(depth_m, viewpoint, config.voxel_m):
+            voxels = np.floor(p_map / config.voxel_m).astype(int) - lowest
+            within = np.all((voxels >= 0) & (voxels < states.shape), axis=1)
+            states[tuple(voxels[within].T)] = FREE
+        advance(done)
+    states[tuple((occupied - lowest).T)] = OCCUPIED
+    return OccupancyGrid(lowest * config.voxel_m, config.voxel_m, states)
+
+
+def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
+    """Voxels [V, 3] (floor of the position over the side) that opaque Gaussians cover.
+
+    A Gaussian covers its opacity times the integral of its two longer axes, 2 pi s1 s2.
+    """
+    sigmas_m, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10]))
+    matter = (opacities >= config.min_opacity) & (
+        sigmas_m.max(axis=1, initial=0) <= config.max_sigma_voxels * config.voxel_m
+    )
+    rows, sigmas_m, opacities = rows[matter], sigmas_m[matter], opacities[matter]
+    longer = np.sort(sigmas_m, axis=1)[:, 1:]
+    cover_m2 = opacities * 2 * np.pi * longer.prod(axis=1)
+    axes = se3.rotation(rows[:, 6:10]).swapaxes(1, 2) * sigmas_m[:, :, None]  # [N, axis, 3]
+    means, cover_m2 = _split(rows[:, 0:3], axes, cover_m2, config.voxel_m / 4)
+    voxels = np.floor(means / config.voxel_m).astype(np.int64)
+    _, first, which = np.unique(packed(voxels), return_index=True, return_inverse=True)
+    covered = np.bincount(which, cover_m2, len(first)) >= config.min_cover * config.voxel_m**2
+    return voxels[first[covered]]
+
+
+def _split(
+    means: np.ndarray, axes: np.ndarray, cover: np.ndarray, max_sigma_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Means and covers of pieces none of whose axes [N, axis, 3] is longer than `max_sigma_m`.
+
+    A Gaussian becomes two, half as long, at +- sqrt(3)/2 of that axis: together they have its
+    variance. The pieces of a large one are evenly spread, at most 2 sqrt(3) `max_sigma_m` apart.
+    """
+    done = []
+    while len(means):
+        lengths = np.linalg.norm(axes, axis=2)
+        large = lengths.max(axis=1) > max_sigma_m
+        done.append((means[~large], cover[~large]))
+        means, axes, cover = means[large], axes[large].copy(), cover[large]
+        piece, longest = np.arange(len(means)), lengths[large].argmax(axis=1)
+        offset = axes[piece, longest] * np.sqrt(3) / 2
+        axes[piece, longest] /= 2
+        means = np.concatenate([means - offset, means + offset])
+        axes, cover = np.concatenate([axes, axes]), np.concatenate([cover, cover]) / 2
+    pieces, covers = zip(*done, strict=True) if done else ([means], [cover])
+    return np.concatenate(pieces), np.concatenate(covers)
+
+
+def _grid(voxels: np.ndarray, config: OccupancyConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest voxel [3] and unknown states [X, Y, Z] around voxels [V, 3]."""
+    lowest = voxels.min(axis=0) - 1
+    size = voxels.max(axis=0) + 2 - lowest
+    if size.astype(float).prod() > config.max_voxels:
+        extent = " x ".join(f"{side * config.voxel_m:.0f}" for side in size)
+        raise ConfigError(
+            f"a grid of {extent} m has more than {config.max_voxels:,} voxels of "
+            f"{config.voxel_m} m. Choose larger voxels."
+        )
+    return lowest, np.full(size, UNKNOWN, np.uint8)
+
+
+def _points_in_front(
+    depth_m: np.ndarray, viewpoint: Viewpoint, voxel_m: float
+) -> Iterator[np.ndarray]:
+    """Points [P, 3] of the map along each ray, half a voxel apart, up to a voxel before what is
+    seen; only as many rays as leave no voxel out."""
+    camera, deepest_m = viewpoint.camera, float(depth_m.max(initial=0))
+    apart_px = voxel_m / 2 * min(camera.fx, camera.fy) / max(deepest_m, voxel_m)
+    every = slice(None, None, max(1, int(apart_px)))
+    rays, depth_m = camera.rays()[every, every].reshape(-1, 3), depth_m[every, every].ravel()
+    longest = np.linalg.norm(rays, axis=1).max()
+    for z_m in np.arange(0, deepest_m, voxel_m / 2 / longest):
+        yield se3.transform(viewpoint.T_map_camera, rays[depth_m - voxel_m > z_m] * z_m)

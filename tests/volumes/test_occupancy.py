@@ -1,0 +1,120 @@
+"""Judges: the solids of the synthetic room, and walls of known place."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from ldo_service.datasets.synthetic.furniture import furnished_room
+from ldo_service.datasets.synthetic.solids import vector
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import Camera
+from ldo_service.volumes import OccupancyConfig, OccupancyGrid, Viewpoint, occupancy
+from ldo_service.volumes.occupancy import FREE, OCCUPIED, UNKNOWN, occupied_voxels
+
+VOXEL_M = 0.1
+
+
+@pytest.fixture(scope="module")
+def grid(mapped) -> OccupancyGrid:
+    return occupancy(mapped.rows, mapped.viewpoints, OccupancyConfig(VOXEL_M))
+
+
+def centers(grid: OccupancyGrid, state: int) -> np.ndarray:
+    """Middles [V, 3] of the voxels in a state."""
+    return grid.origin_m + grid.voxel_m * (np.argwhere(grid.states == state) + 0.5)
+
+
+def state_at(grid: OccupancyGrid, p_map: tuple[float, float, float]) -> int:
+    return int(grid.states[tuple(np.floor((p_map - grid.origin_m) / grid.voxel_m).astype(int))])
+
+
+def disc(mean: tuple[float, float, float], sigma_m: float, opacity_logit: float = 4.0):
+    """A Gaussian that faces the camera."""
+    row = np.zeros(16, np.float32)
+    row[:3], row[3:6], row[6] = mean, np.log([sigma_m, sigma_m, sigma_m / 100]), 1
+    row[10] = opacity_logit
+    return row
+
+
+def test_occupied_voxels_hold_a_surface(grid: OccupancyGrid, p_true: np.ndarray) -> None:
+    distance_m, _ = cKDTree(p_true).query(centers(grid, OCCUPIED))
+    reach_m = np.sqrt(3) / 2 * VOXEL_M  # from the middle of a voxel to its corner
+    assert np.mean(distance_m < reach_m) > 0.98
+    assert distance_m.max() < 2 * reach_m
+
+
+def test_the_surface_is_occupied(grid: OccupancyGrid, p_true: np.ndarray) -> None:
+    """A corner of a voxel may hold too little of it; the next one then holds more."""
+    distance_m, _ = cKDTree(centers(grid, OCCUPIED)).query(p_true[::17])
+    assert np.mean(distance_m < 1.2 * VOXEL_M) > 0.98
+
+
+def test_free_voxels_lie_in_the_room_and_in_nothing(grid: OccupancyGrid) -> None:
+    free, room = centers(grid, FREE), furnished_room(0)
+    assert len(free) > 10_000
+    own = np.stack(room.shell.point_to_local(vector(free.T)))
+    half_m = np.array(room.shell.size_m)[:, None] / 2
+    assert ((np.abs(own) - 1) * half_m).max() < VOXEL_M / 2
+    for solid in room.furniture:
+        if solid.shape == "box":
+            own = np.stack(solid.point_to_local(vector(free.T)))
+            depth_m = ((1 - np.abs(own)) * np.array(solid.size_m)[:, None] / 2).min(axis=0)
+            assert depth_m.max() < VOXEL_M / 2, solid
+
+
+def test_where_the_camera_stood_is_free(grid: OccupancyGrid, mapped) -> None:
+    for viewpoint in mapped.viewpoints:
+        assert state_at(grid, viewpoint.T_map_camera[:3, 3]) == FREE
+
+
+def test_behind_a_wall_nothing_is_known() -> None:
+    camera = Viewpoint(Camera(64, 48, 60.0, 60.0, 31.5, 23.5), np.eye(4))
+    wall = np.stack(
+        [disc((x, y, 2.05), 0.05) for x in np.arange(-2, 2, 0.1) for y in np.arange(-1, 1, 0.1)]
+    )
+    lamp = disc((0.05, 0.05, 4.05), 0.3)
+    grid = occupancy(np.concatenate([wall, lamp[None]]), [camera])
+    assert state_at(grid, (0.05, 0.05, 1.0)) == FREE
+    assert state_at(grid, (0.05, 0.05, 2.05)) == OCCUPIED
+    assert state_at(grid, (0.05, 0.05, 3.0)) == UNKNOWN
+    assert state_at(grid, (0.05, 0.05, 4.05)) == OCCUPIED  # it is in the map, seen or not
+    assert state_at(grid, (1.85, 0.05, 0.2)) == UNKNOWN  # beside the view
+
+
+def test_a_large_gaussian_fills_its_extent() -> None:
+    """Voxels of a disc in which its density is high, and none beyond three sigmas."""
+    row = disc((0.05, 0.05, 0.05), sigma_m=0.5)
+    voxels = occupied_voxels(row[None], OccupancyConfig())
+    assert set(voxels[:, 2]) == {0}
+    found = np.zeros((61, 61), bool)
+    found[tuple(voxels[:, :2].T + 30)] = True
+    radius_m = 0.1 * np.hypot(*np.mgrid[-30:31, -30:31])
+    assert found[radius_m < 0.6].all()
+    assert not found[radius_m > 1.5].any()
+
+
+def test_stray_and_transparent_gaussians_are_no_matter() -> None:
+    stray, glass = disc((0.05, 0.05, 0.05), 0.005), disc((0.05, 0.05, 0.05), 0.05, -1.0)
+    assert len(occupied_voxels(np.stack([stray, glass]), OccupancyConfig())) == 0
+
+
+def test_the_file_has_origin_side_and_states(grid: OccupancyGrid, tmp_path: Path) -> None:
+    grid.save(tmp_path / "grid")
+    read = np.load(tmp_path / "grid")
+    np.testing.assert_array_equal(read["states"], grid.states)
+    np.testing.assert_array_equal(read["origin_m"], grid.origin_m)
+    assert read["voxel_m"] == VOXEL_M
+
+
+def test_a_map_of_nothing_is_said() -> None:
+    with pytest.raises(DataError, match="no opaque surface"):
+        occupancy(np.zeros((0, 16), np.float32), [])
+
+
+def test_a_grid_too_large_is_said() -> None:
+    far = np.stack([disc((x, 0.0, 0.0), 0.05) for x in (0.0, 5000.0)])
+    with pytest.raises(ConfigError, match="larger voxels"):
+        occupancy(far, [], replace(OccupancyConfig(), max_voxels=100_000))
