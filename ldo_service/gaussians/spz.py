@@ -4,8 +4,8 @@ Means are fixed point (0.24 mm, up to 2 km), log scales in steps of 1/16, opacit
 quaternions good to about a tenth of a degree. Format: https://github.com/nianticlabs/spz
 
 An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not turn what it
-is given, so the map (x right, y down, z forward) is turned here, as Niantic's own converter does
-with a PLY. (`GSData.save` would write a PLY, whatever the name of the file.)
+is given, so the map (x right, y down, z forward) is turned here, as Niantic's library turns RDF to
+RUB. (`GSData.save` would write a PLY, whatever the name of the file.)
 """
 
 from pathlib import Path

@@ -34,12 +34,22 @@ from ldo_service.schemas import (
 from ldo_service.wire import keyframe_poses_of, transform
 
 REFINED = "refined"
+EXPORTED = {  # by `ldo export`, per format
+    "ply": ("gaussians.ply",),
+    "splat": ("gaussians.splat",),
+    "spz": ("gaussians.spz",),
+    "tum": ("trajectory.tum",),
+    "csv": ("trajectory.csv",),
+    "mesh": ("mesh.ply",),
+    "occupancy": ("occupancy.npz", "occupancy.pgm", "occupancy.yaml"),
+}
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "trajectory.txt", "frames.csv", "keyframes.json", "map.ply"),
         *("config.yaml", "summary.json"),
         *("trajectory.png", "views.png"),  # by `ldo eval` and `ldo demo`
         *(f"{REFINED}/{name}" for name in ("trajectory.txt", "keyframes.json", "map.ply")),
+        *(name for names in EXPORTED.values() for name in names),
     }
 )
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # of a keyframe, in pixels, rectified

@@ -14,7 +14,7 @@ from ldo_service.geometry import se3
 
 from .marching_cubes import CORNERS, marching_cubes, packed
 from .mesh import Mesh
-from .viewpoints import Viewpoint, surface_depth_m
+from .viewpoints import Viewpoint, surface_color, surface_depth_m
 
 SIDE = 8  # voxels of a block
 BLOCK = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)  # [512, 3]
@@ -65,7 +65,7 @@ def fuse(
     for done, viewpoint in enumerate(viewpoints, 1):
         rendering = viewpoint.render(rows, threads)
         depth_m = surface_depth_m(rendering, SURE_VOXELS * tsdf.config.voxel_m)
-        tsdf.integrate(depth_m, rendering.color, viewpoint)
+        tsdf.integrate(depth_m, surface_color(rendering), viewpoint)
         advance(done)
     return tsdf
 

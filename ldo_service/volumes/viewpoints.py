@@ -28,3 +28,8 @@ def surface_depth_m(rendering: Rendering, tolerance_m: float) -> np.ndarray:
     """
     mean_m, median_m = rendering.depth_m, rendering.median_depth_m
     return np.where(np.abs(mean_m - median_m) <= tolerance_m, mean_m, 0).astype(np.float32)
+
+
+def surface_color(rendering: Rendering) -> np.ndarray:
+    """Colour [H, W, 3], 0..1, without the black background's share."""
+    return rendering.color / np.maximum(rendering.opacity, 1e-6)[..., None]

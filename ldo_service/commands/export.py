@@ -1,0 +1,183 @@
+"""ldo export"""
+
+import csv
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.gaussians.ply import write_ply
+from ldo_service.gaussians.splat import write_splat
+from ldo_service.gaussians.spz import write_spz
+from ldo_service.geometry import Trajectory, se3
+from ldo_service.runs.finished import FinishedRun
+from ldo_service.runs.folder import EXPORTED
+from ldo_service.volumes import (
+    OccupancyConfig,
+    TsdfConfig,
+    floor_plan,
+    fuse,
+    occupancy,
+    write_floor_plan,
+    write_mesh,
+)
+
+from .progress import progress
+
+Format = Literal["ply", "splat", "spz", "tum", "csv", "mesh", "occupancy"]
+Up = Literal["x", "y", "z", "-x", "-y", "-z"]
+TRAJECTORY_COLUMNS = ("stamp_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+INPUTS = ("map.ply", "trajectory.txt", "keyframes.json")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """What to write, from what, and how."""
+
+    run: FinishedRun
+    out: Path
+    voxel_m: float | None
+    up: Up
+    heights_m: tuple[float, float]
+    console: Console
+
+
+def export(
+    folder: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="what `ldo run` wrote")
+    ],
+    format: Annotated[
+        Format,
+        tyro.conf.arg(
+            help="Gaussians: ply, splat, spz; trajectory: tum, csv; for planners: mesh, occupancy"
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help="default: in DIR, named after what it holds"),
+    ] = None,
+    online: Annotated[
+        bool, tyro.conf.arg(help="the run's own map and poses, also where refined ones are")
+    ] = False,
+    voxel: Annotated[
+        float | None,
+        tyro.conf.arg(metavar="M", help="side of a voxel; default: mesh 0.02, occupancy 0.1"),
+    ] = None,
+    up: Annotated[
+        Up, tyro.conf.arg(help="axis of the map that is up, for the floor plan of occupancy")
+    ] = "-y",
+    heights: Annotated[
+        tuple[float, float],
+        tyro.conf.arg(
+            metavar="MIN MAX", help="metres above the first camera that the floor plan sums up"
+        ),
+    ] = (-0.5, 0.5),
+    overwrite: Annotated[bool, tyro.conf.arg(help="replace an earlier FILE")] = False,
+) -> None:
+    """Write the map or the trajectory of a run for other programs.
+
+    Takes the refined map where there is one. `mesh` is a PLY with triangles in colour. `occupancy`
+    is an .npz with a grid of free, occupied and unknown voxels, and beside it a floor plan (.pgm,
+    .yaml) for ROS' map_server. The map has the axes of the first camera: `--up -y` is right when
+    that was held level.
+
+      ldo export runs/desk --format splat
+      ldo export runs/desk --format occupancy --voxel 0.05 --heights -0.8 0.3
+    """
+    if voxel is not None and format not in ("mesh", "occupancy"):
+        raise ConfigError(f"--voxel has no meaning for {format}: leave it out.")
+    run = FinishedRun.open(folder, online)
+    out = out or folder / EXPORTED[format][0]
+    written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
+    require_writable(run, [out, *written], overwrite)
+    job = Job(run, out, voxel, up, heights, Console(stderr=True, highlight=False))
+    try:
+        facts = WRITERS[format](job)
+    except OSError as error:
+        raise ConfigError(f"{out} cannot be written: {error.strerror}.") from error
+    Console(highlight=False).print(f"{out}: {facts}", soft_wrap=True)
+
+
+def require_writable(run: FinishedRun, files: list[Path], overwrite: bool) -> None:
+    """Raises ConfigError for a file that is there already, or that the run itself needs."""
+    needed = {(run.folder / name).resolve() for name in INPUTS}
+    for file in files:
+        if file.resolve() in needed:
+            raise ConfigError(f"{file} is what would be read. Choose another --out.")
+        if file.exists() and not overwrite:
+            raise ConfigError(f"{file} exists. Choose another --out, or add --overwrite.")
+
+
+# --- writers: each says in a few words what it wrote ----------------------------------------------
+def _gaussians(write: Callable) -> Callable[[Job], str]:
+    def write_gaussians(job: Job) -> str:
+        rows = job.run.gaussians()
+        write(job.out, rows)
+        return f"{len(rows):,} Gaussians"
+
+    return write_gaussians
+
+
+def _tum(job: Job) -> str:
+    trajectory = job.run.trajectory()
+    trajectory.save(job.out)
+    return f"{len(trajectory):,} poses"
+
+
+def _csv(job: Job) -> str:
+    trajectory = job.run.trajectory()
+    write_csv(job.out, trajectory)
+    return f"{len(trajectory):,} poses"
+
+
+def write_csv(path: Path, trajectory: Trajectory) -> None:
+    """A line per pose T_map_camera: seconds, metres, quaternion wxyz."""
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(TRAJECTORY_COLUMNS)
+        for stamp_s, T in zip(trajectory.stamps_s, trajectory.T_world_camera, strict=True):
+            numbers = (stamp_s, *T[:3, 3], *se3.quaternion(T[:3, :3]))
+            table.writerow(f"{number:.9f}" for number in numbers)
+
+
+def _mesh(job: Job) -> str:
+    config = TsdfConfig() if job.voxel_m is None else TsdfConfig(job.voxel_m)
+    rows, viewpoints = job.run.gaussians(), job.run.viewpoints()
+    with progress("mesh", len(viewpoints), job.console) as advance:
+        mesh = fuse(rows, viewpoints, config, threads=os.cpu_count() or 1, advance=advance).mesh()
+    if not len(mesh.triangles):
+        raise DataError("no surface is seen from the keyframes, so there is nothing to write.")
+    write_mesh(job.out, mesh)
+    vertices, triangles = len(mesh.vertices_m), len(mesh.triangles)
+    return f"{vertices:,} vertices, {triangles:,} triangles, {mesh.area_m2:.1f} m2"
+
+
+def _occupancy(job: Job) -> str:
+    config = OccupancyConfig() if job.voxel_m is None else OccupancyConfig(job.voxel_m)
+    rows, viewpoints = job.run.gaussians(), job.run.viewpoints()
+    with progress("occupancy", len(viewpoints), job.console) as advance:
+        grid = occupancy(rows, viewpoints, config, threads=os.cpu_count() or 1, advance=advance)
+    plan = floor_plan(grid, job.up, job.heights_m)
+    grid.save(job.out)
+    write_floor_plan(job.out.with_suffix(".yaml"), plan)
+    free, occupied = ((grid.states == state).sum() for state in (1, 2))
+    return (
+        f"{occupied:,} voxels of {grid.voxel_m} m occupied, {free:,} free; floor plan in "
+        f"{job.out.with_suffix('.yaml').name}"
+    )
+
+
+WRITERS: dict[Format, Callable[[Job], str]] = {
+    "ply": _gaussians(write_ply),
+    "splat": _gaussians(write_splat),
+    "spz": _gaussians(write_spz),
+    "tum": _tum,
+    "csv": _csv,
+    "mesh": _mesh,
+    "occupancy": _occupancy,
+}

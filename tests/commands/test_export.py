@@ -1,0 +1,191 @@
+"""What `ldo export` writes is read by others: plyfile, gsply, trimesh, evo, OpenCV, YAML."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from ldo_service import cli
+from ldo_service.errors import LdoError
+from ldo_service.gaussians.ply import read_ply, write_ply
+from ldo_service.geometry import Trajectory, se3
+from ldo_service.runs.folder import WRITTEN, prepare
+
+FRAMES = 16
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run in the synthetic room."""
+    folder = tmp_path_factory.mktemp("runs") / "room"
+    cli.main(["run", "synthetic:room", "--out", str(folder), "--max-frames", str(FRAMES)])
+    return folder
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "room"))
+
+
+def ldo_export(*arguments: object) -> tuple[int, str]:
+    """Exit code of `ldo export ... --debug`, and the error."""
+    try:
+        cli.main(["export", *map(str, arguments), "--debug"])
+    except LdoError as error:
+        return error.exit_code, str(error)
+    except SystemExit as error:
+        return int(error.code or 0), ""
+    return 0, ""
+
+
+def exported(run: Path, format: str, *options: object) -> None:
+    assert ldo_export(run, "--format", format, *options) == (0, "")
+
+
+def test_gaussians_as_ply(run: Path) -> None:
+    exported(run, "ply")
+    np.testing.assert_array_equal(read_ply(run / "gaussians.ply"), read_ply(run / "map.ply"))
+
+
+def test_gaussians_as_splat(run: Path) -> None:
+    exported(run, "splat")
+    rows = read_ply(run / "map.ply")
+    assert (run / "gaussians.splat").stat().st_size == 32 * len(rows)
+
+
+def test_gaussians_as_spz(run: Path) -> None:
+    gsply = pytest.importorskip("gsply", reason="pip install 'ldo-slam[viewer]'")
+    exported(run, "spz")
+    means = gsply.read_spz(run / "gaussians.spz").means
+    expected = read_ply(run / "map.ply")[:, 0:3] * [1, -1, -1]
+    np.testing.assert_allclose(means, expected, atol=0.0002)
+
+
+def test_the_trajectory_as_tum(run: Path) -> None:
+    file_interface = pytest.importorskip("evo.tools.file_interface", reason="pip install evo")
+    exported(run, "tum")
+    read = file_interface.read_tum_trajectory_file(str(run / "trajectory.tum"))
+    expected = Trajectory.load(run / "trajectory.txt")
+    np.testing.assert_allclose(read.poses_se3, expected.T_world_camera, atol=1e-7)
+    np.testing.assert_allclose(read.timestamps, expected.stamps_s, atol=1e-9)
+
+
+def test_the_trajectory_as_csv(run: Path) -> None:
+    exported(run, "csv")
+    with (run / "trajectory.csv").open(newline="") as file:
+        lines = [{k: float(v) for k, v in line.items()} for line in csv.DictReader(file)]
+    expected = Trajectory.load(run / "trajectory.txt")
+    assert len(lines) == FRAMES
+    for line, T in zip(lines, expected.T_world_camera, strict=True):
+        R = se3.rotation(np.array([line["qw"], line["qx"], line["qy"], line["qz"]]))
+        np.testing.assert_allclose([line["x_m"], line["y_m"], line["z_m"]], T[:3, 3], atol=1e-9)
+        np.testing.assert_allclose(R, T[:3, :3], atol=1e-7)
+    assert [line["stamp_s"] for line in lines] == pytest.approx(expected.stamps_s, abs=1e-9)
+
+
+def test_a_mesh_for_planners(run: Path) -> None:
+    trimesh = pytest.importorskip("trimesh", reason="pip install trimesh")
+    exported(run, "mesh", "--voxel", "0.04", "--out", run / "surface.ply")
+    mesh = trimesh.load(run / "surface.ply", process=False)
+    assert len(mesh.faces) > 3000
+    assert 3 < mesh.area < 100
+    assert mesh.visual.vertex_colors[:, :3].std() > 10
+
+
+def test_occupancy_for_planners(run: Path) -> None:
+    exported(run, "occupancy", "--up", "-y", "--heights", "-0.4", "0.6", "--out", run / "grid.npz")
+    grid = np.load(run / "grid.npz")
+    assert grid["voxel_m"] == 0.1
+    assert set(np.unique(grid["states"])) == {0, 1, 2}
+    start = np.floor(-grid["origin_m"] / grid["voxel_m"]).astype(int)
+    assert grid["states"][tuple(start)] == 1  # the first camera stood at the origin
+    facts = yaml.safe_load((run / "grid.yaml").read_text())
+    picture = cv2.imread(str(run / facts["image"]), cv2.IMREAD_UNCHANGED)
+    assert set(np.unique(picture)) == {0, 205, 254}
+    assert picture.shape == grid["states"].shape[::2][::-1]  # z upwards, x to the right
+
+
+def test_the_refined_map_is_taken_where_there_is_one(run: Path) -> None:
+    (run / "refined").mkdir()
+    rows = read_ply(run / "map.ply")[:100]
+    write_ply(run / "refined" / "map.ply", rows)
+    exported(run, "ply", "--out", run / "a.ply")
+    exported(run, "ply", "--out", run / "b.ply", "--online")
+    assert len(read_ply(run / "a.ply")) == 100
+    assert len(read_ply(run / "b.ply")) > 100
+
+
+def test_what_is_there_already_is_replaced_only_on_demand(run: Path) -> None:
+    (run / "gaussians.splat").write_text("mine")
+    code, said = ldo_export(run, "--format", "splat")
+    assert code == 2
+    assert "--overwrite" in said
+    assert (run / "gaussians.splat").read_text() == "mine"
+    exported(run, "splat", "--overwrite")
+
+
+def test_a_floor_plan_in_the_way_is_seen_too(run: Path) -> None:
+    (run / "occupancy.yaml").write_text("mine")
+    code, said = ldo_export(run, "--format", "occupancy")
+    assert (code, "occupancy.yaml exists" in said) == (2, True)
+    assert not (run / "occupancy.npz").exists()
+
+
+def test_voxels_of_a_trajectory_are_refused(run: Path) -> None:
+    code, said = ldo_export(run, "--format", "tum", "--voxel", "0.1")
+    assert (code, "--voxel has no meaning" in said) == (2, True)
+
+
+def test_the_run_itself_is_never_written_over(run: Path) -> None:
+    code, said = ldo_export(run, "--format", "mesh", "--out", run / "map.ply", "--overwrite")
+    assert (code, "Choose another" in said) == (2, True)
+
+
+def test_a_new_run_may_replace_what_was_exported(run: Path) -> None:
+    for format in ("csv", "occupancy"):
+        exported(run, format)
+    assert {path.name for path in run.iterdir()} <= WRITTEN
+    prepare(run, overwrite=True)
+    assert not list(run.iterdir())
+
+
+@pytest.mark.parametrize("format", ["mesh", "occupancy"])
+def test_keyframes_without_camera_are_said(run: Path, format: str) -> None:
+    keyframes = json.loads((run / "keyframes.json").read_text())
+    for keyframe in keyframes:
+        del keyframe["camera"]
+    (run / "keyframes.json").write_text(json.dumps(keyframes))
+    code, said = ldo_export(run, "--format", format)
+    assert (code, "`ldo run` the sequence again" in said) == (3, True)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "format"),
+    [
+        ("map.ply", "ply", "splat"),
+        ("keyframes.json", "[{]", "mesh"),
+        ("keyframes.json", "[[]]", "mesh"),
+        ("keyframes.json", '[{"camera": {}}]', "mesh"),
+        ("trajectory.txt", "1 2 3", "csv"),
+    ],
+)
+def test_a_broken_run_is_bad_data(run: Path, name: str, content: str, format: str) -> None:
+    (run / name).write_text(content)
+    code, said = ldo_export(run, "--format", format)
+    assert code == 3
+    assert name in said
+
+
+def test_something_else_than_a_run_is_said(tmp_path: Path) -> None:
+    code, said = ldo_export(tmp_path, "--format", "tum")
+    assert (code, "is it what `ldo run` wrote?" in said) == (3, True)
+
+
+def test_a_folder_that_is_not_there_is_said(run: Path) -> None:
+    code, said = ldo_export(run, "--format", "tum", "--out", run / "absent" / "a.tum")
+    assert (code, "cannot be written" in said) == (2, True)
