@@ -13,6 +13,7 @@ from .marching_cubes import packed
 from .viewpoints import Viewpoint, surface_depth_m
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
+SLAB = 1 << 18  # voxels looked at at a time
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +77,7 @@ def occupancy(
     lowest, states = _grid(np.concatenate([occupied, np.reshape(stood, (-1, 3))]), config)
     for done, viewpoint in enumerate(viewpoints, 1):
         depth_m = surface_depth_m(viewpoint.render(rows, threads), config.voxel_m)
-        for p_map in _points_in_front(depth_m, viewpoint, config.voxel_m):
-            voxels = np.floor(p_map / config.voxel_m).astype(int) - lowest
-            within = np.all((voxels >= 0) & (voxels < states.shape), axis=1)
-            states[tuple(voxels[within].T)] = FREE
+        _carve(states, lowest, depth_m, viewpoint, config.voxel_m)
         advance(done)
     states[tuple((occupied - lowest).T)] = OCCUPIED
     return OccupancyGrid(lowest * config.voxel_m, config.voxel_m, states)
@@ -141,15 +139,34 @@ def _grid(voxels: np.ndarray, config: OccupancyConfig) -> tuple[np.ndarray, np.n
     return lowest, np.full(size, UNKNOWN, np.uint8)
 
 
-def _points_in_front(
-    depth_m: np.ndarray, viewpoint: Viewpoint, voxel_m: float
-) -> Iterator[np.ndarray]:
-    """Points [P, 3] of the map along each ray, half a voxel apart, up to a voxel before what is
-    seen; only as many rays as leave no voxel out."""
-    camera, deepest_m = viewpoint.camera, float(depth_m.max(initial=0))
-    apart_px = voxel_m / 2 * min(camera.fx, camera.fy) / max(deepest_m, voxel_m)
-    every = slice(None, None, max(1, int(apart_px)))
-    rays, depth_m = camera.rays()[every, every].reshape(-1, 3), depth_m[every, every].ravel()
-    longest = np.linalg.norm(rays, axis=1).max()
-    for z_m in np.arange(0, deepest_m, voxel_m / 2 / longest):
-        yield se3.transform(viewpoint.T_map_camera, rays[depth_m - voxel_m > z_m] * z_m)
+def _carve(
+    states: np.ndarray,
+    lowest: np.ndarray,
+    depth_m: np.ndarray,
+    viewpoint: Viewpoint,
+    voxel_m: float,
+) -> None:
+    """Mark free the voxel where the camera stood, and all through whose middle it looks at
+    something at least a voxel further away."""
+    stood = np.floor(viewpoint.T_map_camera[:3, 3] / voxel_m).astype(int)
+    states[tuple(stood - lowest)] = FREE
+    for voxels in _slabs(states.shape, _frustum_m(depth_m, viewpoint) / voxel_m - lowest):
+        at = viewpoint.look_up((voxels + lowest + 0.5) * voxel_m, depth_m)
+        states[tuple(voxels[at.seen_m - voxel_m >= at.z_m].T)] = FREE
+
+
+def _frustum_m(depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
+    """Corners [5, 3] in the map of what a camera sees: itself, and its image's at full depth."""
+    ends = viewpoint.camera.rays()[[0, 0, -1, -1], [0, -1, 0, -1]] * depth_m.max(initial=0)
+    return se3.transform(viewpoint.T_map_camera, np.vstack([np.zeros(3), ends]))
+
+
+def _slabs(shape: tuple[int, ...], corners: np.ndarray) -> Iterator[np.ndarray]:
+    """Indices [V, 3] of a grid within the box about some points [P, 3], a few layers at a time."""
+    start = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
+    stop = np.minimum(np.ceil(corners.max(axis=0)).astype(int), shape)
+    x, y, z = zip(start, stop, strict=True)
+    layers = max(1, SLAB // max(1, (y[1] - y[0]) * (z[1] - z[0])))
+    for first in range(*x, layers):
+        axes = np.arange(first, min(first + layers, x[1])), np.arange(*y), np.arange(*z)
+        yield np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

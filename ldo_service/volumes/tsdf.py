@@ -148,18 +148,17 @@ class Tsdf:
         self, slots: np.ndarray, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint
     ) -> None:
         voxels = self._blocks[slots, None] * SIDE + BLOCK  # [B, 512, 3]
-        p_camera = se3.transform(se3.inverse(viewpoint.T_map_camera), voxels * self.config.voxel_m)
-        z_m, (row, column, inside) = p_camera[..., 2], _pixels(p_camera, viewpoint)
-        seen_m = np.where(inside, depth_m[row, column], 0)
+        at = viewpoint.look_up(voxels * self.config.voxel_m, depth_m)
         reach_m = self.config.truncation_m
-        told = (seen_m > 0) & (seen_m - z_m >= -reach_m)  # what lies far behind is hidden
-        slot, voxel = slots[np.nonzero(told)[0]], np.nonzero(told)[1]
-        weight = (1 / z_m[told] ** 2).astype(np.float32)
+        told = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)  # what is far behind is hidden
+        block, voxel = np.nonzero(told)
+        slot, z_m, seen_m = slots[block], at.z_m[told], at.seen_m[told]
+        weight = (1 / z_m**2).astype(np.float32)
         total = self._weight[slot, voxel] + weight
         share = weight / total
-        distance_m = np.minimum(seen_m - z_m, reach_m)[told]
+        distance_m = np.minimum(seen_m - z_m, reach_m)
         self._distance_m[slot, voxel] += share * (distance_m - self._distance_m[slot, voxel])
-        seen_color = color[row[told], column[told]]
+        seen_color = color[at.row[told], at.column[told]]
         self._color[slot, voxel] += share[:, None] * (seen_color - self._color[slot, voxel])
         self._weight[slot, voxel] = total
 
@@ -180,7 +179,11 @@ class Tsdf:
 
     def _crossed_cells(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """Lower corners [A, 3], distances [A, 8] and colours [A, 8, 3] of cells with a surface."""
-        yield np.zeros((0, 3), np.int64), np.zeros((0, 8), np.float32), np.zeros((0, 8, 3))
+        yield (
+            np.zeros((0, 3), np.int64),
+            np.zeros((0, 8), np.float32),
+            np.zeros((0, 8, 3), np.float32),
+        )
         for start in range(0, len(self._blocks), CHUNK):
             chunk = np.arange(start, min(start + CHUNK, len(self._blocks)))
             slots, voxels = self._corners(chunk)
@@ -201,21 +204,6 @@ class Tsdf:
         over = corners // SIDE @ [1, 2, 4]
         inner = corners % SIDE @ [SIDE * SIDE, SIDE, 1]
         return neighbours[:, over], inner
-
-
-def _pixels(
-    p_camera: np.ndarray, viewpoint: Viewpoint
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Nearest row and column of camera points [..., 3], and whether they lie in the image."""
-    camera = viewpoint.camera
-    in_front = p_camera[..., 2] > 1e-3
-    u, v = np.moveaxis(
-        camera.project(np.where(in_front[..., None], p_camera, (0.0, 0.0, 1.0))), -1, 0
-    )
-    row, column = np.rint(v), np.rint(u)
-    inside = in_front & (row >= 0) & (column >= 0) & (row < camera.height) & (column < camera.width)
-    row, column = (np.where(inside, index, 0).astype(np.int64) for index in (row, column))
-    return row, column, inside
 
 
 def _unique(lattice: np.ndarray) -> np.ndarray:

@@ -7,6 +7,19 @@ import numpy as np
 from ldo_service.gaussians import Rendering, render
 from ldo_service.geometry import Camera, se3
 
+NEAR_M = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Lookup:
+    """z_m [...] of points in the camera; seen_m [...] depth of the nearest pixel, 0 beside the
+    image and where unknown; row and column [...] of that pixel."""
+
+    z_m: np.ndarray
+    seen_m: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
@@ -18,6 +31,16 @@ class Viewpoint:
     def render(self, rows: np.ndarray, threads: int = 1) -> Rendering:
         """The Gaussians rows [N, 16] seen from here."""
         return render(rows, self.camera, se3.inverse(self.T_map_camera), threads=threads)
+
+    def look_up(self, p_map: np.ndarray, depth_m: np.ndarray) -> Lookup:
+        """What a depth image [H, W] from here says where points [..., 3] of the map appear."""
+        p_camera = se3.transform(se3.inverse(self.T_map_camera), p_map)
+        z_m = p_camera[..., 2]
+        p_camera[z_m < NEAR_M] = np.nan  # so that it lies in no image
+        u, v = np.moveaxis(np.rint(self.camera.project(p_camera)), -1, 0)
+        inside = (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
+        row, column = (np.where(inside, index, 0).astype(np.int32) for index in (v, u))
+        return Lookup(z_m, np.where(inside, depth_m[row, column], 0), row, column)
 
 
 def surface_depth_m(rendering: Rendering, tolerance_m: float) -> np.ndarray:
