@@ -13,8 +13,13 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from ldo_service.errors import ConfigError
+
 CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # c = x + 2 y + 4 z
 EDGES = [(a, a | bit) for bit in (1, 2, 4) for a in range(8) if not a & bit]  # lower corner, upper
+STEPS = np.array([1 << 40, 1 << 20, 1])  # of a packed triple along each axis
+# Of an edge of the lattice: its lower corner, packed, times four, and its axis.
+EDGE_KEYS = [4 * (CORNERS[low] @ STEPS) + (high ^ low).bit_length() - 1 for low, high in EDGES]
 # Corners of each face, counter-clockwise for who looks at it from outside the cell.
 FACES = ((0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4, 5, 7, 6))
 
@@ -32,7 +37,7 @@ class Surface:
 def marching_cubes(cells: np.ndarray, values: np.ndarray, attributes: np.ndarray) -> Surface:
     """The surface value = 0 in some cells of a lattice, linear along their edges.
 
-    cells       [A, 3] integers, lower corner of each cell; below 2^20 in size
+    cells       [A, 3] integers, lower corner of each cell
     values      [A, 8] at its corners x + 2 y + 4 z; finite, equal where cells share a corner
     attributes  [A, 8, C] there
     """
@@ -42,10 +47,9 @@ def marching_cubes(cells: np.ndarray, values: np.ndarray, attributes: np.ndarray
     edge = triangles[cell, which].ravel()
     cell = np.repeat(cell, 3)
     # One point for each edge of the lattice, whichever cells it is met in.
-    lower, upper = np.array(EDGES)[edge].T
-    key = packed(cells[cell] + CORNERS[lower]) * 3 + np.array(EDGE_AXES)[edge]
+    key = (4 * packed(cells))[cell] + np.array(EDGE_KEYS)[edge]
     _, first, point = np.unique(key, return_index=True, return_inverse=True)
-    cell, lower, upper = cell[first], lower[first], upper[first]
+    cell, (lower, upper) = cell[first], np.array(EDGES)[edge[first]].T
     a, b = values[cell, lower], values[cell, upper]
     share = (a / (a - b))[:, None]
     ends = cells[cell] + CORNERS[lower], cells[cell] + CORNERS[upper]
@@ -57,19 +61,20 @@ def marching_cubes(cells: np.ndarray, values: np.ndarray, attributes: np.ndarray
 
 
 def packed(lattice: np.ndarray) -> np.ndarray:
-    """One int64 [...] for each integer triple [..., 3] of size below 2^20, in the same order."""
-    shifted = lattice.astype(np.int64) + (1 << 20)
-    return (shifted[..., 0] << 42) | (shifted[..., 1] << 21) | shifted[..., 2]
+    """One int64 [...] for each integer triple [..., 3], in the same order; below 2^60.
+
+    Raises ConfigError for what lies 2^19 or more from the origin: 10 km of voxels of 2 cm.
+    """
+    if len(lattice) and max(lattice.max(), -lattice.min()) >= 1 << 19:
+        raise ConfigError("the map reaches further than 524,288 voxels: choose larger voxels.")
+    return lattice.astype(np.int64) @ STEPS + (1 << 19) * STEPS.sum()
 
 
 # --- the table ------------------------------------------------------------------------------------
-EDGE_AXES = [(upper ^ lower).bit_length() - 1 for lower, upper in EDGES]
-
-
 def _table() -> np.ndarray:
     """Triangles [256, T, 3] of edge numbers for each set of corners that are within, then -1."""
     cases = [[t for loop in _loops(case) for t in _fan(loop)] for case in range(256)]
-    table = np.full((256, max(map(len, cases)), 3), -1)
+    table = np.full((256, max(map(len, cases)), 3), -1, np.int8)
     for case, triangles in enumerate(cases):
         table[case, : len(triangles)] = np.reshape(triangles, (-1, 3))
     return table

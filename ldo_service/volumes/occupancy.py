@@ -150,8 +150,10 @@ def _carve(
     something at least a voxel further away."""
     stood = np.floor(viewpoint.T_map_camera[:3, 3] / voxel_m).astype(int)
     states[tuple(stood - lowest)] = FREE
+    T_camera_map = se3.inverse(viewpoint.T_map_camera)
     for voxels in _slabs(states.shape, _frustum_m(depth_m, viewpoint) / voxel_m - lowest):
-        at = viewpoint.look_up((voxels + lowest + 0.5) * voxel_m, depth_m)
+        middles_m = (voxels + lowest + 0.5) * voxel_m
+        at = viewpoint.look_up(se3.transform(T_camera_map, middles_m), depth_m)
         states[tuple(voxels[at.seen_m - voxel_m >= at.z_m].T)] = FREE
 
 

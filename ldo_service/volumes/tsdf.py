@@ -112,11 +112,11 @@ class Tsdf:
     def _touched(self, depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
         """Blocks [B, 3] within the truncation of the surface, along each ray."""
         seen, reach = depth_m > 0, self.config.truncation_m
-        rays, depths_m = viewpoint.camera.rays()[seen], depth_m[seen]
-        block_m = SIDE * self.config.voxel_m
+        block_m, origin_m = SIDE * self.config.voxel_m, viewpoint.T_map_camera[:3, 3]
+        rays_map = viewpoint.camera.rays()[seen] @ viewpoint.T_map_camera[:3, :3].T
         near = [
-            _unique(np.floor(se3.transform(viewpoint.T_map_camera, rays * z_m[:, None]) / block_m))
-            for z_m in depths_m + np.linspace(-reach, reach, 3)[:, None]
+            _unique(np.floor((rays_map * z_m[:, None] + origin_m) / block_m))
+            for z_m in depth_m[seen] + np.linspace(-reach, reach, 3)[:, None]
         ]
         return _unique(np.concatenate(near))
 
@@ -147,8 +147,10 @@ class Tsdf:
     def _update(
         self, slots: np.ndarray, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint
     ) -> None:
-        voxels = self._blocks[slots, None] * SIDE + BLOCK  # [B, 512, 3]
-        at = viewpoint.look_up(voxels * self.config.voxel_m, depth_m)
+        T_camera_map, voxel_m = se3.inverse(viewpoint.T_map_camera), self.config.voxel_m
+        corners_camera = se3.transform(T_camera_map, self._blocks[slots] * SIDE * voxel_m)
+        offsets_camera = BLOCK * voxel_m @ T_camera_map[:3, :3].T
+        at = viewpoint.look_up(corners_camera[:, None] + offsets_camera, depth_m)  # [B, 512]
         reach_m = self.config.truncation_m
         told = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)  # what is far behind is hidden
         block, voxel = np.nonzero(told)

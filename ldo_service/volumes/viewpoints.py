@@ -32,13 +32,13 @@ class Viewpoint:
         """The Gaussians rows [N, 16] seen from here."""
         return render(rows, self.camera, se3.inverse(self.T_map_camera), threads=threads)
 
-    def look_up(self, p_map: np.ndarray, depth_m: np.ndarray) -> Lookup:
-        """What a depth image [H, W] from here says where points [..., 3] of the map appear."""
-        p_camera = se3.transform(se3.inverse(self.T_map_camera), p_map)
+    def look_up(self, p_camera: np.ndarray, depth_m: np.ndarray) -> Lookup:
+        """What a depth image [H, W] from here says where points [..., 3] of the camera appear."""
         z_m = p_camera[..., 2]
-        p_camera[z_m < NEAR_M] = np.nan  # so that it lies in no image
-        u, v = np.moveaxis(np.rint(self.camera.project(p_camera)), -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = np.moveaxis(np.rint(self.camera.project(p_camera)), -1, 0)
         inside = (u >= 0) & (v >= 0) & (u < self.camera.width) & (v < self.camera.height)
+        inside &= z_m > NEAR_M
         row, column = (np.where(inside, index, 0).astype(np.int32) for index in (v, u))
         return Lookup(z_m, np.where(inside, depth_m[row, column], 0), row, column)
 

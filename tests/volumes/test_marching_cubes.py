@@ -5,7 +5,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from ldo_service.volumes.marching_cubes import CORNERS, Surface, marching_cubes
+from ldo_service.errors import ConfigError
+from ldo_service.volumes.marching_cubes import CORNERS, Surface, marching_cubes, packed
 
 N = 24
 
@@ -72,6 +73,14 @@ def test_noise_meets_all_cases_and_leaves_no_crack(seed: int) -> None:
     counts = sides(surface)
     assert set(counts.values()) == {1}
     assert all((b, a) in counts for a, b in counts)
+
+
+def test_triples_keep_their_order_and_their_own_number() -> None:
+    far = (1 << 19) - 1
+    triples = np.array([[-far, far, far], [0, -far, 0], [0, 0, -1], [0, 0, 0], [far, -far, -far]])
+    assert (np.diff(packed(triples)) > 0).all()
+    with pytest.raises(ConfigError, match="larger voxels"):
+        packed(np.array([[0, 1 << 19, 0]]))
 
 
 def test_no_crossing_makes_no_surface() -> None:
