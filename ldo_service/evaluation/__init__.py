@@ -1,7 +1,7 @@
 """How good a run is: trajectories, rendered views, pictures of both."""
 
 from .pictures import contact_sheet, depth_picture, trajectory_picture
-from .rendering import psnr
+from .rendering import depth_error, psnr, ssim
 from .trajectory import ErrorStatistics, TrajectoryErrors, align, evaluate_trajectory
 
 __all__ = [
@@ -9,8 +9,10 @@ __all__ = [
     "TrajectoryErrors",
     "align",
     "contact_sheet",
+    "depth_error",
     "depth_picture",
     "evaluate_trajectory",
     "psnr",
+    "ssim",
     "trajectory_picture",
 ]
