@@ -1,0 +1,90 @@
+"""Perceptual distance by a network that the user brings (Zhang et al., CVPR 2018)."""
+
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+
+LAYOUT = (
+    "two inputs float32 [1, 3, H, W], RGB in -1..1, and one output with a single number, as "
+    "torch.onnx.export writes lpips.LPIPS(net='alex')"
+)
+OF_EQUAL_IMAGES = 1e-4  # a distance of an image to itself above this is none
+
+
+class Lpips:
+    """LPIPS of two images, by a network in ONNX in the `LAYOUT`; H and W may be dynamic.
+
+    Raises ConfigError when the file does not fit, on opening or at the first images.
+    """
+
+    def __init__(self, path: Path, *, threads: int = 1) -> None:
+        import onnxruntime  # here, because every start of `ldo` would pay for it
+
+        self.path = path
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 4  # what is wrong is said in the error
+        try:
+            if not path.is_file():
+                raise FileNotFoundError("there is no such file")
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+        except Exception as error:  # onnxruntime has a class per cause, without a common base
+            raise ConfigError(f"--lpips {path} cannot be opened: {_first_line(error)}.") from error
+        self._names = [node.name for node in self._session.get_inputs()]
+        self._require_layout()
+        self._is_judged = False
+
+    def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
+        """The distance of images [H, W, 3] in 0..1."""
+        if not self._is_judged:
+            self._require_distance(a)
+            self._is_judged = True
+        return self._distance(a, b)
+
+    def _distance(self, a: np.ndarray, b: np.ndarray) -> float:
+        feeds = dict(zip(self._names, (_planes(a), _planes(b)), strict=True))
+        try:
+            out = np.asarray(self._session.run(None, feeds)[0])
+        except Exception as error:
+            raise ConfigError(
+                f"--lpips {self.path} fails on images of {a.shape[1]}x{a.shape[0]} pixels: "
+                f"{_first_line(error)}. Export it with dynamic height and width."
+            ) from error
+        if out.size != 1:
+            raise self._misfit(f"its output has the shape {out.shape}")
+        return float(out.item())
+
+    def _require_layout(self) -> None:
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        shapes = [node.shape for node in inputs]
+        are_images = all(
+            node.type == "tensor(float)" and len(node.shape) == 4 and _allows(node.shape[1], 3)
+            for node in inputs
+        )
+        if len(inputs) != 2 or len(outputs) != 1 or not are_images:
+            raise self._misfit(f"it has inputs {shapes} and {len(outputs)} outputs")
+
+    def _require_distance(self, image: np.ndarray) -> None:
+        itself = self._distance(image, image)
+        if not abs(itself) <= OF_EQUAL_IMAGES:
+            raise self._misfit(f"it calls the distance of an image to itself {itself:.3g}")
+
+    def _misfit(self, finding: str) -> ConfigError:
+        return ConfigError(f"--lpips {self.path} is no LPIPS: {finding}. Expected: {LAYOUT}.")
+
+
+def _planes(image: np.ndarray) -> np.ndarray:
+    """[1, 3, H, W] float32 in -1..1."""
+    return np.ascontiguousarray(image.transpose(2, 0, 1)[None] * 2 - 1, np.float32)
+
+
+def _allows(side: int | str | None, length: int) -> bool:
+    return not isinstance(side, int) or side == length
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
