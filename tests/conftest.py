@@ -1,17 +1,64 @@
 """Fixtures that many rooms share."""
 
+import json
 import os
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
+from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence, open_sequence
+from ldo_service.runs.folder import prepare
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.source import Selection
 
 
 @pytest.fixture(scope="session")
 def room() -> Sequence:
     """The synthetic room with its exact truth; frames are ray cast once a session."""
     return Cached(open_sequence("synthetic:room"))
+
+
+@pytest.fixture(scope="session")
+def room_folder(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first 16 frames of the room in the layout of TUM RGB-D, with its truth."""
+    folder = tmp_path_factory.mktemp("data") / "room"
+    lines = []
+    for kind in ("rgb", "depth"):
+        (folder / kind).mkdir(parents=True)
+    for index in range(16):
+        frame = room[index]
+        name = f"{frame.stamp_ns * 1e-9:.6f}"
+        cv2.imwrite(str(folder / f"rgb/{name}.png"), frame.color[..., ::-1])
+        depth = np.round(frame.depth_m * 5000).astype(np.uint16)
+        cv2.imwrite(str(folder / f"depth/{name}.png"), depth)
+        lines.append(name)
+    for kind in ("rgb", "depth"):
+        text = "".join(f"{name} {kind}/{name}.png\n" for name in lines)
+        (folder / f"{kind}.txt").write_text(text)
+    camera = room.camera
+    intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy")}
+    (folder / "camera.json").write_text(
+        json.dumps({**intrinsics, "cx": camera.cx, "cy": camera.cy})
+    )
+    truth = room.truth()
+    assert truth is not None
+    truth.save(folder / "groundtruth.txt")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `ldo run --hold-out 5` writes of `room_folder`: copy it before changing anything."""
+    folder = tmp_path_factory.mktemp("run") / "room"
+    prepare(folder, overwrite=False)
+    config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))
+    run_over_file(
+        open_sequence(str(room_folder)), folder, config, Selection(), print, lambda _done: None
+    )
+    return folder
 
 
 @pytest.fixture(scope="session")

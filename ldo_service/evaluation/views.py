@@ -1,0 +1,202 @@
+"""Frames of a run beside its map, rendered from where the run says the camera was."""
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.datasets import Sequence
+from ldo_service.gaussians.exposure import fitted_exposure
+from ldo_service.gaussians.render import Rendering, render
+from ldo_service.geometry import RgbdFrame, se3
+
+from .rendering import depth_error, psnr, ssim
+from .run_folder import PosedMap, RunFrame
+
+TRAINING_STEP = 5  # of the literature's protocol (SplaTAM, Keetha et al. 2024)
+FIGURES = ("psnr_db", "ssim", "lpips", "depth_l1_m", "depth_share")
+
+PROTOCOL = """\
+Maps are rendered at the poses that the run ended with and compared with its rectified frames,
+colours in 0..1, renderings clipped. PSNR: pixels and channels pooled. SSIM: Wang et al. 2004, 11x11
+Gaussian of 1.5 px, windows inside the image; some published systems print MS-SSIM, often higher.
+Depth L1: mean depth of the rendering, over pixels with measured depth and rendered opacity above
+0.5; "of measured" is the share of measured pixels that these are. Cells: mean / median of frames.
+online: the map at the end of the stream; refined: after the further iterations of --refine.
+A: held-out frames, tracked and never mapped; every pixel. Exposure fitted: with gain and bias per
+channel fitted to each judged frame itself, by least squares.
+B: the literature's: every 5th training frame, pixels without depth black in both images.
+LOST frames have no pose and are only counted, WEAK frames are judged."""
+
+Images = tuple[np.ndarray, np.ndarray]  # seen and shown, [H, W, 3] in 0..1
+Distance = Callable[[np.ndarray, np.ndarray], float]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RenderedView:
+    frame: RgbdFrame
+    rendering: Rendering
+
+    @property
+    def seen(self) -> np.ndarray:
+        """What the camera saw [H, W, 3] float32, 0..1."""
+        return self.frame.color.astype(np.float32) / 255
+
+    @property
+    def shown(self) -> np.ndarray:
+        """What the map shows [H, W, 3] float32, 0..1."""
+        return self.rendering.color.clip(0, 1)
+
+    @property
+    def picture(self) -> np.ndarray:
+        """`shown` [H, W, 3] uint8."""
+        return np.round(self.shown * 255).astype(np.uint8)
+
+    @property
+    def psnr_db(self) -> float:
+        """Of every pixel."""
+        return psnr(*every_pixel(self))
+
+
+@dataclass(frozen=True, slots=True)
+class ViewErrors:
+    """Errors of one frame; `views.PROTOCOL` says how each is computed."""
+
+    frame: int
+    psnr_db: float
+    ssim: float
+    lpips: float | None  # None: nobody gave a network
+    depth_l1_m: float
+    depth_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class RenderingErrors:
+    """One map under one protocol, frame by frame."""
+
+    map: str
+    protocol: str
+    views: tuple[ViewErrors, ...]
+
+    def mean(self, figure: str) -> float | None:
+        values = self._values(figure)
+        return float(np.mean(values)) if len(values) else None
+
+    def median(self, figure: str) -> float | None:
+        values = self._values(figure)
+        return float(np.median(values)) if len(values) else None
+
+    def _values(self, figure: str) -> np.ndarray:
+        """Of the frames that have the figure."""
+        values = np.array([getattr(view, figure) for view in self.views], float)
+        return values[~np.isnan(values)]
+
+
+# --- protocols ------------------------------------------------------------------------------------
+def every_pixel(view: RenderedView) -> Images:
+    return view.seen, view.shown
+
+
+def exposure_fitted(view: RenderedView) -> Images:
+    seen, shown = every_pixel(view)
+    return seen, fitted_exposure(shown, seen).applied(shown)
+
+
+def measured_pixels(view: RenderedView) -> Images:
+    is_measured = (view.frame.depth_m > 0)[..., None]
+    return view.seen * is_measured, view.shown * is_measured
+
+
+HELD_OUT = {"A held out": every_pixel, "A held out, exposure fitted": exposure_fitted}
+TRAINING = {"B training": measured_pixels}
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """The frames of a run that each protocol asks for; those that are LOST have no pose."""
+
+    held_out: tuple[RunFrame, ...]
+    training: tuple[RunFrame, ...]
+
+    @staticmethod
+    def of(frames: Iterable[RunFrame]) -> "Judged":
+        frames = tuple(frames)
+        training = tuple(frame for frame in frames if not frame.is_held_out)
+        return Judged(
+            tuple(frame for frame in frames if frame.is_held_out), training[::TRAINING_STEP]
+        )
+
+    @property
+    def posed(self) -> list[RunFrame]:
+        return [frame for frame in (*self.held_out, *self.training) if not frame.is_lost]
+
+    def counts(self) -> str:
+        """How many, as a line below the protocol."""
+        if not self.held_out:
+            a = "A: none, since the run mapped every frame; `ldo run --hold-out 5` keeps some."
+        else:
+            a = f"A: {_counted(self.held_out)}."
+        return f"{a} B: {_counted(self.training)}."
+
+
+# --- judging --------------------------------------------------------------------------------------
+def view_of(
+    frame: RgbdFrame, rows: np.ndarray, T_map_camera: np.ndarray, threads: int
+) -> RenderedView:
+    T_camera_map = se3.inverse(T_map_camera)
+    return RenderedView(frame, render(rows, frame.camera, T_camera_map, threads=threads))
+
+
+def evaluate_rendering(
+    sequence: Sequence,
+    judged: Judged,
+    maps: Iterable[PosedMap],
+    advance: Callable[[int], None],
+    *,
+    distance: Distance | None = None,
+    threads: int = 1,
+) -> list[RenderingErrors]:
+    """Errors of each map under each protocol that has frames.
+
+    distance  LPIPS of two images [H, W, 3] in 0..1
+    advance   called with the number of frames done
+    Raises DataError when a frame cannot be read or has no pose.
+    """
+    views: dict[tuple[str, str], list[ViewErrors]] = defaultdict(list)
+    for done, frame in enumerate(judged.posed, 1):
+        image = sequence[frame.index]
+        for posed in maps:
+            view = view_of(image, posed.rows, posed.T_map_camera(frame), threads)
+            for protocol, errors in judge(view, frame.is_held_out, distance):
+                views[posed.name, protocol].append(errors)
+        advance(done)
+    order = [(posed.name, protocol) for posed in maps for protocol in (*HELD_OUT, *TRAINING)]
+    return [RenderingErrors(*key, tuple(views[key])) for key in order if key in views]
+
+
+def judge(
+    view: RenderedView, is_held_out: bool, distance: Distance | None = None
+) -> Iterator[tuple[str, ViewErrors]]:
+    """Protocols that a frame belongs to, and its errors by each."""
+    rendering = view.rendering
+    depth = depth_error(rendering.depth_m, rendering.opacity, view.frame.depth_m)
+    for protocol, images in (HELD_OUT if is_held_out else TRAINING).items():
+        seen, shown = images(view)
+        yield (
+            protocol,
+            ViewErrors(
+                view.frame.index,
+                psnr(seen, shown),
+                ssim(seen, shown),
+                distance(seen, shown) if distance else None,
+                depth.l1_m,
+                depth.share,
+            ),
+        )
+
+
+def _counted(frames: tuple[RunFrame, ...]) -> str:
+    lost = sum(frame.is_lost for frame in frames)
+    weak = sum(frame.status == "WEAK" for frame in frames)
+    return f"{len(frames) - lost} of {len(frames)} frames, {lost} LOST, {weak} WEAK"

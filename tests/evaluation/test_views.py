@@ -1,0 +1,153 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.evaluation.run_folder import FinishedRun, PosedMap
+from ldo_service.evaluation.views import (
+    Judged,
+    RenderingErrors,
+    ViewErrors,
+    evaluate_rendering,
+    exposure_fitted,
+    judge,
+    measured_pixels,
+    view_of,
+)
+from ldo_service.geometry import RgbdFrame, Trajectory, se3
+
+A, FITTED, B = "A held out", "A held out, exposure fitted", "B training"
+
+
+@pytest.fixture(scope="module")
+def sequence(room_folder: Path) -> Sequence:
+    return open_sequence(str(room_folder))
+
+
+@pytest.fixture(scope="module")
+def run(finished_run: Path) -> FinishedRun:
+    return FinishedRun.read(finished_run)
+
+
+def evaluate(
+    sequence: Sequence, run: FinishedRun, *maps: PosedMap
+) -> dict[tuple[str, str], RenderingErrors]:
+    judged = Judged.of(run.frames)
+    rows = evaluate_rendering(sequence, judged, maps or run.maps, lambda _done: None)
+    return {(row.map, row.protocol): row for row in rows}
+
+
+def moved(posed: PosedMap, distance_m: float) -> PosedMap:
+    T_new_old = se3.exp(np.array([0, 0, 0, distance_m, 0, 0]))
+    poses = posed.trajectory.T_world_camera @ T_new_old
+    return replace(posed, name="moved", trajectory=Trajectory(posed.trajectory.stamps_s, poses))
+
+
+def test_each_protocol_judges_its_frames(sequence: Sequence, run: FinishedRun) -> None:
+    rows = evaluate(sequence, run)
+    assert list(rows) == [("online", A), ("online", FITTED), ("online", B)]
+    frames = {protocol: [v.frame for v in row.views] for (_, protocol), row in rows.items()}
+    assert frames == {A: [4, 9, 14], FITTED: [4, 9, 14], B: [0, 6, 12]}
+    for row in rows.values():
+        assert row.mean("psnr_db") > 25
+        assert row.mean("ssim") > 0.8
+        assert row.mean("depth_l1_m") < 0.05
+        assert row.mean("depth_share") > 0.95
+        assert row.mean("lpips") is None
+
+
+def test_a_wrong_pose_costs_in_every_figure(sequence: Sequence, run: FinishedRun) -> None:
+    rows = evaluate(sequence, run, run.maps[0], moved(run.maps[0], 0.02))
+    for protocol in (A, FITTED, B):
+        right, wrong = rows["online", protocol], rows["moved", protocol]
+        assert wrong.mean("psnr_db") < right.mean("psnr_db") - 3
+        assert wrong.mean("ssim") < right.mean("ssim") - 0.02
+        assert wrong.mean("depth_l1_m") > right.mean("depth_l1_m")
+
+
+def test_a_lost_frame_is_counted_and_not_judged(sequence: Sequence, run: FinishedRun) -> None:
+    status = {9: "LOST", 6: "LOST", 4: "WEAK"}
+    frames = tuple(replace(f, status=status.get(f.index, f.status)) for f in run.frames)
+    rows = evaluate(sequence, replace(run, frames=frames))
+    assert [view.frame for view in rows["online", A].views] == [4, 14]
+    assert [view.frame for view in rows["online", B].views] == [0, 12]
+    assert Judged.of(frames).counts() == (
+        "A: 2 of 3 frames, 1 LOST, 1 WEAK. B: 2 of 3 frames, 1 LOST, 0 WEAK."
+    )
+
+
+def test_without_held_out_frames_the_counts_say_how_to_get_some(
+    sequence: Sequence, run: FinishedRun
+) -> None:
+    frames = tuple(replace(frame, is_held_out=False) for frame in run.frames)
+    rows = evaluate(sequence, replace(run, frames=frames))
+    assert list(rows) == [("online", B)]
+    assert [view.frame for view in rows["online", B].views] == [0, 5, 10, 15]
+    assert "--hold-out 5" in Judged.of(frames).counts()
+
+
+def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
+    sequence: Sequence, run: FinishedRun
+) -> None:
+    posed, frame = run.maps[0], sequence[4]
+    T_map_camera = posed.T_map_camera(run.frame(4))
+    dark = replace(frame, color=(frame.color * 0.6 + 20).astype(np.uint8))
+    as_seen, darkened = (
+        dict(judge(view_of(image, posed.rows, T_map_camera, 1), True)) for image in (frame, dark)
+    )
+    assert darkened[A].psnr_db < as_seen[A].psnr_db - 3
+    assert darkened[FITTED].psnr_db > as_seen[FITTED].psnr_db
+    assert as_seen[FITTED].psnr_db >= as_seen[A].psnr_db
+    assert darkened[FITTED].depth_l1_m == as_seen[A].depth_l1_m
+
+
+def test_exposure_is_fitted_to_what_is_shown_and_leaves_what_was_seen(
+    sequence: Sequence, run: FinishedRun
+) -> None:
+    view = view_of(sequence[4], run.maps[0].rows, run.maps[0].T_map_camera(run.frame(4)), 1)
+    seen, shown = exposure_fitted(view)
+    np.testing.assert_array_equal(seen, view.seen)
+    np.testing.assert_allclose(shown.mean(axis=(0, 1)), seen.mean(axis=(0, 1)), atol=0.005)
+
+
+def test_pixels_without_depth_are_black_in_both_images(
+    sequence: Sequence, run: FinishedRun
+) -> None:
+    frame = sequence[6]
+    depth_m = frame.depth_m.copy()
+    depth_m[:, :100] = 0
+    holed = RgbdFrame(frame.color, depth_m, frame.camera, frame.stamp_ns, frame.index)
+    view = view_of(holed, run.maps[0].rows, run.maps[0].T_map_camera(run.frame(6)), 1)
+    for image, whole in zip(measured_pixels(view), (view.seen, view.shown), strict=True):
+        assert not image[:, :100].any()
+        np.testing.assert_array_equal(image[depth_m > 0], whole[depth_m > 0])
+
+
+def test_lpips_is_asked_for_the_images_of_each_protocol(
+    sequence: Sequence, run: FinishedRun
+) -> None:
+    asked = []
+
+    def distance(a: np.ndarray, b: np.ndarray) -> float:
+        asked.append((a, b))
+        return float(len(asked))
+
+    view = view_of(sequence[4], run.maps[0].rows, run.maps[0].T_map_camera(run.frame(4)), 1)
+    errors = dict(judge(view, True, distance))
+    assert [errors[A].lpips, errors[FITTED].lpips] == [1, 2]
+    np.testing.assert_array_equal(asked[0], (view.seen, view.shown))
+    np.testing.assert_array_equal(asked[1], exposure_fitted(view))
+
+
+def test_frames_without_a_figure_do_not_enter_its_mean() -> None:
+    views = tuple(
+        ViewErrors(frame, psnr_db, 0.5, None, depth_l1_m, 0.0)
+        for frame, psnr_db, depth_l1_m in ((1, 20.0, np.nan), (2, 30.0, 0.02), (3, 31.0, 0.04))
+    )
+    row = RenderingErrors("online", A, views)
+    assert row.mean("psnr_db") == 27
+    assert row.median("psnr_db") == 30
+    assert row.mean("depth_l1_m") == pytest.approx(0.03)
+    assert row.median("lpips") is None
