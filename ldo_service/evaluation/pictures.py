@@ -37,16 +37,15 @@ def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.nda
     return picture
 
 
-def depth_picture(depth_m: np.ndarray, farthest_m: float | None = None) -> np.ndarray:
+def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = None) -> np.ndarray:
     """Depth [H, W] in Turbo colours [H, W, 3], near is red and far is blue; missing is black.
 
-    Scaled to `farthest_m`, by default the 98th percentile of what was measured.
+    From the nearest to the farthest of `range_m`, by default those of `depth_range`.
     """
     seen = np.isfinite(depth_m) & (depth_m > 0)
     if not seen.any():
         return np.zeros((*depth_m.shape, 3), np.uint8)
-    nearest = float(np.percentile(depth_m[seen], 2))
-    farthest = farthest_m or float(np.percentile(depth_m[seen], 98))
+    nearest, farthest = range_m or depth_range(depth_m)
     nearness = (farthest - np.where(seen, depth_m, farthest)) / max(farthest - nearest, 1e-6)
     gray = np.clip(nearness * 255, 0, 255).astype(np.uint8)
     image = cv2.cvtColor(cv2.applyColorMap(gray, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
@@ -54,27 +53,44 @@ def depth_picture(depth_m: np.ndarray, farthest_m: float | None = None) -> np.nd
     return image
 
 
-def contact_sheet(rows: list[list[np.ndarray]], captions: list[str]) -> np.ndarray:
-    """Images [H, W, 3] uint8 in rows, a caption above each column.
+def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
+    """Percentiles 2 and 98 of what was measured in depth [H, W]; zeros for nothing."""
+    seen = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
+    if seen.size == 0:
+        return 0.0, 0.0
+    nearest, farthest = np.percentile(seen, [2, 98])
+    return float(nearest), float(farthest)
+
+
+def error_picture(a: np.ndarray, b: np.ndarray, gain: float) -> np.ndarray:
+    """|a - b| of images [H, W, 3] in 0..1, amplified, as uint8."""
+    return np.round(np.clip(gain * np.abs(a - b), 0, 1) * 255).astype(np.uint8)
+
+
+def contact_sheet(
+    rows: list[list[np.ndarray]], captions: list[str], labels: list[str] | None = None
+) -> np.ndarray:
+    """Images [H, W, 3] uint8 in rows, a caption above each column, a label above each row.
 
     All are scaled to the height of the first. Raises ValueError for an empty or ragged table.
     """
     if not rows or any(len(row) != len(captions) for row in rows) or not captions:
         raise ValueError("a contact sheet needs rows with one image per caption")
+    if labels is not None and len(labels) != len(rows):
+        raise ValueError("a contact sheet needs a label for each row or none")
     height, width = rows[0][0].shape[:2]
-    gap = 6
-    sheet_size = (
-        CAPTION_PX + len(rows) * (height + gap),
-        len(captions) * (width + gap) + gap,
-        3,
-    )
+    gap, label_px = 6, CAPTION_PX if labels else 0
+    row_px = label_px + height + gap
+    sheet_size = (CAPTION_PX + len(rows) * row_px, len(captions) * (width + gap) + gap, 3)
     sheet = np.full(sheet_size, 255, np.uint8)
     for column, caption in enumerate(captions):
         left = gap + column * (width + gap)
         _text(sheet, caption, (left, CAPTION_PX - 8))
         for row, images in enumerate(rows):
-            top = CAPTION_PX + row * (height + gap)
+            top = CAPTION_PX + row * row_px + label_px
             sheet[top : top + height, left : left + width] = _fitted(images[column], width, height)
+    for row, label in enumerate(labels or []):
+        _text(sheet, label, (gap, CAPTION_PX + row * row_px + label_px - 8))
     return sheet
 
 

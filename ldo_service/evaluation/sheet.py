@@ -1,0 +1,84 @@
+"""Rendered views beside what the camera saw, for the eye."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+
+from .pictures import contact_sheet, depth_picture, depth_range, error_picture
+from .views import RenderedView, RenderingErrors, ViewErrors
+
+VIEWS = 6
+ERROR_GAIN = 4  # a quarter of the range is white
+WIDTH_PX = 320  # of an image
+CAPTIONS = ["camera", "map", f"error x {ERROR_GAIN}", "camera depth", "map depth"]
+
+
+def rendering_sheet(
+    errors: RenderingErrors, view_of_frame: Callable[[int], RenderedView], count: int = VIEWS
+) -> np.ndarray:
+    """Rows [camera, map, error, camera depth, map depth] of some frames, as uint8 RGB.
+
+    Above each are its frame number, its PSNR in `errors`, and the one scale of both depths. The
+    frames are the best, the worst, and others evenly between. Raises ValueError without any.
+    """
+    shown = some_of(errors.views, count)
+    views = [view_of_frame(one.frame) for one in shown]
+    notes = [_note(one, errors.views) for one in shown]
+    labels = [f"{note}; {_scale(view)}" for note, view in zip(notes, views, strict=True)]
+    return contact_sheet([_pictures(view) for view in views], CAPTIONS, labels)
+
+
+def some_of(views: tuple[ViewErrors, ...], count: int = VIEWS) -> list[ViewErrors]:
+    """By frame number: the best and the worst by PSNR, and others evenly spread."""
+    special = {_worst(views), _best(views)} if views else set()
+    others = [view for view in views if view not in special]
+    places = np.linspace(0, len(others), max(0, count - len(special)), endpoint=False)
+    spread = {others[int(place)] for place in places} if others else set()
+    return sorted(special | spread, key=lambda view: view.frame)
+
+
+def _worst(views: tuple[ViewErrors, ...]) -> ViewErrors:
+    return min(views, key=lambda view: view.psnr_db)
+
+
+def _best(views: tuple[ViewErrors, ...]) -> ViewErrors:
+    return max(views, key=lambda view: view.psnr_db)
+
+
+def _note(one: ViewErrors, views: tuple[ViewErrors, ...]) -> str:
+    rank = ", the best" * (one == _best(views)) or ", the worst" * (one == _worst(views))
+    return f"frame {one.frame}: {one.psnr_db:.2f} dB{rank}"
+
+
+def _pictures(view: RenderedView) -> list[np.ndarray]:
+    range_m = _range_m(view)
+    return [
+        _shrunk(picture)
+        for picture in (
+            view.frame.color,
+            view.picture,
+            error_picture(view.seen, view.shown, ERROR_GAIN),
+            depth_picture(view.frame.depth_m, range_m),
+            depth_picture(view.rendering.depth_m, range_m),
+        )
+    ]
+
+
+def _scale(view: RenderedView) -> str:
+    nearest_m, farthest_m = _range_m(view)
+    return f"depth {nearest_m:.2f} m (red) to {farthest_m:.2f} m (blue)"
+
+
+def _range_m(view: RenderedView) -> tuple[float, float]:
+    """Of the camera's depth, or of the map's where the camera has none."""
+    measured_m = view.frame.depth_m
+    return depth_range(measured_m if measured_m.any() else view.rendering.depth_m)
+
+
+def _shrunk(image: np.ndarray) -> np.ndarray:
+    height, width = image.shape[:2]
+    if width <= WIDTH_PX:
+        return image
+    size = (WIDTH_PX, max(1, round(height * WIDTH_PX / width)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
