@@ -23,7 +23,7 @@ RGB-D SLAM as a service: poses and a photo-realistic map, live, on a CPU.
 first steps:
   ldo demo                      the main job on a built-in synthetic room
   ldo run SOURCE --out DIR      track and map a data set
-  ldo eval DIR SOURCE           compare with its ground truth
+  ldo eval DIR SOURCE           judge its trajectory and its map
   ldo serve                     the live service; `ldo publish SOURCE` feeds it
 
 verbs:

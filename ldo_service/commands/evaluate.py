@@ -1,38 +1,30 @@
 """ldo eval"""
 
-import csv
 import json
 import sys
-from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
 from ldo_service.errors import DataError
-from ldo_service.evaluation.pictures import save_picture, trajectory_picture
-from ldo_service.evaluation.trajectory import (
-    PROTOCOL,
-    TrajectoryErrors,
-    evaluate_trajectory,
-)
-from ldo_service.geometry import Trajectory
+from ldo_service.evaluation import trajectory, views
+from ldo_service.evaluation.lpips import Lpips
+from ldo_service.evaluation.results import Results, evaluate_run, plain
+from ldo_service.evaluation.run_folder import FinishedRun
+from ldo_service.evaluation.trajectory import TrajectoryErrors
+from ldo_service.evaluation.views import Judged, RenderingErrors
 from ldo_service.recordings.sequence import open_source
 
 from .options import Json, Source
+from .progress import progress
 
-WIDTH = 120  # of the table in a file
-STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    name: str
-    errors: TrajectoryErrors
+WIDTH = 120  # of the tables in a file
+NO_TRUTH = "The source has no ground truth, so trajectories are not judged."
+NO_LPIPS = "LPIPS is left out; --lpips FILE.onnx adds it."
 
 
 def evaluate(
@@ -40,25 +32,36 @@ def evaluate(
         Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="what `ldo run` wrote")
     ],
     source: Source,
+    lpips: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE.onnx",
+            help="network of LPIPS: two inputs float32 [1, 3, H, W], RGB in -1..1, and one output "
+            "with a single number, as torch.onnx.export writes lpips.LPIPS(net='alex')",
+        ),
+    ] = None,
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Compare a run with the ground truth of its source.
+    """Judge a run: its trajectory by the truth of its source, its map by the frames.
 
-    Prints the protocol above the figures, and draws trajectory.png into DIR.
+    Prints the protocol above the figures, and draws trajectory.png and rendering.png into DIR.
+    `ldo run --hold-out 5` leaves frames to judge the map by that it was not made from. Of a source
+    without ground truth the map alone is judged.
+
+      ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out 5
+      ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
     """
-    truth = open_source(source, run_config(folder).data.options()).truth()
-    if truth is None:
-        raise DataError(f"{source} has no ground truth, so there is nothing to compare with.")
-    final = read_trajectory(folder, "trajectory.txt")
-    rows = compare(folder, final, truth)
-    save_picture(folder / "trajectory.png", trajectory_picture(final, truth))
+    config = run_config(folder)
+    threads = config.mapper.thread_count()
+    distance = Lpips(lpips, threads=threads) if lpips else None
+    run, sequence = FinishedRun.read(folder), open_source(source, config.data.options())
+    run.require_source(sequence)
+    with progress("eval", len(Judged.of(run.frames).posed), Console(stderr=True)) as advance:
+        results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:
-        print(json.dumps({row.name: plain(row.errors) for row in rows}, indent=1))
-        return
-    console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
-    console.print(PROTOCOL, style="dim")
-    console.print(errors_table(rows))
-    console.print(f"Picture: {folder / 'trajectory.png'}")
+        print(json.dumps({**plain(results), "lpips": lpips and str(lpips)}, indent=1))
+    else:
+        print_results(results, lpips)
 
 
 def run_config(folder: Path) -> Config:
@@ -68,52 +71,25 @@ def run_config(folder: Path) -> Config:
     return load_config(folder / "config.yaml")
 
 
-def compare(folder: Path, final: Trajectory, truth: Trajectory) -> list[Row]:
-    """Online and final; all frames that have a pose, and those whose pose was trusted."""
-    online = read_trajectory(folder, "trajectory_online.txt")
-    ok_s = stamps_with_status(folder, "OK")
-    rows = []
-    for name, trajectory in (("online", online), ("final", final)):
-        rows.append(Row(name, evaluate_trajectory(trajectory, truth)))
-        trusted = at_stamps(trajectory, ok_s)
-        if len(trusted) != len(trajectory):
-            rows.append(Row(f"{name}, OK frames", evaluate_trajectory(trusted, truth)))
-    return rows
+def print_results(results: Results, lpips: Path | None) -> None:
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
+    if results.trajectories is None:
+        console.print(NO_TRUTH)
+    else:
+        console.print(trajectory.PROTOCOL, style="dim")
+        console.print(trajectory_table(results.trajectories))
+    console.print(views.PROTOCOL, style="dim")
+    console.print(results.judged.counts(), style="dim")
+    console.print(f"LPIPS by {lpips}." if lpips else NO_LPIPS, style="dim")
+    if results.renderings:
+        console.print(rendering_table(results.renderings, has_lpips=lpips is not None))
+    console.print("Pictures: " + ", ".join(map(str, results.pictures)), soft_wrap=True)
 
 
-def read_trajectory(folder: Path, name: str) -> Trajectory:
-    try:
-        return Trajectory.load(folder / name)
-    except OSError as error:
-        raise DataError(
-            f"{folder / name} cannot be read ({error.strerror}): is {folder} what `ldo run` wrote?"
-        ) from error
-
-
-def stamps_with_status(folder: Path, status: str) -> np.ndarray:
-    """Stamps in seconds of the frames with a status."""
-    try:
-        with (folder / "frames.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
-        return np.array([int(row["stamp_ns"]) * 1e-9 for row in rows if row["status"] == status])
-    except (OSError, KeyError, ValueError) as error:
-        raise DataError(f"{folder / 'frames.csv'} cannot be read: {error!r}.") from error
-
-
-def at_stamps(trajectory: Trajectory, stamps_s: np.ndarray) -> Trajectory:
-    """The poses whose stamp is among `stamps_s` [M], ascending."""
-    if len(stamps_s) == 0:
-        return Trajectory(trajectory.stamps_s[:0], trajectory.T_world_camera[:0])
-    nearest = np.searchsorted(stamps_s, trajectory.stamps_s - STAMP_TOLERANCE_S)
-    gaps_s = stamps_s[np.minimum(nearest, len(stamps_s) - 1)] - trajectory.stamps_s
-    chosen = np.abs(gaps_s) <= STAMP_TOLERANCE_S
-    return Trajectory(trajectory.stamps_s[chosen], trajectory.T_world_camera[chosen])
-
-
-def errors_table(rows: list[Row]) -> Table:
+def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:
     table = Table("trajectory", "poses", "ATE RMSE", "mean", "median", "max", "RPE 1 s")
-    for row in rows:
-        ate, errors = row.errors.ate_m, row.errors
+    for name, errors in rows.items():
+        ate = errors.ate_m
         lengths = (ate.rmse, ate.mean, ate.median, ate.max)
         rpe = "-"
         if errors.rpe_translation_m and errors.rpe_rotation_deg:
@@ -121,11 +97,22 @@ def errors_table(rows: list[Row]) -> Table:
                 f"{100 * errors.rpe_translation_m.rmse:.2f} cm, "
                 f"{errors.rpe_rotation_deg.rmse:.2f} deg"
             )
-        table.add_row(row.name, str(errors.poses), *(f"{100 * m:.2f} cm" for m in lengths), rpe)
+        table.add_row(name, str(errors.poses), *(f"{100 * m:.2f} cm" for m in lengths), rpe)
     return table
 
 
-def plain(errors: TrajectoryErrors) -> dict[str, Any]:
-    tree = asdict(errors)
-    tree["T_truth_estimate"] = errors.T_truth_estimate.tolist()
-    return tree
+def rendering_table(rows: list[RenderingErrors], *, has_lpips: bool) -> Table:
+    columns = {"PSNR dB": ("psnr_db", 1, ".2f"), "SSIM": ("ssim", 1, ".3f")}
+    if has_lpips:
+        columns["LPIPS"] = ("lpips", 1, ".3f")
+    columns |= {"depth L1 cm": ("depth_l1_m", 100, ".2f"), "of measured": ("depth_share", 1, ".1%")}
+    table = Table("map", "protocol", "frames", *columns)
+    for row in rows:
+        cells = (_mean_and_median(row, *column) for column in columns.values())
+        table.add_row(row.map, row.protocol, str(len(row.views)), *cells)
+    return table
+
+
+def _mean_and_median(row: RenderingErrors, figure: str, factor: float, form: str) -> str:
+    values = (row.mean(figure), row.median(figure))
+    return " / ".join("-" if value is None else f"{value * factor:{form}}" for value in values)

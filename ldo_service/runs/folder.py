@@ -47,7 +47,7 @@ WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "trajectory.txt", "frames.csv", "keyframes.json", "map.ply"),
         *("config.yaml", "summary.json"),
-        *("trajectory.png", "views.png"),  # by `ldo eval` and `ldo demo`
+        *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
         *(f"{REFINED}/{name}" for name in ("trajectory.txt", "keyframes.json", "map.ply")),
         *(name for names in EXPORTED.values() for name in names),
     }

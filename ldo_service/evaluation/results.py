@@ -1,0 +1,127 @@
+"""Everything there is to say about a finished run."""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ldo_service.datasets import Sequence
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import Trajectory
+
+from . import trajectory, views
+from .pictures import save_picture, trajectory_picture
+from .run_folder import FinishedRun, at_stamps
+from .sheet import rendering_sheet
+from .trajectory import TrajectoryErrors, evaluate_trajectory
+from .views import FIGURES, Distance, Judged, RenderedView, RenderingErrors, view_of
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    trajectories: dict[str, TrajectoryErrors] | None  # None without ground truth
+    judged: Judged
+    renderings: list[RenderingErrors]
+    pictures: list[Path]
+
+
+def evaluate_run(
+    run: FinishedRun,
+    sequence: Sequence,
+    advance: Callable[[int], None],
+    *,
+    distance: Distance | None = None,
+    threads: int = 1,
+) -> Results:
+    """Judge the trajectories by the truth of the sequence, the maps by its frames, and draw both.
+
+    `distance` and `advance` as for `views.evaluate_rendering`. Raises DataError when a file does
+    not fit or nothing can be judged, ConfigError when a picture cannot be written.
+    """
+    judged, truth = Judged.of(run.frames), sequence.truth()
+    if truth is None and not judged.posed:
+        raise DataError(
+            f"{sequence.name} has no ground truth and {run.folder} no pose to render from, so "
+            "there is nothing to judge."
+        )
+    trajectories = None if truth is None else compare(run, truth)
+    renderings = views.evaluate_rendering(
+        sequence, judged, run.maps, advance, distance=distance, threads=threads
+    )
+    pictures = {"trajectory.png": trajectory_picture(run.estimates["final"], truth)}
+    if renderings:
+        pictures["rendering.png"] = sheet_of_newest(run, sequence, renderings, threads)
+    return Results(trajectories, judged, renderings, draw(run.folder, pictures))
+
+
+def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
+    """Each estimate; all frames that have a pose, and those whose pose was trusted."""
+    rows = {}
+    for name, estimate in run.estimates.items():
+        rows[name] = evaluate_trajectory(estimate, truth)
+        trusted = at_stamps(estimate, run.stamps_s("OK"))
+        if len(trusted) != len(estimate):
+            rows[f"{name}, OK frames"] = evaluate_trajectory(trusted, truth)
+    return rows
+
+
+def sheet_of_newest(
+    run: FinishedRun, sequence: Sequence, renderings: list[RenderingErrors], threads: int
+) -> np.ndarray:
+    """Held-out frames beside the newest map; training frames where none was held out."""
+    newest = run.maps[-1]
+
+    def view(index: int) -> RenderedView:
+        T_map_camera = newest.T_map_camera(run.frame(index))
+        return view_of(sequence[index], newest.rows, T_map_camera, threads)
+
+    return rendering_sheet(next(row for row in renderings if row.map == newest.name), view)
+
+
+def draw(folder: Path, pictures: dict[str, np.ndarray]) -> list[Path]:
+    """Save pictures by their names, and return where."""
+    try:
+        for name, picture in pictures.items():
+            save_picture(folder / name, picture)
+    except OSError as error:
+        raise ConfigError(f"{error}: make room there, or make {folder} writable.") from error
+    return [folder / name for name in pictures]
+
+
+def plain(results: Results) -> dict[str, Any]:
+    """All of it for JSON, frame by frame; what is no finite number is null."""
+    trajectories = results.trajectories
+    return {
+        "protocol": {
+            "trajectory": trajectory.PROTOCOL,
+            "rendering": views.PROTOCOL,
+            "frames": results.judged.counts(),
+        },
+        "trajectory": trajectories and {k: _plain_errors(v) for k, v in trajectories.items()},
+        "rendering": [_plain_rendering(row) for row in results.renderings],
+        "pictures": [str(path) for path in results.pictures],
+    }
+
+
+def _plain_errors(errors: TrajectoryErrors) -> dict[str, Any]:
+    return {**asdict(errors), "T_truth_estimate": errors.T_truth_estimate.tolist()}
+
+
+def _plain_rendering(row: RenderingErrors) -> dict[str, Any]:
+    return {
+        "map": row.map,
+        "protocol": row.protocol,
+        "frames": len(row.views),
+        "mean": {figure: _finite(row.mean(figure)) for figure in FIGURES},
+        "median": {figure: _finite(row.median(figure)) for figure in FIGURES},
+        "per_frame": [
+            {"frame": view.frame, **{f: _finite(getattr(view, f)) for f in FIGURES}}
+            for view in row.views
+        ],
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and np.isfinite(value) else None

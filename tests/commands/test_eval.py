@@ -1,0 +1,159 @@
+"""`ldo eval` over what `ldo run` wrote of 16 frames, 3 of them held out."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ldo_service import cli
+from ldo_service.runs.folder import prepare
+
+
+def ldo(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
+    """Exit code, standard output and standard error."""
+    try:
+        cli.main([str(argument) for argument in arguments])
+        code = 0
+    except SystemExit as leaving:
+        code = int(leaving.code or 0)
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def last_line(text: str) -> str:
+    return text.strip().splitlines()[-1]
+
+
+@pytest.fixture
+def run(finished_run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(finished_run, tmp_path / "run")
+
+
+@pytest.fixture
+def without_truth(room_folder: Path, tmp_path: Path) -> Path:
+    folder = shutil.copytree(room_folder, tmp_path / "untrue")
+    (folder / "groundtruth.txt").unlink()
+    return folder
+
+
+def test_the_protocol_stands_above_the_figures(capsys, run: Path, room_folder: Path) -> None:
+    code, out, _ = ldo(capsys, "eval", run, room_folder)
+    assert code == 0
+    parts = (
+        *("Umeyama", "ATE RMSE", "A: held-out frames", "B: the literature's", "A: 3 of 3 frames"),
+        *("LPIPS is left out", "PSNR dB", "A held out, exposure fitted", "B training", "Pictures"),
+    )
+    places = [out.index(part) for part in parts]
+    assert places == sorted(places)
+    assert out.count("LPIPS") == 1
+    sheet = cv2.imread(str(run / "rendering.png"))
+    assert sheet is not None
+    assert sheet.shape[0] > 3 * 240, "a row for each held-out frame"
+
+
+def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Path) -> None:
+    code, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
+    assert code == 0
+    found = json.loads(out)
+    assert found["trajectory"]["final"]["ate_m"]["rmse"] < 0.005
+    held_out, fitted, training = found["rendering"]
+    assert (held_out["protocol"], held_out["map"]) == ("A held out", "online")
+    assert "exposure fitted" in fitted["protocol"]
+    assert [view["frame"] for view in held_out["per_frame"]] == [4, 9, 14]
+    assert [view["frame"] for view in training["per_frame"]] == [0, 6, 12]
+    for row in (held_out, fitted, training):
+        of_frames = [view["psnr_db"] for view in row["per_frame"]]
+        assert row["mean"]["psnr_db"] == pytest.approx(np.mean(of_frames))
+        assert row["median"]["psnr_db"] == pytest.approx(np.median(of_frames))
+    assert fitted["mean"]["psnr_db"] > held_out["mean"]["psnr_db"] > 25
+
+
+def test_a_source_without_truth_has_its_map_judged(capsys, run: Path, without_truth: Path) -> None:
+    code, out, _ = ldo(capsys, "eval", run, without_truth)
+    assert code == 0
+    assert "no ground truth" in out
+    assert "ATE" not in out
+    assert "A held out" in out
+    code, out, _ = ldo(capsys, "eval", run, without_truth, "--json")
+    assert json.loads(out)["trajectory"] is None
+
+
+def test_nothing_to_judge_is_bad_data(capsys, run: Path, without_truth: Path) -> None:
+    lines = (run / "frames.csv").read_text().replace(",OK,", ",LOST,")
+    (run / "frames.csv").write_text(lines)
+    code, _, err = ldo(capsys, "eval", run, without_truth)
+    assert code == 3
+    assert "nothing to judge" in last_line(err)
+
+
+def test_a_refined_map_has_rows_of_its_own(capsys, run: Path, room_folder: Path) -> None:
+    (run / "refined").mkdir()
+    for name in ("map.ply", "trajectory.txt"):
+        shutil.copy(run / name, run / "refined")
+    code, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
+    assert code == 0
+    found = json.loads(out)
+    online, refined = found["rendering"][:3], found["rendering"][3:]
+    assert {row["map"] for row in online} == {"online"}
+    assert {row["map"] for row in refined} == {"refined"}
+    assert [row["mean"] for row in online] == [row["mean"] for row in refined]
+    assert found["trajectory"]["refined"] == found["trajectory"]["final"]
+
+
+def test_without_held_out_frames_it_says_how_to_get_some(
+    capsys, run: Path, room_folder: Path
+) -> None:
+    header, *lines = (run / "frames.csv").read_text().splitlines()
+    place = header.split(",").index("held_out")
+    rows = [[*row[:place], "0", *row[place + 1 :]] for row in (line.split(",") for line in lines)]
+    (run / "frames.csv").write_text("\n".join([header, *map(",".join, rows)]))
+    code, out, _ = ldo(capsys, "eval", run, room_folder)
+    assert code == 0
+    assert "A: none" in out
+    assert "--hold-out 5" in out
+    assert "A held out" not in out
+    assert "B training" in out
+
+
+@pytest.mark.parametrize("name", ["map.ply", "config.yaml", "frames.csv", "trajectory.txt"])
+def test_a_missing_file_is_one_clear_error(capsys, run: Path, room_folder: Path, name) -> None:
+    (run / name).unlink()
+    code, out, err = ldo(capsys, "eval", run, room_folder)
+    assert (code, out) == (3, "")
+    assert len(err.splitlines()) == 1
+    assert name in err
+
+
+def test_a_truncated_map_is_one_clear_error(capsys, run: Path, room_folder: Path) -> None:
+    content = (run / "map.ply").read_bytes()
+    for length in (0, 50, len(content) // 2, len(content) - 1):
+        (run / "map.ply").write_bytes(content[:length])
+        code, _, err = ldo(capsys, "eval", run, room_folder)
+        assert code == 3
+        assert len(err.splitlines()) == 1
+        assert "map.ply" in err
+
+
+def test_another_source_than_the_runs_is_refused(capsys, run: Path) -> None:
+    code, _, err = ldo(capsys, "eval", run, "synthetic:tour")
+    assert code == 3
+    assert "the run was made from" in last_line(err)
+
+
+def test_a_bad_network_is_refused_before_anything_is_rendered(
+    capsys, run: Path, room_folder: Path
+) -> None:
+    (run / "lpips.onnx").write_text("no network")
+    code, _, err = ldo(capsys, "eval", run, room_folder, "--lpips", run / "lpips.onnx")
+    assert code == 2
+    assert len(err.splitlines()) == 1
+    assert "cannot be opened" in err
+
+
+def test_what_eval_drew_can_be_overwritten(capsys, run: Path, room_folder: Path) -> None:
+    ldo(capsys, "eval", run, room_folder)
+    prepare(run, overwrite=True)
+    assert list(run.iterdir()) == []
