@@ -1,7 +1,6 @@
 """ldo demo"""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -18,10 +17,9 @@ from ldo_service.evaluation.pictures import (
     save_picture,
     trajectory_picture,
 )
-from ldo_service.evaluation.rendering import psnr
+from ldo_service.evaluation.run_folder import FinishedRun
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.gaussians.render import Rendering, render
-from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.evaluation.views import Judged, RenderedView, view_of
 from ldo_service.runs.folder import RunFolder, prepare
 from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
@@ -34,22 +32,6 @@ from .run import with_options
 SOURCE = "synthetic:room"
 HOLD_OUT = 5  # every 5th frame is tracked and never mapped
 SHEET_ROWS = 3
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """A held-out frame and what the map shows from its estimated pose."""
-
-    frame: RgbdFrame
-    rendering: Rendering
-
-    @property
-    def color(self) -> np.ndarray:
-        return (np.clip(self.rendering.color, 0, 1) * 255 + 0.5).astype(np.uint8)
-
-    @property
-    def psnr_db(self) -> float:
-        return psnr(self.frame.color, self.color)
 
 
 def demo(
@@ -74,23 +56,23 @@ def demo(
     job = Job(sequence, out, config, Selection(), console.print)
     with progress("tracking and mapping", job.work, console) as advance:
         record = run_over_file(job, advance)
-    views = list(held_out_views(record, sequence, config.mapper.thread_count()))
+    views = list(held_out_views(out, sequence, config.mapper.thread_count()))
     save_pictures(out, record, sequence, views)
     Console(highlight=False).print(table(record, sequence, views, out))
 
 
-def held_out_views(record: RunFolder, sequence: Sequence, threads: int) -> Iterator[View]:
-    """Held-out frames with the final map rendered at their final poses."""
-    rows, final = record.follower.map.rows, record.final()
-    for index in range(HOLD_OUT - 1, len(sequence), HOLD_OUT):
-        frame = sequence[index]
-        position = np.flatnonzero(np.abs(final.stamps_s - frame.stamp_ns * 1e-9) < 1e-6)
-        if len(position):
-            T_camera_map = se3.inverse(final.T_world_camera[position[0]])
-            yield View(frame, render(rows, frame.camera, T_camera_map, threads=threads))
+def held_out_views(out: Path, sequence: Sequence, threads: int) -> Iterator[RenderedView]:
+    """Held-out frames with the final map rendered at their final poses, as `ldo eval` does."""
+    run = FinishedRun.read(out)
+    (posed,) = run.maps
+    for frame in Judged.of(run.frames).held_out:
+        if not frame.is_lost:
+            yield view_of(sequence[frame.index], posed.rows, posed.T_map_camera(frame), threads)
 
 
-def save_pictures(out: Path, record: RunFolder, sequence: Sequence, views: list[View]) -> None:
+def save_pictures(
+    out: Path, record: RunFolder, sequence: Sequence, views: list[RenderedView]
+) -> None:
     picture = trajectory_picture(record.final(), sequence.truth())
     save_picture(out / "trajectory.png", picture)
     chosen = views[:: max(1, len(views) // SHEET_ROWS)][:SHEET_ROWS]
@@ -98,7 +80,7 @@ def save_pictures(out: Path, record: RunFolder, sequence: Sequence, views: list[
         rows = [
             [
                 view.frame.color,
-                view.color,
+                view.picture,
                 depth_picture(view.frame.depth_m),
                 depth_picture(view.rendering.median_depth_m),
             ]
@@ -108,7 +90,7 @@ def save_pictures(out: Path, record: RunFolder, sequence: Sequence, views: list[
         save_picture(out / "views.png", contact_sheet(rows, captions))
 
 
-def table(record: RunFolder, sequence: Sequence, views: list[View], out: Path) -> Table:
+def table(record: RunFolder, sequence: Sequence, views: list[RenderedView], out: Path) -> Table:
     summary, truth = record.summary, sequence.truth()
     rows = {
         "frames": f"{summary['frames']} of {sequence.camera.width}x{sequence.camera.height}",
