@@ -11,6 +11,7 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence, open_sequence
 from ldo_service.runs.folder import prepare
+from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
 
@@ -55,9 +56,8 @@ def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("run") / "room"
     prepare(folder, overwrite=False)
     config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))
-    run_over_file(
-        open_sequence(str(room_folder)), folder, config, Selection(), print, lambda _done: None
-    )
+    job = Job(open_sequence(str(room_folder)), folder, config, Selection(), print)
+    run_over_file(job, lambda _done: None)
     return folder
 
 

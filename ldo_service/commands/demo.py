@@ -67,7 +67,7 @@ def held_out_views(out: Path, sequence: Sequence, threads: int) -> Iterator[Rend
     (posed,) = run.maps
     for frame in Judged.of(run.frames).held_out:
         if not frame.is_lost:
-            yield view_of(sequence[frame.index], posed.rows, posed.T_map_camera(frame), threads)
+            yield view_of(sequence[frame.index], posed, frame, threads)
 
 
 def save_pictures(

@@ -74,8 +74,7 @@ def sheet_of_newest(
     newest = run.maps[-1]
 
     def view(index: int) -> RenderedView:
-        T_map_camera = newest.T_map_camera(run.frame(index))
-        return view_of(sequence[index], newest.rows, T_map_camera, threads)
+        return view_of(sequence[index], newest, run.frame(index), threads)
 
     return rendering_sheet(next(row for row in renderings if row.map == newest.name), view)
 

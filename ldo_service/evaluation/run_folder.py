@@ -1,6 +1,7 @@
 """What a run wrote, read back. The files: `ldo_service.runs.folder`."""
 
 import csv
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
+from ldo_service.gaussians.exposure import Exposure
 from ldo_service.gaussians.ply import read_ply
 from ldo_service.geometry import Trajectory
 
@@ -29,12 +31,33 @@ class RunFrame:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class Exposures:
+    """Of the keyframes: stamps_ns [K] ascending, gains and biases [K, 2, 3]."""
+
+    stamps_ns: np.ndarray
+    matrices: np.ndarray
+
+    def at(self, stamp_ns: int) -> Exposure:
+        """Linear in time between the keyframes before and after; that of the map without any."""
+        if len(self.stamps_ns) == 0:
+            return Exposure()
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        before, after = max(after - 1, 0), min(after, len(self.stamps_ns) - 1)
+        interval = int(self.stamps_ns[after] - self.stamps_ns[before])
+        elapsed = int(np.clip(stamp_ns - self.stamps_ns[before], 0, interval))
+        share = elapsed / interval if interval else 0.0
+        return Exposure.of((1 - share) * self.matrices[before] + share * self.matrices[after])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class PosedMap:
-    """A map [N, 16] (see `gaussians.model`) and T_map_camera of the frames that are not LOST."""
+    """A map [N, 16] (see `gaussians.model`), T_map_camera of the frames that are not LOST, and the
+    exposures of its keyframes."""
 
     name: str  # online: at the end of the stream; refined: after further iterations
     rows: np.ndarray
     trajectory: Trajectory
+    exposures: "Exposures"
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
         """[4, 4]. Raises DataError when there is none."""
@@ -112,7 +135,19 @@ def _frame(row: dict[str, str]) -> RunFrame:
 
 def _posed_map(name: str, folder: Path) -> PosedMap:
     rows = read_ply(_there(folder, "map.ply"))
-    return PosedMap(name, rows, Trajectory.load(_there(folder, "trajectory.txt")))
+    trajectory = Trajectory.load(_there(folder, "trajectory.txt"))
+    return PosedMap(name, rows, trajectory, _exposures(_there(folder, "keyframes.json")))
+
+
+def _exposures(path: Path) -> Exposures:
+    """Of keyframes that have one; older versions wrote none."""
+    try:
+        keyframes = [k for k in json.loads(path.read_text()) if "exposure" in k]
+        stamps_ns = np.array([int(k["stamp_ns"]) for k in keyframes], np.int64)
+        matrices = np.array([k["exposure"] for k in keyframes], float).reshape(-1, 2, 3)
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path} cannot be read: {error!r}.") from error
+    return Exposures(stamps_ns, matrices)
 
 
 def _there(folder: Path, name: str) -> Path:

@@ -2,12 +2,12 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ldo_service.datasets import Sequence
-from ldo_service.gaussians.exposure import fitted_exposure
+from ldo_service.gaussians.exposure import Exposure, fitted_exposure
 from ldo_service.gaussians.render import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
 
@@ -24,8 +24,9 @@ Gaussian of 1.5 px, windows inside the image; some published systems print MS-SS
 Depth L1: mean depth of the rendering, over pixels with measured depth and rendered opacity above
 0.5; "of measured" is the share of measured pixels that these are. Cells: mean / median of frames.
 online: the map at the end of the stream; refined: after the further iterations of --refine.
-A: held-out frames, tracked and never mapped; every pixel. Exposure fitted: with gain and bias per
-channel fitted to each judged frame itself, by least squares.
+A: held-out frames, tracked and never mapped; every pixel. The map has one brightness, the camera's
+changes: its gain and bias per channel are interpolated between the keyframes before and after.
+Exposure fitted: to each judged frame itself, by least squares. No exposure: the map as it is.
 B: the literature's: every 5th training frame, pixels without depth black in both images.
 LOST frames have no pose and are only counted, WEAK frames are judged."""
 
@@ -37,6 +38,7 @@ Distance = Callable[[np.ndarray, np.ndarray], float]
 class RenderedView:
     frame: RgbdFrame
     rendering: Rendering
+    exposure: Exposure = field(default_factory=Exposure)  # expected of the camera, not fitted
 
     @property
     def seen(self) -> np.ndarray:
@@ -45,8 +47,8 @@ class RenderedView:
 
     @property
     def shown(self) -> np.ndarray:
-        """What the map shows [H, W, 3] float32, 0..1."""
-        return self.rendering.color.clip(0, 1)
+        """What the map shows to such a camera [H, W, 3] float32, 0..1."""
+        return self.exposure.applied(self.rendering.color)
 
     @property
     def picture(self) -> np.ndarray:
@@ -99,8 +101,12 @@ def every_pixel(view: RenderedView) -> Images:
 
 
 def exposure_fitted(view: RenderedView) -> Images:
-    seen, shown = every_pixel(view)
-    return seen, fitted_exposure(shown, seen).applied(shown)
+    shown = view.rendering.color
+    return view.seen, fitted_exposure(shown, view.seen).applied(shown)
+
+
+def map_as_it_is(view: RenderedView) -> Images:
+    return view.seen, view.rendering.color.clip(0, 1)
 
 
 def measured_pixels(view: RenderedView) -> Images:
@@ -108,7 +114,11 @@ def measured_pixels(view: RenderedView) -> Images:
     return view.seen * is_measured, view.shown * is_measured
 
 
-HELD_OUT = {"A held out": every_pixel, "A held out, exposure fitted": exposure_fitted}
+HELD_OUT = {
+    "A held out": every_pixel,
+    "A held out, exposure fitted": exposure_fitted,
+    "A held out, no exposure": map_as_it_is,
+}
 TRAINING = {"B training": measured_pixels}
 
 
@@ -141,11 +151,11 @@ class Judged:
 
 
 # --- judging --------------------------------------------------------------------------------------
-def view_of(
-    frame: RgbdFrame, rows: np.ndarray, T_map_camera: np.ndarray, threads: int
-) -> RenderedView:
-    T_camera_map = se3.inverse(T_map_camera)
-    return RenderedView(frame, render(rows, frame.camera, T_camera_map, threads=threads))
+def view_of(image: RgbdFrame, posed: PosedMap, frame: RunFrame, threads: int = 1) -> RenderedView:
+    """A frame of a run, with its image as it was mapped. Raises DataError when it has no pose."""
+    T_camera_map = se3.inverse(posed.T_map_camera(frame))
+    rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
+    return RenderedView(image, rendering, posed.exposures.at(frame.stamp_ns))
 
 
 def evaluate_rendering(
@@ -167,7 +177,7 @@ def evaluate_rendering(
     for done, frame in enumerate(judged.posed, 1):
         image = sequence[frame.index]
         for posed in maps:
-            view = view_of(image, posed.rows, posed.T_map_camera(frame), threads)
+            view = view_of(image, posed, frame, threads)
             for protocol, errors in judge(view, frame.is_held_out, distance):
                 views[posed.name, protocol].append(errors)
         advance(done)

@@ -59,12 +59,12 @@ def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Pa
     assert code == 0
     found = json.loads(out)
     assert found["trajectory"]["final"]["ate_m"]["rmse"] < 0.005
-    held_out, fitted, training = found["rendering"]
+    held_out, fitted, plain, training = found["rendering"]
     assert (held_out["protocol"], held_out["map"]) == ("A held out", "online")
     assert "exposure fitted" in fitted["protocol"]
     assert [view["frame"] for view in held_out["per_frame"]] == [4, 9, 14]
     assert [view["frame"] for view in training["per_frame"]] == [0, 6, 12]
-    for row in (held_out, fitted, training):
+    for row in (held_out, fitted, plain, training):
         of_frames = [view["psnr_db"] for view in row["per_frame"]]
         assert row["mean"]["psnr_db"] == pytest.approx(np.mean(of_frames))
         assert row["median"]["psnr_db"] == pytest.approx(np.median(of_frames))
@@ -91,12 +91,12 @@ def test_nothing_to_judge_is_bad_data(capsys, run: Path, without_truth: Path) ->
 
 def test_a_refined_map_has_rows_of_its_own(capsys, run: Path, room_folder: Path) -> None:
     (run / "refined").mkdir()
-    for name in ("map.ply", "trajectory.txt"):
+    for name in ("map.ply", "trajectory.txt", "keyframes.json"):
         shutil.copy(run / name, run / "refined")
     code, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
     assert code == 0
     found = json.loads(out)
-    online, refined = found["rendering"][:3], found["rendering"][3:]
+    online, refined = found["rendering"][:4], found["rendering"][4:]
     assert {row["map"] for row in online} == {"online"}
     assert {row["map"] for row in refined} == {"refined"}
     assert [row["mean"] for row in online] == [row["mean"] for row in refined]

@@ -34,7 +34,8 @@ def test_a_run_is_read_as_it_was(finished_run: Path, room_folder: Path) -> None:
 
 def test_a_refined_map_is_another_with_poses_of_its_own(copied: Path) -> None:
     (copied / "refined").mkdir()
-    shutil.copy(copied / "map.ply", copied / "refined")
+    for name in ("map.ply", "keyframes.json"):
+        shutil.copy(copied / name, copied / "refined")
     poses = Trajectory.load(copied / "trajectory.txt")
     moved = poses.T_world_camera.copy()
     moved[:, 0, 3] += 0.5

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence, open_sequence
-from ldo_service.evaluation.run_folder import FinishedRun, PosedMap
+from ldo_service.evaluation.run_folder import Exposures, FinishedRun, PosedMap
 from ldo_service.evaluation.views import (
     Judged,
     RenderingErrors,
@@ -13,12 +13,14 @@ from ldo_service.evaluation.views import (
     evaluate_rendering,
     exposure_fitted,
     judge,
+    map_as_it_is,
     measured_pixels,
     view_of,
 )
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
 
-A, FITTED, B = "A held out", "A held out, exposure fitted", "B training"
+A, FITTED, PLAIN = "A held out", "A held out, exposure fitted", "A held out, no exposure"
+B = "B training"
 
 
 @pytest.fixture(scope="module")
@@ -47,9 +49,9 @@ def moved(posed: PosedMap, distance_m: float) -> PosedMap:
 
 def test_each_protocol_judges_its_frames(sequence: Sequence, run: FinishedRun) -> None:
     rows = evaluate(sequence, run)
-    assert list(rows) == [("online", A), ("online", FITTED), ("online", B)]
+    assert list(rows) == [("online", protocol) for protocol in (A, FITTED, PLAIN, B)]
     frames = {protocol: [v.frame for v in row.views] for (_, protocol), row in rows.items()}
-    assert frames == {A: [4, 9, 14], FITTED: [4, 9, 14], B: [0, 6, 12]}
+    assert frames == {A: [4, 9, 14], FITTED: [4, 9, 14], PLAIN: [4, 9, 14], B: [0, 6, 12]}
     for row in rows.values():
         assert row.mean("psnr_db") > 25
         assert row.mean("ssim") > 0.8
@@ -92,10 +94,9 @@ def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
     sequence: Sequence, run: FinishedRun
 ) -> None:
     posed, frame = run.maps[0], sequence[4]
-    T_map_camera = posed.T_map_camera(run.frame(4))
     dark = replace(frame, color=(frame.color * 0.6 + 20).astype(np.uint8))
     as_seen, darkened = (
-        dict(judge(view_of(image, posed.rows, T_map_camera, 1), True)) for image in (frame, dark)
+        dict(judge(view_of(image, posed, run.frame(4)), True)) for image in (frame, dark)
     )
     assert darkened[A].psnr_db < as_seen[A].psnr_db - 3
     assert darkened[FITTED].psnr_db > as_seen[FITTED].psnr_db
@@ -103,10 +104,24 @@ def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
     assert darkened[FITTED].depth_l1_m == as_seen[A].depth_l1_m
 
 
+def test_the_exposure_expected_is_that_of_the_keyframes_beside_the_frame(
+    sequence: Sequence, run: FinishedRun
+) -> None:
+    """Half a second after a keyframe twice as bright as the map, of one second."""
+    stamp_ns = run.frame(4).stamp_ns
+    matrices = np.array([np.full((2, 3), 2.0), np.full((2, 3), 1.0)]) * [[1], [0]]
+    exposures = Exposures(stamp_ns + np.array([-500_000_000, 500_000_000]), matrices)
+    view = view_of(sequence[4], replace(run.maps[0], exposures=exposures), run.frame(4))
+    _, plain = map_as_it_is(view)
+    np.testing.assert_allclose(view.shown, (1.5 * plain).clip(0, 1), atol=1e-6)
+    assert exposures.at(stamp_ns - 10**9).gain[0] == 2
+    assert exposures.at(stamp_ns + 10**12).gain[0] == 1
+
+
 def test_exposure_is_fitted_to_what_is_shown_and_leaves_what_was_seen(
     sequence: Sequence, run: FinishedRun
 ) -> None:
-    view = view_of(sequence[4], run.maps[0].rows, run.maps[0].T_map_camera(run.frame(4)), 1)
+    view = view_of(sequence[4], run.maps[0], run.frame(4))
     seen, shown = exposure_fitted(view)
     np.testing.assert_array_equal(seen, view.seen)
     np.testing.assert_allclose(shown.mean(axis=(0, 1)), seen.mean(axis=(0, 1)), atol=0.005)
@@ -119,7 +134,7 @@ def test_pixels_without_depth_are_black_in_both_images(
     depth_m = frame.depth_m.copy()
     depth_m[:, :100] = 0
     holed = RgbdFrame(frame.color, depth_m, frame.camera, frame.stamp_ns, frame.index)
-    view = view_of(holed, run.maps[0].rows, run.maps[0].T_map_camera(run.frame(6)), 1)
+    view = view_of(holed, run.maps[0], run.frame(6))
     for image, whole in zip(measured_pixels(view), (view.seen, view.shown), strict=True):
         assert not image[:, :100].any()
         np.testing.assert_array_equal(image[depth_m > 0], whole[depth_m > 0])
@@ -134,9 +149,9 @@ def test_lpips_is_asked_for_the_images_of_each_protocol(
         asked.append((a, b))
         return float(len(asked))
 
-    view = view_of(sequence[4], run.maps[0].rows, run.maps[0].T_map_camera(run.frame(4)), 1)
+    view = view_of(sequence[4], run.maps[0], run.frame(4))
     errors = dict(judge(view, True, distance))
-    assert [errors[A].lpips, errors[FITTED].lpips] == [1, 2]
+    assert [errors[A].lpips, errors[FITTED].lpips, errors[PLAIN].lpips] == [1, 2, 3]
     np.testing.assert_array_equal(asked[0], (view.seen, view.shown))
     np.testing.assert_array_equal(asked[1], exposure_fitted(view))
 
