@@ -10,7 +10,7 @@ out  keyframe/refinement   KeyframeRefinement   where the renderer wants the key
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -217,7 +217,7 @@ class Mapper(Actor):
     def _motion(self, keyframe: int) -> AnchorMotion | None:
         """From where its Gaussians are to where the keyframe is; None while it is too little, which
         adds up until it is enough."""
-        T_map_gaussians = self._map.views.stands[keyframe].T_map_camera
+        T_map_gaussians = self._map.views.poses[keyframe]
         T_new_old = pose_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
         motion = transform(T_new_old)
         if (
@@ -234,8 +234,6 @@ class Mapper(Actor):
 
     def _deltas(self, with_changed: bool) -> Iterator[MapDelta]:
         """What followers do not know, in messages of a bounded size."""
-        if with_changed:
-            self._since_changed = 0
         changes = self._map.changes(with_changed=with_changed)
         for part in parts_of(changes, self.config.part_gaussians):
             yield self._delta(
@@ -243,6 +241,9 @@ class Mapper(Actor):
                 changed=self._gaussians(part.changed),
                 added=self._gaussians(part.added),
             )
+        if with_changed:
+            self._since_changed = 0
+            self._map.rest()
 
     def _delta(
         self,
@@ -264,12 +265,10 @@ class Mapper(Actor):
         )
 
     def _view(self, keyframe: Keyframe) -> ModelView:
-        stand = self._map.views.stands[keyframe.keyframe]
+        views, k = self._map.views, keyframe.keyframe
+        T_camera_map = se3.inverse(views.poses[k])
         rendering = render(
-            self._map.gaussians.rows,
-            stand.camera,
-            se3.inverse(stand.T_map_camera),
-            threads=self._threads,
+            self._map.gaussians.rows, views.cameras[k], T_camera_map, threads=self._threads
         )
         return ModelView(
             stamp_ns=keyframe.stamp_ns,
@@ -277,15 +276,15 @@ class Mapper(Actor):
             version=self._version,
             graph_version=self._poses.version,
             camera=keyframe.camera,
-            T_map_camera=pose_message(stand.T_map_camera),
-            color=Array.of(to_bytes(stand.exposure.applied(rendering.color))),
+            T_map_camera=pose_message(views.poses[k]),
+            color=Array.of(to_bytes(views.exposures[k].applied(rendering.color))),
             depth_m=Array.of(rendering.median_depth_m),
             opacity=Array.of(to_bytes(rendering.opacity)),
         )
 
     def _snapshot_when_due(self) -> Iterator[MapDelta | MapSnapshot]:
         self._since_snapshot += 1
-        grown = len(self._map.gaussians) - self._in_snapshot
+        grown = self._map.size() - self._in_snapshot
         if (
             self._since_snapshot >= self.config.snapshot_keyframes
             and grown >= self.config.snapshot_growth * self._in_snapshot
@@ -295,34 +294,31 @@ class Mapper(Actor):
     def _snapshot(self) -> Iterator[MapDelta | MapSnapshot]:
         """First all that is new, so that followers and late joiners hold the same."""
         yield from self._deltas(with_changed=True)
-        gaussians, stands = self._map.gaussians, self._map.views.stands
-        self._since_snapshot, self._in_snapshot = 0, len(gaussians)
-        size = self.config.part_gaussians
-        starts = range(0, max(len(gaussians), 1), size)
-        exposures = np.array([stand.exposure.matrix for stand in stands.values()], np.float32)
-        for part, start in enumerate(starts):
+        self._since_snapshot, self._in_snapshot = 0, self._map.size()
+        parts = max(1, -(-self._map.size() // self.config.part_gaussians))
+        pieces = regrouped(self._map.pieces(), parts, self.config.part_gaussians)
+        exposures = self._map.views.exposures
+        for part, gaussians in enumerate(pieces):
+            named = list(exposures) if part == 0 else []
+            matrices = [exposures[k].matrix for k in named]
             yield MapSnapshot(
                 stamp_ns=self._newest[0],
                 version=self._version,
                 graph_version=self._poses.version,
                 part=part,
-                parts=len(starts),
-                gaussians=self._gaussians(slice(start, start + size)),
-                keyframes=Array.of(np.array(list(stands) if part == 0 else [], np.int64)),
-                exposures=Array.of(exposures.reshape(-1, 2, 3)[: None if part == 0 else 0]),
+                parts=parts,
+                gaussians=gaussians,
+                keyframes=Array.of(np.array(named, np.int64)),
+                exposures=Array.of(np.array(matrices, np.float32).reshape(-1, 2, 3)),
             )
 
-    def _gaussians(self, chosen: slice | np.ndarray) -> Gaussians:
-        gaussians = self._map.gaussians
-        return Gaussians(
-            ids=Array.of(gaussians.ids[chosen]),
-            params=Array.of(gaussians.rows[chosen]),
-            anchors=Array.of(gaussians.anchors[chosen]),
-        )
+    def _gaussians(self, chosen: np.ndarray) -> Gaussians:
+        awake = self._map.gaussians
+        return gaussians_message(awake.ids[chosen], awake.rows[chosen], awake.anchors[chosen])
 
     def finish(self) -> Iterator[MapDelta | MapSnapshot]:
         """The whole map, so that whoever listens ends with it."""
-        if len(self._map.gaussians):
+        if self._map.size():
             yield from self._snapshot()
 
     # --- state ------------------------------------------------------------------------------------
@@ -364,6 +360,29 @@ class Mapper(Actor):
             "keyframes_repeated": self._repeated,
             **self._map.statistics(),
         }
+
+
+def gaussians_message(ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> Gaussians:
+    return Gaussians(ids=Array.of(ids), params=Array.of(rows), anchors=Array.of(anchors))
+
+
+def regrouped(
+    pieces: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], parts: int, size: int
+) -> Iterator[Gaussians]:
+    """Pieces of ids, rows and anchors as `parts` messages of `size` Gaussians, the last ones of
+    what is left."""
+    waiting: list[np.ndarray] = [np.zeros(0, np.int64), np.zeros((0, ROW), np.float32)]
+    waiting.append(np.zeros(0, np.int32))
+    made = 0
+    for piece in pieces:
+        waiting = [np.concatenate(pair) for pair in zip(waiting, piece, strict=True)]
+        while len(waiting[0]) >= size and made < parts - 1:
+            yield gaussians_message(*(array[:size] for array in waiting))
+            waiting = [array[size:] for array in waiting]
+            made += 1
+    for _ in range(made, parts):
+        yield gaussians_message(*(array[:size] for array in waiting))
+        waiting = [array[size:] for array in waiting]
 
 
 def to_bytes(image: np.ndarray) -> np.ndarray:

@@ -47,6 +47,15 @@ class ChangeLog:
         self._removed.append(ids[ids < self._next_untold])
         self._is_changed = self._is_changed[~mask]
 
+    def woken(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
+        """Rows came back, perhaps with their anchor moved: they count as changed."""
+        if len(ids) == 0:
+            return
+        mask = np.isin(gaussians.ids, ids, assume_unique=True)
+        is_changed = mask.copy()
+        is_changed[~mask] = self._is_changed
+        self._is_changed = is_changed
+
     def take(self, gaussians: GaussianMap, *, with_changed: bool) -> Changes:
         """What is to be told now; it counts as told. Without `with_changed` the rows that changed
         wait for another time."""
@@ -63,7 +72,8 @@ class ChangeLog:
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
     def all_told(self, gaussians: GaussianMap) -> None:
-        """Begin with followers that know the whole map."""
-        self._next_untold = int(gaussians.ids[-1]) + 1 if len(gaussians) else 0
+        """Followers know the whole map, which may be another than it was."""
+        newest = int(gaussians.ids[-1]) if len(gaussians) else -1
+        self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)
         self._removed.clear()

@@ -1,7 +1,6 @@
 """The keyframes that a map was made from, as views to optimise against."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,62 +13,61 @@ from .keyframe_store import KeyframeStore
 from .views import View
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Stand:
-    """What of a keyframe may change, and its camera: 0.5 kB in memory."""
-
-    camera: Camera
-    T_map_camera: np.ndarray  # [4, 4]
-    exposure: Exposure = field(default_factory=Exposure)
-
-
 class KeyframeViews:
     """Views by keyframe: where each stands is in memory, what it saw is in the store.
 
-    `stands` has every keyframe that ever was; a view is there while its images are.
+    `cameras`, `poses` (T_map_camera [4, 4]) and `exposures` have every keyframe that ever was, in
+    order: 0.5 kB each. A view is there while its images are.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
         self.store = store
-        self.stands: dict[int, Stand] = {}
+        self.cameras: dict[int, Camera] = {}
+        self.poses: dict[int, np.ndarray] = {}
+        self.exposures: dict[int, Exposure] = {}
 
     def add(self, view: View) -> None:
+        if not self.poses:
+            self.store.keep_only(())  # what another journey left in the folder
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
 
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self.poses
+
+    def __len__(self) -> int:
+        return len(self.poses)
+
     def is_readable(self, keyframe: int) -> bool:
+        """Whether its images are still there, and undamaged."""
         return self.store.get(keyframe) is not None
 
     def __getitem__(self, keyframe: int) -> View:
         """Raises KeyError when its images were forgotten or cannot be read."""
-        images, stand = self.store.get(keyframe), self.stands[keyframe]
+        images = self.store.get(keyframe)
         if images is None:
             raise KeyError(keyframe)
-        return images.view(stand.T_map_camera, stand.exposure)
+        return images.view(self.poses[keyframe], self.exposures[keyframe])
 
     def __setitem__(self, keyframe: int, view: View) -> None:
-        """Take over its pose and its exposure."""
-        self.stands[keyframe] = Stand(view.camera, view.T_map_camera, view.exposure)
-
-    def move(self, T_map_camera: Mapping[int, np.ndarray]) -> None:
-        """Put keyframes elsewhere."""
-        for keyframe, T in T_map_camera.items():
-            self.stands[keyframe] = replace(self.stands[keyframe], T_map_camera=T)
+        """Take over its camera, pose and exposure."""
+        self.cameras[keyframe] = view.camera
+        self.poses[keyframe] = view.T_map_camera
+        self.exposures[keyframe] = view.exposure
 
     def snapshot(self) -> dict[str, Any]:
-        stands = self.stands.values()
+        exposures = [exposure.matrix for exposure in self.exposures.values()]
         return {
-            "keyframes": list(self.stands),
-            "cameras": [
-                (c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in (s.camera for s in stands)
-            ],
-            "T_map_camera": np.array([s.T_map_camera for s in stands]).reshape(-1, 4, 4),
-            "exposures": np.array([s.exposure.matrix for s in stands]).reshape(-1, 2, 3),
+            "keyframes": list(self.poses),
+            "cameras": [(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in self.cameras.values()],
+            "T_map_camera": np.array(list(self.poses.values())).reshape(-1, 4, 4),
+            "exposures": np.array(exposures, np.float32).reshape(-1, 2, 3),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Become what `state` is the snapshot of; images of later keyframes are dropped."""
-        each = zip(state["cameras"], state["T_map_camera"], state["exposures"], strict=True)
-        stands = [Stand(Camera(*c), T, Exposure.of(matrix)) for c, T, matrix in each]
-        self.stands = dict(zip(state["keyframes"], stands, strict=True))
-        self.store.keep_only(self.stands)
+        keyframes = state["keyframes"]
+        self.cameras = dict(zip(keyframes, (Camera(*c) for c in state["cameras"]), strict=True))
+        self.poses = dict(zip(keyframes, state["T_map_camera"], strict=True))
+        self.exposures = dict(zip(keyframes, map(Exposure.of, state["exposures"]), strict=True))
+        self.store.keep_only(keyframes)

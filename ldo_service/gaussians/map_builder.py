@@ -1,6 +1,6 @@
-"""How keyframes become a map: grown where it lacks something, fitted to a window, pruned."""
+"""How keyframes become a map: grown where it lacks something, fitted to a window, bounded."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 
+from .anchor_spheres import AnchorSpheres, PlacedCamera
 from .changes import ChangeLog, Changes
 from .exposure import Exposure, estimated_exposure
 from .insertion import InsertionConfig, insert
@@ -19,6 +20,8 @@ from .model import GaussianMap
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
 from .render import Rendering, render
+from .sleep import SleepingGaussians, whole_map
+from .sleep_choice import SleepConfig, choose_sleepers
 from .views import View, schedule, shared_surface
 
 
@@ -48,6 +51,8 @@ class MapBuilderConfig:
     window: WindowConfig = field(default_factory=WindowConfig)
     pruning: PruningConfig = field(default_factory=PruningConfig)
     store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)
+    sleep: SleepConfig = field(default_factory=SleepConfig)
+    recent_cameras: int = 8  # what the last keyframes see stays awake
     prune_keyframes: int = 5  # between two prunings
     refined_m: float = 2e-4  # a keyframe that the optimiser moved by so much, or
     refined_rad: float = 2e-4  # turned by so much, is told of
@@ -72,10 +77,11 @@ class MapBuilder:
         folder: Path | None = None,
         threads: int = 1,
     ) -> None:
-        """Images of keyframes go to `folder`, or to a temporary one."""
+        """Images of keyframes and sleeping Gaussians go to `folder`, or to a temporary one."""
         self.config = config or MapBuilderConfig()
         self.gaussians = GaussianMap()
-        self.views = KeyframeViews(KeyframeStore(folder, self.config.store))
+        self.sleeping = SleepingGaussians(folder and folder / "gaussians")
+        self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self._threads = threads
         self._optimiser = Optimiser(self.config.optimiser, threads=threads)
         self._log = ChangeLog()
@@ -91,6 +97,7 @@ class MapBuilder:
 
         T_map_camera [4, 4]; `iterations` of the optimiser. Its Gaussians hang on it.
         """
+        self._wake(PlacedCamera(frame.camera, T_map_camera))
         before = self._seen_from(frame, T_map_camera)
         exposure = self._exposure(frame, before)
         self._insert(frame, T_map_camera, keyframe, before, exposure)
@@ -111,7 +118,7 @@ class MapBuilder:
         estimated = estimated_exposure(before.color, before.opacity, color)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
-        return self.views.stands[self._newest].exposure
+        return self.views.exposures[self._newest]
 
     def _insert(
         self,
@@ -159,8 +166,7 @@ class MapBuilder:
         return [k for k in (*earlier, *recent) if self._shared(newest, k) >= window.min_shared]
 
     def _shared(self, newest: View, keyframe: int) -> float:
-        stand = self.views.stands[keyframe]
-        return shared_surface(newest, stand.camera, stand.T_map_camera)
+        return shared_surface(newest, self.views.cameras[keyframe], self.views.poses[keyframe])
 
     def _rng(self, *what: int) -> np.random.Generator:
         """Of one piece of work: nothing to keep between two."""
@@ -169,13 +175,22 @@ class MapBuilder:
     def _fit(self, plan: Iterable[int], rates: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
         """Mask [N] of the Gaussians that changed."""
         steps_before = self._optimiser.steps(self.gaussians).copy()
-        plan = [k for k in plan if self.views.is_readable(k)]
-        first = next(iter(self.views.stands), None)
+        plan = list(plan)
+        usable = {k for k in set(plan) if self._is_usable(k)}
+        plan = [k for k in plan if k in usable]
+        first = next(iter(self.views.poses), None)
         self._optimiser.optimise(self.gaussians, self.views, plan, rates=rates, fixed=first)
         self._iterations += len(plan)
         touched = self._optimiser.steps(self.gaussians) != steps_before
         self._log.changed(touched)
         return touched
+
+    def _is_usable(self, keyframe: int) -> bool:
+        """Its images are there, and nothing of what it may see sleeps: or what is awake would be
+        bent to stand in for it."""
+        camera = PlacedCamera(self.views.cameras[keyframe], self.views.poses[keyframe])
+        is_awake = not self.sleeping.seen_from(camera, self.views.poses, self._reach_m)
+        return is_awake and self.views.is_readable(keyframe)
 
     def refine(self, iterations: int, rates: tuple[float, float] = (1.0, 1.0)) -> None:
         """Fit to random keyframes, with steps that shrink or grow from one rate to the other."""
@@ -194,6 +209,39 @@ class MapBuilder:
         self._log.removing(self.gaussians, mask)
         self._pruned += self.gaussians.remove(mask)
 
+    # --- sleep ------------------------------------------------------------------------------------
+    @property
+    def _reach_m(self) -> float:
+        return self.config.sleep.reach_m
+
+    def _wake(self, camera: PlacedCamera) -> None:
+        seen = self.sleeping.seen_from(camera, self.views.poses, self._reach_m)
+        ids = self.sleeping.return_to(self.gaussians, seen, self.views.poses)
+        self._log.woken(self.gaussians, ids)
+
+    def rest(self) -> None:
+        """Let Gaussians sleep where there are too many. To be called when followers know all that
+        changed: to them sleeping Gaussians are as before."""
+        if len(self.gaussians) <= self.config.sleep.max_active:
+            return
+        poses = self.views.poses
+        recent = [
+            PlacedCamera(self.views.cameras[k], poses[k])
+            for k in list(poses)[-self.config.recent_cameras :]
+        ]
+        awake = AnchorSpheres.around(self.gaussians.rows, self.gaussians.anchors, poses)
+        choice = choose_sleepers(awake, poses, recent, self.config.sleep)
+        self.sleeping.take_from(self.gaussians, choice.anchors, poses)
+        self._log.all_told(self.gaussians)
+
+    def size(self) -> int:
+        """Gaussians, awake and asleep."""
+        return len(self.gaussians) + len(self.sleeping)
+
+    def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """The whole map, in pieces of ids, rows and anchors; ids ascend throughout."""
+        yield from whole_map(self.gaussians, self.sleeping, self.views.poses)
+
     # --- telling others ---------------------------------------------------------------------------
     def changes(self, *, with_changed: bool) -> Changes:
         """What followers of the map do not know yet; see `ChangeLog.take`."""
@@ -202,9 +250,9 @@ class MapBuilder:
     def refined(self) -> dict[int, np.ndarray]:
         """T_map_keyframe of keyframes that the optimiser moved since others were told."""
         moved = {
-            keyframe: stand.T_map_camera
-            for keyframe, stand in self.views.stands.items()
-            if self._is_news(keyframe, stand.T_map_camera)
+            keyframe: T_map_keyframe
+            for keyframe, T_map_keyframe in self.views.poses.items()
+            if self._is_news(keyframe, T_map_keyframe)
         }
         self._told.update(moved)
         return moved
@@ -221,9 +269,9 @@ class MapBuilder:
 
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Keyframes were corrected: what hangs on each goes with it, and its view."""
-        T_map = {k: T @ self.views.stands[k].T_map_camera for k, T in T_new_old.items()}
+        T_map = {k: T @ self.views.poses[k] for k, T in T_new_old.items()}
         self.gaussians.move_anchors(T_new_old)
-        self.views.move(T_map)
+        self.views.poses.update(T_map)
         self._told.update(T_map)
 
     # --- state ------------------------------------------------------------------------------------
@@ -231,6 +279,7 @@ class MapBuilder:
         """A copy of everything but the images in the store."""
         return {
             "map": self.gaussians.snapshot(),
+            "sleeping": self.sleeping.snapshot(),
             "optimiser": self._optimiser.snapshot(),
             "views": self.views.snapshot(),
             "told": np.array(list(self._told.values())).reshape(-1, 4, 4),
@@ -243,7 +292,8 @@ class MapBuilder:
         self.gaussians = GaussianMap.restore(state["map"])
         self._optimiser.restore(state["optimiser"])
         self.views.restore(state["views"])
-        self._told = dict(zip(self.views.stands, state["told"], strict=True))
+        self.sleeping.restore(state["sleeping"])
+        self._told = dict(zip(self.views.poses, state["told"], strict=True))
         self._newest, self._iterations = state["newest"], state["iterations"]
         self._log.all_told(self.gaussians)
 
@@ -252,5 +302,6 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self._iterations,
+            **self.sleeping.statistics(),
             **self.views.store.statistics(),
         }

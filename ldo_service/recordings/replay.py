@@ -2,8 +2,10 @@
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import yaml
 
@@ -30,7 +32,8 @@ class RecordedActor:
 
     def replay(self, advance: Callable[[], None] = lambda: None) -> Replayed:
         """Feed it to a fresh actor; `advance` is called after each step."""
-        return replay(self.name, self.files, self._make, advance)
+        with TemporaryDirectory(prefix="ldo-replay-") as folder:
+            return replay(self.name, self.files, partial(self._make, Path(folder)), advance)
 
     def verify(self) -> Replayed:
         """Replay. Raises ReplayDiverged, or DataError when something was not recorded."""
@@ -38,10 +41,12 @@ class RecordedActor:
         replayed.verify()
         return replayed
 
-    def _make(self, about: Mapping[str, str]) -> Actor:
+    def _make(self, folder: Path, about: Mapping[str, str]) -> Actor:
+        """One that keeps on disk what outlives it, as it did then, and not where it did."""
         make = box_named(self.name).make
         assert make is not None
-        return make(config_of(yaml.safe_load(about.get("config", "")) or {}))
+        config = config_of(yaml.safe_load(about.get("config", "")) or {})
+        return make(replace(config, mapper=replace(config.mapper, folder=str(folder))))
 
     def caveats(self) -> list[str]:
         """Why the bits may differ here although nothing is wrong."""
