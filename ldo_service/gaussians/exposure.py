@@ -8,9 +8,10 @@ import numpy as np
 LEAST_GAIN = 0.1  # below, nothing of the map's brightness can be told from the image
 BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of brightness
 SATURATED = 0.97  # of the range: beyond, the sensor says no more
-FEWEST_BLOCKS = 100
+LEAST_SHARE = 0.15  # of the image that must be comparable
+FEWEST_BLOCKS = 16
 OUTLIER_SIGMAS = 2.5
-ROUNDS = 3
+ROUNDS = 6
 GAIN_PRIOR = 1e-4  # variance of colour below which gain 1 is believed more than the images
 
 
@@ -62,8 +63,9 @@ def estimated_exposure(
     too few.
     """
     x, y = _averaged(rendered), _averaged(seen)
-    usable = (_averaged(opacity) > 0.95) & (y.max(axis=-1) < SATURATED)
-    if np.count_nonzero(usable) < FEWEST_BLOCKS:
+    saturated = _averaged(seen.max(axis=-1) >= SATURATED)
+    usable = (_averaged(opacity) > 0.95) & (saturated == 0)
+    if np.count_nonzero(usable) < max(FEWEST_BLOCKS, LEAST_SHARE * usable.size):
         return None
     channels = [_robust_line(x[usable, c], y[usable, c]) for c in range(3)]
     return Exposure.of(np.array(channels).T)

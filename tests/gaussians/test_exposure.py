@@ -1,6 +1,6 @@
 import numpy as np
 
-from ldo_service.gaussians import Exposure, fitted_exposure
+from ldo_service.gaussians import Exposure, estimated_exposure, fitted_exposure
 
 
 def test_exposure_starts_by_changing_nothing() -> None:
@@ -25,3 +25,51 @@ def test_fit_finds_the_exposure_that_was_applied() -> None:
 def test_fit_of_an_image_without_contrast_changes_the_bias_only() -> None:
     found = fitted_exposure(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.7))
     np.testing.assert_allclose(found.matrix, [[1, 1, 1], [0.2, 0.2, 0.2]], atol=1e-6)
+
+
+def shown_and_seen(gain: float, bias: float) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth map image, and the same through a camera that is a pixel off."""
+    rng = np.random.default_rng(3)
+    coarse = rng.uniform(0.1, 0.7, (8, 10, 3)).astype(np.float32)
+    shown = coarse.repeat(16, axis=0).repeat(16, axis=1)
+    seen = np.roll(shown, 1, axis=1) * np.float32(gain) + np.float32(bias)
+    return shown, seen.astype(np.float32)
+
+
+def test_exposure_of_a_new_image_is_found_beside_outliers_and_new_surface() -> None:
+    shown, seen = shown_and_seen(0.8, 0.05)
+    opacity = np.ones(shown.shape[:2], np.float32)
+    seen[:40, :40] = 0.9  # somebody walked in
+    opacity[:, 120:] = 0.3  # not mapped yet
+    found = estimated_exposure(shown, opacity, seen)
+    assert found is not None
+    np.testing.assert_allclose(found.gain, 0.8, atol=0.02)
+    np.testing.assert_allclose(found.bias, 0.05, atol=0.01)
+
+
+def test_saturated_pixels_say_nothing() -> None:
+    shown, seen = shown_and_seen(1.9, 0.0)
+    found = estimated_exposure(shown, np.ones(shown.shape[:2], np.float32), seen.clip(0, 1))
+    assert found is not None
+    np.testing.assert_allclose(found.gain, 1.9, atol=0.15)
+
+
+def test_without_a_map_behind_it_no_exposure_is_estimated() -> None:
+    shown, seen = shown_and_seen(0.8, 0.0)
+    opacity = np.zeros(shown.shape[:2], np.float32)
+    opacity[:16, :16] = 1
+    assert estimated_exposure(shown, opacity, seen) is None
+
+
+def test_one_colour_alone_changes_no_gain() -> None:
+    flat = np.full((160, 160, 3), 0.5, np.float32)
+    found = estimated_exposure(flat, np.ones((160, 160), np.float32), flat * np.float32(0.8))
+    assert found is not None
+    np.testing.assert_allclose(found.gain, 1.0, atol=1e-3)
+    np.testing.assert_allclose(found.applied(flat), 0.4, atol=1e-3)
+
+
+def test_removed_undoes_applied() -> None:
+    exposure = Exposure.of(np.array([[0.8, 1.1, 0.9], [0.05, -0.02, 0.0]]))
+    color = np.random.default_rng(0).uniform(0.1, 0.8, (4, 5, 3)).astype(np.float32)
+    np.testing.assert_allclose(exposure.removed(exposure.applied(color)), color, atol=1e-6)

@@ -1,0 +1,193 @@
+"""Keyframes become a map that looks like them, the same way each time, in bounded memory."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.evaluation.rendering import psnr
+from ldo_service.gaussians import OptimiserConfig, PruningConfig, render
+from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, WindowConfig
+from ldo_service.gaussians.sleep_choice import SleepConfig
+from ldo_service.geometry import RgbdFrame, se3
+
+KEYFRAMES = (0, 6, 12, 18)
+HELD_OUT = (3, 9, 15)
+
+
+@pytest.fixture(scope="module")
+def posed(room) -> dict[int, tuple[RgbdFrame, np.ndarray]]:
+    """Frames of a quarter of their size, and where they were taken."""
+    truth = room.truth()
+    return {
+        i: (halved(halved(room[i])), truth.T_world_camera[i])
+        for i in sorted((*KEYFRAMES, *HELD_OUT))
+    }
+
+
+def halved(frame: RgbdFrame) -> RgbdFrame:
+    size = (frame.camera.height // 2, 2, frame.camera.width // 2, 2, -1)
+    color = frame.color.astype(float).reshape(size).mean(axis=(1, 3))
+    depth_m = frame.depth_m.reshape(size).mean(axis=(1, 3))[..., 0]
+    return RgbdFrame(np.round(color).astype(np.uint8), depth_m, frame.camera.halved())
+
+
+def built(
+    posed: dict, config: MapBuilderConfig | None = None, *, iterations: int = 10, **options
+) -> MapBuilder:
+    builder = MapBuilder(config, **options)
+    for keyframe, i in enumerate(KEYFRAMES):
+        builder.add(*posed[i], keyframe, iterations)
+    return builder
+
+
+def mean_psnr(builder: MapBuilder, posed: dict, frames=HELD_OUT) -> float:
+    values = []
+    for i in frames:
+        frame, T_map_camera = posed[i]
+        seen = render(builder.gaussians.rows, frame.camera, se3.inverse(T_map_camera)).color
+        values.append(psnr(seen.clip(0, 1), frame.color / np.float32(255)))
+    return float(np.mean(values))
+
+
+def test_fitting_improves_views_that_it_was_not_fitted_to(posed: dict) -> None:
+    inserted, fitted = built(posed, iterations=0), built(posed, iterations=15)
+    assert mean_psnr(fitted, posed) > mean_psnr(inserted, posed) + 1
+    refined = built(posed, iterations=15)
+    refined.refine(60, (1.0, 0.1))
+    assert mean_psnr(refined, posed) > mean_psnr(fitted, posed) + 0.5
+
+
+@pytest.mark.parametrize("threads", [2, 3])
+def test_the_same_keyframes_give_the_same_bits(posed: dict, threads: int) -> None:
+    config = MapBuilderConfig(
+        optimiser=OptimiserConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
+    )
+    one, many = (
+        built(posed, config, iterations=4),
+        built(posed, config, iterations=4, threads=threads),
+    )
+    assert one.gaussians.rows.tobytes() == many.gaussians.rows.tobytes()
+    assert [T.tobytes() for T in one.views.poses.values()] == [
+        T.tobytes() for T in many.views.poses.values()
+    ]
+
+
+def test_a_restored_builder_goes_on_as_its_predecessor(posed: dict, tmp_path: Path) -> None:
+    first = MapBuilder(folder=tmp_path)
+    for keyframe, i in enumerate(KEYFRAMES[:3]):
+        first.add(*posed[i], keyframe, 5)
+    second = MapBuilder(folder=tmp_path)
+    second.restore(first.snapshot())
+    for builder in (first, second):
+        builder.add(*posed[KEYFRAMES[3]], 3, 5)
+        builder.refine(5)
+    assert first.gaussians.rows.tobytes() == second.gaussians.rows.tobytes()
+    assert first.statistics()["iterations"] == second.statistics()["iterations"]
+
+
+def test_a_new_journey_finds_nothing_of_another_in_its_folder(posed: dict, tmp_path: Path) -> None:
+    built(posed, iterations=0, folder=tmp_path)
+    anew = MapBuilder(folder=tmp_path)
+    anew.add(*posed[KEYFRAMES[0]], 0, 3)
+    assert anew.views.store.keyframes() == [0]
+
+
+def test_a_darker_camera_leaves_the_brightness_of_the_map(posed: dict) -> None:
+    """Its exposure is found before its Gaussians are inserted, and theirs are the map's colours."""
+    frame, T = posed[6]
+    dark = {**posed, 6: (replace(frame, color=(0.7 * frame.color + 8).astype(np.uint8)), T)}
+    builder = built(dark, iterations=4)
+    assert np.abs(builder.views.exposures[1].gain - 0.7).max() < 0.06
+    assert mean_psnr(builder, posed) > mean_psnr(built(posed, iterations=4), posed) - 1.5
+
+
+def test_keyframes_that_are_gone_from_the_disk_are_left_out(posed: dict, tmp_path: Path) -> None:
+    builder = MapBuilder(folder=tmp_path)
+    builder.views.store.config = replace(builder.views.store.config, cache_mb=0)
+    for keyframe, i in enumerate(KEYFRAMES[:3]):
+        builder.add(*posed[i], keyframe, 2)
+    for file in sorted((tmp_path / "images").iterdir())[:2]:
+        file.write_bytes(file.read_bytes()[:-20])
+    builder.add(*posed[KEYFRAMES[3]], 3, 20)
+    assert builder.views.store.keyframes() == [2, 3]
+    assert 0 < builder.statistics()["iterations"] - 3 * 2 < 20
+
+
+def test_pruning_looks_at_what_was_fitted_alone(posed: dict) -> None:
+    config = MapBuilderConfig(pruning=PruningConfig(min_opacity=0.9), prune_keyframes=1)
+    builder = built(posed, config, iterations=3)
+    assert builder.statistics()["gaussians_pruned"] > 100
+    assert (1 / (1 + np.exp(-builder.gaussians.opacity_logits))).min() < 0.9 + 0.1
+
+
+def test_a_correction_moves_gaussians_and_view_together(posed: dict) -> None:
+    builder = built(posed, iterations=2)
+    before = mean_psnr(builder, posed, KEYFRAMES[:1])
+    T_new_old = se3.exp(np.array([0.1, -0.2, 0.05, 0.3, 0.1, -0.2]))
+    builder.move(dict.fromkeys(range(len(KEYFRAMES)), T_new_old))
+    frame, T = posed[KEYFRAMES[0]]
+    np.testing.assert_allclose(builder.views.poses[0], T_new_old @ T, atol=1e-12)
+    moved = {KEYFRAMES[0]: (frame, T_new_old @ T)}
+    assert abs(mean_psnr(builder, moved, KEYFRAMES[:1]) - before) < 0.1
+    assert builder.refined() == {}, "who moved it knows"
+
+
+def test_moved_keyframes_are_told_once(posed: dict) -> None:
+    config = MapBuilderConfig(
+        optimiser=OptimiserConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
+    )
+    builder = built(posed, config, iterations=10)
+    refined = builder.refined()
+    assert refined
+    assert 0 not in refined, "the first one fixes the place of the map"
+    assert builder.refined() == {}
+
+
+def elsewhere(posed: dict, x_m: float) -> dict:
+    """The same walk in another place: nothing is seen from the first."""
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return {i: (frame, T @ pose) for i, (frame, pose) in posed.items()}
+
+
+def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
+    config = MapBuilderConfig(sleep=SleepConfig(max_active=2000, reach_m=20), recent_cameras=2)
+    builder, far = MapBuilder(config), elsewhere(posed, 100.0)
+    for keyframe, i in enumerate(KEYFRAMES):
+        builder.add(*posed[i], keyframe, 2)
+        builder.changes(with_changed=True)
+    for keyframe, i in enumerate(KEYFRAMES, len(KEYFRAMES)):
+        builder.add(*far[i], keyframe, 2)
+        builder.changes(with_changed=True)
+        builder.rest()
+    asleep = builder.statistics()["gaussians_asleep"]
+    assert asleep > 1000
+    assert builder.size() == len(builder.gaussians) + asleep
+    whole = np.concatenate([ids for ids, _, _ in builder.pieces()])
+    assert np.all(np.diff(whole) > 0)
+    assert len(whole) == builder.size()
+    iterations = builder.statistics()["iterations"]
+    builder.refine(12)
+    assert builder.statistics()["iterations"] - iterations < 12, "views of what sleeps are left out"
+    size = builder.size()
+    builder.add(*posed[KEYFRAMES[0]], 2 * len(KEYFRAMES), 0)  # home again
+    assert builder.statistics()["gaussians_woken"] > 1000
+    assert builder.size() < 1.15 * size, "inserted a second time"
+    assert mean_psnr(builder, posed, KEYFRAMES[:1]) > 20
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"newest_share": 0.8, "covisible_share": 0.3},
+        {"newest_share": -0.1},
+        {"recent": -1},
+        {"min_shared": 1.5},
+    ],
+)
+def test_senseless_windows_are_refused(change: dict) -> None:
+    with pytest.raises(ConfigError):
+        WindowConfig(**change)
