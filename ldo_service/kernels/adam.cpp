@@ -38,7 +38,7 @@ void adam_step(AdamRows rows, const uint32_t* indices, const float* gradients, i
                const AdamRates& rates, int threads) {
   const Buffer<Correction> correction = corrections(rates);
   const Floats rate = Floats::load(rates.rate);
-  parallel_for((m + kJobRows - 1) / kJobRows, threads, [&](int64_t job) {
+  Team(threads).each((m + kJobRows - 1) / kJobRows, [&](int64_t job) {
     for (int64_t i = job * kJobRows; i < std::min(m, (job + 1) * kJobRows); ++i) {
       const Floats gradient = Floats::load(gradients + i * kAdamFloats);
       if (!any(Floats(0.0f) < abs(gradient))) continue;  // hidden behind others

@@ -20,9 +20,9 @@ decltype(&baseline::adam_step) adam_step_for(Isa isa) {
 decltype(&baseline::adam_step) chosen = nullptr;  // when the module is imported
 
 void require_indices(const uint32_t* indices, size_t m, size_t n) {
-  for (size_t i = 0; i < m; ++i)
-    require(indices[i] < n && (i == 0 || indices[i - 1] < indices[i]),
-            "indices must ascend and be below the number of rows.");
+  bool ascend = m == 0 || indices[m - 1] < n;
+  for (size_t i = 1; i < m; ++i) ascend = ascend && indices[i - 1] < indices[i];
+  require(ascend, "indices must ascend and be below the number of rows.");
 }
 
 void adam_step(const WritableArray& rows, const WritableArray& mean, const WritableArray& square,

@@ -216,12 +216,12 @@ void each_depth(const LossInput& in, int64_t row, F f) {
 }
 
 // The derivative needs the number of depths that count, so that is found first.
-void depth_loss(const LossInput& in, int threads, LossOutput& out) {
+void depth_loss(const LossInput& in, Team& team, LossOutput& out) {
   Buffer<DepthSums> rows(in.height);
   const int64_t size = static_cast<int64_t>(in.width) * in.height;
   const float* rendered = in.planes + 3 * size;
   float *by_depth = out.gradients + 3 * size, *by_opacity = out.gradients + 4 * size;
-  parallel_for(in.height, threads, [&](int64_t y) {
+  team.each(in.height, [&](int64_t y) {
     Floats count = 0.0f;
     each_depth(in, y, [&](int64_t, int, Floats depth) {
       count = count + select(Floats(0.0f) < depth, 1.0f, 0.0f);
@@ -231,7 +231,7 @@ void depth_loss(const LossInput& in, int threads, LossOutput& out) {
   double count = 0;
   for (int y = 0; y < in.height; ++y) count += rows[y].count;
   const float step = count > 0 ? in.weights.depth / static_cast<float>(count) : 0.0f;
-  parallel_for(in.height, threads, [&](int64_t y) {
+  team.each(in.height, [&](int64_t y) {
     Floats absolute = 0.0f;
     each_depth(in, y, [&](int64_t pixel, int n, Floats depth) {
       const Floats error = Floats::load_first(rendered + pixel, n) - depth;
@@ -250,9 +250,10 @@ void depth_loss(const LossInput& in, int threads, LossOutput& out) {
 }  // namespace
 
 void image_loss(const LossInput& in, int threads, LossOutput& out) {
+  Team team(threads);
   const int bands = (in.height + kBand - 1) / kBand, strips = (in.width + kStrip - 1) / kStrip;
   Buffer<RowSums> sums(static_cast<size_t>(3) * strips * in.height);
-  parallel_for(3 * bands * strips, threads, [&](int64_t job) {
+  team.each(3 * bands * strips, [&](int64_t job) {
     const int column = static_cast<int>(job / bands), band = static_cast<int>(job % bands);
     const int channel = column / strips, left = column % strips * kStrip, top = band * kBand;
     const Part part{channel, left, std::min(in.width, left + kStrip), top,
@@ -273,7 +274,7 @@ void image_loss(const LossInput& in, int threads, LossOutput& out) {
       out.exposure[3 + column / strips] += row.bias;
     }
   out.d_ssim = 1.0 - ssim;
-  depth_loss(in, threads, out);
+  depth_loss(in, team, out);
 }
 
 }  // namespace ldo::LDO_ISA

@@ -1,47 +1,112 @@
 // Jobs that may run side by side.
 //
-// The caller cuts the work into jobs without looking at the number of threads, and every job
-// writes its own part of the output: then the result has the same bits for any number of threads.
+// Every job writes its own part of the output. Where sums of floats are taken, the work is cut into
+// jobs without looking at the number of threads: then the result has the same bits for any number.
 #pragma once
 #include <algorithm>
 #include <atomic>
+#include <condition_variable>
 #include <cstdint>
-#include <memory>
+#include <mutex>
+#include <system_error>
 #include <thread>
+#include <vector>
 
 namespace ldo::LDO_ISA {
 
-class Workers {  // threads that are joined on every way out of the scope
+// The threads of one call, this one included: started once, joined on every way out of the scope.
+class Team {
  public:
-  explicit Workers(int capacity) : threads_(new std::thread[capacity]) {}
-  Workers(const Workers&) = delete;
-  Workers& operator=(const Workers&) = delete;
-  ~Workers() {
-    for (int i = 0; i < started_; ++i) threads_[i].join();
+  explicit Team(int threads) {
+    helpers_.reserve(threads - 1);
+    try {
+      for (int i = 1; i < threads; ++i) helpers_.emplace_back([this] { help(); });
+    } catch (const std::system_error&) {  // no more threads to be had: those that are do the work
+    }
   }
+  Team(const Team&) = delete;
+  Team& operator=(const Team&) = delete;
+  ~Team() {
+    open_round(nullptr, nullptr, 0);
+    for (std::thread& helper : helpers_) helper.join();
+  }
+
+  int size() const { return static_cast<int>(helpers_.size()) + 1; }
+
+  // Calls f(job) for every job in [0, jobs); returns when all are done. f must not throw.
   template <class F>
-  void start(const F& work) {
-    threads_[started_] = std::thread([&work] { work(); });
-    ++started_;
+  void each(int64_t jobs, const F& f) {
+    if (jobs <= 1 || helpers_.empty()) {
+      for (int64_t job = 0; job < jobs; ++job) f(job);
+      return;
+    }
+    const auto call = [](const void* function, int64_t job) {
+      (*static_cast<const F*>(function))(job);
+    };
+    open_round(call, &f, jobs);
+    work();
+    close_round();
   }
 
  private:
-  std::unique_ptr<std::thread[]> threads_;
-  int started_ = 0;
-};
+  using Call = void (*)(const void* function, int64_t job);
 
-// Calls f(job) for every job in [0, jobs) on up to `threads` threads, this one included; returns
-// when all are done. f must not throw.
-template <class F>
-void parallel_for(int64_t jobs, int threads, const F& f) {
-  std::atomic<int64_t> next{0};
-  const auto work = [&] {
-    for (int64_t job; (job = next.fetch_add(1, std::memory_order_relaxed)) < jobs;) f(job);
-  };
-  const int helpers = static_cast<int>(std::min<int64_t>(threads, jobs)) - 1;
-  Workers workers(std::max(helpers, 0));
-  for (int i = 0; i < helpers; ++i) workers.start(work);
-  work();
-}
+  void open_round(Call call, const void* function, int64_t jobs) {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      call_ = call;
+      function_ = function;
+      jobs_ = jobs;
+      next_ = 0;
+      ++round_;
+      is_open_ = true;
+    }
+    opened_.notify_all();
+  }
+
+  // Waits for the helpers that have begun; one that wakes later finds the round closed.
+  void close_round() {
+    yield_while([this] { return working_ > 0; });
+    std::unique_lock<std::mutex> lock(mutex_);
+    is_open_ = false;
+    left_.wait(lock, [this] { return working_ == 0; });
+  }
+
+  void work() {
+    for (int64_t job; (job = next_.fetch_add(1, std::memory_order_relaxed)) < jobs_;)
+      call_(function_, job);
+  }
+
+  void help() {
+    for (int64_t seen = 0;;) {
+      yield_while([&] { return round_ == seen; });
+      std::unique_lock<std::mutex> lock(mutex_);
+      opened_.wait(lock, [&] { return is_open_ && round_ != seen; });
+      seen = round_;
+      if (call_ == nullptr) return;
+      ++working_;
+      lock.unlock();
+      work();
+      lock.lock();
+      if (--working_ == 0) left_.notify_one();
+    }
+  }
+
+  // The next round is mostly a few microseconds away, and sleeping costs more.
+  template <class Condition>
+  static void yield_while(Condition condition) {
+    for (int i = 0; i < 64 && condition(); ++i) std::this_thread::yield();
+  }
+
+  std::vector<std::thread> helpers_;
+  std::mutex mutex_;
+  std::condition_variable opened_, left_;
+  Call call_ = nullptr;  // null: the last round
+  const void* function_ = nullptr;
+  int64_t jobs_ = 0;
+  std::atomic<int64_t> next_{0}, round_{0};
+  std::atomic<int> working_{0};
+  bool is_open_ = false;
+};
 
 }  // namespace ldo::LDO_ISA

@@ -27,7 +27,10 @@ struct alignas(64) Splat {
 // Tiles [x0, x1] x [y0, y1] that a splat may touch.
 struct TileRange {
   uint16_t x0, y0, x1, y1;
+  uint32_t first_pair;  // of the splat and its tiles, among the pairs of its piece
 };
+
+inline uint32_t area(const TileRange& r) { return (r.x1 - r.x0 + 1) * (r.y1 - r.y0 + 1); }
 
 // Rows [0, count) as columns of sixteen; missing ones are zero.
 inline void transpose_rows(const float* rows, int count, float (&columns)[kRowFloats][kLanes]) {
@@ -161,7 +164,7 @@ inline bool tiles_of(const SplatColumns& s, int lane, const View& view, TileRang
   if (!pixels_within(s.u[lane], s.x_radius[lane], view.width, x0, x1)) return false;
   if (!pixels_within(s.v[lane], s.y_radius[lane], view.height, y0, y1)) return false;
   const auto tile = [](int pixel) { return static_cast<uint16_t>(pixel / kTile); };
-  out = {tile(x0), tile(y0), tile(x1), tile(y1)};
+  out = {tile(x0), tile(y0), tile(x1), tile(y1), 0};
   return true;
 }
 

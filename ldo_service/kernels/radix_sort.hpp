@@ -9,12 +9,13 @@ struct Keyed {
   uint32_t key, value;
 };
 
-constexpr int kDigitBits = 11;
-constexpr int kDigits = 1 << kDigitBits;
+constexpr int kMaxDigitBits = 12;  // the histogram and the ends of all bins stay in cache
 
-// The pieces in which an array of n is worked on: few enough that their histograms stay in cache.
+// The pieces in which an array of n is sorted, one a thread: a stable sort has one result only, so
+// that here the number of threads may decide how the work is cut.
 struct Pieces {
-  explicit Pieces(int64_t n) : n(n), length(std::max<int64_t>(8192, (n + 15) / 16)) {}
+  Pieces(int64_t n, const Team& team)
+      : n(n), length(std::max<int64_t>(4096, (n + team.size() - 1) / team.size())) {}
   int64_t count() const { return (n + length - 1) / length; }
   int64_t begin(int64_t piece) const { return piece * length; }
   int64_t end(int64_t piece) const { return std::min(n, (piece + 1) * length); }
@@ -35,30 +36,41 @@ inline uint32_t to_offsets(uint32_t* counts, int64_t pieces, int64_t bins) {
   return sum;
 }
 
-inline void sort_digit(const Keyed* from, Keyed* to, const Pieces& pieces, uint32_t lowest,
-                       int shift, int threads, Buffer<uint32_t>& places) {
-  const auto digit = [=](const Keyed& k) { return (k.key - lowest) >> shift & (kDigits - 1); };
-  parallel_for(pieces.count(), threads, [&](int64_t piece) {
-    uint32_t* counts = &places[piece * kDigits];
-    std::fill(counts, counts + kDigits, 0u);
-    for (int64_t i = pieces.begin(piece); i < pieces.end(piece); ++i) ++counts[digit(from[i])];
+struct Digit {
+  uint32_t operator()(uint32_t key) const { return (key - lowest) >> shift & (bins() - 1); }
+  uint32_t bins() const { return uint32_t{1} << bits; }
+  uint32_t lowest;
+  int shift, bits;
+};
+
+inline void sort_by(Digit digit, const Keyed* from, Keyed* to, const Pieces& pieces, Team& team,
+                    Buffer<uint32_t>& places) {
+  const auto bins_of = [&](int64_t piece) { return &places[piece * digit.bins()]; };
+  team.each(pieces.count(), [&](int64_t piece) {
+    uint32_t* counts = bins_of(piece);
+    std::fill(counts, counts + digit.bins(), 0u);
+    for (int64_t i = pieces.begin(piece); i < pieces.end(piece); ++i) ++counts[digit(from[i].key)];
   });
-  to_offsets(places.data(), pieces.count(), kDigits);
-  parallel_for(pieces.count(), threads, [&](int64_t piece) {
-    uint32_t* place = &places[piece * kDigits];
+  to_offsets(places.data(), pieces.count(), digit.bins());
+  team.each(pieces.count(), [&](int64_t piece) {
+    uint32_t* place = bins_of(piece);
     for (int64_t i = pieces.begin(piece); i < pieces.end(piece); ++i)
-      to[place[digit(from[i])]++] = from[i];
+      to[place[digit(from[i].key)]++] = from[i];
   });
 }
 
 // Sorts items[0, n) by key, all in [lowest, highest]; equal keys keep their order. `spare` is as
 // large and is overwritten. Returns the one of the two that holds the result.
 inline Keyed* radix_sort(Keyed* items, Keyed* spare, int64_t n, uint32_t lowest, uint32_t highest,
-                         int threads) {
-  const Pieces pieces(n);
-  Buffer<uint32_t> places(pieces.count() * kDigits);
-  for (int shift = 0; shift < 32 && (highest - lowest) >> shift != 0; shift += kDigitBits) {
-    sort_digit(items, spare, pieces, lowest, shift, threads, places);
+                         Team& team) {
+  const int bits = highest == lowest ? 0 : 32 - __builtin_clz(highest - lowest);
+  if (bits == 0) return items;
+  const int digits = (bits + kMaxDigitBits - 1) / kMaxDigitBits;
+  const int digit_bits = (bits + digits - 1) / digits;
+  const Pieces pieces(n, team);
+  Buffer<uint32_t> places(pieces.count() << digit_bits);
+  for (int shift = 0; shift < bits; shift += digit_bits) {
+    sort_by({lowest, shift, digit_bits}, items, spare, pieces, team, places);
     std::swap(items, spare);
   }
   return items;

@@ -11,7 +11,6 @@ struct RecordedPass final : Pass {
     splats.splats.keep();
     lists.splats.keep();
     lists.slots.keep();
-    lists.pairs.keep();
     touched.keep();
     sums.keep();
   }
@@ -31,49 +30,53 @@ struct RecordedPass final : Pass {
 };
 
 template <class F>
-void each_tile(const TileLists& lists, int threads, const F& f) {
-  parallel_for(static_cast<int64_t>(lists.columns) * lists.rows, threads, [&](int64_t tile) {
+void each_tile(const TileLists& lists, Team& team, const F& f) {
+  team.each(static_cast<int64_t>(lists.columns) * lists.rows, [&](int64_t tile) {
     const uint32_t start = lists.start[tile];
     f(tile, static_cast<int>(tile % lists.columns), static_cast<int>(tile / lists.columns),
       lists.splats.data() + start, static_cast<int64_t>(lists.start[tile + 1] - start));
   });
 }
 
-// Sums over the tiles of a splat, in the order of the tiles.
-Floats sum_over_tiles(const RecordedPass& pass, int64_t splat) {
-  const uint32_t* slot = &pass.lists.slots[pass.lists.first[splat]];
-  Floats sum = 0.0f;
-  for (int64_t left = area(pass.splats.tiles[splat]); left > 0; --left)
-    sum = sum + Floats::load(&pass.sums[static_cast<int64_t>(*slot++) * kSumFloats]);
-  return sum;
-}
+// Sums over the tiles of each splat in turn, in the order of the tiles.
+class SumsOverTiles {
+ public:
+  SumsOverTiles(const RecordedPass& pass, int64_t piece)
+      : sums_(pass.sums.data()),
+        slot_(&pass.lists.slots[pass.splats.counts[piece].first_pair]),
+        end_(slot_ + pass.splats.counts[piece].pairs) {}
 
-// The sums lie in the order of the tiles: asked for early, they are there when they are added.
-// Inlined by force: GCC drops calls of a function that does nothing but prefetch.
-[[gnu::always_inline]] inline void prefetch_sums(const RecordedPass& pass, int64_t splat,
-                                                 int64_t end) {
-  const TileLists& lists = pass.lists;
-  if (splat + 64 < end) __builtin_prefetch(&lists.slots[lists.first[splat + 64]]);
-  if (splat + 24 >= end) return;
-  const uint32_t* slot = &lists.slots[lists.first[splat + 24]];
-  for (int64_t left = std::min<int64_t>(area(pass.splats.tiles[splat + 24]), 4); left > 0; --left)
-    __builtin_prefetch(&pass.sums[static_cast<int64_t>(*slot++) * kSumFloats]);
-}
+  [[gnu::always_inline]] inline Floats next(const TileRange& range) {
+    Floats sum = 0.0f;
+    for (const uint32_t* end = slot_ + area(range); slot_ < end; ++slot_) {
+      if (slot_ + kAhead < end_) __builtin_prefetch(sums_of(slot_[kAhead]));
+      sum = sum + Floats::load(sums_of(*slot_));
+    }
+    return sum;
+  }
+
+ private:
+  static constexpr int kAhead = 64;  // pairs: they lie in the order of the tiles
+  const float* sums_of(uint32_t slot) const { return sums_ + int64_t{slot} * kSumFloats; }
+  const float* sums_;
+  const uint32_t *slot_, *end_;
+};
 
 // The splats of one piece of the Gaussians, sixteen at a time.
 void differentiate_piece(const float* rows, const RecordedPass& pass,
-                         const ProjectionGradient& differentiate, int64_t piece, int64_t to,
+                         const ProjectionGradient& differentiate, int64_t piece,
                          const Gradients& out, PoseSums& pose) {
-  const int64_t begin = piece * kProjectionPiece, end = begin + pass.splats.counts[piece];
-  for (int64_t i = begin; i < end; i += kLanes, to += kLanes) {
-    const int count = static_cast<int>(std::min<int64_t>(kLanes, end - i));
+  const PieceCounts& counts = pass.splats.counts[piece];
+  SumsOverTiles sum_over_tiles(pass, piece);
+  for (int64_t done = 0; done < counts.splats; done += kLanes) {
+    const int count = static_cast<int>(std::min<int64_t>(kLanes, counts.splats - done));
+    const int64_t first = piece * kProjectionPiece + done, to = counts.first_splat + done;
+    const uint32_t* gaussians = &pass.splats.gaussians[first];
     Floats matrix[kLanes], sums[kLanes], gradient[kLanes];
-    const uint32_t* gaussians = &pass.splats.gaussians[i];
     for (int k = 0; k < kLanes; ++k) {  // the last is repeated, with no gradient
-      prefetch_sums(pass, i + k, end);
       matrix[k] =
           Floats::load(rows + static_cast<int64_t>(gaussians[std::min(k, count - 1)]) * kRowFloats);
-      sums[k] = k < count ? sum_over_tiles(pass, i + k) : Floats(0.0f);
+      sums[k] = k < count ? sum_over_tiles.next(pass.splats.tiles[first + k]) : Floats(0.0f);
     }
     transpose(matrix);
     transpose(sums);
@@ -93,9 +96,10 @@ void rasterise(const float* rows, int64_t n, const View& view, int threads, Pass
   auto& pass = static_cast<RecordedPass&>(memory);
   VisibleSplats& visible = pass.splats;
   TileLists& lists = pass.lists;
-  project(rows, n, view, threads, visible);
-  list_by_tile(visible, view, threads, lists);
-  each_tile(lists, threads, [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {
+  Team team(threads);
+  project(rows, n, view, team, visible);
+  list_by_tile(visible, view, team, lists);
+  each_tile(lists, team, [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {
     Tile tile(column, row, view);
     tile.blend<true>(visible.splats.data(), list, size);
     tile.store(out);
@@ -107,11 +111,12 @@ std::unique_ptr<Pass> new_pass() { return std::make_unique<RecordedPass>(); }
 void rasterise_planes(const float* rows, int64_t n, const View& view, int threads, Pass& opaque,
                       float* planes) {
   auto& pass = static_cast<RecordedPass&>(opaque);
-  project(rows, n, view, threads, pass.splats);
-  list_by_tile(pass.splats, view, threads, pass.lists);
+  Team team(threads);
+  project(rows, n, view, team, pass.splats);
+  list_by_tile(pass.splats, view, team, pass.lists);
   pass.touched.resize(pass.lists.splats.size());
   pass.blended.resize(static_cast<size_t>(pass.lists.columns) * pass.lists.rows * kBlocks);
-  each_tile(pass.lists, threads,
+  each_tile(pass.lists, team,
             [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
               Tile tile(column, row, view);
               tile.blend(pass.splats.splats.data(), list, size, pass.record(t));
@@ -125,8 +130,9 @@ void rasterise_planes(const float* rows, int64_t n, const View& view, int thread
 void backpropagate(const float* rows, Pass& opaque, const float* planes, const float* gradients,
                    NeedlePenalty penalty, int threads, Gradients out) {
   auto& pass = static_cast<RecordedPass&>(opaque);
+  Team team(threads);
   pass.sums.resize(pass.lists.splats.size() * kSumFloats);
-  each_tile(pass.lists, threads,
+  each_tile(pass.lists, team,
             [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
               TileGradient differentiate(column, row, pass.view, planes, gradients);
               const int64_t ahead = pass.size_of_tile(t + 1);
@@ -135,14 +141,11 @@ void backpropagate(const float* rows, Pass& opaque, const float* planes, const f
             });
 
   const int64_t pieces = pass.splats.counts.size();
-  Buffer<int64_t> first(pieces);
-  for (int64_t piece = 0, sum = 0; piece < pieces; sum += pass.splats.counts[piece++])
-    first[piece] = sum;
   Buffer<PoseSums> poses(pieces);
   const ProjectionGradient differentiate(pass.view, penalty);
-  parallel_for(pieces, threads, [&](int64_t piece) {
+  team.each(pieces, [&](int64_t piece) {
     PoseSums pose;
-    differentiate_piece(rows, pass, differentiate, piece, first[piece], out, pose);
+    differentiate_piece(rows, pass, differentiate, piece, out, pose);
     poses[piece] = pose;
   });
   std::fill(out.pose, out.pose + 6, 0.0);
