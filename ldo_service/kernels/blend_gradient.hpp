@@ -2,8 +2,11 @@
 //
 // With w_i = alpha_i T_i and q_i = dL/dC . c_i + dL/dD z_i + dL/dO, the part of L that a pixel
 // owes to splat i is w_i q_i, and
-//   dL/d ln(alpha_i) = w_i q_i - alpha_i / (1 - alpha_i) sum_{j > i} w_j q_j.
-// The sum over all j is known from the images; what is in front is taken off on the way.
+//   dL/d ln(alpha_i) = w_i (q_i - m_i),  m_i = sum_{j > i} w_j q_j / T_{i+1}:
+// what the splat shows against the mean of what it hides. The sum over all j is known from the
+// images and what is in front is taken off on the way, so that m is known behind every sixteenth
+// splat; from there m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i leads back through the sixteen without a
+// division, and the rounding of m shrinks as T_{i+1} / T_i.
 #pragma once
 #include "blend.hpp"
 
@@ -37,28 +40,46 @@ struct Moments {
   Floats zeroth, first, second;
 };
 
-// Sixteen pixels on the way from front to back.
+// Sixteen pixels on the way from front to back, sixteen splats at a time.
 struct BlockGradient {
   Floats px, py;             // pixels
   Floats gradient[kPlanes];  // of L by the images
   Floats behind;             // sum of w q over the splats that are still to come
   Floats transmittance = 1.0f;
 
-  // Weights and v of the next splat.
-  [[gnu::always_inline]] inline void differentiate(const Splat& s, Floats& weight, Floats& v) {
-    const Floats log2_alpha = log2_alpha_of(s, px - s.u, py - s.v);
-    const Floats alpha = capped_alpha(log2_alpha);
-    weight = alpha * transmittance;
-    const Floats q =
-        gradient[kRed] * s.color[0] +
-        (gradient[kGreen] * s.color[1] +
-         (gradient[kBlue] * s.color[2] + (gradient[kDepth] * s.z + gradient[kPlaneOpacity])));
-    const Floats own = weight * q;
-    behind = behind - own;
-    v = select(log2_alpha < kLog2MaxAlpha, own - alpha * behind * reciprocal(Floats(1.0f) - alpha),
-               0.0f);
-    transmittance = transmittance - weight;
+  // Weights and v of the next splats, which `next(i)` gives.
+  template <class Next>
+  [[gnu::always_inline]] inline void differentiate(int count, const Next& next, FloatsRow* weights,
+                                                   FloatsRow* v) {
+    alignas(64) FloatsRow passed[kLanes], mixed[kLanes], own[kLanes];  // 1 - alpha, alpha q, w q
+    for (int i = 0; i < count; ++i) {
+      const Splat& s = next(i);
+      const Floats alpha = capped_alpha(log2_alpha_of(s, px - s.u, py - s.v));
+      const Floats q =
+          gradient[kRed] * s.color[0] +
+          (gradient[kGreen] * s.color[1] +
+           (gradient[kBlue] * s.color[2] + (gradient[kDepth] * s.z + gradient[kPlaneOpacity])));
+      const Floats weight = alpha * transmittance;
+      transmittance = transmittance - weight;
+      const Floats part = weight * q;
+      behind = behind - part;
+      weight.store(weights[i]);
+      part.store(own[i]);
+      (alpha * q).store(mixed[i]);
+      (Floats(1.0f) - alpha).store(passed[i]);
+    }
+    Floats mean = behind / max(transmittance, kLeastTransmittance);
+    for (int i = count - 1; i >= 0; --i) {
+      const Floats pass = Floats::load(passed[i]);
+      const Floats by_log = Floats::load(own[i]) - Floats::load(weights[i]) * mean;
+      select(pass >= kLeastPassed, by_log, 0.0f).store(v[i]);
+      mean = pass * mean + Floats::load(mixed[i]);
+    }
   }
+
+ private:
+  // Keeps 0 / 0 away. What the floor does to pixels below it is far below what they count.
+  static constexpr float kLeastTransmittance = 1e-30f;
 };
 
 // Moments of v, by pixel with a lane per splat, about the splats' means (mx, my) as seen from the
@@ -140,19 +161,20 @@ class TileGradient {
                                                  float center_y, const Splat* splats,
                                                  const uint32_t* list, const uint32_t* places,
                                                  int count, float* sums) {
-    Floats weights[kLanes], v[kLanes], out[kLanes];
+    alignas(64) FloatsRow weights[kLanes], v[kLanes];
     alignas(64) float mean_x[kLanes] = {}, mean_y[kLanes] = {};
-    for (int i = 0; i < count; ++i) {
+    const auto next = [&](int i) -> const Splat& {
       const Splat& s = splats[list[places[i]]];
-      block.differentiate(s, weights[i], v[i]);
       mean_x[i] = s.u - center_x;
       mean_y[i] = s.v - center_y;
-    }
-    for (int i = count; i < kLanes; ++i) weights[i] = v[i] = 0.0f;
-    transpose(v);
-    moments_about_mean(v, Floats::load(mean_x), Floats::load(mean_y), out);
-    transpose(weights);
-    sum_weights(weights, out + kWeightRed);
+      return s;
+    };
+    block.differentiate(count, next, weights, v);
+    Floats by_pixel[kLanes], out[kLanes];
+    transpose(weights, count, by_pixel);  // first: these do not wait for v
+    sum_weights(by_pixel, out + kWeightRed);
+    transpose(v, count, by_pixel);
+    moments_about_mean(by_pixel, Floats::load(mean_x), Floats::load(mean_y), out);
     for (int k = kSplatSums; k < kSumFloats; ++k) out[k] = 0.0f;
     transpose(out);
     for (int i = 0; i < count; ++i) {

@@ -267,6 +267,21 @@ inline Floats reciprocal(Floats x) {
 
 inline Floats abs(Floats x) { return max(x, Floats(0.0f) - x); }
 
+#if defined(__AVX2__)
+struct SetBits {  // of every byte: which they are, from the lowest, and how many
+  struct {
+    uint8_t index[8];
+    uint8_t count;
+  } of_byte[256] = {};
+  constexpr SetBits() {
+    for (int byte = 0; byte < 256; ++byte)
+      for (int bit = 0; bit < 8; ++bit)
+        if (byte >> bit & 1) of_byte[byte].index[of_byte[byte].count++] = bit;
+  }
+};
+inline constexpr SetBits kSetBits;
+#endif
+
 // Writes the i in [0, n) whose words[i] has the bit set, in order; returns how many. Without
 // branches, as the bits follow no pattern. `out` has room for kLanes beyond n.
 inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out) {
@@ -282,7 +297,21 @@ inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out
     count += __builtin_popcount(set);
   }
 #else
-  for (int i = 0; i < n; ++i) {
+  int i = 0;
+#if defined(__AVX2__)
+  const __m256i wanted = _mm256_set1_epi32(1 << bit);
+  for (; i + 8 <= n; i += 8) {
+    const __m256i word = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(words + i));
+    const __m256i is_set = _mm256_cmpeq_epi32(_mm256_and_si256(word, wanted), wanted);
+    const int set = _mm256_movemask_ps(_mm256_castsi256_ps(is_set));
+    const __m128i lanes =
+        _mm_loadl_epi64(reinterpret_cast<const __m128i*>(kSetBits.of_byte[set].index));
+    const __m256i index = _mm256_add_epi32(_mm256_cvtepu8_epi32(lanes), _mm256_set1_epi32(i));
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + count), index);
+    count += kSetBits.of_byte[set].count;
+  }
+#endif
+  for (; i < n; ++i) {
     out[count] = static_cast<uint32_t>(i);
     count += words[i] >> bit & 1;
   }

@@ -74,4 +74,15 @@ inline void transpose(Floats (&rows)[kLanes]) {
   transpose_blocks<8>(rows);
 }
 
+// Sixteen floats in memory. Rows of `Floats` that are found by a number known only at run time lie
+// in these: GCC copies the structs through general registers.
+using FloatsRow = float[kLanes];
+
+// The columns of `count` rows in memory; missing rows are zero.
+inline void transpose(const FloatsRow* rows, int count, Floats (&columns)[kLanes]) {
+  for (int i = 0; i < kLanes; ++i)
+    columns[i] = i < count ? Floats::load(rows[i]) : Floats(0.0f);
+  transpose(columns);
+}
+
 }  // namespace ldo::LDO_ISA
