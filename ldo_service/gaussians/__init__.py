@@ -7,7 +7,7 @@ from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
-from .rasteriser import Rasteriser, RowGradients
+from .rasteriser import Rasteriser, Reached, RowGradients
 from .render import Rendering, render
 from .views import View
 
@@ -23,6 +23,7 @@ __all__ = [
     "OptimiserConfig",
     "PruningConfig",
     "Rasteriser",
+    "Reached",
     "Rendering",
     "RowGradients",
     "View",

@@ -2,14 +2,16 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from weakref import ref
 
 import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.kernels import _adam
 
+from .adam_step import AdamStep
 from .model import GaussianMap, aligned_rows
-from .rasteriser import RowGradients
+from .rasteriser import Rasteriser, Reached, RowGradients
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,7 @@ class Adam:
         self._ids = np.zeros(0, np.int64)
         self._moments = [aligned_rows(0), aligned_rows(0)]  # with room to grow
         self._steps = np.zeros(0, np.int32)
+        self._followed: tuple[ref[GaussianMap], int] | None = None  # whose ids, and which of them
 
     def step(
         self,
@@ -68,27 +71,54 @@ class Adam:
         Gaussians without any gradient (hidden, or not in `indices`) stay as they are.
         Kingma and Ba, 2015, algorithm 1. Bitwise equal for any number of threads.
         """
-        self._follow(gaussians.ids)
-        config, n = self.config, len(gaussians)
-        mean, square = (moment[:n] for moment in self._moments)
+        step = self._step(gaussians, rate)
         _adam.adam_step(
-            gaussians.rows,
-            mean,
-            square,
-            self._steps,
+            step.rows,
+            step.mean,
+            step.square,
+            step.steps,
             gradients.indices,
             gradients.rows,
-            config.rates() * np.float32(rate),
-            config.beta1,
-            config.beta2,
-            config.epsilon,
+            step.rates,
+            step.beta1,
+            step.beta2,
+            step.epsilon,
             threads,
         )
-        gaussians.touch()
+        gaussians.touch(gradients.indices)
+
+    def descend(
+        self,
+        gaussians: GaussianMap,
+        rasteriser: Rasteriser,
+        by_planes: np.ndarray,
+        *,
+        rate: float = 1.0,
+        needle_weight: float = 0.0,
+        needle_ratio: float = 1.0,
+    ) -> Reached:
+        """`step` against the gradients of what `rasteriser` last rendered of this map, which are
+        never written out; `Rasteriser.gradients` says what `by_planes` and the needles are."""
+        reached = rasteriser.descend(
+            by_planes,
+            self._step(gaussians, rate),
+            needle_weight=needle_weight,
+            needle_ratio=needle_ratio,
+        )
+        gaussians.touch(reached.indices)
+        return reached
+
+    def _step(self, gaussians: GaussianMap, rate: float) -> AdamStep:
+        self._follow(gaussians)
+        config, n = self.config, len(gaussians)
+        mean, square = (moment[:n] for moment in self._moments)
+        rates = config.rates() * np.float32(rate)
+        betas = config.beta1, config.beta2
+        return AdamStep(gaussians.rows, mean, square, self._steps, rates, *betas, config.epsilon)
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
         """[N] int32, how many steps each Gaussian has made. A view."""
-        self._follow(gaussians.ids)
+        self._follow(gaussians)
         return self._steps
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -103,13 +133,21 @@ class Adam:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Become what `state` is the snapshot of, exactly."""
+        self._followed = None
         self._ids, self._steps = state["ids"].copy(), state["steps"].copy()
         self._reserve(len(self._ids))
         for moment, saved in zip(self._moments, (state["mean"], state["square"]), strict=True):
             moment[: len(saved)], moment[len(saved) :] = saved, 0
 
-    def _follow(self, ids: np.ndarray) -> None:
+    def _follow(self, gaussians: GaussianMap) -> None:
         """Forget the Gaussians that went; those that came, or came back, begin with zeros."""
+        followed = ref(gaussians), gaussians.membership
+        if followed == self._followed:
+            return
+        self._followed = followed
+        self._match(gaussians.ids)
+
+    def _match(self, ids: np.ndarray) -> None:
         n = len(self._ids)
         if not np.array_equal(ids[:n], self._ids):
             self._sort_out(ids)

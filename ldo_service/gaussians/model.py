@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ldo_service.geometry import se3
+from ldo_service.kernels._rasterise import Bounds
 
 ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused
 _CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache
@@ -14,7 +15,9 @@ class GaussianMap:
     """Gaussians in the map frame, in order of insertion.
 
     `rows`, its columns (`means`, ...), `ids` and `anchors` are views without a copy, valid until
-    Gaussians come or go. Who writes through them calls `touch`. `version` grows with every change.
+    Gaussians come or go. Who writes through them calls `touch` before the next rendering. `version`
+    grows with every change, `membership` when Gaussians come or go. `bounds` says to `render` where
+    the rows lie, so that it reads those in view only.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
@@ -24,6 +27,8 @@ class GaussianMap:
         self._size = 0
         self._next_id = 0
         self.version = 0
+        self.membership = 0
+        self.bounds = Bounds()
 
     def __len__(self) -> int:
         return self._size
@@ -68,9 +73,17 @@ class GaussianMap:
         """[N] int32, id of the keyframe that each Gaussian moves with."""
         return self._anchors[: self._size]
 
-    def touch(self) -> None:
-        """Say that something was written through a view."""
+    def touch(self, rows: np.ndarray | slice | None = None) -> None:
+        """Say that something was written through a view: to the rows with these numbers
+        (uint32, or a slice without a step), or to any."""
         self.version += 1
+        if rows is None:
+            self.bounds.forget()
+        elif isinstance(rows, slice):
+            first, last, _ = rows.indices(self._size)
+            self.bounds.forget(first, max(first, last))
+        else:
+            self.bounds.forget_rows(rows)
 
     def add(self, rows: np.ndarray, anchor: int) -> np.ndarray:
         """Append rows [M, 16] that hang on keyframe `anchor`; returns their ids [M].
@@ -93,7 +106,8 @@ class GaussianMap:
         self._anchors[start:stop] = anchors
         self._size = stop
         self._next_id = int(ids[-1]) + 1 if len(ids) else self._next_id
-        self.touch()
+        self.membership += 1
+        self.touch(slice(start, stop))
 
     def remove(self, mask: np.ndarray) -> int:
         """Drop the Gaussians where mask [N] is true; the others keep their order and ids.
@@ -106,8 +120,9 @@ class GaussianMap:
         size = first + int(np.count_nonzero(keep))
         for array in (self._rows, self._ids, self._anchors):
             array[first:size] = array[first : self._size][keep]
+        self.touch(slice(first, None))
         removed, self._size = self._size - size, size
-        self.touch()
+        self.membership += 1
         return removed
 
     def take_out(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -146,6 +161,7 @@ class GaussianMap:
             array[first : self._size][stay] = array[first:old_size].copy()
             array[places] = returned
         self.touch()
+        self.membership += 1
 
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Move what hangs on each keyframe: mean <- T mean, quat <- q(T) quat.

@@ -103,7 +103,9 @@ class Optimiser:
         config = self.config
         # how it looks, and what is wrong
         T_camera_map = se3.inverse(view.T_map_camera)
-        planes = self._rasteriser.render(gaussians.rows, view.camera, T_camera_map)
+        planes = self._rasteriser.render(
+            gaussians.rows, view.camera, T_camera_map, bounds=gaussians.bounds
+        )
         by_planes = self._room_for(planes)
         loss = image_loss(
             planes,
@@ -115,15 +117,18 @@ class Optimiser:
             mask=view.mask,
             threads=self.threads,
         )
-        # who is to blame
-        gradients = self._rasteriser.gradients(
-            by_planes, needle_weight=config.needle_weight, needle_ratio=config.max_needle_ratio
+        # who is to blame, and a step of each
+        reached = self._adam.descend(
+            gaussians,
+            self._rasteriser,
+            by_planes,
+            rate=rate,
+            needle_weight=config.needle_weight,
+            needle_ratio=config.max_needle_ratio,
         )
-        # steps
-        self._adam.step(gaussians, gradients, rate=rate, threads=self.threads)
         if not is_fixed:
             view = self._exposed(view, loss.by_exposure, rate)
-            view = self._placed(view, gradients.xi, rate)
+            view = self._placed(view, reached.xi, rate)
         return loss, view
 
     def _room_for(self, planes: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _rasterise
 
+from .adam_step import AdamStep
 from .model import aligned_rows
 
 PLANES = 5  # red, green, blue, weighted depth, opacity
@@ -30,6 +31,20 @@ class RowGradients:
     xi: np.ndarray
 
 
+@dataclass(frozen=True, slots=True)
+class Reached:
+    """What a step of the optimiser reached. Views: valid until the next rendering.
+
+    indices  [V] uint32, ascending: the rows that may touch the image
+    weights  [V] float32, of each Gaussian, summed over the pixels (px); 0: hidden, and not moved
+    xi       [6] float64, dL/dxi at xi = 0 of T_map_camera exp(xi): rotation rad, translation m
+    """
+
+    indices: np.ndarray
+    weights: np.ndarray
+    xi: np.ndarray
+
+
 class Rasteriser:
     """Renders one view after the other for the optimiser, and keeps the memory for the next.
 
@@ -44,8 +59,16 @@ class Rasteriser:
         self._visible = 0
         self._indices = np.empty(0, np.uint32)
         self._gradients = aligned_rows(0)
+        self._weights = np.empty(0, np.float32)
 
-    def render(self, rows: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
+    def render(
+        self,
+        rows: np.ndarray,
+        camera: Camera,
+        T_camera_map: np.ndarray,
+        *,
+        bounds: _rasterise.Bounds | None = None,
+    ) -> np.ndarray:
         """Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity.
 
         Arguments as those of `render`; the result is overwritten by the next rendering.
@@ -58,7 +81,7 @@ class Rasteriser:
         T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         self._visible = _rasterise.rasterise_planes(
-            self._pass, rows, T, *intrinsics, self._planes, self.threads
+            self._pass, rows, T, *intrinsics, self._planes, self.threads, bounds
         )
         self._rows = rows
         return self._planes
@@ -72,19 +95,62 @@ class Rasteriser:
         axis of i) - log needle_ratio), with w_i held fixed. The rows must still be as they were
         rendered. Bitwise equal for any number of threads.
         """
-        if len(self._indices) < self._visible:
-            self._indices = np.empty(self._visible * 5 // 4, np.uint32)
+        indices = self._room_for_indices()
+        if len(self._gradients) < self._visible:
             self._gradients = aligned_rows(self._visible * 5 // 4)
-        seen = slice(self._visible)
+        gradients = self._gradients[: self._visible]
         xi = _rasterise.backpropagate(
             self._pass,
             self._rows,
             self._planes,
             by_planes,
-            self._indices[seen],
-            self._gradients[seen],
+            indices,
+            gradients,
             needle_weight,
             float(np.log(needle_ratio)),
             self.threads,
         )
-        return RowGradients(self._indices[seen], self._gradients[seen], xi)
+        return RowGradients(indices, gradients, xi)
+
+    def descend(
+        self,
+        by_planes: np.ndarray,
+        step: AdamStep,
+        *,
+        needle_weight: float = 0.0,
+        needle_ratio: float = 1.0,
+    ) -> Reached:
+        """The step of `step` against what `gradients` would give, to the same bits.
+
+        Changes the rows that were rendered, in place, and the moments. Their gradients stay in
+        cache, which saves a sixth of an iteration. Raises ValueError where `step` is for other
+        rows than were rendered last, or they were stepped on since.
+        """
+        indices = self._room_for_indices()
+        if len(self._weights) < self._visible:
+            self._weights = np.empty(self._visible * 5 // 4, np.float32)
+        weights = self._weights[: self._visible]
+        xi = _rasterise.descend(
+            self._pass,
+            step.rows,
+            step.mean,
+            step.square,
+            step.steps,
+            step.rates,
+            step.beta1,
+            step.beta2,
+            step.epsilon,
+            self._planes,
+            by_planes,
+            indices,
+            weights,
+            needle_weight,
+            float(np.log(needle_ratio)),
+            self.threads,
+        )
+        return Reached(indices, weights, xi)
+
+    def _room_for_indices(self) -> np.ndarray:
+        if len(self._indices) < self._visible:
+            self._indices = np.empty(self._visible * 5 // 4, np.uint32)
+        return self._indices[: self._visible]

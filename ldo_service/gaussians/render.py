@@ -36,7 +36,13 @@ class Rendering:
 
 
 def render(
-    rows: np.ndarray, camera: Camera, T_camera_map: np.ndarray, *, threads: int = 1
+    rows: np.ndarray,
+    camera: Camera,
+    T_camera_map: np.ndarray,
+    *,
+    threads: int = 1,
+    bounds: _rasterise.Bounds | None = None,
+    memory: _rasterise.Pass | None = None,
 ) -> Rendering:
     """Render Gaussians into a pinhole camera.
 
@@ -67,5 +73,7 @@ def render(
             camera.width,
             camera.height,
             threads,
+            memory,
+            bounds,
         )
     )

@@ -1,8 +1,5 @@
 // Python binding of Adam: checks what comes in, picks the instruction set.
-#include <cmath>
-
-#include "adam.hpp"
-#include "arrays.hpp"
+#include "adam_arguments.hpp"
 #include "isa.hpp"
 
 namespace ldo {
@@ -29,27 +26,14 @@ void adam_step(const WritableArray& rows, const WritableArray& mean, const Writa
                const WritableArray& steps, const Array& indices, const Array& gradients,
                const Array& rates, float beta1, float beta2, float epsilon, int threads) {
   require_threads(threads);
-  require(rows.ndim() == 2 && rows.shape(1) == kAdamFloats, "rows must have shape [N, 16].");
+  const AdamRows state = adam_rows_of(rows, mean, square, steps);
+  const AdamRates hyper = adam_rates_of(rates, beta1, beta2, epsilon);
   require(indices.ndim() == 1, "indices must have shape [M].");
-  const size_t n = rows.shape(0), m = indices.shape(0);
-  require_shape(mean, "mean", {n, kAdamFloats});
-  require_shape(square, "square", {n, kAdamFloats});
-  require_shape(steps, "steps", {n});
+  const size_t m = indices.shape(0);
   require_shape(gradients, "gradients", {m, kAdamFloats});
-  require_shape(rates, "rates", {kAdamFloats});
-  require(beta1 >= 0 && beta1 < 1 && beta2 >= 0 && beta2 < 1, "beta1, beta2 must be in [0, 1).");
-  require(epsilon > 0, "epsilon must be positive.");
   const uint32_t* which = values_of<uint32_t>(indices, "indices");
-  require_indices(which, m, n);
-  const AdamRows state{values_of<float>(rows, "rows"), values_of<float>(mean, "mean"),
-                       values_of<float>(square, "square"), values_of<int32_t>(steps, "steps")};
+  require_indices(which, m, rows.shape(0));
   const float* by_rows = values_of<float>(gradients, "gradients");
-  AdamRates hyper{{}, beta1, beta2, epsilon};
-  const float* rate = values_of<float>(rates, "rates");
-  for (int j = 0; j < kAdamFloats; ++j) {
-    require(std::isfinite(rate[j]) && rate[j] >= 0, "rates must be finite and not negative.");
-    hyper.rate[j] = rate[j];
-  }
   nb::gil_scoped_release release;
   chosen(state, which, by_rows, m, hyper, threads);
 }

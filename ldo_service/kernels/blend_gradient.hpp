@@ -5,8 +5,8 @@
 //   dL/d ln(alpha_i) = w_i (q_i - m_i),  m_i = sum_{j > i} w_j q_j / T_{i+1}:
 // what the splat shows against the mean of what it hides. The sum over all j is known from the
 // images and what is in front is taken off on the way, so that m is known behind every sixteenth
-// splat; from there m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i leads back through the sixteen without a
-// division, and the rounding of m shrinks as T_{i+1} / T_i.
+// splat; from there m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i leads back through the sixteen
+// without a division, and the rounding of m shrinks as T_{i+1} / T_i.
 #pragma once
 #include "blend.hpp"
 

@@ -1,6 +1,7 @@
 // Compiled once per instruction set, LDO_ISA.
 #include "rasterise.hpp"
 
+#include "adam_step.hpp"
 #include "projection_gradient.hpp"
 
 namespace ldo::LDO_ISA {
@@ -62,10 +63,11 @@ class SumsOverTiles {
   const uint32_t *slot_, *end_;
 };
 
-// The splats of one piece of the Gaussians, sixteen at a time.
-void differentiate_piece(const float* rows, const RecordedPass& pass,
-                         const ProjectionGradient& differentiate, int64_t piece,
-                         const Gradients& out, PoseSums& pose) {
+// Calls take(place among the visible, row number, gradient) for the splats of one piece of the
+// Gaussians, which are differentiated sixteen at a time.
+template <class Take>
+void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& differentiate,
+                         int64_t piece, PoseSums& pose, const Take& take) {
   const PieceCounts& counts = pass.splats.counts[piece];
   SumsOverTiles sum_over_tiles(pass, piece);
   for (int64_t done = 0; done < counts.splats; done += kLanes) {
@@ -74,8 +76,7 @@ void differentiate_piece(const float* rows, const RecordedPass& pass,
     const uint32_t* gaussians = &pass.splats.gaussians[first];
     Floats matrix[kLanes], sums[kLanes], gradient[kLanes];
     for (int k = 0; k < kLanes; ++k) {  // the last is repeated, with no gradient
-      matrix[k] =
-          Floats::load(rows + static_cast<int64_t>(gaussians[std::min(k, count - 1)]) * kRowFloats);
+      matrix[k] = Floats::load(pass.rows + int64_t{gaussians[std::min(k, count - 1)]} * kRowFloats);
       sums[k] = k < count ? sum_over_tiles.next(pass.splats.tiles[first + k]) : Floats(0.0f);
     }
     transpose(matrix);
@@ -84,35 +85,72 @@ void differentiate_piece(const float* rows, const RecordedPass& pass,
     for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
     differentiate(columns, sums, gradient, pose);
     transpose(gradient);
-    for (int k = 0; k < count; ++k) gradient[k].store(out.rows + (to + k) * kRowFloats);
-    std::copy(gaussians, gaussians + count, out.indices + to);
+    for (int k = 0; k < count; ++k) take(to + k, gaussians[k], gradient[k]);
   }
+}
+
+void differentiate_tiles(RecordedPass& pass, const float* planes, const float* gradients,
+                         Team& team) {
+  pass.sums.resize(pass.lists.splats.size() * kSumFloats);
+  each_tile(pass.lists, team,
+            [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
+              TileGradient differentiate(column, row, pass.view, planes, gradients);
+              const int64_t ahead = pass.size_of_tile(t + 1);
+              differentiate(pass.splats.splats.data(), list, size, ahead, pass.record(t),
+                            pass.sums.data() + pass.lists.start[t] * int64_t{kSumFloats});
+            });
+}
+
+void add_up(const Buffer<PoseSums>& poses, double* out) {
+  std::fill(out, out + 6, 0.0);
+  for (size_t piece = 0; piece < poses.size(); ++piece) {
+    const auto& [rotation, translation] = poses[piece];
+    const Floats lanes[6] = {rotation.x,    rotation.y,    rotation.z,
+                             translation.x, translation.y, translation.z};
+    for (int k = 0; k < 6; ++k) out[k] += sum(lanes[k]);
+  }
+}
+
+// From the derivatives by the images to those by the rows, which `take` gets one by one.
+template <class Take>
+void differentiate(Pass& opaque, const float* planes, const float* gradients, NeedlePenalty penalty,
+                   int threads, double* by_pose, const Take& take) {
+  auto& pass = static_cast<RecordedPass&>(opaque);
+  Team team(threads);
+  differentiate_tiles(pass, planes, gradients, team);
+  Buffer<PoseSums> poses(pass.splats.counts.size());
+  const ProjectionGradient differentiate(pass.view, penalty);
+  team.each(poses.size(), [&](int64_t piece) {
+    PoseSums pose;
+    differentiate_piece(pass, differentiate, piece, pose, take);
+    poses[piece] = pose;
+  });
+  add_up(poses, by_pose);
 }
 
 }  // namespace
 
-void rasterise(const float* rows, int64_t n, const View& view, int threads, Pass& memory,
+void rasterise(const Gaussians& gaussians, const View& view, int threads, Pass& memory,
                Images out) {
   auto& pass = static_cast<RecordedPass&>(memory);
-  VisibleSplats& visible = pass.splats;
-  TileLists& lists = pass.lists;
   Team team(threads);
-  project(rows, n, view, team, visible);
-  list_by_tile(visible, view, team, lists);
-  each_tile(lists, team, [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {
-    Tile tile(column, row, view);
-    tile.blend<true>(visible.splats.data(), list, size);
-    tile.store(out);
-  });
+  project(gaussians, view, team, pass.splats);
+  list_by_tile(pass.splats, view, team, pass.lists);
+  each_tile(pass.lists, team,
+            [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {
+              Tile tile(column, row, view);
+              tile.blend<true>(pass.splats.splats.data(), list, size);
+              tile.store(out);
+            });
 }
 
 std::unique_ptr<Pass> new_pass() { return std::make_unique<RecordedPass>(); }
 
-void rasterise_planes(const float* rows, int64_t n, const View& view, int threads, Pass& opaque,
+void rasterise_planes(const Gaussians& gaussians, const View& view, int threads, Pass& opaque,
                       float* planes) {
   auto& pass = static_cast<RecordedPass&>(opaque);
   Team team(threads);
-  project(rows, n, view, team, pass.splats);
+  project(gaussians, view, team, pass.splats);
   list_by_tile(pass.splats, view, team, pass.lists);
   pass.touched.resize(pass.lists.splats.size());
   pass.blended.resize(static_cast<size_t>(pass.lists.columns) * pass.lists.rows * kBlocks);
@@ -122,39 +160,33 @@ void rasterise_planes(const float* rows, int64_t n, const View& view, int thread
               tile.blend(pass.splats.splats.data(), list, size, pass.record(t));
               tile.store_planes(planes);
             });
-  pass.gaussians = n;
+  pass.rows = gaussians.rows;
+  pass.gaussians = gaussians.n;
   pass.visible = pass.splats.count;
   pass.view = view;
 }
 
-void backpropagate(const float* rows, Pass& opaque, const float* planes, const float* gradients,
-                   NeedlePenalty penalty, int threads, Gradients out) {
-  auto& pass = static_cast<RecordedPass&>(opaque);
-  Team team(threads);
-  pass.sums.resize(pass.lists.splats.size() * kSumFloats);
-  each_tile(pass.lists, team,
-            [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
-              TileGradient differentiate(column, row, pass.view, planes, gradients);
-              const int64_t ahead = pass.size_of_tile(t + 1);
-              differentiate(pass.splats.splats.data(), list, size, ahead, pass.record(t),
-                            pass.sums.data() + pass.lists.start[t] * int64_t{kSumFloats});
-            });
+void backpropagate(Pass& pass, const float* planes, const float* gradients, NeedlePenalty penalty,
+                   int threads, Gradients out) {
+  differentiate(pass, planes, gradients, penalty, threads, out.pose,
+                [&](int64_t place, uint32_t row, Floats gradient) {
+                  out.indices[place] = row;
+                  gradient.store(out.rows + place * kRowFloats);
+                });
+}
 
-  const int64_t pieces = pass.splats.counts.size();
-  Buffer<PoseSums> poses(pieces);
-  const ProjectionGradient differentiate(pass.view, penalty);
-  team.each(pieces, [&](int64_t piece) {
-    PoseSums pose;
-    differentiate_piece(rows, pass, differentiate, piece, out, pose);
-    poses[piece] = pose;
-  });
-  std::fill(out.pose, out.pose + 6, 0.0);
-  for (int64_t piece = 0; piece < pieces; ++piece) {
-    const auto& [rotation, translation] = poses[piece];
-    const Floats lanes[6] = {rotation.x,    rotation.y,    rotation.z,
-                             translation.x, translation.y, translation.z};
-    for (int k = 0; k < 6; ++k) out.pose[k] += sum(lanes[k]);
-  }
+// In place: nothing reads a row again once its gradient is known.
+void descend(Pass& pass, const float* planes, const float* gradients, NeedlePenalty penalty,
+             AdamRows rows, const AdamRates& rates, int threads, Reached out) {
+  const AdamStep step(rows, rates);
+  differentiate(pass, planes, gradients, penalty, threads, out.pose,
+                [&](int64_t place, uint32_t row, Floats gradient) {
+                  alignas(64) float fields[kRowFloats];
+                  gradient.store(fields);
+                  out.indices[place] = row;
+                  out.weights[place] = fields[kWeight];
+                  step(row, gradient);
+                });
 }
 
 }  // namespace ldo::LDO_ISA

@@ -3,6 +3,8 @@
 #include <cstdint>
 #include <memory>
 
+#include "adam.hpp"
+
 namespace ldo {
 
 // One Gaussian is one row of 16 floats, one cache line.
@@ -22,6 +24,22 @@ struct View {
   int width, height;
 };
 
+// What is known of kBlockRows consecutive rows. Keyframes insert Gaussians in the order of their
+// pixels, so that such a block is a small patch, and one that no ray of the view comes near is
+// left out unread.
+struct BlockBound {
+  float low[3], high[3];  // of the means, metres
+  float sigma;            // the largest standard deviation, metres
+  bool is_known = false;  // a block whose rows may have changed is read, and measured on the way
+};
+constexpr int64_t kBlockRows = 256;
+
+struct Gaussians {
+  const float* rows;
+  int64_t n;
+  BlockBound* bounds;  // [ceil(n / kBlockRows)], or null: every row is read
+};
+
 struct Images {         // row-major, height x width
   float* color;         // 3 floats a pixel, background black
   float* depth;         // sum of weight * z, metres: divide by opacity for a mean
@@ -39,6 +57,7 @@ constexpr int kWeight = kFields;  // no gradient: the Gaussian's weights summed 
 class Pass {
  public:
   virtual ~Pass() = default;
+  const float* rows = nullptr;  // that were rendered
   int64_t gaussians = 0, visible = 0;
   View view{};
 };
@@ -55,15 +74,21 @@ struct Gradients {
   double* pose;       // [6] by xi in T_map_camera exp(xi): rotation, then translation
 };
 
-#define LDO_DECLARE_RASTERISE(isa)                                                          \
-  namespace isa {                                                                           \
-  void rasterise(const float* rows, int64_t n, const View& view, int threads, Pass& memory, \
-                 Images out);                                                               \
-  std::unique_ptr<Pass> new_pass();                                                         \
-  void rasterise_planes(const float* rows, int64_t n, const View& view, int threads, Pass&, \
-                        float* planes);                                                     \
-  void backpropagate(const float* rows, Pass&, const float* planes, const float* gradients, \
-                     NeedlePenalty, int threads, Gradients out);                            \
+struct Reached {      // by a step of Adam
+  uint32_t* indices;  // as above
+  float* weights;     // [visible] of each row, summed over the pixels
+  double* pose;       // as above
+};
+
+#define LDO_DECLARE_RASTERISE(isa)                                                              \
+  namespace isa {                                                                               \
+  void rasterise(const Gaussians&, const View& view, int threads, Pass& memory, Images out);    \
+  std::unique_ptr<Pass> new_pass();                                                             \
+  void rasterise_planes(const Gaussians&, const View& view, int threads, Pass&, float* planes); \
+  void backpropagate(Pass&, const float* planes, const float* gradients, NeedlePenalty,         \
+                     int threads, Gradients out);                                               \
+  void descend(Pass&, const float* planes, const float* gradients, NeedlePenalty, AdamRows,     \
+               const AdamRates&, int threads, Reached out);                                     \
   }
 LDO_DECLARE_RASTERISE(baseline)
 LDO_DECLARE_RASTERISE(avx2)

@@ -1,14 +1,15 @@
 // Python binding of the rasteriser: checks what comes in, picks the instruction set.
+#include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
-#include <cmath>
 #include <memory>
 #include <mutex>
 #include <string>
 #include <tuple>
+#include <vector>
 
-#include "arrays.hpp"
+#include "adam_arguments.hpp"
 #include "isa.hpp"
 #include "rasterise.hpp"
 
@@ -28,10 +29,11 @@ struct Kernels {
   decltype(&baseline::new_pass) new_pass;
   decltype(&baseline::rasterise_planes) rasterise_planes;
   decltype(&baseline::backpropagate) backpropagate;
+  decltype(&baseline::descend) descend;
 };
 
 #define LDO_KERNELS(isa) \
-  Kernels { isa::rasterise, isa::new_pass, isa::rasterise_planes, isa::backpropagate }
+  Kernels { isa::rasterise, isa::new_pass, isa::rasterise_planes, isa::backpropagate, isa::descend }
 Kernels kernels_for(Isa isa) {
 #if LDO_X86
   if (isa == Isa::avx512) return LDO_KERNELS(avx512);
@@ -44,22 +46,30 @@ Kernels kernels_for(Isa isa) {
 
 Kernels kernels;  // chosen with isa
 
-// A pass as Python holds it: used by one call at a time.
+// A thing that is used by one call at a time.
+class Exclusive {
+ public:
+  explicit Exclusive(std::mutex& busy) : lock_(busy, std::try_to_lock) {
+    require(lock_.owns_lock(), "this pass is in use by another thread: give each its own.");
+  }
+
+ private:
+  std::unique_lock<std::mutex> lock_;
+};
+
+// A pass as Python holds it.
 class PassOfPython {
  public:
   PassOfPython() : pass_(kernels.new_pass()) {}
   bool is_rendered = false;
 
-  class Use {
+  class Use : Exclusive {
    public:
-    explicit Use(PassOfPython& owner) : lock_(owner.busy_, std::try_to_lock), pass_(*owner.pass_) {
-      require(lock_.owns_lock(), "this pass is in use by another thread: give each its own.");
-    }
+    explicit Use(PassOfPython& owner) : Exclusive(owner.busy_), pass_(*owner.pass_) {}
     Pass& operator*() const { return pass_; }
     Pass* operator->() const { return &pass_; }
 
    private:
-    std::unique_lock<std::mutex> lock_;
     Pass& pass_;
   };
 
@@ -68,7 +78,54 @@ class PassOfPython {
   std::mutex busy_;
 };
 
-const float* rows_of(const Array& rows, const std::string& name) {
+// The bounds of the blocks of an array of rows, which tells of every change.
+class BoundsOfPython {
+ public:
+  // Rows [first, last) have changed.
+  void forget(int64_t first, int64_t last) {
+    const Exclusive use(busy_);
+    require(0 <= first && first <= last, "rows [first, last) must not be negative.");
+    const int64_t size = blocks_.size();
+    for (int64_t block = first / kBlockRows; block < size && block * kBlockRows < last; ++block)
+      blocks_[block].is_known = false;
+  }
+  void forget_rows(const Array& indices) {
+    const Exclusive use(busy_);
+    require(indices.ndim() == 1, "indices must have shape [M].");
+    const uint32_t* rows = values_of<uint32_t>(indices, "indices");
+    for (size_t i = 0; i < indices.shape(0); ++i)
+      if (rows[i] / kBlockRows < blocks_.size()) blocks_[rows[i] / kBlockRows].is_known = false;
+  }
+
+  class Use : Exclusive {
+   public:
+    explicit Use(BoundsOfPython& owner) : Exclusive(owner.busy_), owner_(owner) {}
+    BlockBound* of(const float* rows, int64_t n) const { return owner_.follow(rows, n); }
+
+   private:
+    BoundsOfPython& owner_;
+  };
+
+ private:
+  // Rows that moved in memory, or came behind the others, are not known.
+  BlockBound* follow(const float* rows, int64_t n) {
+    if (rows != rows_) blocks_.clear();
+    if (n > n_ && n_ / kBlockRows < static_cast<int64_t>(blocks_.size()))
+      blocks_[n_ / kBlockRows].is_known = false;
+    blocks_.resize((n + kBlockRows - 1) / kBlockRows);
+    rows_ = rows;
+    n_ = n;
+    return blocks_.data();
+  }
+
+  std::vector<BlockBound> blocks_;
+  const float* rows_ = nullptr;
+  int64_t n_ = 0;
+  std::mutex busy_;
+};
+
+template <class AnyArray>
+const float* rows_of(const AnyArray& rows, const std::string& name) {
   require(rows.ndim() == 2 && rows.shape(1) == kRowFloats, name + " must have shape [N, 16].");
   require(rows.shape(0) <= static_cast<size_t>(kMaxGaussians), name + ": more than 2^27.");
   return values_of<float>(rows, name);
@@ -95,11 +152,27 @@ Image image(float* data, std::initializer_list<size_t> shape) {
   return Image(data, shape, owner);
 }
 
+// The rows that a rendering looks at: all of them, or those whose bounds come near the view.
+class Seen {
+ public:
+  Seen(const Array& rows, BoundsOfPython* bounds)
+      : gaussians{rows_of(rows, "rows"), static_cast<int64_t>(rows.shape(0)), nullptr} {
+    if (bounds == nullptr) return;
+    use_.emplace(*bounds);
+    gaussians.bounds = use_->of(gaussians.rows, gaussians.n);
+  }
+  Gaussians gaussians;
+
+ private:
+  std::optional<BoundsOfPython::Use> use_;
+};
+
 std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array& T_camera_map,
                                                  float fx, float fy, float cx, float cy, int width,
-                                                 int height, int threads, PassOfPython* memory) {
+                                                 int height, int threads, PassOfPython* memory,
+                                                 BoundsOfPython* bounds) {
   require_threads(threads);
-  const float* data = rows_of(rows, "rows");
+  const Seen seen(rows, bounds);
   const View view = view_of(T_camera_map, fx, fy, cx, cy, width, height);
   const size_t h = height, w = width, pixels = h * w;
   std::unique_ptr<float[]> color(new float[3 * pixels]), depth(new float[pixels]),
@@ -110,7 +183,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
   held.is_rendered = false;
   {
     nb::gil_scoped_release release;
-    kernels.rasterise(data, rows.shape(0), view, threads, *pass,
+    kernels.rasterise(seen.gaussians, view, threads, *pass,
                       {color.get(), depth.get(), median_depth.get(), opacity.get()});
   }
   return {image(color.release(), {h, w, 3}), image(depth.release(), {h, w}),
@@ -118,11 +191,12 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
 }
 
 int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_camera_map, float fx,
-                         float fy, float cx, float cy, const WritableArray& planes, int threads) {
+                         float fy, float cx, float cy, const WritableArray& planes, int threads,
+                         BoundsOfPython* bounds) {
   require_threads(threads);
   require(planes.ndim() == 3 && planes.shape(0) == kPlanes, "planes must have shape [5, H, W].");
   require(planes.shape(1) <= kMaxSide && planes.shape(2) <= kMaxSide, "planes are too large.");
-  const float* data = rows_of(rows, "rows");
+  const Seen seen(rows, bounds);
   float* images = values_of<float>(planes, "planes");
   const View view = view_of(T_camera_map, fx, fy, cx, cy, static_cast<int>(planes.shape(2)),
                             static_cast<int>(planes.shape(1)));
@@ -130,42 +204,83 @@ int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_c
   held.is_rendered = false;
   {
     nb::gil_scoped_release release;
-    kernels.rasterise_planes(data, rows.shape(0), view, threads, *pass, images);
+    kernels.rasterise_planes(seen.gaussians, view, threads, *pass, images);
   }
   held.is_rendered = true;
   return pass->visible;
 }
 
-nb::ndarray<nb::numpy, double> backpropagate(PassOfPython& held, const Array& rows,
-                                             const Array& planes, const Array& gradients,
-                                             const WritableArray& indices,
-                                             const WritableArray& row_gradients,
-                                             float needle_weight, float needle_log_ratio,
-                                             int threads) {
-  require_threads(threads);
-  const PassOfPython::Use pass(held);
-  require(needle_weight >= 0 && needle_log_ratio >= 0, "the needle penalty must not be negative.");
-  require(held.is_rendered, "this pass holds no rendering: call rasterise_planes first.");
-  const size_t height = pass->view.height, width = pass->view.width, visible = pass->visible;
-  const float* data = rows_of(rows, "rows");
-  require(static_cast<int64_t>(rows.shape(0)) == pass->gaussians,
-          "rows are not those that were rendered: their number has changed.");
-  require_shape(planes, "planes", {kPlanes, height, width});
-  require_shape(gradients, "gradients", {kPlanes, height, width});
+using PoseGradient = nb::ndarray<nb::numpy, double>;
+
+PoseGradient pose_gradient(std::unique_ptr<double[]> values) {
+  nb::capsule owner(values.get(), [](void* p) noexcept { delete[] static_cast<double*>(p); });
+  return PoseGradient(values.release(), {6}, owner);
+}
+
+// What every derivative of a rendering is asked for with, checked.
+struct Backward {
+  template <class AnyArray>
+  Backward(PassOfPython& held, const AnyArray& rows, const Array& planes, const Array& gradients,
+           float needle_weight, float needle_log_ratio, int threads)
+      : pass(held), penalty{needle_weight, needle_log_ratio}, threads(threads) {
+    require_threads(threads);
+    require(needle_weight >= 0 && needle_log_ratio >= 0,
+            "the needle penalty must not be negative.");
+    require(held.is_rendered, "this pass holds no rendering: call rasterise_planes first.");
+    const size_t height = pass->view.height, width = pass->view.width;
+    require(rows_of(rows, "rows") == pass->rows &&
+                static_cast<int64_t>(rows.shape(0)) == pass->gaussians,
+            "rows are not those that were rendered.");
+    require_shape(planes, "planes", {kPlanes, height, width});
+    require_shape(gradients, "gradients", {kPlanes, height, width});
+    images = values_of<float>(planes, "planes");
+    by_images = values_of<float>(gradients, "gradients");
+  }
+  PassOfPython::Use pass;
+  const NeedlePenalty penalty;
+  const int threads;
+  const float *images, *by_images;
+};
+
+PoseGradient backpropagate(PassOfPython& held, const Array& rows, const Array& planes,
+                           const Array& gradients, const WritableArray& indices,
+                           const WritableArray& row_gradients, float needle_weight,
+                           float needle_log_ratio, int threads) {
+  const Backward b(held, rows, planes, gradients, needle_weight, needle_log_ratio, threads);
+  const size_t visible = b.pass->visible;
   require_shape(indices, "indices", {visible});
   require_shape(row_gradients, "row_gradients", {visible, kRowFloats});
-  const float *images = values_of<float>(planes, "planes"),
-              *by_images = values_of<float>(gradients, "gradients");
   std::unique_ptr<double[]> pose(new double[6]);
   const Gradients out{values_of<uint32_t>(indices, "indices"),
                       values_of<float>(row_gradients, "row_gradients"), pose.get()};
   {
     nb::gil_scoped_release release;
-    kernels.backpropagate(data, *pass, images, by_images, {needle_weight, needle_log_ratio},
-                          threads, out);
+    kernels.backpropagate(*b.pass, b.images, b.by_images, b.penalty, threads, out);
   }
-  nb::capsule owner(pose.get(), [](void* p) noexcept { delete[] static_cast<double*>(p); });
-  return nb::ndarray<nb::numpy, double>(pose.release(), {6}, owner);
+  return pose_gradient(std::move(pose));
+}
+
+PoseGradient descend(PassOfPython& held, const WritableArray& rows, const WritableArray& mean,
+                     const WritableArray& square, const WritableArray& steps, const Array& rates,
+                     float beta1, float beta2, float epsilon, const Array& planes,
+                     const Array& gradients, const WritableArray& indices,
+                     const WritableArray& weights, float needle_weight, float needle_log_ratio,
+                     int threads) {
+  const Backward b(held, rows, planes, gradients, needle_weight, needle_log_ratio, threads);
+  const AdamRows state = adam_rows_of(rows, mean, square, steps);
+  const AdamRates hyper = adam_rates_of(rates, beta1, beta2, epsilon);
+  const size_t visible = b.pass->visible;
+  require_shape(indices, "indices", {visible});
+  require_shape(weights, "weights", {visible});
+  std::unique_ptr<double[]> pose(new double[6]);
+  const Reached out{values_of<uint32_t>(indices, "indices"), values_of<float>(weights, "weights"),
+                    pose.get()};
+  held.is_rendered = false;  // the rows are about to change
+  {
+    nb::gil_scoped_release release;
+    kernels.descend(*b.pass, b.images, b.by_images, b.penalty, state, hyper, threads, out);
+  }
+  return pose_gradient(std::move(pose));
 }
 
 }  // namespace
@@ -175,14 +290,21 @@ NB_MODULE(_rasterise, m) {
   isa = chosen_isa();
   kernels = kernels_for(isa);
   nb::class_<PassOfPython>(m, "Pass").def(nb::init<>());
+  nb::class_<BoundsOfPython>(m, "Bounds")
+      .def(nb::init<>())
+      .def("forget", &BoundsOfPython::forget, "first"_a = 0, "last"_a = kMaxGaussians)
+      .def("forget_rows", &BoundsOfPython::forget_rows, "indices"_a);
   m.def("isa", [] { return std::string(name(isa)); });
   m.def("rasterise", &rasterise, "rows"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
-        "width"_a, "height"_a, "threads"_a = 1, "memory"_a = nb::none());
+        "width"_a, "height"_a, "threads"_a = 1, "memory"_a = nb::none(), "bounds"_a = nb::none());
   m.def("rasterise_planes", &rasterise_planes, "forward"_a, "rows"_a, "T_camera_map"_a, "fx"_a,
-        "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1);
+        "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1, "bounds"_a = nb::none());
   m.def("backpropagate", &backpropagate, "forward"_a, "rows"_a, "planes"_a, "gradients"_a,
         "indices"_a, "row_gradients"_a, "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f,
         "threads"_a = 1);
+  m.def("descend", &descend, "forward"_a, "rows"_a, "mean"_a, "square"_a, "steps"_a, "rates"_a,
+        "beta1"_a, "beta2"_a, "epsilon"_a, "planes"_a, "gradients"_a, "indices"_a, "weights"_a,
+        "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f, "threads"_a = 1);
 }
 
 }  // namespace ldo

@@ -1,11 +1,12 @@
 // Which splats each tile of 16x16 pixels blends, in which order.
 #pragma once
-#include "projection.hpp"
+#include "culling.hpp"
 #include "radix_sort.hpp"
 
 namespace ldo::LDO_ISA {
 
-constexpr int64_t kProjectionPiece = 4096;  // Gaussians
+constexpr int64_t kPieceBlocks = 16;
+constexpr int64_t kProjectionPiece = kPieceBlocks * kBlockRows;  // Gaussians
 
 struct PieceCounts {  // of the splats of a piece, and their pairs with tiles
   int64_t splats;
@@ -14,7 +15,8 @@ struct PieceCounts {  // of the splats of a piece, and their pairs with tiles
 };
 
 struct VisibleSplats {
-  Buffer<Splat> splats;  // those of piece p start at p * kProjectionPiece
+  Buffer<uint32_t> blocks;  // of rows that may be in view, ascending
+  Buffer<Splat> splats;     // those of piece p of the blocks start at p * kProjectionPiece
   Buffer<TileRange> tiles;
   Buffer<uint32_t> gaussians;  // row of each splat
   Buffer<PieceCounts> counts;  // of each piece
@@ -28,24 +30,52 @@ struct VisibleSplats {
   }
 };
 
-// Projects rows [begin, end) and appends the visible ones at `begin`.
-inline PieceCounts project_piece(const float* rows, int64_t begin, int64_t end,
-                                 const Projection& project, VisibleSplats& out) {
-  alignas(64) float columns[kRowFloats][kLanes];
-  alignas(64) SplatColumns s;
-  int64_t place = begin;
-  uint32_t pairs = 0;
-  for (int64_t i = begin; i < end; i += kLanes) {
-    transpose_rows(rows + i * kRowFloats, static_cast<int>(std::min<int64_t>(kLanes, end - i)),
-                   columns);
-    project(columns, s);
-    for (uint32_t rest = s.drawn; rest != 0; rest &= rest - 1) {
-      const int k = __builtin_ctz(rest);
-      TileRange& tiles = out.tiles[place];
-      if (!tiles_of(s, k, project.view, tiles)) continue;
-      tiles.first_pair = pairs;
-      pairs += area(tiles);
-      out.splats[place] = {s.u[k],
+// Appends the visible splats of the blocks of a piece, and measures the blocks that are not known.
+class PieceProjection {
+ public:
+  PieceProjection(const Gaussians& gaussians, const Projection& project, int64_t piece,
+                  VisibleSplats& out)
+      : gaussians_(gaussians), project_(project), out_(out), place_(piece * kProjectionPiece) {}
+
+  PieceCounts operator()(const uint32_t* blocks, int64_t count) {
+    const int64_t first = place_;
+    for (int64_t i = 0; i < count; ++i) {
+      BlockBound* bound = gaussians_.bounds == nullptr ? nullptr : &gaussians_.bounds[blocks[i]];
+      if (bound == nullptr || bound->is_known)
+        project_block(blocks[i], [](const auto&, int) {});
+      else
+        *bound = measured(blocks[i]);
+    }
+    return {place_ - first, pairs_};
+  }
+
+ private:
+  BlockBound measured(uint32_t block) {
+    Measure measure;
+    project_block(block, [&](const auto& columns, int count) { measure.add(columns, count); });
+    return measure.bound();
+  }
+
+  template <class Look>
+  void project_block(uint32_t block, const Look& look) {
+    const int64_t begin = block * kBlockRows, end = std::min(begin + kBlockRows, gaussians_.n);
+    for (int64_t i = begin; i < end; i += kLanes) {
+      const int count = static_cast<int>(std::min<int64_t>(kLanes, end - i));
+      transpose_rows(gaussians_.rows + i * kRowFloats, count, columns_);
+      look(columns_, count);
+      project_(columns_, splats_);
+      for (uint32_t rest = splats_.drawn; rest != 0; rest &= rest - 1)
+        append(__builtin_ctz(rest), static_cast<uint32_t>(i));
+    }
+  }
+
+  [[gnu::always_inline]] inline void append(int k, uint32_t first_row) {
+    const SplatColumns& s = splats_;
+    TileRange& tiles = out_.tiles[place_];
+    if (!tiles_of(s, k, project_.view, tiles)) return;
+    tiles.first_pair = pairs_;
+    pairs_ += area(tiles);
+    out_.splats[place_] = {s.u[k],
                            s.v[k],
                            s.a[k],
                            s.b[k],
@@ -53,13 +83,19 @@ inline PieceCounts project_piece(const float* rows, int64_t begin, int64_t end,
                            s.log2_opacity[k],
                            s.x_slope[k],
                            s.y_slope[k],
-                           {columns[kColor][k], columns[kColor + 1][k], columns[kColor + 2][k]},
+                           {columns_[kColor][k], columns_[kColor + 1][k], columns_[kColor + 2][k]},
                            s.z[k]};
-      out.gaussians[place++] = static_cast<uint32_t>(i + k);
-    }
+    out_.gaussians[place_++] = first_row + k;
   }
-  return {place - begin, pairs};
-}
+
+  const Gaussians& gaussians_;
+  const Projection& project_;
+  VisibleSplats& out_;
+  int64_t place_;
+  uint32_t pairs_ = 0;
+  alignas(64) float columns_[kRowFloats][kLanes];
+  alignas(64) SplatColumns splats_;
+};
 
 // Says where the splats and the pairs of each piece begin among all.
 inline void sum_counts(VisibleSplats& visible) {
@@ -102,17 +138,18 @@ inline void order_by_depth(VisibleSplats& visible, Team& team) {
     std::swap(visible.depths, visible.spare);
 }
 
-inline void project(const float* rows, int64_t n, const View& view, Team& team,
-                    VisibleSplats& out) {
+inline void project(const Gaussians& gaussians, const View& view, Team& team, VisibleSplats& out) {
+  list_blocks_in_view(gaussians, view, out.blocks);
+  const int64_t blocks = out.blocks.size(), n = blocks * kBlockRows;
   out.splats.resize(n);
   out.tiles.resize(n);
   out.gaussians.resize(n);
-  out.counts.resize((n + kProjectionPiece - 1) / kProjectionPiece);
+  out.counts.resize((blocks + kPieceBlocks - 1) / kPieceBlocks);
   const Projection projection(view);
   team.each(out.counts.size(), [&](int64_t piece) {
-    const int64_t begin = piece * kProjectionPiece;
-    out.counts[piece] =
-        project_piece(rows, begin, std::min(n, begin + kProjectionPiece), projection, out);
+    const int64_t begin = piece * kPieceBlocks;
+    PieceProjection project_piece(gaussians, projection, piece, out);
+    out.counts[piece] = project_piece(&out.blocks[begin], std::min(kPieceBlocks, blocks - begin));
   });
   sum_counts(out);
   order_by_depth(out, team);

@@ -80,8 +80,7 @@ using FloatsRow = float[kLanes];
 
 // The columns of `count` rows in memory; missing rows are zero.
 inline void transpose(const FloatsRow* rows, int count, Floats (&columns)[kLanes]) {
-  for (int i = 0; i < kLanes; ++i)
-    columns[i] = i < count ? Floats::load(rows[i]) : Floats(0.0f);
+  for (int i = 0; i < kLanes; ++i) columns[i] = i < count ? Floats::load(rows[i]) : Floats(0.0f);
   transpose(columns);
 }
 

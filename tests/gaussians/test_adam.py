@@ -4,7 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians import Adam, AdamConfig, GaussianMap, RowGradients
+from ldo_service.gaussians import Adam, AdamConfig, GaussianMap, Rasteriser, RowGradients
+from ldo_service.geometry import Camera
 
 
 def map_of(n: int) -> GaussianMap:
@@ -72,6 +73,55 @@ def test_moments_of_any_set_of_gaussians_are_found_by_their_ids(present) -> None
         expected = g * (1 - 0.9 ** steps[:, None]), g**2 * (1 - 0.95 ** steps[:, None])
         np.testing.assert_allclose(adam.snapshot()["mean"], expected[0], rtol=1e-4)
         np.testing.assert_allclose(adam.snapshot()["square"], expected[1], rtol=1e-4)
+
+
+def seen_map(n: int) -> GaussianMap:
+    rng, gaussians = np.random.default_rng(n), GaussianMap(capacity=1)
+    rows = rng.normal(size=(n, 16)).astype(np.float32)
+    rows[:, 2], rows[:, 3:6] = rng.uniform(1, 3, n), np.log(0.05)
+    gaussians.add(rows, 0)
+    return gaussians
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_descent_is_the_step_against_the_gradients_to_the_bit(threads: int) -> None:
+    camera, by_planes = Camera(40, 32, 40.0, 40.0, 20.0, 16.0), np.ones((5, 32, 40), np.float32)
+    maps, adams = (seen_map(9_000), seen_map(9_000)), (Adam(), Adam())
+    needles = {"needle_weight": 0.1, "needle_ratio": 1.5}
+    for rate in (1.0, 0.5):
+        at_once, in_two = Rasteriser(threads=threads), Rasteriser()
+        for rasteriser, gaussians in zip((at_once, in_two), maps, strict=True):
+            rasteriser.render(gaussians.rows, camera, np.eye(4), bounds=gaussians.bounds)
+        reached = adams[0].descend(maps[0], at_once, by_planes, rate=rate, **needles)
+        derivatives = in_two.gradients(by_planes, **needles)
+        adams[1].step(maps[1], derivatives, rate=rate)
+        assert reached.indices.tobytes() == derivatives.indices.tobytes()
+        assert reached.weights.tobytes() == derivatives.rows[:, 14].tobytes()
+        assert reached.xi.tobytes() == derivatives.xi.tobytes()
+    assert maps[0].rows.tobytes() == maps[1].rows.tobytes() != seen_map(9_000).rows.tobytes()
+    a, b = (adam.snapshot() for adam in adams)
+    assert all(a[name].tobytes() == b[name].tobytes() for name in a)
+    assert 0 < np.count_nonzero(a["steps"]) < 9_000
+
+
+def test_descent_of_another_map_than_was_rendered_is_refused() -> None:
+    camera, by_planes = Camera(8, 8, 8.0, 8.0, 4.0, 4.0), np.ones((5, 8, 8), np.float32)
+    rendered, other, rasteriser = seen_map(50), seen_map(50), Rasteriser()
+    rasteriser.render(rendered.rows, camera, np.eye(4))
+    with pytest.raises(ValueError, match="not those that were rendered"):
+        Adam().descend(other, rasteriser, by_planes)
+    Adam().descend(rendered, rasteriser, by_planes)
+    with pytest.raises(ValueError, match="holds no rendering"):
+        Adam().descend(rendered, rasteriser, by_planes)
+
+
+def test_moments_go_with_the_map_that_is_stepped_on() -> None:
+    adam, first, second = Adam(), map_of(6), map_of(6)
+    adam.step(first, gradients(first, [1, 2]))
+    second.remove(np.array([0, 1, 0, 0, 0, 0], bool))
+    adam.step(second, gradients(second, [2]))
+    np.testing.assert_array_equal(adam.snapshot()["ids"], second.ids)
+    np.testing.assert_array_equal(adam.snapshot()["steps"], [0, 2, 0, 0, 0])
 
 
 def test_new_gaussian_begins_with_a_full_step() -> None:

@@ -244,7 +244,7 @@ def rendered(n: int = 5) -> tuple[_rasterise.Pass, dict]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rows": gaussians(4, 0)}, "number has changed"),
+        ({"rows": gaussians(4, 0)}, "not those that were rendered"),
         ({"planes": np.zeros((5, 9, 8), np.float32)}, r"\[5, 9, 9\]"),
         ({"gradients": np.zeros((5, 9, 9))}, "float32"),
         ({"gradients": np.zeros((4, 9, 9), np.float32)}, r"\[5, 9, 9\]"),
