@@ -113,12 +113,24 @@ class TileGradient {
     for (int b = 0; b < kBlocks; ++b) {
       for (int64_t i = ahead * b / kBlocks; i < ahead * (b + 1) / kBlocks; ++i)
         __builtin_prefetch(&splats[list[n + i]]);
+      prefetch_row(b);
       if (record.blended[b] > 0) differentiate_block(b, splats, list, n, record, sums);
     }
   }
 
  private:
   static constexpr int kBatch = 2048;  // splats of the list that are looked at together
+  // Row `row` of the next tile's pixels, which lies in as many places as there are images.
+  [[gnu::always_inline]] inline void prefetch_row(int row) const {
+    if (x_ + kTile >= view_.width || y_ + row >= view_.height) return;
+    const int64_t size = static_cast<int64_t>(view_.width) * view_.height;
+    const int64_t pixel = static_cast<int64_t>(y_ + row) * view_.width + x_ + kTile;
+    for (int k = 0; k < kPlanes; ++k) {
+      __builtin_prefetch(planes_ + k * size + pixel);
+      __builtin_prefetch(gradients_ + k * size + pixel);
+    }
+  }
+
   static constexpr int kFactors = 5;   // what weights are summed with: dL/dC, dL/dD and one
 
   void differentiate_block(int b, const Splat* splats, const uint32_t* list, int64_t n,

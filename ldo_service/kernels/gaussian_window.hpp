@@ -1,5 +1,7 @@
 // The Gaussian window of SSIM (11 taps, sigma 1.5), along rows and across them.
 #pragma once
+#include <type_traits>
+
 #include "simd.hpp"
 
 namespace ldo::LDO_ISA {
@@ -10,12 +12,18 @@ constexpr int kTaps = 2 * kReach + 1;
 constexpr float kTap[kReach + 1] = {0.26601171f, 0.21300553f, 0.10936069f,
                                     0.03600077f, 0.00759876f, 0.00102838f};
 
-// The windowed sum at sixteen places, of which `at(k)` gives the values k to the right or below.
+template <int K>
+using Offset = std::integral_constant<int, K>;
+
+// The windowed sum at sixteen places, of which `at(Offset<k>())` gives the values k to the right or
+// below.
 template <class At>
 [[gnu::always_inline]] inline Floats window(At at) {
-  Floats sum = at(0) * kTap[0];
-#pragma GCC unroll 5
-  for (int k = 1; k <= kReach; ++k) sum = sum + (at(k) + at(-k)) * kTap[k];
+  Floats sum = at(Offset<0>()) * kTap[0];
+  const auto add = [&](auto k) __attribute__((always_inline)) {
+    sum = sum + (at(k) + at(Offset<-k()>())) * kTap[k()];
+  };
+  add(Offset<1>()), add(Offset<2>()), add(Offset<3>()), add(Offset<4>()), add(Offset<5>());
   return sum;
 }
 
@@ -42,7 +50,7 @@ class RowRing {
     }
     Floats operator()(int image, int column) const {
       return window(
-          [&](int k) { return Floats::load(row_[kReach + k] + image * kColumns + column); });
+          [&](auto k) { return Floats::load(row_[kReach + k()] + image * kColumns + column); });
     }
 
    private:

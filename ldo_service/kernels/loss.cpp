@@ -99,8 +99,9 @@ class PartLoss {
   }
 
   static void across(const float* from, float* to, int begin, int end) {
-    each_vector(begin, end, [&](int i) {
-      window([&](int k) { return Floats::load(from + i + k); }).store(to + i);
+    each_vector(begin, end, [&](int i) __attribute__((always_inline)) {
+      const Neighbours around(from + i);
+      window([&](auto k) { return around.at<decltype(k)::value>(); }).store(to + i);
     });
   }
 

@@ -265,6 +265,41 @@ inline Floats reciprocal(Floats x) {
 #endif
 }
 
+// The sixteen values at `p`, on a cache line, and those about them. Shifted in registers where the
+// machine can: loads that straddle cache lines cost twice.
+class Neighbours {
+ public:
+#if defined(__AVX512F__)
+  explicit Neighbours(const float* p)
+      : left_(_mm512_load_si512(p - kLanes)),
+        middle_(_mm512_load_si512(p)),
+        right_(_mm512_load_si512(p + kLanes)) {}
+
+  template <int Right>  // the values so many places to the right, or to the left
+  [[gnu::always_inline]] inline Floats at() const {
+    __m512i out = middle_;
+    if constexpr (Right > 0) out = _mm512_alignr_epi32(right_, middle_, Right);
+    if constexpr (Right < 0) out = _mm512_alignr_epi32(middle_, left_, kLanes + Right);
+    Floats values;
+    values.v[0] = _mm512_castsi512_ps(out);
+    return values;
+  }
+
+ private:
+  __m512i left_, middle_, right_;
+#else
+  explicit Neighbours(const float* p) : middle_(p) {}
+
+  template <int Right>
+  [[gnu::always_inline]] inline Floats at() const {
+    return Floats::load(middle_ + Right);
+  }
+
+ private:
+  const float* middle_;
+#endif
+};
+
 inline Floats abs(Floats x) { return max(x, Floats(0.0f) - x); }
 
 #if defined(__AVX2__)
