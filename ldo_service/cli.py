@@ -76,6 +76,7 @@ def first_lines() -> Iterator[str]:
 def verbs() -> dict[str, Callable[..., None]]:
     """Each verb's function; its docstring is its help."""
     from ldo_service.commands import (
+        bench,
         control,
         demo,
         doctor,
@@ -103,5 +104,6 @@ def verbs() -> dict[str, Callable[..., None]]:
         "simulate": simulate.simulate,
         "topics": topics.topics,
         "config": show_config.show_config,
+        "bench": bench.bench,
         "doctor": doctor.doctor,
     }

@@ -11,6 +11,8 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _rasterise
 
+RenderMemory = _rasterise.Pass  # scratch that one rendering leaves to the next
+
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
@@ -42,7 +44,7 @@ def render(
     *,
     threads: int = 1,
     bounds: _rasterise.Bounds | None = None,
-    memory: _rasterise.Pass | None = None,
+    memory: RenderMemory | None = None,
 ) -> Rendering:
     """Render Gaussians into a pinhole camera.
 

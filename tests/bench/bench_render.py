@@ -7,48 +7,38 @@ work on the machine slows both: read the ratio, not the milliseconds. The protot
 here with the flags of its README, and the instruction sets are matched through LDO_ISA.
 
 `render` is what the service shows: colour, depth, median depth, opacity. The other rows are one
-iteration: forward (no median), loss with its derivative, backward to the parameters and the pose,
-Adam. The prototype's Adam is part of its backward; its loss is given the windowed means of the
-frame, which ours computes.
+iteration: forward (no median), loss with its derivative, descent (backward to the parameters and
+the pose, with a step of Adam). The prototype's loss is given the windowed means of the frame, which
+ours computes. `ldo bench render` measures the same scene and steps without a prototype.
 """
 
 import argparse
 import ctypes
-import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from ldo_service.kernels import _adam, _loss, _rasterise
+from ldo_service.evaluation.iteration import (
+    Iteration,
+    Steps,
+    bench_camera,
+    medians_ms,
+    noise_frame,
+)
+from ldo_service.gaussians import render
+from ldo_service.gaussians.render import RenderMemory
+from ldo_service.gaussians.render_reference import render_reference
+from ldo_service.geometry import Camera
+from ldo_service.kernels import _rasterise
 
 SIZES = ((100_000, 640, 480), (100_000, 320, 240), (500_000, 640, 480))
-T_CAMERA_MAP = np.eye(4, dtype=np.float32)[:3]
 RATES = np.array([1e-4] * 3 + [1e-3] * 10 + [1e-3] + [0] * 2, np.float32)
 BETA1, BETA2, EPSILON = 0.9, 0.95, 1e-15
-Steps = dict[str, Callable[[], object]]
-
-
-def room(n: int, width: int, height: int, seed: int = 0) -> np.ndarray:
-    """Rows of n flat Gaussians on the walls of a room, each about as wide as its share of pixels;
-    a tenth of them lies beyond the edges of the image."""
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(-0.65, 0.65, n), rng.uniform(-0.5, 0.5, n)
-    z = np.minimum(4, np.minimum(1.5 / np.abs(y).clip(0.01), 2.2 / np.abs(x).clip(0.01)))
-    z *= 1 + 0.02 * rng.standard_normal(n)
-    sigma = 0.9 * z * np.sqrt(width * height / n) / (0.82 * width)
-    rows = aligned((n, 16))
-    rows[:, :3] = np.stack([x * z, y * z, z], -1)
-    rows[:, 3:6] = np.log(sigma[:, None] * [1, 1, 0.2] * rng.uniform(0.6, 1.5, (n, 3)))
-    rows[:, 6:10] = rng.standard_normal((n, 4))
-    rows[:, 10] = rng.uniform(0, 4, n)
-    rows[:, 11:14] = rng.uniform(0, 1, (n, 3))
-    return rows
 
 
 def aligned(shape: tuple[int, ...]) -> np.ndarray:
@@ -58,68 +48,20 @@ def aligned(shape: tuple[int, ...]) -> np.ndarray:
     return memory[skip : skip + int(np.prod(shape))].reshape(shape)
 
 
-def target(width: int, height: int) -> tuple[np.ndarray, np.ndarray]:
-    """A frame: colour planes [3, H, W] uint8 and depth [H, W] with holes."""
-    rng = np.random.default_rng(1)
-    depth_m = rng.uniform(1, 4, (height, width)).astype(np.float32)
-    depth_m[rng.uniform(size=depth_m.shape) < 0.2] = 0
-    return rng.integers(0, 256, (3, height, width), np.uint8), depth_m
+def ours(iteration: Iteration) -> Steps:
+    memory = RenderMemory()
 
+    def show() -> np.ndarray:
+        return render(
+            iteration.gaussians.rows,
+            iteration.camera,
+            np.eye(4),
+            threads=iteration.threads,
+            bounds=iteration.gaussians.bounds,
+            memory=memory,
+        ).color
 
-def intrinsics(width: int, height: int) -> tuple[float, float, float, float]:
-    return 0.82 * width, 0.82 * width, (width - 1) / 2, (height - 1) / 2
-
-
-def ours(rows: np.ndarray, width: int, height: int, threads: int) -> Steps:
-    camera = intrinsics(width, height)
-    rows = rows.copy() if rows.ctypes.data % 64 else rows
-    color, depth_m = target(width, height)
-    forward, planes, gradients = _rasterise.Pass(), *(aligned((5, height, width)) for _ in "ab")
-    exposure = np.array([[1, 1, 1], [0, 0, 0]], np.float32)
-    moments, steps = [aligned(rows.shape) for _ in "ab"], np.zeros(len(rows), np.int32)
-    indices, by_row = np.zeros(len(rows), np.uint32), aligned(rows.shape)
-    seen, memory = slice(0, 0), _rasterise.Pass()
-
-    def render() -> np.ndarray:
-        return _rasterise.rasterise(rows, T_CAMERA_MAP, *camera, width, height, threads, memory)[0]
-
-    def rasterise() -> np.ndarray:
-        nonlocal seen
-        seen = slice(
-            _rasterise.rasterise_planes(forward, rows, T_CAMERA_MAP, *camera, planes, threads)
-        )
-        return planes
-
-    def loss() -> np.ndarray:
-        _loss.image_loss(planes, color, depth_m, None, exposure, 0.8, 0.2, 1.0, gradients, threads)
-        return gradients
-
-    def backward() -> None:
-        _rasterise.backpropagate(
-            forward, rows, planes, gradients, indices[seen], by_row[seen], 0.0, 0.0, threads
-        )
-
-    def adam() -> None:
-        _adam.adam_step(
-            rows,
-            *moments,
-            steps,
-            indices[seen],
-            by_row[seen],
-            RATES,
-            BETA1,
-            BETA2,
-            EPSILON,
-            threads,
-        )
-
-    return {
-        "render": render,
-        "forward": rasterise,
-        "loss": loss,
-        "backward": backward,
-        "adam": adam,
-    }
+    return {"render": show} | iteration.steps()
 
 
 def compiled_prototype(folder: Path) -> ctypes.CDLL | None:
@@ -137,12 +79,12 @@ def compiled_prototype(folder: Path) -> ctypes.CDLL | None:
     return out
 
 
-def prototype(
-    library: ctypes.CDLL, rows: np.ndarray, width: int, height: int, threads: int
-) -> Steps:
-    camera = np.array([*np.eye(3).ravel(), 0, 0, 0, *intrinsics(width, height)], np.float32)
+def prototype(library: ctypes.CDLL, rows: np.ndarray, view: Camera, threads: int) -> Steps:
+    width, height = view.width, view.height
+    intrinsics = view.fx, view.fy, view.cx, view.cy
+    camera = np.array([*np.eye(3).ravel(), 0, 0, 0, *intrinsics], np.float32)
     rows = rows + aligned(rows.shape)
-    color, depth_m = target(width, height)
+    color, depth_m = noise_frame(view)
     color = (color / 255).astype(np.float32)
     planes, gradients = aligned((5, height, width)), aligned((5, height, width))
     statistics, parts = np.zeros((6, height, width), np.float32), np.zeros(4)
@@ -166,7 +108,7 @@ def prototype(
         library.rc_loss(context, *images, *size, at(gradients), at(parts))
         return gradients
 
-    def backward() -> None:  # and Adam
+    def descent() -> None:
         library.rc_backward_tiles(context, at(planes), at(gradients))
         beta_and_step = (number(BETA1), number(BETA2), number(EPSILON), 10)
         library.rc_backward_params(
@@ -176,26 +118,7 @@ def prototype(
     def render() -> np.ndarray:
         return forward()[:3].transpose(1, 2, 0)
 
-    return {"render": render, "forward": forward, "loss": loss, "backward": backward}
-
-
-def medians_ms(
-    runs: list[Steps], repeats: int, clock: Callable[[], float]
-) -> list[dict[str, float]]:
-    """Of each step, run in turns, after one turn to warm up."""
-    times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
-    for _ in range(repeats + 1):
-        for steps, lists in zip(runs, times, strict=True):
-            for name, step in steps.items():
-                start = clock()
-                step()
-                lists[name].append(clock() - start)
-    out = []
-    for lists in times:
-        whole = sum(np.array(lists[name][1:]) for name in lists if name != "render")
-        medians = {name: float(np.median(values[1:])) * 1e3 for name, values in lists.items()}
-        out.append(medians | {"iteration": float(np.median(whole)) * 1e3})
-    return out
+    return {"render": render, "forward": forward, "loss": loss, "descent": descent}
 
 
 def check_agreement(mine: Steps, theirs: Steps) -> None:
@@ -225,30 +148,37 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many of the scenes")
     parser.add_argument("--cpu", action="store_true", help="CPU time, for a busy machine")
-    parser.add_argument("--json", action="store_true", help="one line of JSON per scene")
     arguments = parser.parse_args()
     isa, threads = _rasterise.isa(), arguments.threads
     clock = time.process_time if arguments.cpu else time.perf_counter
-    if not arguments.json:
-        print(f"isa {isa}, {threads} thread(s), median of {arguments.repeats}")
-        print(
-            f"{'Gaussians':>10} {'image':>9} {'step':>10} {'ours ms':>9} {'prototype ms':>13} ratio"
-        )
+    print(f"isa {isa}, {threads} thread(s), median of {arguments.repeats}")
+    print(f"{'Gaussians':>10} {'image':>9} {'step':>10} {'ours ms':>9} {'prototype ms':>13} ratio")
     with tempfile.TemporaryDirectory() as folder:
         library = compiled_prototype(Path(folder))
         for n, width, height in SIZES[: arguments.sizes]:
-            rows = room(n, width, height)
-            runs = [ours(rows, width, height, threads)]
+            iteration = Iteration(n, bench_camera(width, height), threads=threads)
+            runs = [ours(iteration)]
             if library is not None:
-                runs.append(prototype(library, rows, width, height, threads))
+                rows = iteration.gaussians.rows
+                runs.append(prototype(library, rows, iteration.camera, threads))
                 check_agreement(*runs)
-            mine, *theirs = medians_ms(runs, arguments.repeats, clock)
-            if arguments.json:
-                facts = {"gaussians": n, "width": width, "height": height, "isa": isa}
-                times = {f"{name}_ms": time_ms for name, time_ms in mine.items()}
-                print(json.dumps(facts | {"threads": threads} | times))
-            else:
-                report(n, f"{width}x{height}", mine, theirs[0] if theirs else None)
+            mine, *theirs = medians_ms(runs, ["iteration"], arguments.repeats, clock)
+            report(n, f"{width}x{height}", mine, theirs[0] if theirs else None)
+    time_the_twin()
+
+
+def time_the_twin() -> None:
+    """The plain twin beside the kernel, at a size where it takes a second or so."""
+    iteration = Iteration(300, bench_camera(48, 36))
+    rows, camera = iteration.gaussians.rows, iteration.camera
+    runs: list[Steps] = [
+        {"render": lambda: render(rows, camera, np.eye(4))},
+        {"render": lambda: render_reference(rows.astype(float), camera, np.eye(4))},
+    ]
+    kernel, twin = medians_ms(runs, repeats=3)
+    print(
+        f"300 Gaussians, 48x36: kernel {kernel['render']:.2f} ms, plain twin {twin['render']:.0f} ms"
+    )
 
 
 if __name__ == "__main__":

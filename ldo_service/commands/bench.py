@@ -1,0 +1,71 @@
+"""ldo bench"""
+
+import json
+from dataclasses import asdict
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service import kernels
+from ldo_service.errors import ConfigError
+from ldo_service.evaluation.iteration import Iteration, bench_camera, iteration_times
+
+
+def bench(
+    what: Annotated[
+        Literal["render"],
+        tyro.conf.Positional,
+        tyro.conf.arg(help="an iteration of the optimiser: rendering, loss, gradients, Adam"),
+    ],
+    gaussians: Annotated[int, tyro.conf.arg(help="in view")] = 100_000,
+    elsewhere: Annotated[int, tyro.conf.arg(help="Gaussians more, out of view")] = 0,
+    size: Annotated[str, tyro.conf.arg(metavar="WxH", help="of the image, pixels")] = "640x480",
+    threads: Annotated[int, tyro.conf.arg(help="of the kernels")] = 1,
+    repeats: Annotated[int, tyro.conf.arg(help="that the medians are taken of")] = 20,
+    json_: Annotated[bool, tyro.conf.arg(name="json", help="print one JSON object")] = False,
+) -> None:
+    """Measure how long an iteration takes on this machine.
+
+    Medians over repeats on a made-up scene, in milliseconds of wall time. Adam is a part of the
+    backward pass: adam_ms is what it adds, the pass with it less the pass without, and iteration_ms
+    is forward, loss and the pass with it. LDO_ISA=avx512, avx2 or baseline picks the instructions.
+    """
+    width, height = _pixels(size)
+    if not min(gaussians, threads, repeats) >= 1 or elsewhere < 0:
+        raise ConfigError("gaussians, threads and repeats must be 1 or more, elsewhere 0 or more.")
+    camera = bench_camera(width, height)
+    iteration = Iteration(gaussians, camera, threads=threads, elsewhere=elsewhere)
+    times = asdict(iteration_times(iteration, repeats))
+    facts = {
+        "isa": kernels.isa(),
+        "gaussians": gaussians,
+        "elsewhere": elsewhere,
+        "width": width,
+        "height": height,
+        "threads": threads,
+    }
+    if json_:
+        print(json.dumps(times | facts))
+    else:
+        Console().print(_table(what, facts, times))
+
+
+def _pixels(size: str) -> tuple[int, int]:
+    width, _, height = size.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and 1 <= int(width) <= 8192 >= int(height)):
+        raise ConfigError(f"--size {size}: must be WIDTHxHEIGHT in pixels, as 640x480.")
+    if int(height) < 1:
+        raise ConfigError(f"--size {size}: must be at least one pixel high.")
+    return int(width), int(height)
+
+
+def _table(what: str, facts: dict[str, object], times: dict[str, float]) -> Table:
+    title = f"{what}: {facts['gaussians']:,} Gaussians, {facts['width']}x{facts['height']}"
+    table = Table(title=f"{title}, {facts['isa']}, {facts['threads']} thread(s)")
+    for name in ("step", "ms"):
+        table.add_column(name, justify="left" if name == "step" else "right")
+    for name, time_ms in times.items():
+        table.add_row(name.removesuffix("_ms"), f"{time_ms:.2f}")
+    return table

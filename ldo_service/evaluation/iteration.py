@@ -1,0 +1,161 @@
+"""Time of one iteration of the optimiser, step by step, on a made-up scene."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.gaussians import (
+    Adam,
+    Exposure,
+    GaussianMap,
+    LossWeights,
+    Rasteriser,
+    Reached,
+    RowGradients,
+    image_loss,
+)
+from ldo_service.geometry import Camera, se3
+
+Steps = dict[str, Callable[[], object]]
+_WEIGHTS = LossWeights(l1=0.8, d_ssim=0.2, depth=1.0)
+
+
+def bench_camera(width: int, height: int) -> Camera:
+    """About 63 degrees wide, as RGB-D cameras are."""
+    return Camera(width, height, 0.82 * width, 0.82 * width, (width - 1) / 2, (height - 1) / 2)
+
+
+def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
+    """Rows [n, 16] of flat Gaussians on the walls of a room around the camera, line by line of its
+    image, each about as wide as its share of pixels; a tenth lies beyond the image's edges."""
+    rng = np.random.default_rng(seed)
+    x, y = rng.uniform(-0.65, 0.65, n), np.sort(rng.uniform(-0.5, 0.5, n))
+    z = np.minimum(4, np.minimum(1.5 / np.abs(y).clip(0.01), 2.2 / np.abs(x).clip(0.01)))
+    z *= 1 + 0.02 * rng.standard_normal(n)
+    sigma_m = 0.9 * z * np.sqrt(camera.width * camera.height / max(n, 1)) / camera.fx
+    rows = np.zeros((n, 16), np.float32)
+    rows[:, :3] = np.stack([x * z, y * z, z], -1)
+    rows[:, 3:6] = np.log(sigma_m[:, None] * [1, 1, 0.2] * rng.uniform(0.6, 1.5, (n, 3)))
+    rows[:, 6:10] = rng.standard_normal((n, 4))
+    rows[:, 10] = rng.uniform(0, 4, n)
+    rows[:, 11:14] = rng.uniform(0, 1, (n, 3))
+    return rows
+
+
+def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """A frame: colour planes [3, H, W] uint8 and depth [H, W] in metres, with holes."""
+    rng = np.random.default_rng(1)
+    depth_m = rng.uniform(1, 4, (camera.height, camera.width)).astype(np.float32)
+    depth_m[rng.uniform(size=depth_m.shape) < 0.2] = 0
+    return rng.integers(0, 256, (3, camera.height, camera.width), np.uint8), depth_m
+
+
+class Iteration:
+    """The steps of an iteration against one view, as `Optimiser.step` makes them.
+
+    n          Gaussians about the view
+    elsewhere  as many more in other directions, which no pixel shows
+    """
+
+    def __init__(self, n: int, camera: Camera, *, threads: int = 1, elsewhere: int = 0) -> None:
+        self.camera, self.threads = camera, threads
+        self.gaussians = GaussianMap(n + elsewhere)
+        self.gaussians.add(walls(n, camera), 0)
+        for keyframe, part in enumerate(_shares(elsewhere, n)):
+            self.gaussians.add(walls(part, camera, keyframe), 1 + keyframe)
+        self.gaussians.move_anchors(_turned_away(range(1, 1 + len(_shares(elsewhere, n)))))
+        self._rasteriser, self._adam = Rasteriser(threads=threads), Adam()
+        self._color, self._depth_m = noise_frame(camera)
+        self._planes = self.forward()
+        self._by_planes = np.empty_like(self._planes)
+
+    def forward(self) -> np.ndarray:
+        """Planes [5, H, W], as `Rasteriser.render`."""
+        self._planes = self._rasteriser.render(
+            self.gaussians.rows, self.camera, np.eye(4), bounds=self.gaussians.bounds
+        )
+        return self._planes
+
+    def loss(self) -> np.ndarray:
+        """Derivatives by the planes [5, H, W]."""
+        frame = self._color, self._depth_m, Exposure()
+        image_loss(self._planes, *frame, _WEIGHTS, self._by_planes, threads=self.threads)
+        return self._by_planes
+
+    def backward(self) -> RowGradients:
+        """Derivatives by rows and pose, alone."""
+        return self._rasteriser.gradients(self._by_planes)
+
+    def descent(self) -> Reached:
+        """Derivatives by rows and pose, and with them a step of Adam."""
+        return self._adam.descend(self.gaussians, self._rasteriser, self._by_planes, rate=0.1)
+
+    def steps(self) -> Steps:
+        return {"forward": self.forward, "loss": self.loss, "descent": self.descent}
+
+
+@dataclass(frozen=True, slots=True)
+class IterationTimes:
+    """Medians in milliseconds. Adam's is what a step of Adam adds to the backward pass, in which it
+    is made: the pass with it less the pass without."""
+
+    forward_ms: float
+    loss_ms: float
+    backward_ms: float
+    adam_ms: float
+    iteration_ms: float
+
+
+def iteration_times(
+    iteration: Iteration, repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> IterationTimes:
+    """Median times of the steps of `iteration`, which is made `repeats` times."""
+    unfused = {"again": iteration.forward, "backward": iteration.backward}
+    (times,) = medians_ms([iteration.steps() | unfused], ["iteration"], repeats, clock)
+    backward_ms = min(times["backward"], times["descent"])
+    return IterationTimes(
+        times["forward"],
+        times["loss"],
+        backward_ms,
+        times["descent"] - backward_ms,
+        times["iteration"],
+    )
+
+
+def medians_ms(
+    runs: Sequence[Steps],
+    sums: Sequence[str] = (),
+    repeats: int = 20,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[dict[str, float]]:
+    """Median time of each step, run in turns after one turn to warm up, so that other work on the
+    machine slows all of them; under the names in `sums` also of forward, loss and descent in all.
+    """
+    times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
+    for _ in range(repeats + 1):
+        for steps, lists in zip(runs, times, strict=True):
+            for name, step in steps.items():
+                start = clock()
+                step()
+                lists[name].append(clock() - start)
+    out = []
+    for lists in times:
+        table = {name: np.array(values[1:]) * 1e3 for name, values in lists.items()}
+        table |= dict.fromkeys(sums, table["forward"] + table["loss"] + table["descent"])
+        out.append({name: float(np.median(values)) for name, values in table.items()})
+    return out
+
+
+def _shares(n: int, largest: int) -> list[int]:
+    return [min(largest, n - start) for start in range(0, n, max(largest, 1))]
+
+
+def _turned_away(keyframes: Sequence[int]) -> dict[int, np.ndarray]:
+    """About the vertical, by angles from a quarter to three quarters of a turn."""
+    angles = np.linspace(0.5 * np.pi, 1.5 * np.pi, max(len(keyframes), 2))
+    return {
+        keyframe: se3.exp(np.array([0, angle, 0, 0, 0, 0]))
+        for keyframe, angle in zip(keyframes, angles, strict=False)
+    }
