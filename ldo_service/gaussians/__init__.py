@@ -8,12 +8,13 @@ from .model import GaussianMap
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
 from .rasteriser import Rasteriser, Reached, RowGradients
-from .render import Rendering, render
+from .render import Contributions, Rendering, RenderMemory, render
 from .views import View
 
 __all__ = [
     "Adam",
     "AdamConfig",
+    "Contributions",
     "Exposure",
     "GaussianMap",
     "ImageLoss",
@@ -24,6 +25,7 @@ __all__ = [
     "PruningConfig",
     "Rasteriser",
     "Reached",
+    "RenderMemory",
     "Rendering",
     "RowGradients",
     "View",

@@ -15,6 +15,21 @@ RenderMemory = _rasterise.Pass  # scratch that one rendering leaves to the next
 
 
 @dataclass(frozen=True, slots=True)
+class Contributions:
+    """Who made an image.
+
+    indices  [V] uint32, ascending: the rows with any weight
+    weights  [V] float32, w_i summed over the pixels (px)
+    top      [H, W] int32, per pixel the row with the largest w_i, of equals the nearest; -1 where
+             no row has any: `np.where(top >= 0, labels[top], nothing)` is an image of labels
+    """
+
+    indices: np.ndarray
+    weights: np.ndarray
+    top: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
 class Rendering:
     """What a camera sees of the map. With w_i = alpha_i prod_{j<i} (1 - alpha_j), near to far:
 
@@ -23,12 +38,14 @@ class Rendering:
     median_depth_m   [H, W] float32, z where the transmittance first falls below one half, or 0:
                      a surface that was there, where the mean may lie between two
     opacity          [H, W] float32, sum w_i = 1 - transmittance
+    contributions    if they were asked for
     """
 
     color: np.ndarray
     weighted_depth_m: np.ndarray
     median_depth_m: np.ndarray
     opacity: np.ndarray
+    contributions: Contributions | None = None
 
     @property
     def depth_m(self) -> np.ndarray:
@@ -45,6 +62,7 @@ def render(
     threads: int = 1,
     bounds: _rasterise.Bounds | None = None,
     memory: RenderMemory | None = None,
+    contributions: bool = False,
 ) -> Rendering:
     """Render Gaussians into a pinhole camera.
 
@@ -57,6 +75,10 @@ def render(
                   Rows that hold NaN or infinity are not drawn.
     camera        without distortion; raises DataError with it
     T_camera_map  [4, 4]
+    bounds        of these rows (`GaussianMap.bounds`): those out of view are then not read, which
+                  changes no bit
+    memory        scratch for this call and the next, one call at a time: fresh pages cost time
+    contributions also say who made the image, for about half as much time again
     Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads; the
     last bits differ between instruction sets (`ldo_service.kernels.isa`).
     Zwicker et al., EWA splatting, 2002; Kerbl et al., 3D Gaussian splatting, 2023.
@@ -64,18 +86,17 @@ def render(
     if camera.distortion:
         raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
     T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
-    return Rendering(
-        *_rasterise.rasterise(
-            rows,
-            T,
-            camera.fx,
-            camera.fy,
-            camera.cx,
-            camera.cy,
-            camera.width,
-            camera.height,
-            threads,
-            memory,
-            bounds,
-        )
-    )
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    size = camera.width, camera.height
+    memory = memory or RenderMemory()
+    images = _rasterise.rasterise(rows, T, *intrinsics, *size, threads, memory, bounds)
+    made_by = _contributions(memory, camera, threads) if contributions else None
+    return Rendering(*images, made_by)
+
+
+def _contributions(memory: RenderMemory, camera: Camera, threads: int) -> Contributions:
+    indices, weights = np.empty(memory.visible, np.uint32), np.empty(memory.visible, np.float32)
+    top = np.empty((camera.height, camera.width), np.int32)
+    _rasterise.contributions(memory, indices, weights, top, threads)
+    seen = weights > 0
+    return Contributions(indices[seen], weights[seen], top)

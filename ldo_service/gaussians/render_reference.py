@@ -10,7 +10,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 
-from .render import Rendering
+from .render import Contributions, Rendering
 
 
 def rotations(quats: Any, xp: Any = np) -> Any:
@@ -76,4 +76,15 @@ def render_reference(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np)
     behind_half = np.concatenate([after < np.log(0.5), np.ones_like(u[..., None], bool)], axis=2)
     median = np.append(z, 0.0)[np.argmax(behind_half, axis=2)]
     opacity = xp.sum(weights, axis=2)
-    return Rendering(weights @ colors, weights @ z, median, opacity)
+    images = weights @ colors, weights @ z, median, opacity
+    return Rendering(*images, contributions_reference(weights, order) if xp is np else None)
+
+
+def contributions_reference(weights: np.ndarray, order: np.ndarray) -> Contributions:
+    """From weights [H, W, N] of Gaussians near to far, which are rows `order` [N]."""
+    nobody = np.full((*weights.shape[:2], 1), np.finfo(weights.dtype).tiny)
+    top = np.append(order, -1)[np.argmax(np.concatenate([weights, nobody], axis=2), axis=2)]
+    by_row = np.zeros(max(order, default=-1) + 1)
+    by_row[order] = weights.sum(axis=(0, 1))
+    indices = np.flatnonzero(by_row)
+    return Contributions(indices, by_row[indices], top)

@@ -47,6 +47,23 @@ class Pass:
     """
 
     def __init__(self) -> None: ...
+    @property
+    def visible(self) -> int:
+        """Number V of Gaussians that may touch the image last rendered."""
+
+def contributions(
+    forward: Pass,
+    indices: NDArray[np.uint32],
+    weights: NDArray[np.float32],
+    top: NDArray[np.int32],
+    threads: int = 1,
+) -> None:
+    """Who made the image that was last rendered with `forward`.
+
+    Writes the V row numbers, ascending, to `indices` [V], the Gaussians' weights summed over the
+    pixels to `weights` [V], and to `top` [H, W] the row with the largest weight, or -1; of equal
+    weights the nearer one's. Bitwise equal for any number of threads.
+    """
 
 def rasterise_planes(
     forward: Pass,

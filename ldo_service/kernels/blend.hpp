@@ -113,6 +113,23 @@ struct TileRecord {
   uint32_t* blended;  // [kBlocks] how many splats each block blended
 };
 
+// Calls f(first, places, count) for the splats that block b blended, front to back, sixteen at a
+// time: they are at places first + places[i] of the tile's list of n, i < count.
+template <class F>
+[[gnu::always_inline]] inline void each_sixteen_blended(const TileRecord& record, int b, int64_t n,
+                                                        const F& f) {
+  constexpr int kLookedAt = 2048;  // splats of the list together
+  int64_t left = record.blended[b];
+  for (int64_t first = 0; left > 0; first += kLookedAt) {
+    alignas(64) uint32_t places[kLookedAt + kLanes];
+    const int size = static_cast<int>(std::min<int64_t>(kLookedAt, n - first));
+    const int64_t found = indices_with_bit(record.touched + first, size, b, places);
+    const int count = static_cast<int>(std::min(left, found));
+    for (int i = 0; i < count; i += kLanes) f(first, places + i, std::min(kLanes, count - i));
+    left -= count;
+  }
+}
+
 class Tile {
  public:
   Tile(int column, int row, const View& view) : x_(column * kTile), y_(row * kTile), view_(view) {
@@ -121,15 +138,10 @@ class Tile {
   }
 
   template <bool WithMedian>
-  void blend(const Splat* splats, const uint32_t* list, int64_t n) {
-    for (int64_t first = 0; first < n && open_ != 0; first += kBatch)
-      blend_batch<WithMedian>(splats, list + first, std::min<int64_t>(kBatch, n - first), touched_);
-  }
-
   void blend(const Splat* splats, const uint32_t* list, int64_t n, const TileRecord& record) {
     for (int64_t first = 0; first < n && open_ != 0; first += kBatch)
-      blend_batch<false>(splats, list + first, std::min<int64_t>(kBatch, n - first),
-                         record.touched + first);
+      blend_batch<WithMedian>(splats, list + first, std::min<int64_t>(kBatch, n - first),
+                              record.touched + first);
     std::copy(blended_, blended_ + kBlocks, record.blended);
   }
 
@@ -226,7 +238,6 @@ class Tile {
   uint32_t open_ = 0;  // blocks in the image with a pixel that light still passes
   Block blocks_[kBlocks];
   Splat batch_[kBatch];
-  uint32_t touched_[kBatch];  // bit b: this splat of the batch reaches block b
   uint32_t blended_[kBlocks] = {};
 };
 

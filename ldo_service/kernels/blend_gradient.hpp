@@ -119,7 +119,6 @@ class TileGradient {
   }
 
  private:
-  static constexpr int kBatch = 2048;  // splats of the list that are looked at together
   // Row `row` of the next tile's pixels, which lies in as many places as there are images.
   [[gnu::always_inline]] inline void prefetch_row(int row) const {
     if (x_ + kTile >= view_.width || y_ + row >= view_.height) return;
@@ -131,23 +130,18 @@ class TileGradient {
     }
   }
 
-  static constexpr int kFactors = 5;   // what weights are summed with: dL/dC, dL/dD and one
+  static constexpr int kFactors = 5;  // what weights are summed with: dL/dC, dL/dD and one
 
   void differentiate_block(int b, const Splat* splats, const uint32_t* list, int64_t n,
                            const TileRecord& record, float* sums) {
     const float x = static_cast<float>(x_ + b % 4 * 4), y = static_cast<float>(y_ + b / 4 * 4);
     BlockGradient block = open_block(b);
-    int64_t left = record.blended[b];
-    for (int64_t first = 0; left > 0; first += kBatch) {
-      alignas(64) uint32_t places[kBatch + kLanes];
-      const int size = static_cast<int>(std::min<int64_t>(kBatch, n - first));
-      const int64_t found = indices_with_bit(record.touched + first, size, b, places);
-      const int count = static_cast<int>(std::min(left, found));
-      for (int i = 0; i < count; i += kLanes)
-        add_sixteen(block, x + 1.5f, y + 1.5f, splats, list + first, places + i,
-                    std::min(kLanes, count - i), sums + first * kSumFloats);
-      left -= count;
-    }
+    each_sixteen_blended(record, b, n,
+                         [&](int64_t first, const uint32_t* places, int count)
+                             __attribute__((always_inline)) {
+                               add_sixteen(block, x + 1.5f, y + 1.5f, splats, list + first, places,
+                                           count, sums + first * kSumFloats);
+                             });
   }
 
   [[gnu::always_inline]] inline BlockGradient open_block(int b) {

@@ -2,6 +2,7 @@
 #include "rasterise.hpp"
 
 #include "adam_step.hpp"
+#include "contributions.hpp"
 #include "projection_gradient.hpp"
 
 namespace ldo::LDO_ISA {
@@ -89,6 +90,28 @@ void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& dif
   }
 }
 
+// Projects, sorts and blends, keeps the record, and gives each finished tile to `store`.
+template <bool WithMedian, class Store>
+void blend_tiles(const Gaussians& gaussians, const View& view, int threads, Pass& opaque,
+                 const Store& store) {
+  auto& pass = static_cast<RecordedPass&>(opaque);
+  Team team(threads);
+  project(gaussians, view, team, pass.splats);
+  list_by_tile(pass.splats, view, team, pass.lists);
+  pass.touched.resize(pass.lists.splats.size());
+  pass.blended.resize(static_cast<size_t>(pass.lists.columns) * pass.lists.rows * kBlocks);
+  each_tile(pass.lists, team,
+            [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
+              Tile tile(column, row, view);
+              tile.blend<WithMedian>(pass.splats.splats.data(), list, size, pass.record(t));
+              store(tile);
+            });
+  pass.rows = gaussians.rows;
+  pass.gaussians = gaussians.n;
+  pass.visible = pass.splats.count;
+  pass.view = view;
+}
+
 void differentiate_tiles(RecordedPass& pass, const float* planes, const float* gradients,
                          Team& team) {
   pass.sums.resize(pass.lists.splats.size() * kSumFloats);
@@ -130,40 +153,39 @@ void differentiate(Pass& opaque, const float* planes, const float* gradients, Ne
 
 }  // namespace
 
-void rasterise(const Gaussians& gaussians, const View& view, int threads, Pass& memory,
-               Images out) {
-  auto& pass = static_cast<RecordedPass&>(memory);
-  Team team(threads);
-  project(gaussians, view, team, pass.splats);
-  list_by_tile(pass.splats, view, team, pass.lists);
-  each_tile(pass.lists, team,
-            [&](int64_t, int column, int row, const uint32_t* list, int64_t size) {
-              Tile tile(column, row, view);
-              tile.blend<true>(pass.splats.splats.data(), list, size);
-              tile.store(out);
-            });
+void rasterise(const Gaussians& gaussians, const View& view, int threads, Pass& pass, Images out) {
+  blend_tiles<true>(gaussians, view, threads, pass, [&](const Tile& tile) { tile.store(out); });
+}
+
+void rasterise_planes(const Gaussians& gaussians, const View& view, int threads, Pass& pass,
+                      float* planes) {
+  blend_tiles<false>(gaussians, view, threads, pass,
+                     [&](const Tile& tile) { tile.store_planes(planes); });
 }
 
 std::unique_ptr<Pass> new_pass() { return std::make_unique<RecordedPass>(); }
 
-void rasterise_planes(const Gaussians& gaussians, const View& view, int threads, Pass& opaque,
-                      float* planes) {
+void contributions(Pass& opaque, int threads, Contributions out) {
   auto& pass = static_cast<RecordedPass&>(opaque);
   Team team(threads);
-  project(gaussians, view, team, pass.splats);
-  list_by_tile(pass.splats, view, team, pass.lists);
-  pass.touched.resize(pass.lists.splats.size());
-  pass.blended.resize(static_cast<size_t>(pass.lists.columns) * pass.lists.rows * kBlocks);
+  pass.sums.resize(pass.lists.splats.size());
   each_tile(pass.lists, team,
             [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
-              Tile tile(column, row, view);
-              tile.blend(pass.splats.splats.data(), list, size, pass.record(t));
-              tile.store_planes(planes);
+              const TileContributions contribute(column, row, pass.view);
+              contribute(pass.splats, list, size, pass.record(t),
+                         pass.sums.data() + pass.lists.start[t], out.top);
             });
-  pass.rows = gaussians.rows;
-  pass.gaussians = gaussians.n;
-  pass.visible = pass.splats.count;
-  pass.view = view;
+  team.each(pass.splats.counts.size(), [&](int64_t piece) {
+    const PieceCounts& counts = pass.splats.counts[piece];
+    const uint32_t* slot = &pass.lists.slots[counts.first_pair];
+    for (int64_t k = 0; k < counts.splats; ++k) {
+      const int64_t splat = piece * kProjectionPiece + k, place = counts.first_splat + k;
+      out.indices[place] = pass.splats.gaussians[splat];
+      out.weights[place] = 0.0f;
+      for (const uint32_t* end = slot + area(pass.splats.tiles[splat]); slot < end; ++slot)
+        out.weights[place] += pass.sums[*slot];
+    }
+  });
 }
 
 void backpropagate(Pass& pass, const float* planes, const float* gradients, NeedlePenalty penalty,

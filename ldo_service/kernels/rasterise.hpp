@@ -74,6 +74,12 @@ struct Gradients {
   double* pose;       // [6] by xi in T_map_camera exp(xi): rotation, then translation
 };
 
+struct Contributions {  // to what was rendered
+  uint32_t* indices;    // as above
+  float* weights;       // [visible] of each row, summed over the pixels; 0: hidden
+  int32_t* top;         // height x width: the row with the largest weight, -1 where none has any
+};
+
 struct Reached {      // by a step of Adam
   uint32_t* indices;  // as above
   float* weights;     // [visible] of each row, summed over the pixels
@@ -83,6 +89,7 @@ struct Reached {      // by a step of Adam
 #define LDO_DECLARE_RASTERISE(isa)                                                              \
   namespace isa {                                                                               \
   void rasterise(const Gaussians&, const View& view, int threads, Pass& memory, Images out);    \
+  void contributions(Pass&, int threads, Contributions out);                                    \
   std::unique_ptr<Pass> new_pass();                                                             \
   void rasterise_planes(const Gaussians&, const View& view, int threads, Pass&, float* planes); \
   void backpropagate(Pass&, const float* planes, const float* gradients, NeedlePenalty,         \

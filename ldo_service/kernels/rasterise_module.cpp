@@ -26,14 +26,18 @@ using Image = nb::ndarray<nb::numpy, float>;
 // The functions of the chosen instruction set.
 struct Kernels {
   decltype(&baseline::rasterise) rasterise;
+  decltype(&baseline::contributions) contributions;
   decltype(&baseline::new_pass) new_pass;
   decltype(&baseline::rasterise_planes) rasterise_planes;
   decltype(&baseline::backpropagate) backpropagate;
   decltype(&baseline::descend) descend;
 };
 
-#define LDO_KERNELS(isa) \
-  Kernels { isa::rasterise, isa::new_pass, isa::rasterise_planes, isa::backpropagate, isa::descend }
+#define LDO_KERNELS(isa)                                                                          \
+  Kernels {                                                                                       \
+    isa::rasterise, isa::contributions, isa::new_pass, isa::rasterise_planes, isa::backpropagate, \
+        isa::descend                                                                              \
+  }
 Kernels kernels_for(Isa isa) {
 #if LDO_X86
   if (isa == Isa::avx512) return LDO_KERNELS(avx512);
@@ -186,6 +190,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
     kernels.rasterise(seen.gaussians, view, threads, *pass,
                       {color.get(), depth.get(), median_depth.get(), opacity.get()});
   }
+  held.is_rendered = true;
   return {image(color.release(), {h, w, 3}), image(depth.release(), {h, w}),
           image(median_depth.release(), {h, w}), image(opacity.release(), {h, w})};
 }
@@ -209,6 +214,24 @@ int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_c
   held.is_rendered = true;
   return pass->visible;
 }
+
+void contributions(PassOfPython& held, const WritableArray& indices, const WritableArray& weights,
+                   const WritableArray& top, int threads) {
+  require_threads(threads);
+  const PassOfPython::Use pass(held);
+  require(held.is_rendered, "this pass holds no rendering: call rasterise first.");
+  const size_t visible = pass->visible;
+  require_shape(indices, "indices", {visible});
+  require_shape(weights, "weights", {visible});
+  require_shape(top, "top",
+                {static_cast<size_t>(pass->view.height), static_cast<size_t>(pass->view.width)});
+  const Contributions out{values_of<uint32_t>(indices, "indices"),
+                          values_of<float>(weights, "weights"), values_of<int32_t>(top, "top")};
+  nb::gil_scoped_release release;
+  kernels.contributions(*pass, threads, out);
+}
+
+int64_t visible(PassOfPython& held) { return PassOfPython::Use(held)->visible; }
 
 using PoseGradient = nb::ndarray<nb::numpy, double>;
 
@@ -289,7 +312,7 @@ NB_MODULE(_rasterise, m) {
   using namespace nb::literals;
   isa = chosen_isa();
   kernels = kernels_for(isa);
-  nb::class_<PassOfPython>(m, "Pass").def(nb::init<>());
+  nb::class_<PassOfPython>(m, "Pass").def(nb::init<>()).def_prop_ro("visible", &visible);
   nb::class_<BoundsOfPython>(m, "Bounds")
       .def(nb::init<>())
       .def("forget", &BoundsOfPython::forget, "first"_a = 0, "last"_a = kMaxGaussians)
@@ -301,6 +324,8 @@ NB_MODULE(_rasterise, m) {
         "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1, "bounds"_a = nb::none());
   m.def("backpropagate", &backpropagate, "forward"_a, "rows"_a, "planes"_a, "gradients"_a,
         "indices"_a, "row_gradients"_a, "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f,
+        "threads"_a = 1);
+  m.def("contributions", &contributions, "forward"_a, "indices"_a, "weights"_a, "top"_a,
         "threads"_a = 1);
   m.def("descend", &descend, "forward"_a, "rows"_a, "mean"_a, "square"_a, "steps"_a, "rates"_a,
         "beta1"_a, "beta2"_a, "epsilon"_a, "planes"_a, "gradients"_a, "indices"_a, "weights"_a,

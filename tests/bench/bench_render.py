@@ -176,9 +176,8 @@ def time_the_twin() -> None:
         {"render": lambda: render_reference(rows.astype(float), camera, np.eye(4))},
     ]
     kernel, twin = medians_ms(runs, repeats=3)
-    print(
-        f"300 Gaussians, 48x36: kernel {kernel['render']:.2f} ms, plain twin {twin['render']:.0f} ms"
-    )
+    both = f"kernel {kernel['render']:.2f} ms, plain twin {twin['render']:.0f} ms"
+    print(f"300 Gaussians, 48x36: {both}")
 
 
 if __name__ == "__main__":

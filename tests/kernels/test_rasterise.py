@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.gaussians.render import Rendering
+from ldo_service.gaussians import Rendering, render
 from ldo_service.gaussians.render_reference import render_reference
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels import _rasterise, isa
@@ -24,8 +24,15 @@ images = {}
 for name in {key.split("/")[0] for key in scenes.files}:
     rows, T, camera = (scenes[f"{name}/{part}"] for part in ("rows", "T", "camera"))
     fx, fy, cx, cy, width, height = camera
-    out = _rasterise.rasterise(rows, T, fx, fy, cx, cy, int(width), int(height), 2)
+    memory = _rasterise.Pass()
+    size = int(width), int(height)
+    out = _rasterise.rasterise(rows, T, fx, fy, cx, cy, *size, 2, memory)
     images |= {f"{name}/{k}": image for k, image in enumerate(out)}
+    V = memory.visible
+    indices, weights = np.zeros(V, np.uint32), np.zeros(V, np.float32)
+    top = np.zeros(size[::-1], np.int32)
+    _rasterise.contributions(memory, indices, weights, top, 2)
+    images |= {f"{name}/{k}": v for k, v in zip(("indices", "weights", "top"), (indices, weights, top))}
 np.savez(sys.argv[2], isa=_rasterise.isa(), **images)
 """
 
@@ -118,6 +125,49 @@ def test_kernel_agrees_with_its_plain_twin(scene: str, by_kernel: dict, by_refer
             np.testing.assert_allclose(actual, wanted, atol=atol, err_msg=name)
         else:  # a step at T = 1/2, where the last bit decides
             assert np.mean(np.abs(actual - wanted) > 1e-5) < 0.003
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_contributions_agree_with_the_plain_twin(
+    scene: str, by_kernel: dict, by_reference: dict
+) -> None:
+    expected, n = by_reference[scene].contributions, len(SCENES[scene][0])
+    indices, weights, top = (by_kernel[f"{scene}/{k}"] for k in ("indices", "weights", "top"))
+    assert np.all(np.diff(indices.astype(int)) > 0)
+    by_row, wanted = np.zeros(n), np.zeros(n)
+    by_row[indices], wanted[expected.indices] = weights, expected.weights
+    pixels = top.size
+    np.testing.assert_allclose(by_row, wanted, atol=2e-4 * pixels**0.5, rtol=1e-5)
+    assert set(indices[weights > 0]) >= set(np.flatnonzero(wanted > 0.03 * pixels))
+    assert np.mean(top != expected.top) < 0.003  # where two weights are equal but for rounding
+
+
+def test_nearer_of_two_equal_weights_is_on_top() -> None:
+    rows = np.repeat(gaussians(1, 0), 2, axis=0)
+    rows[:, :3], rows[:, 3:6] = (0, 0, 1), 9  # so wide that alpha is the opacity
+    rows[:, 10] = [0, 20]  # one half, then all that is left
+    rows[1, 2] = 2
+    seen = render(rows, Camera(9, 9, 20, 20, 4, 4), np.eye(4), contributions=True).contributions
+    assert seen is not None
+    np.testing.assert_array_equal(seen.indices, [0, 1])
+    np.testing.assert_allclose(seen.weights, [40.5, 0.99 * 40.5], rtol=1e-3)
+    assert (seen.top == 0).all()
+
+
+def test_contributions_follow_culling_and_leave_out_who_is_hidden() -> None:
+    rows = np.concatenate([gaussians(5_000, 1), gaussians(5_000, 2, depth_m=(-3, -1))])
+    rows[:, 10] += 4
+    camera, bounds = camera_of(60, 50), _rasterise.Bounds()
+    seen = [
+        render(rows, camera, np.eye(4), contributions=True, **options).contributions
+        for options in ({}, {"bounds": bounds}, {"bounds": bounds, "threads": 3})
+    ]
+    for other in seen[1:]:
+        for name in ("indices", "weights", "top"):
+            assert getattr(seen[0], name).tobytes() == getattr(other, name).tobytes()
+    assert 100 < len(seen[0].indices) < 4_000
+    assert set(np.unique(seen[0].top)) <= {-1, *seen[0].indices.tolist()}
+    assert seen[0].weights.min() > 0
 
 
 def test_scenes_cover_what_they_name(by_reference: dict) -> None:
