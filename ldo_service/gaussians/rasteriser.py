@@ -68,10 +68,13 @@ class Rasteriser:
         T_camera_map: np.ndarray,
         *,
         bounds: _rasterise.Bounds | None = None,
+        tiles: np.ndarray | None = None,
     ) -> np.ndarray:
         """Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity.
 
-        Arguments as those of `render`; the result is overwritten by the next rendering.
+        Arguments as those of `render`; the result is overwritten by the next rendering. Where
+        `tiles` [ceil(H / 16), ceil(W / 16)] uint8 is 0, the planes are zero and are not computed;
+        give `image_loss` the same, and the gradients are those of these tiles alone.
         """
         if camera.distortion:
             raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
@@ -81,7 +84,7 @@ class Rasteriser:
         T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         self._visible = _rasterise.rasterise_planes(
-            self._pass, rows, T, *intrinsics, self._planes, self.threads, bounds
+            self._pass, rows, T, *intrinsics, self._planes, self.threads, bounds, tiles
         )
         self._rows = rows
         return self._planes

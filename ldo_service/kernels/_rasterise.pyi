@@ -76,8 +76,11 @@ def rasterise_planes(
     planes: NDArray[np.float32],
     threads: int = 1,
     bounds: Bounds | None = None,
+    tiles: NDArray[np.uint8] | None = None,
 ) -> int:
     """Write red, green, blue, weighted depth and opacity to `planes` [5, H, W].
+
+    Where `tiles` [ceil(H / 16), ceil(W / 16)] is 0, the planes are zero and cost nothing.
 
     Returns the number V of Gaussians that may touch the image. Otherwise as `rasterise`.
     """

@@ -12,7 +12,6 @@ constexpr float kNearPlane = 0.05f;  // metres
 constexpr float kLowPass = 0.3f;     // px^2, added to the image covariance
 constexpr float kLog2e = 1.44269504f;
 constexpr float kLog2MinAlpha = -7.99435344f;  // log2(1 / 255): weaker contributions are dropped
-constexpr int kTile = 16;                      // pixels
 
 // log2 alpha(x, y) = a dx^2 + b dx dy + c dy^2 + log2_opacity, with dx = x - u, dy = y - v.
 struct alignas(64) Splat {

@@ -26,6 +26,10 @@ struct RecordedPass final : Pass {
     const bool exists = tile < static_cast<int64_t>(lists.columns) * lists.rows;
     return exists ? lists.start[tile + 1] - lists.start[tile] : 0;
   }
+  // Of the pairs with tiles that are not wanted.
+  float* sums_of_nothing(int floats) {
+    return &sums[int64_t{lists.start[lists.start.size() - 1]} * floats];
+  }
   TileRecord record(int64_t tile) {
     return {touched.data() + lists.start[tile], blended.data() + tile * kBlocks};
   }
@@ -92,12 +96,13 @@ void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& dif
 
 // Projects, sorts and blends, keeps the record, and gives each finished tile to `store`.
 template <bool WithMedian, class Store>
-void blend_tiles(const Gaussians& gaussians, const View& view, int threads, Pass& opaque,
-                 const Store& store) {
+void blend_tiles(const Gaussians& gaussians, const View& view, const uint8_t* wanted, int threads,
+                 Pass& opaque, const Store& store) {
   auto& pass = static_cast<RecordedPass&>(opaque);
   Team team(threads);
-  project(gaussians, view, team, pass.splats);
-  list_by_tile(pass.splats, view, team, pass.lists);
+  const TileGrid grid(view, wanted);
+  project(gaussians, view, grid, team, pass.splats);
+  list_by_tile(pass.splats, grid, team, pass.lists);
   pass.touched.resize(pass.lists.splats.size());
   pass.blended.resize(static_cast<size_t>(pass.lists.columns) * pass.lists.rows * kBlocks);
   each_tile(pass.lists, team,
@@ -115,6 +120,7 @@ void blend_tiles(const Gaussians& gaussians, const View& view, int threads, Pass
 void differentiate_tiles(RecordedPass& pass, const float* planes, const float* gradients,
                          Team& team) {
   pass.sums.resize(pass.lists.splats.size() * kSumFloats);
+  std::fill_n(pass.sums_of_nothing(kSumFloats), kSumFloats, 0.0f);
   each_tile(pass.lists, team,
             [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
               TileGradient differentiate(column, row, pass.view, planes, gradients);
@@ -154,12 +160,13 @@ void differentiate(Pass& opaque, const float* planes, const float* gradients, Ne
 }  // namespace
 
 void rasterise(const Gaussians& gaussians, const View& view, int threads, Pass& pass, Images out) {
-  blend_tiles<true>(gaussians, view, threads, pass, [&](const Tile& tile) { tile.store(out); });
+  blend_tiles<true>(gaussians, view, nullptr, threads, pass,
+                    [&](const Tile& tile) { tile.store(out); });
 }
 
-void rasterise_planes(const Gaussians& gaussians, const View& view, int threads, Pass& pass,
-                      float* planes) {
-  blend_tiles<false>(gaussians, view, threads, pass,
+void rasterise_planes(const Gaussians& gaussians, const View& view, const uint8_t* tiles,
+                      int threads, Pass& pass, float* planes) {
+  blend_tiles<false>(gaussians, view, tiles, threads, pass,
                      [&](const Tile& tile) { tile.store_planes(planes); });
 }
 
@@ -169,6 +176,7 @@ void contributions(Pass& opaque, int threads, Contributions out) {
   auto& pass = static_cast<RecordedPass&>(opaque);
   Team team(threads);
   pass.sums.resize(pass.lists.splats.size());
+  *pass.sums_of_nothing(1) = 0.0f;
   each_tile(pass.lists, team,
             [&](int64_t t, int column, int row, const uint32_t* list, int64_t size) {
               const TileContributions contribute(column, row, pass.view);

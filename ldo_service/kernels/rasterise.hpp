@@ -40,6 +40,8 @@ struct Gaussians {
   BlockBound* bounds;  // [ceil(n / kBlockRows)], or null: every row is read
 };
 
+constexpr int kTile = 16;  // pixels
+
 struct Images {         // row-major, height x width
   float* color;         // 3 floats a pixel, background black
   float* depth;         // sum of weight * z, metres: divide by opacity for a mean
@@ -86,16 +88,19 @@ struct Reached {      // by a step of Adam
   double* pose;       // as above
 };
 
-#define LDO_DECLARE_RASTERISE(isa)                                                              \
-  namespace isa {                                                                               \
-  void rasterise(const Gaussians&, const View& view, int threads, Pass& memory, Images out);    \
-  void contributions(Pass&, int threads, Contributions out);                                    \
-  std::unique_ptr<Pass> new_pass();                                                             \
-  void rasterise_planes(const Gaussians&, const View& view, int threads, Pass&, float* planes); \
-  void backpropagate(Pass&, const float* planes, const float* gradients, NeedlePenalty,         \
-                     int threads, Gradients out);                                               \
-  void descend(Pass&, const float* planes, const float* gradients, NeedlePenalty, AdamRows,     \
-               const AdamRates&, int threads, Reached out);                                     \
+// `tiles`, one byte for each tile of kTile x kTile pixels, row by row: where it is 0 the planes are
+// zero. Null: all are wanted.
+#define LDO_DECLARE_RASTERISE(isa)                                                             \
+  namespace isa {                                                                              \
+  void rasterise(const Gaussians&, const View& view, int threads, Pass& memory, Images out);   \
+  void contributions(Pass&, int threads, Contributions out);                                   \
+  std::unique_ptr<Pass> new_pass();                                                            \
+  void rasterise_planes(const Gaussians&, const View& view, const uint8_t* tiles, int threads, \
+                        Pass&, float* planes);                                                 \
+  void backpropagate(Pass&, const float* planes, const float* gradients, NeedlePenalty,        \
+                     int threads, Gradients out);                                              \
+  void descend(Pass&, const float* planes, const float* gradients, NeedlePenalty, AdamRows,    \
+               const AdamRates&, int threads, Reached out);                                    \
   }
 LDO_DECLARE_RASTERISE(baseline)
 LDO_DECLARE_RASTERISE(avx2)

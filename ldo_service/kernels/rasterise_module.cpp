@@ -197,7 +197,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
 
 int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_camera_map, float fx,
                          float fy, float cx, float cy, const WritableArray& planes, int threads,
-                         BoundsOfPython* bounds) {
+                         BoundsOfPython* bounds, const std::optional<Array>& tiles) {
   require_threads(threads);
   require(planes.ndim() == 3 && planes.shape(0) == kPlanes, "planes must have shape [5, H, W].");
   require(planes.shape(1) <= kMaxSide && planes.shape(2) <= kMaxSide, "planes are too large.");
@@ -205,11 +205,14 @@ int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_c
   float* images = values_of<float>(planes, "planes");
   const View view = view_of(T_camera_map, fx, fy, cx, cy, static_cast<int>(planes.shape(2)),
                             static_cast<int>(planes.shape(1)));
+  const auto across = [](size_t pixels) { return (pixels + kTile - 1) / kTile; };
+  if (tiles) require_shape(*tiles, "tiles", {across(planes.shape(1)), across(planes.shape(2))});
+  const uint8_t* wanted = tiles ? values_of<uint8_t>(*tiles, "tiles") : nullptr;
   const PassOfPython::Use pass(held);
   held.is_rendered = false;
   {
     nb::gil_scoped_release release;
-    kernels.rasterise_planes(seen.gaussians, view, threads, *pass, images);
+    kernels.rasterise_planes(seen.gaussians, view, wanted, threads, *pass, images);
   }
   held.is_rendered = true;
   return pass->visible;
@@ -321,7 +324,8 @@ NB_MODULE(_rasterise, m) {
   m.def("rasterise", &rasterise, "rows"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
         "width"_a, "height"_a, "threads"_a = 1, "memory"_a = nb::none(), "bounds"_a = nb::none());
   m.def("rasterise_planes", &rasterise_planes, "forward"_a, "rows"_a, "T_camera_map"_a, "fx"_a,
-        "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1, "bounds"_a = nb::none());
+        "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1, "bounds"_a = nb::none(),
+        "tiles"_a = nb::none());
   m.def("backpropagate", &backpropagate, "forward"_a, "rows"_a, "planes"_a, "gradients"_a,
         "indices"_a, "row_gradients"_a, "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f,
         "threads"_a = 1);

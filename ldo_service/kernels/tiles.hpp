@@ -30,12 +30,37 @@ struct VisibleSplats {
   }
 };
 
+// The tiles of an image, all or some of which are wanted.
+struct TileGrid {
+  TileGrid(const View& view, const uint8_t* wanted)
+      : columns((view.width + kTile - 1) / kTile),
+        rows((view.height + kTile - 1) / kTile),
+        wanted_(wanted) {}
+  int64_t count() const { return static_cast<int64_t>(columns) * rows; }
+  bool wants(uint32_t tile) const { return wanted_ == nullptr || wanted_[tile] != 0; }
+  bool wants_any(const TileRange& range) const {
+    if (wanted_ == nullptr) return true;
+    for (int y = range.y0; y <= range.y1; ++y)
+      for (int x = range.x0; x <= range.x1; ++x)
+        if (wanted_[static_cast<int64_t>(y) * columns + x] != 0) return true;
+    return false;
+  }
+  const int columns, rows;
+
+ private:
+  const uint8_t* wanted_;
+};
+
 // Appends the visible splats of the blocks of a piece, and measures the blocks that are not known.
 class PieceProjection {
  public:
-  PieceProjection(const Gaussians& gaussians, const Projection& project, int64_t piece,
-                  VisibleSplats& out)
-      : gaussians_(gaussians), project_(project), out_(out), place_(piece * kProjectionPiece) {}
+  PieceProjection(const Gaussians& gaussians, const Projection& project, const TileGrid& grid,
+                  int64_t piece, VisibleSplats& out)
+      : gaussians_(gaussians),
+        project_(project),
+        grid_(grid),
+        out_(out),
+        place_(piece * kProjectionPiece) {}
 
   PieceCounts operator()(const uint32_t* blocks, int64_t count) {
     const int64_t first = place_;
@@ -72,7 +97,7 @@ class PieceProjection {
   [[gnu::always_inline]] inline void append(int k, uint32_t first_row) {
     const SplatColumns& s = splats_;
     TileRange& tiles = out_.tiles[place_];
-    if (!tiles_of(s, k, project_.view, tiles)) return;
+    if (!tiles_of(s, k, project_.view, tiles) || !grid_.wants_any(tiles)) return;
     tiles.first_pair = pairs_;
     pairs_ += area(tiles);
     out_.splats[place_] = {s.u[k],
@@ -90,6 +115,7 @@ class PieceProjection {
 
   const Gaussians& gaussians_;
   const Projection& project_;
+  const TileGrid& grid_;
   VisibleSplats& out_;
   int64_t place_;
   uint32_t pairs_ = 0;
@@ -138,7 +164,8 @@ inline void order_by_depth(VisibleSplats& visible, Team& team) {
     std::swap(visible.depths, visible.spare);
 }
 
-inline void project(const Gaussians& gaussians, const View& view, Team& team, VisibleSplats& out) {
+inline void project(const Gaussians& gaussians, const View& view, const TileGrid& grid, Team& team,
+                    VisibleSplats& out) {
   list_blocks_in_view(gaussians, view, out.blocks);
   const int64_t blocks = out.blocks.size(), n = blocks * kBlockRows;
   out.splats.resize(n);
@@ -148,7 +175,7 @@ inline void project(const Gaussians& gaussians, const View& view, Team& team, Vi
   const Projection projection(view);
   team.each(out.counts.size(), [&](int64_t piece) {
     const int64_t begin = piece * kPieceBlocks;
-    PieceProjection project_piece(gaussians, projection, piece, out);
+    PieceProjection project_piece(gaussians, projection, grid, piece, out);
     out.counts[piece] = project_piece(&out.blocks[begin], std::min(kPieceBlocks, blocks - begin));
   });
   sum_counts(out);
@@ -162,7 +189,8 @@ struct TileLists {
   Buffer<uint32_t> start;   // [columns * rows + 1] into splats
   Buffer<uint32_t> splats;  // front to back within a tile; kPrefetchAhead zeros at the end
   // Where in `splats` each pair of a splat and a tile went: splats as in VisibleSplats, and the
-  // tiles of their ranges row by row.
+  // tiles of their ranges row by row. Pairs with a tile that is not wanted all went behind the
+  // last.
   Buffer<uint32_t> slots;
 };
 
@@ -192,11 +220,11 @@ template <class F>
 }
 
 // A counting sort by tile of the splats in depth order.
-inline void list_by_tile(const VisibleSplats& visible, const View& view, Team& team,
+inline void list_by_tile(const VisibleSplats& visible, const TileGrid& grid, Team& team,
                          TileLists& out) {
-  out.columns = (view.width + kTile - 1) / kTile;
-  out.rows = (view.height + kTile - 1) / kTile;
-  const int64_t tiles = static_cast<int64_t>(out.columns) * out.rows;
+  out.columns = grid.columns;
+  out.rows = grid.rows;
+  const int64_t tiles = grid.count();
   const Pieces pieces(visible.count, team);
   Buffer<uint32_t> places(pieces.count() * tiles);
   team.each(pieces.count(), [&](int64_t piece) {
@@ -204,14 +232,15 @@ inline void list_by_tile(const VisibleSplats& visible, const View& view, Team& t
     std::fill(counts, counts + tiles, 0u);
     each_by_depth(visible, pieces.begin(piece), pieces.end(piece),
                   [&](uint32_t, const TileRange& range) {
-                    each_pair(range, out.columns, [&](uint32_t, uint32_t tile) { ++counts[tile]; });
+                    each_pair(range, out.columns,
+                              [&](uint32_t, uint32_t tile) { counts[tile] += grid.wants(tile); });
                   });
   });
   const uint32_t total = to_offsets(places.data(), pieces.count(), tiles);
   out.start.resize(tiles + 1);
   std::fill(out.start.data(), out.start.data() + tiles + 1, total);
   if (total > 0) std::copy(places.data(), places.data() + tiles, out.start.data());
-  out.slots.resize(total + 1);
+  out.slots.resize(visible.pairs + 1);
   out.splats.resize(total + kPrefetchAhead);
   std::fill(out.splats.data() + total, out.splats.data() + total + kPrefetchAhead, 0u);
   team.each(pieces.count(), [&](int64_t piece) {
@@ -220,9 +249,10 @@ inline void list_by_tile(const VisibleSplats& visible, const View& view, Team& t
                   [&](uint32_t splat, const TileRange& range) {
                     uint32_t* slots = &out.slots[visible.first_pair(splat)];
                     each_pair(range, out.columns, [&](uint32_t pair, uint32_t tile) {
-                      const uint32_t slot = place[tile]++;
-                      out.splats[slot] = splat;
-                      slots[pair] = slot;
+                      slots[pair] = total;
+                      if (!grid.wants(tile)) return;
+                      slots[pair] = place[tile]++;
+                      out.splats[slots[pair]] = splat;
                     });
                   });
   });
