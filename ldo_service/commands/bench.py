@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from ldo_service import kernels
 from ldo_service.errors import ConfigError
@@ -49,7 +49,9 @@ def bench(
     if json_:
         print(json.dumps(times | facts))
     else:
-        Console().print(_table(what, facts, times))
+        console = Console(highlight=False)
+        console.print(f"{what}: " + ", ".join(f"{name} {fact}" for name, fact in facts.items()))
+        console.print(_table(times))
 
 
 def _pixels(size: str) -> tuple[int, int]:
@@ -61,11 +63,8 @@ def _pixels(size: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def _table(what: str, facts: dict[str, object], times: dict[str, float]) -> Table:
-    title = f"{what}: {facts['gaussians']:,} Gaussians, {facts['width']}x{facts['height']}"
-    table = Table(title=f"{title}, {facts['isa']}, {facts['threads']} thread(s)")
-    for name in ("step", "ms"):
-        table.add_column(name, justify="left" if name == "step" else "right")
+def _table(times: dict[str, float]) -> Table:
+    table = Table("step", Column("ms", justify="right"))
     for name, time_ms in times.items():
         table.add_row(name.removesuffix("_ms"), f"{time_ms:.2f}")
     return table

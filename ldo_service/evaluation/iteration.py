@@ -113,7 +113,7 @@ def iteration_times(
 ) -> IterationTimes:
     """Median times of the steps of `iteration`, which is made `repeats` times."""
     unfused = {"again": iteration.forward, "backward": iteration.backward}
-    (times,) = medians_ms([iteration.steps() | unfused], ["iteration"], repeats, clock)
+    (times,) = medians_ms([iteration.steps() | unfused], repeats, clock)
     backward_ms = min(times["backward"], times["descent"])
     return IterationTimes(
         times["forward"],
@@ -125,14 +125,10 @@ def iteration_times(
 
 
 def medians_ms(
-    runs: Sequence[Steps],
-    sums: Sequence[str] = (),
-    repeats: int = 20,
-    clock: Callable[[], float] = time.perf_counter,
+    runs: Sequence[Steps], repeats: int, clock: Callable[[], float] = time.perf_counter
 ) -> list[dict[str, float]]:
     """Median time of each step, run in turns after one turn to warm up, so that other work on the
-    machine slows all of them; under the names in `sums` also of forward, loss and descent in all.
-    """
+    machine slows all of them. Where there is a descent, also of the iteration that it ends."""
     times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
     for _ in range(repeats + 1):
         for steps, lists in zip(runs, times, strict=True):
@@ -140,12 +136,15 @@ def medians_ms(
                 start = clock()
                 step()
                 lists[name].append(clock() - start)
-    out = []
-    for lists in times:
-        table = {name: np.array(values[1:]) * 1e3 for name, values in lists.items()}
-        table |= dict.fromkeys(sums, table["forward"] + table["loss"] + table["descent"])
-        out.append({name: float(np.median(values)) for name, values in table.items()})
-    return out
+    return [_medians(lists) for lists in times]
+
+
+def _medians(times_s: dict[str, list[float]]) -> dict[str, float]:
+    times_ms = {name: np.array(values[1:]) * 1e3 for name, values in times_s.items()}
+    if "descent" in times_ms:
+        parts = [times_ms[name] for name in ("forward", "loss", "descent")]
+        times_ms["iteration"] = np.sum(parts, axis=0)
+    return {name: float(np.median(values)) for name, values in times_ms.items()}
 
 
 def _shares(n: int, largest: int) -> list[int]:

@@ -10,7 +10,6 @@ from ldo_service.kernels import _loss
 
 from .exposure import Exposure
 
-
 TILE = 16  # pixels across
 
 
@@ -57,8 +56,8 @@ def image_loss(
     color    [3, H, W] uint8, y = color / 255
     depth_m  [H, W] float32, d; 0 where not measured, which does not count
     mask     [H, W] uint8: where it is 0 both images are taken as black and depth does not count
-    tiles    [ceil(H / 16), ceil(W / 16)] uint8: the pixels of tiles where it is 0 count as if masked,
-             and the means are over the pixels of the others, of which there must be one
+    tiles    [ceil(H / 16), ceil(W / 16)] uint8: the pixels of tiles where it is 0 are masked, and
+             means are over the pixels of the others alone, of which there must be some
     SSIM has an 11x11 Gaussian window of sigma 1.5 px and sees zeros beyond the image, as in 3DGS
     (Wang et al. 2004; Kerbl et al. 2023). Raises ValueError for arrays that do not fit. Bitwise
     equal for any number of threads.

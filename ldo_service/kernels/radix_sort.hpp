@@ -11,11 +11,14 @@ struct Keyed {
 
 constexpr int kMaxDigitBits = 12;  // the histogram and the ends of all bins stay in cache
 
-// The pieces in which an array of n is sorted, one a thread: a stable sort has one result only, so
-// that here the number of threads may decide how the work is cut.
+// The pieces in which an array of n is sorted: one for a thread alone, some for each of several, of
+// which one may be held up. A stable sort has one result only, so that here the number of threads
+// may decide how the work is cut.
 struct Pieces {
-  Pieces(int64_t n, const Team& team)
-      : n(n), length(std::max<int64_t>(4096, (n + team.size() - 1) / team.size())) {}
+  Pieces(int64_t n, const Team& team) : n(n) {
+    const int64_t wanted = team.size() == 1 ? 1 : int64_t{4} * team.size();
+    length = std::max<int64_t>(4096, (n + wanted - 1) / wanted);
+  }
   int64_t count() const { return (n + length - 1) / length; }
   int64_t begin(int64_t piece) const { return piece * length; }
   int64_t end(int64_t piece) const { return std::min(n, (piece + 1) * length); }

@@ -162,7 +162,7 @@ def main() -> None:
                 rows = iteration.gaussians.rows
                 runs.append(prototype(library, rows, iteration.camera, threads))
                 check_agreement(*runs)
-            mine, *theirs = medians_ms(runs, ["iteration"], arguments.repeats, clock)
+            mine, *theirs = medians_ms(runs, arguments.repeats, clock)
             report(n, f"{width}x{height}", mine, theirs[0] if theirs else None)
     time_the_twin()
 

@@ -32,7 +32,7 @@ for name in {key.split("/")[0] for key in scenes.files}:
     indices, weights = np.zeros(V, np.uint32), np.zeros(V, np.float32)
     top = np.zeros(size[::-1], np.int32)
     _rasterise.contributions(memory, indices, weights, top, 2)
-    images |= {f"{name}/{k}": v for k, v in zip(("indices", "weights", "top"), (indices, weights, top))}
+    images |= {f"{name}/indices": indices, f"{name}/weights": weights, f"{name}/top": top}
 np.savez(sys.argv[2], isa=_rasterise.isa(), **images)
 """
 
