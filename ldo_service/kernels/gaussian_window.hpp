@@ -15,16 +15,20 @@ constexpr float kTap[kReach + 1] = {0.26601171f, 0.21300553f, 0.10936069f,
 template <int K>
 using Offset = std::integral_constant<int, K>;
 
+// Adds the taps K, K + 1, ... on both sides to `sum`.
+template <int K, class At>
+[[gnu::always_inline]] inline Floats add_taps(const At& at, Floats sum) {
+  if constexpr (K > kReach)
+    return sum;
+  else
+    return add_taps<K + 1>(at, sum + (at(Offset<K>()) + at(Offset<-K>())) * kTap[K]);
+}
+
 // The windowed sum at sixteen places, of which `at(Offset<k>())` gives the values k to the right or
 // below.
 template <class At>
-[[gnu::always_inline]] inline Floats window(At at) {
-  Floats sum = at(Offset<0>()) * kTap[0];
-  const auto add = [&](auto k) __attribute__((always_inline)) {
-    sum = sum + (at(k) + at(Offset<-k()>())) * kTap[k()];
-  };
-  add(Offset<1>()), add(Offset<2>()), add(Offset<3>()), add(Offset<4>()), add(Offset<5>());
-  return sum;
+[[gnu::always_inline]] inline Floats window(const At& at) {
+  return add_taps<1>(at, at(Offset<0>()) * kTap[0]);
 }
 
 // Columns of an image that are worked on together, and as many more on each side as windows of
@@ -48,9 +52,10 @@ class RowRing {
     Around(RowRing& ring, int y) {
       for (int k = 0; k < kTaps; ++k) row_[k] = ring.row(y + k - kReach, 0);
     }
-    Floats operator()(int image, int column) const {
-      return window(
-          [&](auto k) { return Floats::load(row_[kReach + k()] + image * kColumns + column); });
+    [[gnu::always_inline]] inline Floats operator()(int image, int column) const {
+      return window([&](auto k) __attribute__((always_inline)) {
+        return Floats::load(row_[kReach + k()] + image * kColumns + column);
+      });
     }
 
    private:
