@@ -1,5 +1,6 @@
 """The command line: one clear paragraph and the right exit code."""
 
+import json
 import resource
 import subprocess
 import sys
@@ -155,3 +156,26 @@ def test_a_closed_pipe_is_no_error() -> None:
         text=True,
     )
     assert done.stderr == ""
+
+
+def test_bench_prints_one_json_object_or_a_table(capsys) -> None:
+    small = ("bench", "render", "--gaussians", "300", "--size", "64x48", "--repeats", "2")
+    code, out, _ = ldo(capsys, *small, "--threads", "2", "--elsewhere", "500", "--json")
+    assert code == 0
+    facts = json.loads(out)
+    steps = [facts[f"{step}_ms"] for step in ("forward", "loss", "backward", "adam")]
+    assert all(time_ms >= 0 for time_ms in steps)
+    assert facts["iteration_ms"] > 0
+    assert facts["isa"] in ("baseline", "avx2", "avx512")
+    wanted = {"gaussians": 300, "elsewhere": 500, "width": 64, "height": 48, "threads": 2}
+    assert wanted.items() <= facts.items()
+    code, out, _ = ldo(capsys, *small)
+    assert code == 0
+    assert "iteration" in out
+
+
+@pytest.mark.parametrize("change", [("--size", "64"), ("--size", "0x3"), ("--threads", "0")])
+def test_bench_refuses_what_cannot_be(capsys, change: tuple[str, str]) -> None:
+    code, _, err = ldo(capsys, "bench", "render", *change)
+    assert code == 2
+    assert_one_paragraph(err)
