@@ -16,8 +16,8 @@ class GaussianMap:
 
     `rows`, its columns (`means`, ...), `ids` and `anchors` are views without a copy, valid until
     Gaussians come or go. Who writes through them calls `touch` before the next rendering. `version`
-    grows with every change, `membership` when Gaussians come or go. `bounds` says to `render` where
-    the rows lie, so that it reads those in view only.
+    grows with every change, `membership` when Gaussians may have come or gone. `bounds` says to
+    `render` where the rows lie, so that it reads those in view only.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
@@ -74,10 +74,11 @@ class GaussianMap:
         return self._anchors[: self._size]
 
     def touch(self, rows: np.ndarray | slice | None = None) -> None:
-        """Say that something was written through a view: to the rows with these numbers
-        (uint32, or a slice without a step), or to any."""
+        """Say what was written through a view: the rows with these numbers (uint32, or a slice
+        without a step). Without an argument anything may have changed, which is always safe."""
         self.version += 1
         if rows is None:
+            self.membership += 1
             self.bounds.forget()
         elif isinstance(rows, slice):
             first, last, _ = rows.indices(self._size)

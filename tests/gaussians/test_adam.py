@@ -160,3 +160,13 @@ def test_rates_reach_the_fields_they_are_named_after() -> None:
 def test_senseless_configuration_is_refused(change: dict) -> None:
     with pytest.raises(ConfigError):
         AdamConfig(**change)
+
+
+def test_moments_notice_any_change_that_touch_tells_of() -> None:
+    adam, gaussians = Adam(), map_of(3)
+    adam.step(gaussians, gradients(gaussians, [0, 1]))
+    gaussians.ids[:] += 5  # others in the same places
+    gaussians.touch()
+    adam.step(gaussians, gradients(gaussians, [6]))
+    np.testing.assert_array_equal(adam.snapshot()["ids"], [5, 6, 7])
+    np.testing.assert_array_equal(adam.snapshot()["steps"], [0, 1, 0])
