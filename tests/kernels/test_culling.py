@@ -60,9 +60,9 @@ def test_gaussian_that_slides_out_of_view_is_drawn_as_long_as_a_pixel_shows_it(e
     """The bound is tight: it lets go a little after the image does, and never before."""
     axis, sign = divmod(edge, 2)
     drawn, read = [], []
-    for step in np.linspace(0, 1.5, 200):
+    for step in np.linspace(0, 3, 150):
         rows = np.zeros((BLOCK, 16), np.float32)
-        rows[:, 2], rows[:, 3:6], rows[:, 6], rows[:, 10] = 2, np.log(0.05), 1, 9
+        rows[:, 2], rows[:, 3:6], rows[:, 6], rows[:, 10] = 2, np.log(0.5), 1, 9
         rows[:, axis] = step * (1 - 2 * sign) * 2
         bounds = _rasterise.Bounds()
         render(rows, CAMERA, np.eye(4), bounds=bounds)
