@@ -21,7 +21,6 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.changes import Changes
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
 from ldo_service.gaussians.model import ROW
-from ldo_service.gaussians.render import render
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
@@ -118,9 +117,9 @@ class Mapper(Actor):
     def __init__(self, config: MapperConfig | None = None) -> None:
         super().__init__()
         self.config = config or MapperConfig()
-        self._threads = self.config.thread_count()
         folder = Path(self.config.folder) if self.config.folder else None
-        self._map = MapBuilder(self.config.builder, folder=folder, threads=self._threads)
+        threads = self.config.thread_count()
+        self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
         self._poses = KeyframePoses()
         self._links: dict[int, tuple[int, tuple[float, ...]]] = {}  # reference and information
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
@@ -266,10 +265,7 @@ class Mapper(Actor):
 
     def _view(self, keyframe: Keyframe) -> ModelView:
         views, k = self._map.views, keyframe.keyframe
-        T_camera_map = se3.inverse(views.poses[k])
-        rendering = render(
-            self._map.gaussians.rows, views.cameras[k], T_camera_map, threads=self._threads
-        )
+        rendering = self._map.seen_from(views.cameras[k], views.poses[k])
         return ModelView(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.keyframe,

@@ -88,7 +88,9 @@ def insert(
     T_camera_map = se3.inverse(T_map_camera)
 
     # What is missing?
-    before = before or render(gaussians.rows, frame.camera, T_camera_map, threads=threads)
+    before = before or render(
+        gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, threads=threads
+    )
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
     wanted = unexplained(frame, before, config) & (depth_m > 0)
 
@@ -117,8 +119,11 @@ def insert(
     # Undo the blur of overlapping neighbours.
     new_colors = gaussians.colors[len(gaussians) - len(ids) :]
     for _ in range(config.color_steps):
-        after = render(gaussians.rows, frame.camera, T_camera_map, threads=threads)
+        after = render(
+            gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, threads=threads
+        )
         correct_colors(new_colors, cells, frame, after, config.max_color_step)
+        gaussians.touch(slice(len(gaussians) - len(ids), None))
     return ids
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry import Camera, RgbdFrame, se3
 
 from .anchor_spheres import AnchorSpheres, PlacedCamera
 from .changes import ChangeLog, Changes
@@ -19,7 +19,7 @@ from .keyframe_views import KeyframeViews
 from .model import GaussianMap
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
-from .render import Rendering, render
+from .render import Rendering, RenderMemory, render
 from .sleep import SleepingGaussians, whole_map
 from .sleep_choice import SleepConfig, choose_sleepers
 from .views import View, schedule, shared_surface
@@ -82,7 +82,7 @@ class MapBuilder:
         self.gaussians = GaussianMap()
         self.sleeping = SleepingGaussians(folder and folder / "gaussians")
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
-        self._threads = threads
+        self._threads, self._memory = threads, RenderMemory()
         self._optimiser = Optimiser(self.config.optimiser, threads=threads)
         self._log = ChangeLog()
         self._told: dict[int, np.ndarray] = {}  # T_map_keyframe that others know
@@ -98,7 +98,7 @@ class MapBuilder:
         T_map_camera [4, 4]; `iterations` of the optimiser. Its Gaussians hang on it.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera))
-        before = self._seen_from(frame, T_map_camera)
+        before = self.seen_from(frame.camera, T_map_camera)
         exposure = self._exposure(frame, before)
         self._insert(frame, T_map_camera, keyframe, before, exposure)
         view = replace(View.of(frame, T_map_camera, keyframe), exposure=exposure)
@@ -108,9 +108,16 @@ class MapBuilder:
         if len(self._told) % self.config.prune_keyframes == 0:
             self._prune(touched)
 
-    def _seen_from(self, frame: RgbdFrame, T_map_camera: np.ndarray) -> Rendering:
-        T_camera_map = se3.inverse(T_map_camera)
-        return render(self.gaussians.rows, frame.camera, T_camera_map, threads=self._threads)
+    def seen_from(self, camera: Camera, T_map_camera: np.ndarray) -> Rendering:
+        """What the map shows there, of what is awake."""
+        return render(
+            self.gaussians.rows,
+            camera,
+            se3.inverse(T_map_camera),
+            bounds=self.gaussians.bounds,
+            memory=self._memory,
+            threads=self._threads,
+        )
 
     def _exposure(self, frame: RgbdFrame, before: Rendering) -> Exposure:
         """Against the map; where too little of it is in view, as the keyframe before."""
