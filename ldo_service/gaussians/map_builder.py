@@ -22,7 +22,7 @@ from .pruning import PruningConfig, superfluous
 from .render import Rendering, RenderMemory, render
 from .sleep import SleepingGaussians, whole_map
 from .sleep_choice import SleepConfig, choose_sleepers
-from .views import View, schedule, shared_surface
+from .views import View, sampled_surface, schedule, shared_surface
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,10 +170,11 @@ class MapBuilder:
         if len(earlier) > window.earlier:
             chosen = rng.choice(len(earlier), window.earlier, replace=False)
             earlier = [earlier[i] for i in np.sort(chosen)]
-        return [k for k in (*earlier, *recent) if self._shared(newest, k) >= window.min_shared]
+        surface = sampled_surface(newest)
+        return [k for k in (*earlier, *recent) if self._shared(surface, k) >= window.min_shared]
 
-    def _shared(self, newest: View, keyframe: int) -> float:
-        return shared_surface(newest, self.views.cameras[keyframe], self.views.poses[keyframe])
+    def _shared(self, p_map: np.ndarray, keyframe: int) -> float:
+        return shared_surface(p_map, self.views.cameras[keyframe], self.views.poses[keyframe])
 
     def _rng(self, *what: int) -> np.random.Generator:
         """Of one piece of work: nothing to keep between two."""

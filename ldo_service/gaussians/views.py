@@ -36,21 +36,22 @@ class View:
         return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
 
 
-def shared_surface(
-    newest: View, camera: Camera, T_map_camera: np.ndarray, *, step_px: int = 32
-) -> float:
-    """Share of the surface measured in `newest` that lies in the image of another camera, in
-    front of it; of every `step_px`-th pixel. Occlusion is not looked at."""
+def sampled_surface(view: View, *, step_px: int = 32) -> np.ndarray:
+    """Points [M, 3] in the map that a view measured, of every `step_px`-th pixel."""
     coarse = slice(step_px // 2, None, step_px)
-    z = newest.depth_m[coarse, coarse]
-    points = newest.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
-    if len(points) == 0:
-        return 0.0
-    points = se3.transform(se3.inverse(T_map_camera) @ newest.T_map_camera, points)
+    z = view.depth_m[coarse, coarse]
+    points = view.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
+    return se3.transform(view.T_map_camera, points)
+
+
+def shared_surface(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) -> float:
+    """Share of points [M, 3] that lie in the image of a camera, in front of it; 0 of none.
+    Occlusion is not looked at."""
+    points = se3.transform(se3.inverse(T_map_camera), p_map)
     points = points[points[:, 2] > 0.05]
     u, v = camera.project(points).T
     inside = (u >= 0) & (v >= 0) & (u <= camera.width - 1) & (v <= camera.height - 1)
-    return float(np.count_nonzero(inside)) / np.count_nonzero(z > 0)
+    return float(np.count_nonzero(inside)) / max(len(p_map), 1)
 
 
 def schedule(

@@ -1,6 +1,6 @@
 import numpy as np
 
-from ldo_service.gaussians.views import View, schedule, shared_surface
+from ldo_service.gaussians.views import View, sampled_surface, schedule, shared_surface
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -15,7 +15,8 @@ def view_at(x_m: float, *, turned: bool = False, depth_m: float = 2.0) -> View:
 
 
 def shared(newest: View, other: View) -> float:
-    return shared_surface(newest, other.camera, other.T_map_camera, step_px=4)
+    surface = sampled_surface(newest, step_px=4)
+    return shared_surface(surface, other.camera, other.T_map_camera)
 
 
 def test_view_shares_all_with_itself_and_nothing_with_what_lies_behind() -> None:
