@@ -19,7 +19,7 @@ from .keyframe_views import KeyframeViews
 from .model import GaussianMap
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
-from .render import Rendering, RenderMemory, render
+from .render import Contributions, Rendering, RenderMemory, render
 from .sleep import SleepingGaussians, whole_map
 from .sleep_choice import SleepConfig, choose_sleepers
 from .views import View, sampled_surface, schedule, shared_surface
@@ -106,9 +106,12 @@ class MapBuilder:
         self._told[keyframe], self._newest = T_map_camera, keyframe
         touched = self._fit(self._plan(view, iterations))
         if len(self._told) % self.config.prune_keyframes == 0:
-            self._prune(touched)
+            self._prune_misshapen(touched)
+        self._prune_unconfirmed()
 
-    def seen_from(self, camera: Camera, T_map_camera: np.ndarray) -> Rendering:
+    def seen_from(
+        self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
+    ) -> Rendering:
         """What the map shows there, of what is awake."""
         return render(
             self.gaussians.rows,
@@ -116,6 +119,7 @@ class MapBuilder:
             se3.inverse(T_map_camera),
             bounds=self.gaussians.bounds,
             memory=self._memory,
+            contributions=contributions,
             threads=self._threads,
         )
 
@@ -209,11 +213,36 @@ class MapBuilder:
             )
             self._fit([known[i] for i in chosen], rates)
 
-    def _prune(self, touched: np.ndarray) -> None:
+    # --- pruning ----------------------------------------------------------------------------------
+    def _prune_misshapen(self, touched: np.ndarray) -> None:
         """Among those that the window reached, so that it costs no more in a larger map."""
         among = np.flatnonzero(touched)
         mask = np.zeros(len(self.gaussians), bool)
         mask[among] = superfluous(self.gaussians.rows[among], self.config.pruning)
+        self._remove(mask)
+
+    def _prune_unconfirmed(self) -> None:
+        """Of the Gaussians of one keyframe, now that others have seen the same."""
+        age, pruning = self.config.pruning.confirm_keyframes, self.config.pruning
+        keyframes = list(self.views.poses)[-1 - age :]
+        if len(keyframes) <= age or pruning.min_weight_px == 0:
+            return
+        own = np.flatnonzero(self.gaussians.anchors == keyframes[0])
+        weights_px = np.zeros(len(self.gaussians), np.float32)
+        for keyframe in (keyframes[0], keyframes[age // 2], keyframes[-1]):
+            shown = self._contributions(keyframe)
+            weights_px[shown.indices] = np.maximum(weights_px[shown.indices], shown.weights)
+        mask = np.zeros(len(self.gaussians), bool)
+        mask[own] = weights_px[own] < pruning.min_weight_px
+        self._remove(mask)
+
+    def _contributions(self, keyframe: int) -> Contributions:
+        camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
+        shown = self.seen_from(camera, pose, contributions=True).contributions
+        assert shown is not None
+        return shown
+
+    def _remove(self, mask: np.ndarray) -> None:
         self._log.removing(self.gaussians, mask)
         self._pruned += self.gaussians.remove(mask)
 

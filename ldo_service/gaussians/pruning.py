@@ -12,10 +12,16 @@ class PruningConfig:
     min_opacity: float = 0.005  # Kerbl et al. 2023, sec. 5.2
     max_relative_scale: float = 10.0  # longest axis, in means of its neighbourhood (paper, III.A)
     neighbourhood_m: float = 0.25  # edge of the cubes that are neighbourhoods
+    # Once so many keyframes came after its own, a Gaussian must show in an image: in that of its
+    # own keyframe, of the newest, or of the one between. Others have grown over it.
+    confirm_keyframes: int = 5
+    min_weight_px: float = 0.1  # sum of its weights over the image; 0: all are confirmed
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_opacity < 1:
             raise ConfigError(f"min_opacity={self.min_opacity} must be in [0, 1).")
+        if self.confirm_keyframes < 1 or not self.min_weight_px >= 0:
+            raise ConfigError(f"{self}: confirm_keyframes at least 1, min_weight_px at least 0.")
         if not (self.max_relative_scale > 1 and self.neighbourhood_m > 0):
             raise ConfigError(f"{self}: max_relative_scale above 1, neighbourhood_m positive.")
 

@@ -2,9 +2,9 @@
 
     python tests/bench/bench_laps.py [SOURCE] [--laps 10] [--stride 1] [--out DIR]
 
-Every frame of SOURCE again and again, with stamps that go on. Writes keyframes.csv (keyframe, lap,
-CPU ms of the mapper, Gaussians awake and asleep, resident MB) and laps.png, and prints the mean of
-each lap. CPU time is that of the mapper's thread with one thread of the renderer.
+Every frame of SOURCE again and again, with stamps that go on. Writes keyframes.csv (keyframe,
+frame, lap, CPU ms of the mapper, Gaussians awake and asleep, resident MB) and laps.png, and prints
+the mean of each lap. CPU time is that of the mapper's thread with one thread of the renderer.
 """
 
 import argparse
@@ -36,6 +36,7 @@ class Mapped:
     """One keyframe in the map."""
 
     keyframe: int
+    frame: int
     lap: int
     cpu_ms: float
     gaussians: int
@@ -59,6 +60,7 @@ class TimedMapper(Mapper):
             self.mapped.append(
                 Mapped(
                     message.keyframe,
+                    message.frame,
                     message.frame // self._frames_per_lap,
                     1e3 * (time.thread_time() - started_s),
                     int(facts["gaussians"]),
