@@ -79,12 +79,14 @@ class MapperConfig:
     snapshot_keyframes: int = 10  # between snapshots on the network
     snapshot_growth: float = 0.25  # and at least this share of new Gaussians: a large map is sent
     # seldom, so that snapshots never cost more than a few times the deltas
+    snapshot_keyframes_max: int = 200  # but after so many in any case: who joined late, or missed a
+    # delta, waits no longer
     part_gaussians: int = 16_384  # in one message: 1.2 MB, so that none blocks the others long
     changed_keyframes: int = 5  # between telling how old Gaussians changed: the optimiser touches
     # all that is in view at every keyframe
     checkpoint_keyframes: int = 5  # between saved states; a crash costs at most so many of the map
-    motion_min_m: float = 1e-4  # a correction that moves a keyframe less shows nowhere: 0.05 px
-    motion_min_rad: float = 1e-4
+    motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
+    motion_min_rad: float = 2e-4  # As builder.refined_m: what is not told must not be taken back
 
     def __post_init__(self) -> None:
         counts = (
@@ -122,6 +124,8 @@ class Mapper(Actor):
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
         self._poses = KeyframePoses()
         self._links: dict[int, tuple[int, tuple[float, ...]]] = {}  # reference and information
+        self._refinements = 0  # sent
+        self._unacknowledged: dict[int, int] = {}  # the refinement that no correction knows yet
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
         self._version = 0  # of the map, as followers know it
         self._since_snapshot = (
@@ -190,7 +194,11 @@ class Mapper(Actor):
             if reference in self._poses and (keyframe in moved or reference in moved)
         )
         if poses:
-            yield KeyframeRefinement(stamp_ns=self._newest[0], poses=poses)
+            self._refinements += 1
+            self._unacknowledged.update(dict.fromkeys(moved, self._refinements))
+            yield KeyframeRefinement(
+                stamp_ns=self._newest[0], poses=poses, number=self._refinements
+            )
 
     def _measured(
         self, keyframe: int, reference: int, information: tuple[float, ...]
@@ -207,23 +215,32 @@ class Mapper(Actor):
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> Iterator[MapDelta]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
-        moved = self._poses.correct(message.graph_version, keyframe_poses_of(message))
-        motions = tuple(filter(None, map(self._motion, moved)))
+        self._unacknowledged = {
+            k: number for k, number in self._unacknowledged.items() if number > message.refinements
+        }
+        T_map = keyframe_poses_of(message)
+        self._poses.correct(message.graph_version, T_map, held=self._unacknowledged.keys())
+        motions = tuple(self._motion(keyframe) for keyframe in self._misplaced())
         if motions:
             self._map.move({m.keyframe: transform(m.T_new_old) for m in motions})
             yield self._delta(motions=motions)
 
-    def _motion(self, keyframe: int) -> AnchorMotion | None:
-        """From where its Gaussians are to where the keyframe is; None while it is too little, which
-        adds up until it is enough."""
+    def _misplaced(self) -> list[int]:
+        """Keyframes that are not where their Gaussians are; too little to show adds up until it is
+        enough."""
+        poses = self._map.views.poses
+        are_far = se3.differ(
+            np.array([self._poses[keyframe] for keyframe in poses]),
+            np.array(list(poses.values())),
+            self.config.motion_min_m,
+            self.config.motion_min_rad,
+        )
+        return [keyframe for keyframe, is_far in zip(poses, are_far, strict=True) if is_far]
+
+    def _motion(self, keyframe: int) -> AnchorMotion:
+        """From where its Gaussians are to where the keyframe is."""
         T_map_gaussians = self._map.views.poses[keyframe]
         T_new_old = pose_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
-        motion = transform(T_new_old)
-        if (
-            float(np.linalg.norm(motion[:3, 3])) <= self.config.motion_min_m
-            and se3.rotation_angle(motion) <= self.config.motion_min_rad
-        ):
-            return None
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
 
     # --- messages ---------------------------------------------------------------------------------
@@ -281,9 +298,9 @@ class Mapper(Actor):
     def _snapshot_when_due(self) -> Iterator[MapDelta | MapSnapshot]:
         self._since_snapshot += 1
         grown = self._map.size() - self._in_snapshot
-        if (
-            self._since_snapshot >= self.config.snapshot_keyframes
-            and grown >= self.config.snapshot_growth * self._in_snapshot
+        has_grown = grown >= self.config.snapshot_growth * self._in_snapshot
+        if self._since_snapshot >= (
+            self.config.snapshot_keyframes if has_grown else self.config.snapshot_keyframes_max
         ):
             yield from self._snapshot()
 
@@ -338,6 +355,9 @@ class Mapper(Actor):
             "version": self._version,
             "map": self._map.snapshot(),
             "poses": self._poses.snapshot(),
+            "refinements": self._refinements,
+            "unacknowledged": list(self._unacknowledged.items()),
+            "since_changed": self._since_changed,
             "links": [(k, reference, info) for k, (reference, info) in self._links.items()],
         }
 
@@ -348,6 +368,9 @@ class Mapper(Actor):
         self._version = int(saved["version"]) + VERSIONS_IN_A_CHECKPOINT
         self._map.restore(saved["map"])
         self._poses.restore(saved["poses"])
+        self._refinements = saved["refinements"]
+        self._unacknowledged = dict(saved["unacknowledged"])
+        self._since_changed = saved["since_changed"]
         self._links = {k: (reference, tuple(info)) for k, reference, info in saved["links"]}
 
     def facts(self) -> dict[str, float]:

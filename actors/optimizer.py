@@ -44,12 +44,15 @@ class Optimizer(Actor):
         self._version = 0
         self._T_odom_newest = np.eye(4)
         self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
+        self._waiting_number = 0  # of the last refinement that came
+        self._refinements = 0  # number of the last one that all poses agree with
         self._repeated = self._bridged = self._refined = 0
         self._saved: dict[str, Any] = {}
 
     def handle(self, message: Keyframe | KeyframeRefinement) -> Iterator[Correction]:
         if isinstance(message, KeyframeRefinement):
             self._refine(message.poses)
+            self._waiting_number = message.number
         elif message.keyframe in self._graph:
             self._repeated += 1  # sent again after a restart
             return
@@ -57,7 +60,11 @@ class Optimizer(Actor):
             self._add(message)
             self._refine(())
         self._version += 1
-        yield correction_message(message.stamp_ns, self._version, self._graph.poses())
+        if not self._early:
+            self._refinements = self._waiting_number
+        yield correction_message(
+            message.stamp_ns, self._version, self._graph.poses(), self._refinements
+        )
 
     def _refine(self, poses: tuple[MeasuredPose, ...]) -> None:
         """Replace measurements; those of a keyframe that is still under way wait for it."""
@@ -96,6 +103,7 @@ class Optimizer(Actor):
             self._saved = {
                 "version": self._version,
                 "T_odom_newest": self._T_odom_newest,
+                "refinements": (self._waiting_number, self._refinements),
                 "graph": self._graph.snapshot(),
                 "early": [msgspec.msgpack.encode(pose) for pose in self._early.values()],
             }
@@ -105,6 +113,7 @@ class Optimizer(Actor):
         saved = state["graph"]
         self._version = saved["version"] + 1  # one more may have been sent and not saved
         self._T_odom_newest = saved["T_odom_newest"]
+        self._waiting_number, self._refinements = saved["refinements"]
         self._graph.restore(saved["graph"])
         early = [msgspec.msgpack.decode(body, type=MeasuredPose) for body in saved["early"]]
         self._early = {(pose.reference, pose.keyframe): pose for pose in early}

@@ -99,6 +99,12 @@ class Config:
     record: RecordConfig = field(default_factory=RecordConfig)
     stage: StageConfig = field(default_factory=StageConfig)
 
+    def with_map_folder(self, folder: Path) -> "Config":
+        """The mapper keeps images and sleeping Gaussians there, if nowhere else: its successor
+        finds them."""
+        mapper = dataclasses.replace(self.mapper, folder=self.mapper.folder or str(folder))
+        return dataclasses.replace(self, mapper=mapper)
+
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
     """The defaults, changed by a YAML file, changed by `section.field=value` settings.

@@ -53,6 +53,7 @@ class MapFollower:
         if delta.changed.ids.shape[0]:
             where = np.searchsorted(self.map.ids, delta.changed.ids.numpy())
             self.map.rows[where] = delta.changed.params.numpy()
+            self.map.touch(where.astype(np.uint32))
         self._append(delta.added)
         self.version = delta.version
 

@@ -13,7 +13,7 @@ import signal
 import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
@@ -139,7 +139,7 @@ class Service:
 
         make = box.make
         assert make is not None
-        config = with_map_folder(self.config, self.state / "map")
+        config = self.config.with_map_folder(self.state / "map")
         try:
             return Stage(
                 lambda: make(config),
@@ -193,12 +193,6 @@ class Service:
     def _require_known(self, names: Sequence[str]) -> None:
         for name in names:
             box_named(name)
-
-
-def with_map_folder(config: Config, folder: Path) -> Config:
-    """The mapper keeps images and sleeping Gaussians beside its state, if nowhere else."""
-    mapper = config.mapper
-    return replace(config, mapper=replace(mapper, folder=mapper.folder or str(folder)))
 
 
 def state_folder(folder: Path | None, stack: ExitStack) -> Path:

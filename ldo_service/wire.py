@@ -74,7 +74,10 @@ def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
 
 
 def correction_message(
-    stamp_ns: int, graph_version: int, T_map_keyframe: dict[int, np.ndarray]
+    stamp_ns: int,
+    graph_version: int,
+    T_map_keyframe: dict[int, np.ndarray],
+    refinements: int = 0,
 ) -> Correction:
     rows = [np.r_[T[:3, 3], se3.quaternion(T[:3, :3])] for T in T_map_keyframe.values()]
     return Correction(
@@ -82,6 +85,7 @@ def correction_message(
         graph_version=graph_version,
         keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
         T_map_keyframe=Array.of(np.array(rows, np.float64).reshape(-1, 7)),
+        refinements=refinements,
     )
 
 

@@ -13,9 +13,11 @@ class Correction(Message, frozen=True, kw_only=True):
     graph_version: int  # ascending
     keyframes: Array  # i8 [K], ids, ascending
     T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
+    refinements: int = 0  # number of the last keyframe/refinement that it takes into account
 
     def check(self) -> None:
         require_count("graph_version", self.graph_version)
+        require_count("refinements", self.refinements)
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]
         self.T_map_keyframe.require("T_map_keyframe", "f8", (count, 7))

@@ -58,3 +58,7 @@ class KeyframeRefinement(Message, frozen=True, kw_only=True):
     """keyframe/refinement: measurements that replace earlier ones between the same keyframes."""
 
     poses: tuple[MeasuredPose, ...]
+    number: int = 0  # ascending from 1; 0: not counted
+
+    def check(self) -> None:
+        require_count("number", self.number)

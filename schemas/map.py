@@ -115,6 +115,9 @@ class ModelView(Message, frozen=True, kw_only=True):
         self.opacity.require("opacity", "u1", size)
 
 
+MOST_ITERATIONS = 500  # half a minute in which no keyframe is mapped
+
+
 class MapRefine(Message, frozen=True, kw_only=True):
     """map/refine: asked of the mapper, to fit the map further to the keyframes it has."""
 
@@ -124,9 +127,11 @@ class MapRefine(Message, frozen=True, kw_only=True):
 
     def check(self) -> None:
         require_count("iterations", self.iterations)
+        if self.iterations > MOST_ITERATIONS:
+            raise ValueError(f"{self.iterations} iterations: ask for {MOST_ITERATIONS} at a time")
         require_finite("rates", (self.first_rate, self.last_rate))
-        if not min(self.first_rate, self.last_rate) > 0:
-            raise ValueError(f"rates {self.first_rate} and {self.last_rate} must be positive")
+        if not (0 < self.first_rate <= 1 and 0 < self.last_rate <= 1):
+            raise ValueError(f"rates {self.first_rate} and {self.last_rate} must be in (0, 1]")
 
 
 def require_version(version: int, graph_version: int) -> None:

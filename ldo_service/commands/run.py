@@ -61,6 +61,8 @@ def run(
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
     """
+    if realtime and refine:
+        raise ConfigError("--refine needs a run over a file: leave out --realtime.")
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
     selection = Selection(stride, max_frames)

@@ -11,6 +11,7 @@ SATURATED = 0.97  # of the range: beyond, the sensor says no more
 LEAST_SHARE = 0.15  # of the image that must be comparable
 FEWEST_BLOCKS = 16
 OUTLIER_SIGMAS = 2.5
+MAX_GAIN = 3.0  # and its inverse: a stop and a half
 ROUNDS = 6
 GAIN_PRIOR = 1e-4  # variance of colour below which gain 1 is believed more than the images
 
@@ -60,15 +61,16 @@ def estimated_exposure(
 
     rendered, seen [H, W, 3] in 0..1, opacity [H, W]. Least squares over averages of 8x8 pixels that
     are opaque and not saturated, without outliers (moved things, new surface). None where these are
-    too few.
+    too few, or the gain is none that a camera would choose: then the images show different things.
     """
     x, y = _averaged(rendered), _averaged(seen)
     saturated = _averaged(seen.max(axis=-1) >= SATURATED)
     usable = (_averaged(opacity) > 0.95) & (saturated == 0)
     if np.count_nonzero(usable) < max(FEWEST_BLOCKS, LEAST_SHARE * usable.size):
         return None
-    channels = [_robust_line(x[usable, c], y[usable, c]) for c in range(3)]
-    return Exposure.of(np.array(channels).T)
+    channels = np.array([_robust_line(x[usable, c], y[usable, c]) for c in range(3)])
+    is_plausible = np.all((channels[:, 0] > 1 / MAX_GAIN) & (channels[:, 0] < MAX_GAIN))
+    return Exposure.of(channels.T) if is_plausible else None
 
 
 def _averaged(image: np.ndarray) -> np.ndarray:

@@ -87,7 +87,7 @@ class MapBuilder:
         self._log = ChangeLog()
         self._told: dict[int, np.ndarray] = {}  # T_map_keyframe that others know
         self._newest: int | None = None
-        self._iterations = self._pruned = 0
+        self._iterations = self._dropped = self._pruned = self._excess = 0
 
     # --- keyframes --------------------------------------------------------------------------------
     def add(
@@ -189,6 +189,7 @@ class MapBuilder:
         steps_before = self._optimiser.steps(self.gaussians).copy()
         plan = list(plan)
         usable = {k for k in set(plan) if self._is_usable(k)}
+        self._dropped += sum(k not in usable for k in plan)
         plan = [k for k in plan if k in usable]
         first = next(iter(self.views.poses), None)
         self._optimiser.optimise(self.gaussians, self.views, plan, rates=rates, fixed=first)
@@ -268,6 +269,7 @@ class MapBuilder:
         ]
         awake = AnchorSpheres.around(self.gaussians.rows, self.gaussians.anchors, poses)
         choice = choose_sleepers(awake, poses, recent, self.config.sleep)
+        self._excess = choice.excess
         self.sleeping.take_from(self.gaussians, choice.anchors, poses)
         self._log.all_told(self.gaussians)
 
@@ -286,23 +288,16 @@ class MapBuilder:
 
     def refined(self) -> dict[int, np.ndarray]:
         """T_map_keyframe of keyframes that the optimiser moved since others were told."""
-        moved = {
-            keyframe: T_map_keyframe
-            for keyframe, T_map_keyframe in self.views.poses.items()
-            if self._is_news(keyframe, T_map_keyframe)
-        }
+        poses = self.views.poses
+        is_news = se3.differ(
+            np.array(list(poses.values())),
+            np.array([self._told[keyframe] for keyframe in poses]),
+            self.config.refined_m,
+            self.config.refined_rad,
+        )
+        moved = {k: poses[k] for k, is_new in zip(poses, is_news, strict=True) if is_new}
         self._told.update(moved)
         return moved
-
-    def _is_news(self, keyframe: int, T_map_keyframe: np.ndarray) -> bool:
-        told = self._told[keyframe]
-        if told is T_map_keyframe:
-            return False
-        T = se3.inverse(told) @ T_map_keyframe
-        return bool(
-            np.linalg.norm(T[:3, 3]) > self.config.refined_m
-            or se3.rotation_angle(T) > self.config.refined_rad
-        )
 
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Keyframes were corrected: what hangs on each goes with it, and its view."""
@@ -339,6 +334,8 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self._iterations,
+            "iterations_dropped": self._dropped,  # their keyframe is gone, or sees what sleeps
+            "gaussians_over_cap": self._excess,  # they may be looked at, so they do not sleep
             **self.sleeping.statistics(),
             **self.views.store.statistics(),
         }

@@ -116,7 +116,9 @@ class GaussianMap:
         Returns how many went. Raises ValueError for a mask of another size or type.
         """
         self._require_mask(mask)
-        first = int(np.argmax(mask)) if len(mask) else 0  # what comes before stays in place
+        if not np.any(mask):
+            return 0
+        first = int(np.argmax(mask))  # what comes before stays in place
         keep = ~mask[first:]
         size = first + int(np.count_nonzero(keep))
         for array in (self._rows, self._ids, self._anchors):

@@ -1,6 +1,6 @@
 """Where keyframes are in the map, as one receiver knows it. Conventions: `ldo_service.geometry`."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -67,19 +67,22 @@ class KeyframePoses:
             T_reference_keyframe = se3.inverse(self._T_map[link.reference]) @ T_map_keyframe
             self._links[keyframe] = replace(link, T_reference_keyframe=T_reference_keyframe)
 
-    def correct(self, version: int, T_map: Mapping[int, np.ndarray]) -> dict[int, np.ndarray]:
+    def correct(
+        self, version: int, T_map: Mapping[int, np.ndarray], held: Collection[int] = ()
+    ) -> dict[int, np.ndarray]:
         """Take over a correction; T_new_old of every known keyframe that it places anew.
 
-        Keyframes that are newer than the newest it names are chained again from their references.
-        An older correction than the last changes nothing.
+        Keyframes that are newer than the newest it names are chained again from their references,
+        and so are those `held`, whose links are better than what the correction knew. An older
+        correction than the last changes nothing.
         """
         if version <= self.version or not T_map:
             return {}
         self.version = version
         newest = max(T_map)
         old = dict(self._T_map)
-        self._T_map.update({k: T for k, T in T_map.items() if k in old})
-        for keyframe in sorted(k for k in old if k > newest):
+        self._T_map.update({k: T for k, T in T_map.items() if k in old and k not in held})
+        for keyframe in sorted(k for k in old if k > newest or k in held):
             earlier = max((k for k in old if k < keyframe), default=None)
             self._T_map[keyframe] = self._placed(self._links[keyframe], earlier)
         return {

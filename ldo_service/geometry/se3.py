@@ -133,3 +133,13 @@ def from_quaternion(translation: Array, q: Array) -> Array:
     T[:3, :3] = rotation(np.asarray(q, float))
     T[:3, 3] = translation
     return T
+
+
+def differ(T_a: np.ndarray, T_b: np.ndarray, distance_m: float, angle_rad: float) -> np.ndarray:
+    """Mask [K] of the pairs of transforms [K, 4, 4] that are further apart, or turned by more."""
+    T_a, T_b = np.reshape(T_a, (-1, 4, 4)), np.reshape(T_b, (-1, 4, 4))
+    apart_m = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
+    # |R_a - R_b| = 2 sqrt(2) sin(angle / 2): unlike the trace it loses no digits at small angles
+    chord = np.linalg.norm(T_a[:, :3, :3] - T_b[:, :3, :3], axis=(1, 2))
+    turned_rad = 2 * np.arcsin(np.minimum(chord / np.sqrt(8), 1))
+    return (apart_m > distance_m) | (turned_rad > angle_rad)

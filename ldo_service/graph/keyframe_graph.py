@@ -105,7 +105,11 @@ class KeyframeGraph:
 
     # --- iSAM2 ------------------------------------------------------------------------------------
     def _new_isam(self) -> gtsam.ISAM2:
+        solver = gtsam.ISAM2GaussNewtonParams()
+        solver.setWildfireThreshold(0.0)  # 0.001 by default: smaller changes would not be passed on
         parameters = gtsam.ISAM2Params()
+        parameters.setOptimizationParams(solver)
+        parameters.findUnusedFactorSlots = True  # or the list grows with every replacement
         parameters.setRelinearizeThreshold(0.01)  # rad and m, gtsam's advice for poses
         parameters.relinearizeSkip = 1
         return gtsam.ISAM2(parameters)

@@ -3,6 +3,8 @@
 import asyncio
 import time
 from collections.abc import Sequence as Ordered
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from ldo_service.actors.graph import RUNNING, Box
 from ldo_service.config import config_yaml
@@ -32,12 +34,14 @@ def run_in_real_time(job: Job, advance: Advance) -> RunFolder:
     """
     if job.refine:
         raise ConfigError("--refine needs a run over a file: leave out --realtime.")
-    return asyncio.run(_RealTimeRun(job, advance).go())
+    with TemporaryDirectory(prefix="ldo-map-") as folder:
+        return asyncio.run(_RealTimeRun(job, Path(folder), advance).go())
 
 
 class _RealTimeRun:
-    def __init__(self, job: Job, advance: Advance) -> None:
-        self._sequence, self._config, self._advance = job.sequence, job.config, advance
+    def __init__(self, job: Job, folder: Path, advance: Advance) -> None:
+        self._sequence, self._advance = job.sequence, advance
+        self._config = job.config.with_map_folder(folder)
         self._indices = job.selection.indices(job.sequence)
         self._reader = Reader(job.sequence, self._indices, job.warn)
         self._record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker.hold_out)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.optimizer import Optimizer
 from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.map_builder import MapBuilderConfig
@@ -16,7 +17,7 @@ from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import KeyframeRefinement, MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.topics import KEYFRAME_NEW
-from ldo_service.wire import correction_message, rgbd_of, transform
+from ldo_service.wire import correction_message, keyframe_poses_of, rgbd_of, transform
 
 STILL = OptimiserConfig(rotation_rate_rad=0.0, translation_rate_m=0.0)
 CONFIG = MapperConfig(
@@ -162,6 +163,35 @@ def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
                     assert 1e-5 < np.linalg.norm(moved) < 0.02
                     known[pose.keyframe, "refined"] = pose
     assert len(known) > 5, "nothing was refined"
+
+
+def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyframes) -> None:
+    optimiser = OptimiserConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
+    builder = MapBuilderConfig(optimiser=optimiser)
+    mapper, optimizer = Mapper(replace(CONFIG, builder=builder, iterations=6)), Optimizer()
+    for keyframe in keyframes[:4]:
+        made = list(mapper.handle(keyframe))
+        (before,) = optimizer.handle(keyframe)
+        refinements = [m for m in made if isinstance(m, KeyframeRefinement)]
+        assert list(mapper.handle(before)) == [], "it was on its way when the renderer moved them"
+        for refinement in refinements:
+            (after,) = optimizer.handle(refinement)
+            assert after.refinements == refinement.number
+            assert list(mapper.handle(after)) == [], "the graph agrees with the renderer"
+    assert after.refinements > 1
+    turned = {
+        k: se3.exp(np.array([0, 0, 0, 0.1, 0, 0])) @ T for k, T in keyframe_poses_of(after).items()
+    }
+    far = correction_message(0, after.graph_version + 1, turned, after.refinements)
+    (delta,) = mapper.handle(far)
+    assert len(delta.motions) == 4
+
+
+def test_a_map_that_no_longer_grows_is_still_sent_whole_now_and_then(keyframes) -> None:
+    config = replace(CONFIG, snapshot_growth=100.0, snapshot_keyframes_max=3)
+    made = [list(mapper_made) for mapper_made in map(Mapper(config).handle, keyframes[:8])]
+    whole = [any(isinstance(m, MapSnapshot) for m in messages) for messages in made]
+    assert whole == [True, False, False, True, False, False, True, False]
 
 
 def seen_psnr(rows: np.ndarray, frame: RgbdFrame, T_map_camera: np.ndarray) -> float:

@@ -73,3 +73,9 @@ def test_removed_undoes_applied() -> None:
     exposure = Exposure.of(np.array([[0.8, 1.1, 0.9], [0.05, -0.02, 0.0]]))
     color = np.random.default_rng(0).uniform(0.1, 0.8, (4, 5, 3)).astype(np.float32)
     np.testing.assert_allclose(exposure.removed(exposure.applied(color)), color, atol=1e-6)
+
+
+def test_images_of_different_things_have_no_exposure() -> None:
+    shown, _ = shown_and_seen(1.0, 0.0)
+    other = 0.8 - shown
+    assert estimated_exposure(shown, np.ones(shown.shape[:2], np.float32), other) is None

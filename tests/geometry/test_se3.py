@@ -108,3 +108,14 @@ def test_transform_applies_rotation_then_translation_to_any_batch() -> None:
     T = se3.from_quaternion(np.array([1.0, 2, 3]), np.array([1.0, 0, 0, 1]))  # 90 deg about z
     points = np.broadcast_to([1.0, 0, 0], (2, 4, 3))
     np.testing.assert_allclose(se3.transform(T, points), np.broadcast_to([1, 3, 3], (2, 4, 3)))
+
+
+def test_transforms_that_differ_are_told_by_distance_or_angle() -> None:
+    rng = np.random.default_rng(0)
+    T = np.array([se3.exp(rng.normal(size=6)) for _ in range(4)])
+    steps = np.array([[0, 0, 0, 0, 0, 9e-4], [0, 0, 0, 0, 2e-3, 0], [9e-5, 0, 0, 0, 0, 0]])
+    other = T.copy()
+    for k, xi in enumerate((*steps, np.array([0, 2e-4, 0, 0, 0, 0]))):
+        other[k] = T[k] @ se3.exp(xi)
+    assert se3.differ(T, other, 1e-3, 1e-4).tolist() == [False, True, False, True]
+    assert se3.differ(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), 1, 1).shape == (0,)

@@ -101,3 +101,37 @@ def test_equal_measurements_give_equal_bits() -> None:
     one, two = built(truth, measurements).poses(), built(truth, measurements).poses()
     for keyframe in one:
         np.testing.assert_array_equal(one[keyframe], two[keyframe])
+
+
+def test_small_changes_of_a_link_reach_every_keyframe_behind_it() -> None:
+    truth = circle(16)
+    graph = built(truth, measured(truth, [(i, i + 1) for i in range(15)], 0.0))
+    T_0_1 = se3.inverse(truth[0]) @ truth[1]
+    for step in range(1, 21):
+        T = T_0_1 @ se3.exp(np.array([0, 0, 0, step * 5e-4, 0, 0]))
+        graph.replace([RelativePose(0, 1, T, INFORMATION)])
+    moved = graph.pose(0) @ T @ se3.inverse(truth[1])
+    for keyframe in range(1, 16):
+        np.testing.assert_allclose(graph.pose(keyframe), moved @ truth[keyframe], atol=1e-6)
+
+
+def test_a_replaced_measurement_counts_once_before_and_after_a_restore() -> None:
+    truth = circle(8)
+    measurements = measured(truth, [(i, i + 1) for i in range(7)], 0.0)
+    graph = built(truth, measurements)
+    closure = RelativePose(0, 7, se3.inverse(truth[0]) @ truth[7], INFORMATION)
+    graph.replace([closure])
+    wrong = RelativePose(3, 4, measurements[3].T_a_b @ se3.exp(np.full(6, 0.1)), INFORMATION)
+    graph.replace([wrong])
+    graph.replace([measurements[3]])
+    restored = KeyframeGraph()
+    restored.restore(graph.snapshot())
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, truth[keyframe], atol=2e-3)  # within what is relinearised
+        np.testing.assert_allclose(restored.pose(keyframe), truth[keyframe], atol=1e-6)
+
+
+def test_a_measurement_of_an_unknown_keyframe_replaces_nothing() -> None:
+    graph = built(circle(4), measured(circle(4), [(0, 1)], 0.0))
+    with pytest.raises(KeyError):
+        graph.replace([RelativePose(0, 9, np.eye(4), INFORMATION)])
