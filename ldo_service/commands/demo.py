@@ -17,9 +17,9 @@ from ldo_service.evaluation.pictures import (
     save_picture,
     trajectory_picture,
 )
-from ldo_service.evaluation.run_folder import FinishedRun
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import Judged, RenderedView, view_of
+from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import RunFolder, prepare
 from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
@@ -63,7 +63,7 @@ def demo(
 
 def held_out_views(out: Path, sequence: Sequence, threads: int) -> Iterator[RenderedView]:
     """Held-out frames with the final map rendered at their final poses, as `ldo eval` does."""
-    run = FinishedRun.read(out)
+    run = read_run(out)
     (posed,) = run.maps
     for frame in Judged.of(run.frames).held_out:
         if not frame.is_lost:

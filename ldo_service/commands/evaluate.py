@@ -10,14 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.errors import DataError
 from ldo_service.evaluation import trajectory, views
 from ldo_service.evaluation.lpips import Lpips
 from ldo_service.evaluation.results import Results, evaluate_run, plain
-from ldo_service.evaluation.run_folder import FinishedRun
 from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import Judged, RenderingErrors
 from ldo_service.recordings.sequence import open_source
+from ldo_service.runs.finished import read_run, written
 
 from .options import Json, Source
 from .progress import progress
@@ -54,7 +53,7 @@ def evaluate(
     config = run_config(folder)
     threads = config.mapper.thread_count()
     distance = Lpips(lpips, threads=threads) if lpips else None
-    run, sequence = FinishedRun.read(folder), open_source(source, config.data.options())
+    run, sequence = read_run(folder), open_source(source, config.data.options())
     run.require_source(sequence)
     with progress("eval", len(Judged.of(run.frames).posed), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
@@ -66,9 +65,7 @@ def evaluate(
 
 def run_config(folder: Path) -> Config:
     """The configuration that a run was made with."""
-    if not (folder / "config.yaml").is_file():
-        raise DataError(f"{folder} has no config.yaml: is it what `ldo run` wrote?")
-    return load_config(folder / "config.yaml")
+    return load_config(written(folder, "config.yaml"))
 
 
 def print_results(results: Results, lpips: Path | None) -> None:

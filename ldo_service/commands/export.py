@@ -15,8 +15,8 @@ from ldo_service.gaussians.ply import write_ply
 from ldo_service.gaussians.splat import write_splat
 from ldo_service.gaussians.spz import write_spz
 from ldo_service.geometry import Trajectory, se3
-from ldo_service.runs.finished import FinishedRun
-from ldo_service.runs.folder import EXPORTED
+from ldo_service.runs.finished import MapFolder, newest_map
+from ldo_service.runs.folder import EXPORTED, MAP_FILES
 from ldo_service.volumes import (
     OccupancyConfig,
     TsdfConfig,
@@ -32,14 +32,13 @@ from .progress import progress
 Format = Literal["ply", "splat", "spz", "tum", "csv", "mesh", "occupancy"]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]
 TRAJECTORY_COLUMNS = ("stamp_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
-INPUTS = ("map.ply", "trajectory.txt", "keyframes.json")
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
     """What to write, from what, and how."""
 
-    run: FinishedRun
+    source: MapFolder
     out: Path
     voxel_m: float | None
     up: Up
@@ -91,11 +90,11 @@ def export(
     """
     if voxel is not None and format not in ("mesh", "occupancy"):
         raise ConfigError(f"--voxel has no meaning for {format}: leave it out.")
-    run = FinishedRun.open(folder, online)
+    source = MapFolder(folder) if online else newest_map(folder)
     out = out or folder / EXPORTED[format][0]
     written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
-    require_writable(run, [out, *written], overwrite)
-    job = Job(run, out, voxel, up, heights, Console(stderr=True, highlight=False))
+    require_writable(source, [out, *written], overwrite)
+    job = Job(source, out, voxel, up, heights, Console(stderr=True, highlight=False))
     try:
         facts = WRITERS[format](job)
     except OSError as error:
@@ -103,9 +102,9 @@ def export(
     Console(highlight=False).print(f"{out}: {facts}", soft_wrap=True)
 
 
-def require_writable(run: FinishedRun, files: list[Path], overwrite: bool) -> None:
-    """Raises ConfigError for a file that is there already, or that the run itself needs."""
-    needed = {(run.folder / name).resolve() for name in INPUTS}
+def require_writable(source: MapFolder, files: list[Path], overwrite: bool) -> None:
+    """Raises ConfigError for a file that is there already, or that is read."""
+    needed = {(source.folder / name).resolve() for name in MAP_FILES}
     for file in files:
         if file.resolve() in needed:
             raise ConfigError(f"{file} is what would be read. Choose another --out.")
@@ -116,7 +115,7 @@ def require_writable(run: FinishedRun, files: list[Path], overwrite: bool) -> No
 # --- writers: each says in a few words what it wrote ----------------------------------------------
 def _gaussians(write: Callable) -> Callable[[Job], str]:
     def write_gaussians(job: Job) -> str:
-        rows = job.run.gaussians()
+        rows = job.source.gaussians()
         write(job.out, rows)
         return f"{len(rows):,} Gaussians"
 
@@ -124,13 +123,13 @@ def _gaussians(write: Callable) -> Callable[[Job], str]:
 
 
 def _tum(job: Job) -> str:
-    trajectory = job.run.trajectory()
+    trajectory = job.source.trajectory()
     trajectory.save(job.out)
     return f"{len(trajectory):,} poses"
 
 
 def _csv(job: Job) -> str:
-    trajectory = job.run.trajectory()
+    trajectory = job.source.trajectory()
     write_csv(job.out, trajectory)
     return f"{len(trajectory):,} poses"
 
@@ -147,7 +146,7 @@ def write_csv(path: Path, trajectory: Trajectory) -> None:
 
 def _mesh(job: Job) -> str:
     config = TsdfConfig() if job.voxel_m is None else TsdfConfig(job.voxel_m)
-    rows, viewpoints = job.run.gaussians(), job.run.viewpoints()
+    rows, viewpoints = job.source.gaussians(), job.source.viewpoints()
     with progress("mesh", len(viewpoints), job.console) as advance:
         mesh = fuse(rows, viewpoints, config, threads=os.cpu_count() or 1, advance=advance).mesh()
     if not len(mesh.triangles):
@@ -159,7 +158,7 @@ def _mesh(job: Job) -> str:
 
 def _occupancy(job: Job) -> str:
     config = OccupancyConfig() if job.voxel_m is None else OccupancyConfig(job.voxel_m)
-    rows, viewpoints = job.run.gaussians(), job.run.viewpoints()
+    rows, viewpoints = job.source.gaussians(), job.source.viewpoints()
     with progress("occupancy", len(viewpoints), job.console) as advance:
         grid = occupancy(rows, viewpoints, config, threads=os.cpu_count() or 1, advance=advance)
     plan = floor_plan(grid, job.up, job.heights_m)

@@ -12,8 +12,8 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Trajectory
 
 from . import trajectory, views
+from .finished_run import FinishedRun, at_stamps
 from .pictures import save_picture, trajectory_picture
-from .run_folder import FinishedRun, at_stamps
 from .sheet import rendering_sheet
 from .trajectory import TrajectoryErrors, evaluate_trajectory
 from .views import FIGURES, Distance, Judged, RenderedView, RenderingErrors, view_of

@@ -11,8 +11,8 @@ from ldo_service.gaussians.exposure import Exposure, fitted_exposure
 from ldo_service.gaussians.render import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
 
+from .finished_run import PosedMap, RunFrame
 from .rendering import depth_error, psnr, ssim
-from .run_folder import PosedMap, RunFrame
 
 TRAINING_STEP = 5  # of the literature's protocol (SplaTAM, Keetha et al. 2024)
 FIGURES = ("psnr_db", "ssim", "lpips", "depth_l1_m", "depth_share")

@@ -1,6 +1,12 @@
-"""What a run left in its folder, to be worked on."""
+"""What a run left in its folder, read back. The files: `runs.folder`.
 
+Every function raises DataError for a file that is missing or is not what a run writes.
+"""
+
+import csv
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,28 +14,54 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import DataError
+from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
 from ldo_service.gaussians.ply import read_ply
 from ldo_service.geometry import Camera, Trajectory
 from ldo_service.volumes import Viewpoint
 
-from .folder import CAMERA
+from .folder import CAMERA, REFINED
 
-REFINED = "refined"  # folder in that of the run, with a map, keyframes and trajectory of its own
+
+def read_run(folder: Path) -> FinishedRun:
+    """All that is judged of a run."""
+    frames = _frames(written(folder, "frames.csv"))
+    online = Trajectory.load(written(folder, "trajectory_online.txt"))
+    maps = [MapFolder(folder).posed("online")]
+    estimates = {"online": online, "final": maps[0].trajectory}
+    if has_refined(folder):
+        maps.append(MapFolder(folder / REFINED).posed("refined"))
+        estimates["refined"] = maps[1].trajectory
+    return FinishedRun(folder, frames, estimates, tuple(maps))
+
+
+def newest_map(folder: Path) -> "MapFolder":
+    """What was refined after the run; the run's own where nothing was."""
+    return MapFolder(folder / REFINED if has_refined(folder) else folder)
+
+
+def has_refined(folder: Path) -> bool:
+    """The map is the last file that a refinement writes."""
+    return (folder / REFINED / "map.ply").is_file()
+
+
+def written(folder: Path, name: str) -> Path:
+    """A file that every run writes."""
+    if not (folder / name).is_file():
+        raise DataError(f"{folder} has no {name}: is it what `ldo run` wrote?")
+    return folder / name
 
 
 @dataclass(frozen=True, slots=True)
-class FinishedRun:
-    """`folder` holds map.ply, trajectory.txt and keyframes.json. Reading them raises DataError."""
+class MapFolder:
+    """`folder` holds map.ply, trajectory.txt and keyframes.json: a run's own or its refined ones.
+
+    Only the map must be there; each is read when it is asked for.
+    """
 
     folder: Path
 
-    @classmethod
-    def open(cls, folder: Path, online: bool = False) -> "FinishedRun":
-        """What was refined after the run, where it was and `online` does not ask for the other."""
-        if not (folder / "map.ply").is_file():
-            raise DataError(f"{folder} has no map.ply: is it what `ldo run` wrote?")
-        refined = folder / REFINED
-        return cls(folder if online or not (refined / "map.ply").is_file() else refined)
+    def __post_init__(self) -> None:
+        written(self.folder, "map.ply")
 
     def gaussians(self) -> np.ndarray:
         """Rows [N, 16], see `gaussians.model`."""
@@ -37,26 +69,56 @@ class FinishedRun:
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every frame that has a pose, after the last correction."""
-        return Trajectory.load(self.folder / "trajectory.txt")
+        return Trajectory.load(written(self.folder, "trajectory.txt"))
 
     def viewpoints(self) -> list[Viewpoint]:
         """Where the keyframes were taken."""
-        path = self.folder / "keyframes.json"
+        with self._keyframes() as (path, keyframes):
+            return [_viewpoint(path, keyframe) for keyframe in keyframes]
+
+    def exposures(self) -> Exposures:
+        """Of keyframes that have one; older versions wrote none."""
+        with self._keyframes() as (_, keyframes):
+            exposed = [keyframe for keyframe in keyframes if "exposure" in keyframe]
+            stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
+            matrices = np.array([keyframe["exposure"] for keyframe in exposed], float)
+            return Exposures(stamps_ns, matrices.reshape(-1, 2, 3))
+
+    def posed(self, name: str) -> PosedMap:
+        return PosedMap(name, self.gaussians(), self.trajectory(), self.exposures())
+
+    @contextmanager
+    def _keyframes(self) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
+        """Where keyframes.json is and what it holds; what makes no sense is the file's fault."""
+        path = written(self.folder, "keyframes.json")
         try:
-            return [_viewpoint(path, entry) for entry in json.loads(path.read_text())]
+            yield path, json.loads(path.read_text())
         except OSError as error:
             raise DataError(f"{path} cannot be read: {error.strerror}.") from error
         except (ValueError, KeyError, TypeError) as error:
             raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
 
 
-def _viewpoint(path: Path, entry: dict[str, Any]) -> Viewpoint:
-    if "camera" not in entry:
+def _viewpoint(path: Path, keyframe: dict[str, Any]) -> Viewpoint:
+    if "camera" not in keyframe:
         raise DataError(
             f"{path} does not say with which camera its keyframes were taken: an older version "
             "wrote it. `ldo run` the sequence again."
         )
-    T_map_camera = np.array(entry["T_map_camera"], float)
+    T_map_camera = np.array(keyframe["T_map_camera"], float)
     if T_map_camera.shape != (4, 4) or not np.all(np.isfinite(T_map_camera)):
-        raise ValueError(f"T_map_camera of keyframe {entry['keyframe']} is no finite 4x4 matrix")
-    return Viewpoint(Camera(*(entry["camera"][name] for name in CAMERA)), T_map_camera)
+        raise ValueError(f"T_map_camera of keyframe {keyframe['keyframe']} is no finite 4x4 matrix")
+    return Viewpoint(Camera(*(keyframe["camera"][name] for name in CAMERA)), T_map_camera)
+
+
+def _frames(path: Path) -> tuple[RunFrame, ...]:
+    try:
+        with path.open(newline="") as file:
+            return tuple(_frame(row) for row in csv.DictReader(file))
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path} cannot be read: {error!r}.") from error
+
+
+def _frame(row: dict[str, str]) -> RunFrame:
+    is_held_out = bool(int(row["held_out"]))
+    return RunFrame(int(row["frame"]), int(row["stamp_ns"]), row["status"], is_held_out)

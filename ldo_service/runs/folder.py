@@ -33,7 +33,8 @@ from ldo_service.schemas import (
 )
 from ldo_service.wire import keyframe_poses_of, transform
 
-REFINED = "refined"
+MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
+REFINED = "refined"  # folder in that of the run, with such files of its own
 EXPORTED = {  # by `ldo export`, per format
     "ply": ("gaussians.ply",),
     "splat": ("gaussians.splat",),
@@ -45,10 +46,9 @@ EXPORTED = {  # by `ldo export`, per format
 }
 WRITTEN = frozenset(
     {
-        *("trajectory_online.txt", "trajectory.txt", "frames.csv", "keyframes.json", "map.ply"),
-        *("config.yaml", "summary.json"),
+        *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
         *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
-        *(f"{REFINED}/{name}" for name in ("trajectory.txt", "keyframes.json", "map.ply")),
+        *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
     }
 )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ldo_service import cli
-from ldo_service.runs.folder import prepare
+from ldo_service.runs.folder import MAP_FILES, prepare
 
 
 def ldo(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
@@ -91,7 +91,7 @@ def test_nothing_to_judge_is_bad_data(capsys, run: Path, without_truth: Path) ->
 
 def test_a_refined_map_has_rows_of_its_own(capsys, run: Path, room_folder: Path) -> None:
     (run / "refined").mkdir()
-    for name in ("map.ply", "trajectory.txt", "keyframes.json"):
+    for name in MAP_FILES:
         shutil.copy(run / name, run / "refined")
     code, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
     assert code == 0

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence, open_sequence
-from ldo_service.evaluation.run_folder import Exposures, FinishedRun, PosedMap
+from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap
 from ldo_service.evaluation.views import (
     Judged,
     RenderingErrors,
@@ -18,6 +18,7 @@ from ldo_service.evaluation.views import (
     view_of,
 )
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
+from ldo_service.runs.finished import read_run
 
 A, FITTED, PLAIN = "A held out", "A held out, exposure fitted", "A held out, no exposure"
 B = "B training"
@@ -30,7 +31,7 @@ def sequence(room_folder: Path) -> Sequence:
 
 @pytest.fixture(scope="module")
 def run(finished_run: Path) -> FinishedRun:
-    return FinishedRun.read(finished_run)
+    return read_run(finished_run)
 
 
 def evaluate(

@@ -1,20 +1,110 @@
+"""A folder that `ldo run` wrote, and folders that something happened to."""
+
 import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
 from ldo_service.gaussians.ply import write_ply
-from ldo_service.geometry import Camera, se3
-from ldo_service.runs.finished import FinishedRun
+from ldo_service.geometry import Camera, Trajectory, se3
+from ldo_service.runs.finished import MapFolder, newest_map, read_run
+from ldo_service.runs.folder import CAMERA, MAP_FILES, prepare
 
-CAMERA = Camera(320, 240, 260.0, 261.0, 159.5, 119.5)
+SOME_CAMERA = Camera(320, 240, 260.0, 261.0, 159.5, 119.5)
 T_MAP_CAMERA = se3.exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
 
 
+# --- all of it ------------------------------------------------------------------------------------
+@pytest.fixture
+def copied(finished_run: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(finished_run, tmp_path / "run")
+
+
+@pytest.fixture
+def refined(copied: Path) -> Path:
+    """The same with a refined map, which is the same map."""
+    (copied / "refined").mkdir()
+    for name in MAP_FILES:
+        shutil.copy(copied / name, copied / "refined")
+    return copied
+
+
+def test_a_run_is_read_as_it_was(finished_run: Path, room_folder: Path) -> None:
+    run = read_run(finished_run)
+    run.require_source(open_sequence(str(room_folder)))
+    assert [frame.index for frame in run.frames if frame.is_held_out] == [4, 9, 14]
+    assert list(run.estimates) == ["online", "final"]
+    (posed,) = run.maps
+    assert posed.rows.shape[1] == 16
+    assert len(posed.rows) > 10_000
+    np.testing.assert_array_equal(
+        posed.T_map_camera(run.frame(9)), run.estimates["final"].T_world_camera[9]
+    )
+
+
+def test_a_refined_map_is_another_with_poses_of_its_own(refined: Path) -> None:
+    poses = Trajectory.load(refined / "trajectory.txt")
+    moved = poses.T_world_camera.copy()
+    moved[:, 0, 3] += 0.5
+    Trajectory(poses.stamps_s, moved).save(refined / "refined/trajectory.txt")
+    run = read_run(refined)
+    assert [posed.name for posed in run.maps] == ["online", "refined"]
+    assert list(run.estimates) == ["online", "final", "refined"]
+    first, second = (posed.T_map_camera(run.frame(3)) for posed in run.maps)
+    assert second[0, 3] - first[0, 3] == pytest.approx(0.5, abs=1e-6)
+
+
+def test_a_run_in_the_place_of_a_refined_one_is_not_refined(
+    refined: Path, finished_run: Path
+) -> None:
+    prepare(refined, overwrite=True)
+    shutil.copytree(finished_run, refined, dirs_exist_ok=True)
+    assert [posed.name for posed in read_run(refined).maps] == ["online"]
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+def overwrite(path: Path) -> None:
+    path.write_text("something else\n1,2\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil"),
+    [
+        ("map.ply", Path.unlink),
+        ("map.ply", cut),
+        ("map.ply", overwrite),
+        ("frames.csv", Path.unlink),
+        ("frames.csv", overwrite),
+        ("trajectory.txt", Path.unlink),
+        ("trajectory.txt", overwrite),
+        ("keyframes.json", Path.unlink),
+        ("keyframes.json", overwrite),
+        ("trajectory_online.txt", Path.unlink),
+        ("refined/map.ply", cut),
+        ("refined/trajectory.txt", Path.unlink),
+    ],
+)
+def test_a_file_that_is_missing_or_spoilt_is_named(
+    refined: Path, name: str, spoil: Callable[[Path], None]
+) -> None:
+    spoil(refined / name)
+    with pytest.raises(DataError, match=Path(name).name) as caught:
+        read_run(refined)
+    assert str((refined / name).parent) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+# --- a map ----------------------------------------------------------------------------------------
 def keyframe(**changes: object) -> dict[str, object]:
-    camera = {name: getattr(CAMERA, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    camera = {name: getattr(SOME_CAMERA, name) for name in CAMERA}
     return {"keyframe": 0, "camera": camera, "T_map_camera": T_MAP_CAMERA.tolist(), **changes}
 
 
@@ -26,18 +116,21 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_keyframes_are_seen_from_where_they_were_taken(folder: Path) -> None:
-    first, _ = FinishedRun.open(folder).viewpoints()
-    assert first.camera == CAMERA
+    first, _ = MapFolder(folder).viewpoints()
+    assert first.camera == SOME_CAMERA
     np.testing.assert_array_equal(first.T_map_camera, T_MAP_CAMERA)
 
 
+def test_keyframes_of_older_versions_have_the_exposure_of_the_map(folder: Path) -> None:
+    np.testing.assert_array_equal(MapFolder(folder).exposures().at(0).gain, np.ones(3))
+
+
 def test_what_was_refined_goes_first(folder: Path) -> None:
-    assert FinishedRun.open(folder).folder == folder
+    assert newest_map(folder).folder == folder
     (folder / "refined").mkdir()
-    assert FinishedRun.open(folder).folder == folder  # as long as nothing is in it
+    assert newest_map(folder).folder == folder  # as long as nothing is in it
     write_ply(folder / "refined" / "map.ply", np.zeros((0, 16), np.float32))
-    assert FinishedRun.open(folder).folder == folder / "refined"
-    assert FinishedRun.open(folder, online=True).folder == folder
+    assert newest_map(folder).folder == folder / "refined"
 
 
 @pytest.mark.parametrize(
@@ -52,4 +145,4 @@ def test_what_was_refined_goes_first(folder: Path) -> None:
 def test_a_keyframe_without_sense_is_said(folder: Path, changes: dict, said: str) -> None:
     (folder / "keyframes.json").write_text(json.dumps([keyframe(**changes)]))
     with pytest.raises(DataError, match=said):
-        FinishedRun.open(folder).viewpoints()
+        MapFolder(folder).viewpoints()

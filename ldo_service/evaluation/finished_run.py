@@ -1,7 +1,5 @@
-"""What a run wrote, read back. The files: `ldo_service.runs.folder`."""
+"""What is judged of a run. `ldo_service.runs.finished` reads it from a folder."""
 
-import csv
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +8,6 @@ import numpy as np
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
-from ldo_service.gaussians.ply import read_ply
 from ldo_service.geometry import Trajectory
 
 STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond, as float64 seconds
@@ -18,7 +15,7 @@ STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond, as float64
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """A line of frames.csv."""
+    """A frame that was tracked."""
 
     index: int  # in the sequence
     stamp_ns: int
@@ -57,7 +54,7 @@ class PosedMap:
     name: str  # online: at the end of the stream; refined: after further iterations
     rows: np.ndarray
     trajectory: Trajectory
-    exposures: "Exposures"
+    exposures: Exposures
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
         """[4, 4]. Raises DataError when there is none."""
@@ -73,24 +70,12 @@ class PosedMap:
 @dataclass(frozen=True, eq=False, slots=True)
 class FinishedRun:
     """`estimates` holds T_map_camera as published (online), after the last correction (final), and
-    after further iterations (refined), where there were any."""
+    after further iterations (refined), where there were any. Pictures are drawn into `folder`."""
 
     folder: Path
     frames: tuple[RunFrame, ...]  # every frame that was tracked
     estimates: dict[str, Trajectory]
     maps: tuple[PosedMap, ...]  # one of the final poses, perhaps one of the refined
-
-    @staticmethod
-    def read(folder: Path) -> "FinishedRun":
-        """Raises DataError for a file that is missing or cannot be read."""
-        frames = _frames(folder / "frames.csv")
-        maps = [_posed_map("online", folder)]
-        if (folder / "refined").is_dir():
-            maps.append(_posed_map("refined", folder / "refined"))
-        estimates = {"online": Trajectory.load(_there(folder, "trajectory_online.txt"))}
-        for name, posed in zip(("final", "refined"), maps, strict=False):
-            estimates[name] = posed.trajectory
-        return FinishedRun(folder, frames, estimates, tuple(maps))
 
     def frame(self, index: int) -> RunFrame:
         return next(frame for frame in self.frames if frame.index == index)
@@ -118,39 +103,3 @@ def at_stamps(trajectory: Trajectory, stamps_s: np.ndarray) -> Trajectory:
     gaps_s = stamps_s[np.minimum(nearest, len(stamps_s) - 1)] - trajectory.stamps_s
     chosen = np.abs(gaps_s) <= STAMP_TOLERANCE_S
     return Trajectory(trajectory.stamps_s[chosen], trajectory.T_world_camera[chosen])
-
-
-def _frames(path: Path) -> tuple[RunFrame, ...]:
-    try:
-        with path.open(newline="") as file:
-            return tuple(_frame(row) for row in csv.DictReader(file))
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path} cannot be read: {error!r}.") from error
-
-
-def _frame(row: dict[str, str]) -> RunFrame:
-    is_held_out = bool(int(row["held_out"]))
-    return RunFrame(int(row["frame"]), int(row["stamp_ns"]), row["status"], is_held_out)
-
-
-def _posed_map(name: str, folder: Path) -> PosedMap:
-    rows = read_ply(_there(folder, "map.ply"))
-    trajectory = Trajectory.load(_there(folder, "trajectory.txt"))
-    return PosedMap(name, rows, trajectory, _exposures(_there(folder, "keyframes.json")))
-
-
-def _exposures(path: Path) -> Exposures:
-    """Of keyframes that have one; older versions wrote none."""
-    try:
-        keyframes = [k for k in json.loads(path.read_text()) if "exposure" in k]
-        stamps_ns = np.array([int(k["stamp_ns"]) for k in keyframes], np.int64)
-        matrices = np.array([k["exposure"] for k in keyframes], float).reshape(-1, 2, 3)
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{path} cannot be read: {error!r}.") from error
-    return Exposures(stamps_ns, matrices)
-
-
-def _there(folder: Path, name: str) -> Path:
-    if not (folder / name).is_file():
-        raise DataError(f"{folder} has no {name}: is it what `ldo run` wrote?")
-    return folder / name

@@ -1,0 +1,40 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.errors import DataError
+from ldo_service.evaluation.finished_run import at_stamps
+from ldo_service.geometry import Trajectory
+from ldo_service.runs.finished import read_run
+
+
+def test_a_frame_that_should_have_a_pose_and_has_none_is_an_error(finished_run: Path) -> None:
+    run = read_run(finished_run)
+    posed = run.maps[0]
+    kept = np.arange(len(posed.trajectory)) != 7
+    poses = Trajectory(posed.trajectory.stamps_s[kept], posed.trajectory.T_world_camera[kept])
+    with pytest.raises(DataError, match=r"no pose for frame 7.*calls OK"):
+        replace(posed, trajectory=poses).T_map_camera(run.frame(7))
+
+
+def test_another_source_is_refused(finished_run: Path, room: Sequence, room_folder: Path) -> None:
+    run = read_run(finished_run)
+    later = replace(run.frames[3], stamp_ns=run.frames[3].stamp_ns + 1)
+    beyond = replace(run.frames[3], index=16)
+    sequence = open_sequence(str(room_folder))
+    for frame in (later, beyond):
+        with pytest.raises(DataError, match="the SOURCE that the run was made from"):
+            replace(run, frames=(*run.frames[:3], frame)).require_source(sequence)
+    assert len(room) > 16
+
+
+def test_poses_are_chosen_by_stamp() -> None:
+    poses = Trajectory(
+        np.array([1e9, 1e9 + 0.033333333, 1e9 + 0.066666667]), np.tile(np.eye(4), (3, 1, 1))
+    )
+    assert at_stamps(poses, np.array([1e9 + 0.0333333335])).stamps_s.tolist() == [poses.stamps_s[1]]
+    assert len(at_stamps(poses, np.array([1e9 + 0.04]))) == 0
+    assert len(at_stamps(poses, np.zeros(0))) == 0
