@@ -26,6 +26,8 @@ Source = Annotated[
         "recognised by its files), a recording, or synthetic:room, :tour or :flat",
     ),
 ]
+MaxFrames = Annotated[int | None, tyro.conf.arg(metavar="N", help="stop after so many frames")]
+Stride = Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")]
 Recording = Annotated[
     Path,
     tyro.conf.Positional,

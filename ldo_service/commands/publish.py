@@ -17,7 +17,7 @@ from ldo_service.runs.source import Selection
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.wire import camera_rgbd_message
 
-from .options import ConfigFile, Endpoint, Robot, Settings, Source
+from .options import ConfigFile, Endpoint, MaxFrames, Robot, Settings, Source, Stride
 from .progress import progress
 
 MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad
@@ -30,10 +30,8 @@ def publish(
     rate: Annotated[
         float | None, tyro.conf.arg(metavar="HZ", help="frames per second; default: as recorded")
     ] = None,
-    stride: Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")] = 1,
-    max_frames: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help="stop after so many frames")
-    ] = None,
+    stride: Stride = 1,
+    max_frames: MaxFrames = None,
     restamp: Annotated[
         bool,
         tyro.conf.arg(help="stamp frames with the time of sending instead of the recorded one"),

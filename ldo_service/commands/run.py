@@ -18,7 +18,7 @@ from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
 from ldo_service.runs.source import Selection
 
-from .options import ConfigFile, Overwrite, Settings, Source
+from .options import ConfigFile, MaxFrames, Overwrite, Settings, Source, Stride
 from .progress import progress
 
 
@@ -27,10 +27,8 @@ def run(
     out: Annotated[Path, tyro.conf.arg(metavar="DIR", help="folder for the results")],
     config: ConfigFile = None,
     set: Settings = (),
-    max_frames: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help="stop after so many frames")
-    ] = None,
-    stride: Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")] = 1,
+    max_frames: MaxFrames = None,
+    stride: Stride = 1,
     hold_out: Annotated[
         int | None,
         tyro.conf.arg(metavar="N", help="track every n-th frame and never map it; 0: map all"),

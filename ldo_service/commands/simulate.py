@@ -13,7 +13,7 @@ from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.simulation import Made, simulate_graph
 from ldo_service.runs.source import Selection
 
-from .options import ConfigFile, Json, Settings, Source
+from .options import ConfigFile, Json, MaxFrames, Settings, Source, Stride
 from .progress import progress
 from .run import with_options
 
@@ -22,10 +22,8 @@ def simulate(
     source: Source,
     config: ConfigFile = None,
     set: Settings = (),
-    max_frames: Annotated[
-        int | None, tyro.conf.arg(metavar="N", help="stop after so many frames")
-    ] = None,
-    stride: Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")] = 1,
+    max_frames: MaxFrames = None,
+    stride: Stride = 1,
     threads: Annotated[
         int | None, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
     ] = None,
