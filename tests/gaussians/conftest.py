@@ -1,7 +1,14 @@
-"""Gaussians of every kind, to be written and read back."""
+"""Gaussians of every kind, and a room to fit some to."""
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+
+from ldo_service.datasets import Sequence
+from ldo_service.geometry import RgbdFrame
+
+Posed = tuple[RgbdFrame, np.ndarray]  # and T_world_camera
 
 
 @pytest.fixture
@@ -16,3 +23,17 @@ def some_rows() -> np.ndarray:
     rows[:, 11:14] = rng.uniform(0, 1, (200, 3))
     rows[0, 11:14], rows[1, 11:14] = 0, 1
     return rows
+
+
+@pytest.fixture(scope="package")
+def small_room(room: Sequence) -> Callable[[int], Posed]:
+    """A frame of the synthetic room at a quarter of its size, and where it was taken."""
+    T_world_camera = room.truth().T_world_camera
+    return lambda index: (halved(halved(room[index])), T_world_camera[index])
+
+
+def halved(frame: RgbdFrame) -> RgbdFrame:
+    size = (frame.camera.height // 2, 2, frame.camera.width // 2, 2, -1)
+    color = frame.color.astype(float).reshape(size).mean(axis=(1, 3))
+    depth_m = frame.depth_m.reshape(size).mean(axis=(1, 3))[..., 0]
+    return RgbdFrame(np.round(color).astype(np.uint8), depth_m, frame.camera.halved())

@@ -11,27 +11,17 @@ from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, WindowConfig
 from ldo_service.gaussians.sleep_choice import SleepConfig
-from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry import se3
+
+from .conftest import Posed
 
 KEYFRAMES = (0, 6, 12, 18)
 HELD_OUT = (3, 9, 15)
 
 
 @pytest.fixture(scope="module")
-def posed(room) -> dict[int, tuple[RgbdFrame, np.ndarray]]:
-    """Frames of a quarter of their size, and where they were taken."""
-    truth = room.truth()
-    return {
-        i: (halved(halved(room[i])), truth.T_world_camera[i])
-        for i in sorted((*KEYFRAMES, *HELD_OUT))
-    }
-
-
-def halved(frame: RgbdFrame) -> RgbdFrame:
-    size = (frame.camera.height // 2, 2, frame.camera.width // 2, 2, -1)
-    color = frame.color.astype(float).reshape(size).mean(axis=(1, 3))
-    depth_m = frame.depth_m.reshape(size).mean(axis=(1, 3))[..., 0]
-    return RgbdFrame(np.round(color).astype(np.uint8), depth_m, frame.camera.halved())
+def posed(small_room) -> dict[int, Posed]:
+    return {i: small_room(i) for i in sorted((*KEYFRAMES, *HELD_OUT))}
 
 
 def built(

@@ -15,25 +15,18 @@ from ldo_service.gaussians import (
     insert,
     render,
 )
-from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry import se3
 
 
 @pytest.fixture(scope="module")
-def start(room) -> tuple[GaussianMap, list[View]]:
-    """A map of three views of the synthetic room, of a quarter of its size."""
-    truth, gaussians, views = room.truth(), GaussianMap(), []
+def start(small_room) -> tuple[GaussianMap, list[View]]:
+    """A map of three views of the synthetic room."""
+    gaussians, views = GaussianMap(), []
     for i in (0, 4, 8):
-        frame, T_map_camera = halved(halved(room[i])), truth.T_world_camera[i]
+        frame, T_map_camera = small_room(i)
         insert(gaussians, frame, T_map_camera, i)
         views.append(View.of(frame, T_map_camera, i))
     return gaussians, views
-
-
-def halved(frame: RgbdFrame) -> RgbdFrame:
-    size = (frame.camera.height // 2, 2, frame.camera.width // 2, 2, -1)
-    color = frame.color.astype(float).reshape(size).mean(axis=(1, 3))
-    depth_m = frame.depth_m.reshape(size).mean(axis=(1, 3))[..., 0]
-    return RgbdFrame(np.round(color).astype(np.uint8), depth_m, frame.camera.halved())
 
 
 def copied(gaussians: GaussianMap) -> GaussianMap:
