@@ -10,7 +10,7 @@ import pytest
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence, open_sequence
-from ldo_service.runs.folder import prepare
+from ldo_service.runs.folder import CAMERA, prepare
 from ldo_service.runs.job import Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
@@ -39,11 +39,8 @@ def room_folder(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Pat
     for kind in ("rgb", "depth"):
         text = "".join(f"{name} {kind}/{name}.png\n" for name in lines)
         (folder / f"{kind}.txt").write_text(text)
-    camera = room.camera
-    intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy")}
-    (folder / "camera.json").write_text(
-        json.dumps({**intrinsics, "cx": camera.cx, "cy": camera.cy})
-    )
+    intrinsics = {name: getattr(room.camera, name) for name in CAMERA}
+    (folder / "camera.json").write_text(json.dumps(intrinsics))
     truth = room.truth()
     assert truth is not None
     truth.save(folder / "groundtruth.txt")
@@ -52,7 +49,7 @@ def room_folder(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="session")
 def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `ldo run --hold-out 5` writes of `room_folder`: copy it before changing anything."""
+    """What `ldo run --hold-out 5` writes of `room_folder`; not to be changed."""
     folder = tmp_path_factory.mktemp("run") / "room"
     prepare(folder, overwrite=False)
     config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))

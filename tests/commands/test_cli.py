@@ -13,10 +13,10 @@ from ldo_service import cli
 LDO = (sys.executable, "-m", "ldo_service")
 
 
-def ldo(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
+def ldo(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
     """Exit code, standard output and standard error of a call in this process."""
     try:
-        cli.main(arguments)
+        cli.main([str(argument) for argument in arguments])
         code = 0
     except SystemExit as leaving:
         code = int(leaving.code or 0)

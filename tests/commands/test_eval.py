@@ -8,28 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from ldo_service import cli
 from ldo_service.runs.folder import MAP_FILES, prepare
-
-
-def ldo(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
-    """Exit code, standard output and standard error."""
-    try:
-        cli.main([str(argument) for argument in arguments])
-        code = 0
-    except SystemExit as leaving:
-        code = int(leaving.code or 0)
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
+from tests.commands.test_cli import ldo
 
 
 def last_line(text: str) -> str:
     return text.strip().splitlines()[-1]
-
-
-@pytest.fixture
-def run(finished_run: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(finished_run, tmp_path / "run")
 
 
 @pytest.fixture

@@ -21,17 +21,13 @@ T_MAP_CAMERA = se3.exp(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
 
 # --- all of it ------------------------------------------------------------------------------------
 @pytest.fixture
-def copied(finished_run: Path, tmp_path: Path) -> Path:
-    return shutil.copytree(finished_run, tmp_path / "run")
-
-
-@pytest.fixture
-def refined(copied: Path) -> Path:
-    """The same with a refined map, which is the same map."""
-    (copied / "refined").mkdir()
+def refined(finished_run: Path, tmp_path: Path) -> Path:
+    """A copy with a refined map, which is the same map."""
+    run = shutil.copytree(finished_run, tmp_path / "run")
+    (run / "refined").mkdir()
     for name in MAP_FILES:
-        shutil.copy(copied / name, copied / "refined")
-    return copied
+        shutil.copy(run / name, run / "refined")
+    return run
 
 
 def test_a_run_is_read_as_it_was(finished_run: Path, room_folder: Path) -> None:
