@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.graph import RUNNING
-from ldo_service.config import Config
+from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import Out
@@ -19,6 +19,8 @@ from ldo_service.wire import camera_rgbd_message
 from tests.runtime.cast import eventually, running, send
 
 FRAMES = 30
+ROUGH = "mapper.iterations=2"  # so few that it is quick, so many that keyframes move
+CONFIG = load_config(settings=(ROUGH,))
 
 
 def stages(folder: Path, transport: MemoryTransport) -> list[Stage]:
@@ -28,10 +30,10 @@ def stages(folder: Path, transport: MemoryTransport) -> list[Stage]:
         make, topics = box.make, [out.topic.name for out in box.outputs]
         made.append(
             Stage(
-                lambda make=make: make(Config()),
+                lambda make=make: make(CONFIG),
                 transport,
                 expected={name: lossless_consumers(RUNNING, name) for name in topics},
-                journal=open_recorder(folder, box.name, "robot", Config()),
+                journal=open_recorder(folder, box.name, "robot", CONFIG),
             )
         )
     return made

@@ -11,7 +11,7 @@ from ldo_service.errors import DataError, FrameError
 from ldo_service.recordings.sequence import RecordingSequence, open_source
 from tests.commands.test_cli import ldo
 
-from .conftest import FRAMES
+from .conftest import FRAMES, ROUGH
 
 
 def test_the_frames_are_those_of_the_camera(recording: Path, room: Sequence) -> None:
@@ -27,9 +27,9 @@ def test_the_frames_are_those_of_the_camera(recording: Path, room: Sequence) -> 
 
 
 def test_a_run_over_it_is_a_run_over_its_source(recording: Path, tmp_path: Path, capsys) -> None:
-    limit = ("--max-frames", str(FRAMES))
+    options = ("--max-frames", str(FRAMES), "--set", ROUGH)
     for source, out in ((str(recording), "recorded"), ("synthetic:room", "source")):
-        code, _, err = ldo(capsys, "run", source, "--out", str(tmp_path / out), *limit)
+        code, _, err = ldo(capsys, "run", source, "--out", str(tmp_path / out), *options)
         assert code == 0, err
     for name in ("trajectory.txt", "map.ply"):
         assert (tmp_path / "recorded" / name).read_bytes() == (

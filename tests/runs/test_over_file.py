@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Camera, RawFrame, Trajectory
-from ldo_service.runs.folder import RunFolder, prepare
-from ldo_service.runs.job import Job
+from ldo_service.runs.folder import RunFolder
 from ldo_service.runs.over_file import run_over_file
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import Warn
+
+from .jobs import job
 
 FRAMES = 40
 
@@ -33,18 +33,8 @@ class Spoilt(Cached):
         return super().read(index)
 
 
-def run(
-    sequence: Sequence,
-    folder: Path,
-    *settings: str,
-    frames: int = FRAMES,
-    warn=print,
-    refine: int = 0,
-) -> RunFolder:
-    prepare(folder, overwrite=False)
-    config = load_config(settings=settings)
-    job = Job(sequence, folder, config, Selection(max_frames=frames), warn, refine)
-    return run_over_file(job, lambda _done: None)
+def run(sequence: Sequence, folder: Path, *settings: str, warn: Warn = print) -> RunFolder:
+    return run_over_file(job(sequence, folder, *settings, frames=FRAMES, warn=warn), lambda _: None)
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.runs.folder import prepare
-from ldo_service.runs.job import Job
 from ldo_service.runs.realtime import run_in_real_time
-from ldo_service.runs.source import Selection
+
+from .jobs import job
 
 
 @pytest.mark.timeout(60)
@@ -21,9 +19,7 @@ def test_a_paced_run_takes_as_long_as_the_sequence_and_accounts_for_every_frame(
     frames = 45
     for index in range(frames):
         room.read(index)
-    prepare(tmp_path / "out", overwrite=False)
-    job = Job(room, tmp_path / "out", load_config(), Selection(max_frames=frames), print)
-    record = run_in_real_time(job, lambda _done: None)
+    record = run_in_real_time(job(room, tmp_path / "out", frames=frames), lambda _done: None)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["wall_s"] >= (frames - 1) / 30
     tracked = sum(summary["status"].values())

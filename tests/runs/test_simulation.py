@@ -19,11 +19,13 @@ from ldo_service.schemas import Keyframe
 from tests.actors.conftest import frames, keyframes, tracked  # noqa: F401
 from tests.commands.test_cli import ldo
 
+from .jobs import ROUGH
+
 FRAMES = 30
 
 
 def simulated(sequence: Sequence, *settings: str) -> dict[str, Made]:
-    config = load_config(settings=settings)
+    config = load_config(settings=(ROUGH, *settings))
     return simulate_graph(sequence, config, Selection(max_frames=FRAMES), print, lambda _done: None)
 
 
@@ -86,7 +88,7 @@ def test_the_renderer_uses_the_threads_it_is_given(
 ) -> None:
     def share_of_helpers(threads: int) -> float:
         """CPU time that threads other than this one spend while it maps."""
-        mapper = Mapper(MapperConfig(threads=threads))
+        mapper = Mapper(MapperConfig(threads=threads, iterations=1))
         whole_s, own_s = time.process_time(), time.thread_time()
         for keyframe in keyframes:
             list(mapper.handle(keyframe))
