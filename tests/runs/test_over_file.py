@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.evaluation.views import Judged, evaluate_rendering
 from ldo_service.geometry import Camera, RawFrame, Trajectory
+from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import RunFolder
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Warn
@@ -125,6 +128,20 @@ def test_held_out_frames_are_marked_and_not_mapped(room: Sequence, tmp_path: Pat
     held_out = [row for row in rows if row["held_out"] == "1"]
     assert [int(row["frame"]) for row in held_out] == list(range(4, FRAMES, 5))
     assert not any(row["keyframe"] for row in held_out)
+
+
+def test_a_refined_map_lies_beside_the_runs_own_and_looks_better(
+    room: Sequence, tmp_path: Path
+) -> None:
+    asked, done = replace(job(room, tmp_path / "out", frames=10), refine=30), []
+    record = run_over_file(asked, done.append)
+    assert record.summary["refine_iterations"] == 30
+    assert done[-1] == asked.work
+    run = read_run(tmp_path / "out")
+    judged = Judged.of(run.frames)
+    online, refined = evaluate_rendering(room, judged, run.maps, lambda _done: None)
+    assert (online.map, refined.map) == ("online", "refined")
+    assert refined.mean("psnr_db") > online.mean("psnr_db") + 1
 
 
 @pytest.mark.timeout(60)
