@@ -154,7 +154,8 @@ def _carve(
     for voxels in _slabs(states.shape, _frustum_m(depth_m, viewpoint) / voxel_m - lowest):
         middles_m = (voxels + lowest + 0.5) * voxel_m
         at = viewpoint.look_up(se3.transform(T_camera_map, middles_m), depth_m)
-        states[tuple(voxels[at.seen_m - voxel_m >= at.z_m].T)] = FREE
+        in_front = (at.seen_m > 0) & (at.z_m <= at.seen_m - voxel_m)
+        states[tuple(voxels[in_front].T)] = FREE
 
 
 def _frustum_m(depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:

@@ -18,6 +18,7 @@ FINE = InsertionConfig(max_contrast=0.2)  # what is judged here is made from the
 class Mapped:
     rows: np.ndarray
     viewpoints: list[Viewpoint]
+    frames: range  # of the room, one for each viewpoint
 
 
 @pytest.fixture(scope="package")
@@ -27,7 +28,7 @@ def mapped(room: Sequence) -> Mapped:
     for keyframe, index in enumerate(KEYFRAMES):
         insert(gaussians, room[index], T_world_camera[index], keyframe, FINE)
     viewpoints = [Viewpoint(room.camera, T_world_camera[index]) for index in KEYFRAMES]
-    return Mapped(gaussians.rows, viewpoints)
+    return Mapped(gaussians.rows, viewpoints, KEYFRAMES)
 
 
 @pytest.fixture(scope="package")

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from ldo_service.datasets import Sequence
 from ldo_service.datasets.synthetic.furniture import furnished_room
 from ldo_service.datasets.synthetic.solids import vector
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.geometry import Camera
+from ldo_service.geometry import Camera, se3
 from ldo_service.volumes import OccupancyConfig, OccupancyGrid, Viewpoint, occupancy
 from ldo_service.volumes.occupancy import FREE, OCCUPIED, UNKNOWN, occupied_voxels
 
@@ -63,6 +64,19 @@ def test_free_voxels_lie_in_the_room_and_in_nothing(grid: OccupancyGrid) -> None
             own = np.stack(solid.point_to_local(vector(free.T)))
             depth_m = ((1 - np.abs(own)) * np.array(solid.size_m)[:, None] / 2).min(axis=0)
             assert depth_m.max() < VOXEL_M / 2, solid
+
+
+def test_free_voxels_were_looked_through(grid: OccupancyGrid, mapped, room: Sequence) -> None:
+    """Judged by the true depth of the frames. Where a camera stood is free without being seen."""
+    free = centers(grid, FREE)
+    seen = np.zeros(len(free), bool)
+    for viewpoint, index in zip(mapped.viewpoints, mapped.frames, strict=True):
+        p_camera = se3.transform(se3.inverse(viewpoint.T_map_camera), free)
+        column, row = np.rint(room.camera.project(p_camera)).astype(int).T
+        within = (p_camera[:, 2] > 0) & (column >= 0) & (column < 320) & (row >= 0) & (row < 240)
+        depth_m = room[index].depth_m[np.where(within, row, 0), np.where(within, column, 0)]
+        seen |= within & (p_camera[:, 2] < depth_m)
+    assert np.count_nonzero(~seen) <= len(mapped.viewpoints)
 
 
 def test_where_the_camera_stood_is_free(grid: OccupancyGrid, mapped) -> None:
