@@ -29,7 +29,7 @@ CHUNK = 512  # blocks worked on at a time: a quarter of a million voxels
 @dataclass(frozen=True, slots=True)
 class TsdfConfig:
     voxel_m: float = 0.02
-    truncation_voxels: float = 4.0  # more rounds off thin things, less tears noisy walls
+    truncation_voxels: float = 4.0  # less tears noisy walls, more what is thin and seen twice
     max_memory_mb: int = 1024  # of the voxels: 1000 m2 of surface at 2 cm
 
     def __post_init__(self) -> None:
