@@ -29,8 +29,10 @@ class OptimiserConfig:
     exposure_rate: float = 0.005  # step of gains and biases per iteration
     exposure_prior: float = 0.5  # pull to gain 1, bias 0: else the map's brightness drifts.
     # 0.01: -0.6 dB on held-out views of the kitchen, whose camera changes its exposure
-    rotation_rate_rad: float = 2e-4  # step of keyframe poses per iteration: +0.3 dB there
-    translation_rate_m: float = 2e-4
+    # Step of keyframe poses per iteration. 2e-4 gains 0.3 dB there, and adds 1 mm of noise to poses
+    # that are exact (90 frames of a Replica apartment: ATE 0.02 cm without, 0.13 cm with).
+    rotation_rate_rad: float = 0.0
+    translation_rate_m: float = 0.0
 
     def __post_init__(self) -> None:
         rates = (self.exposure_rate, self.rotation_rate_rad, self.translation_rate_m)

@@ -19,9 +19,7 @@ from ldo_service.schemas import KeyframeRefinement, MapDelta, MapRefine, MapSnap
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.wire import correction_message, keyframe_poses_of, rgbd_of, transform
 
-STILL = OptimiserConfig(rotation_rate_rad=0.0, translation_rate_m=0.0)
 CONFIG = MapperConfig(
-    builder=MapBuilderConfig(optimiser=STILL),
     iterations=2,
     changed_keyframes=3,
     snapshot_keyframes=2,
