@@ -72,7 +72,8 @@ NO_GAUSSIANS = Gaussians(
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
     builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
-    iterations: int = 12  # of the optimiser per keyframe: 10 FPS on two cores at 640x480
+    iterations: int = 12  # of the optimiser per keyframe, fewer where the map is dense: 12 FPS on
+    # two cores at 640x480
     least_iterations: int = 3  # however many keyframes wait: none is left as it was inserted
     folder: str = ""  # for the images of keyframes; empty: a temporary one, or within the state
     threads: int = 0  # of the renderer; 0: all cores but one, which the tracker needs

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from .render import Contributions, Rendering, RenderMemory, render
 from .sleep import SleepingGaussians, whole_map
 from .sleep_choice import SleepConfig, choose_sleepers
 from .views import View, sampled_surface, schedule, shared_surface
+
+MOST_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +90,7 @@ class MapBuilder:
         self._log = ChangeLog()
         self._told: dict[int, np.ndarray] = {}  # T_map_keyframe that others know
         self._newest: int | None = None
-        self._iterations = self._dropped = self._pruned = self._excess = 0
+        self._iterations = self._unusable = self._pruned = self._excess = 0
 
     # --- keyframes --------------------------------------------------------------------------------
     def add(
@@ -95,7 +98,9 @@ class MapBuilder:
     ) -> None:
         """Take in a keyframe, later than all before, and fit the map to its window.
 
-        T_map_camera [4, 4]; `iterations` of the optimiser. Its Gaussians hang on it.
+        T_map_camera [4, 4]; `iterations` of the optimiser that reach the usual number of Gaussians:
+        fewer where more are in view, so that a keyframe costs the same however dense the map is.
+        Its Gaussians hang on it.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera))
         before = self.seen_from(frame.camera, T_map_camera)
@@ -104,10 +109,10 @@ class MapBuilder:
         view = replace(View.of(frame, T_map_camera, keyframe), exposure=exposure)
         self.views.add(view)
         self._told[keyframe], self._newest = T_map_camera, keyframe
-        touched = self._fit(self._plan(view, iterations))
+        touched = self._fit(self._plan(view, MOST_PER_EFFORT * iterations), effort=iterations)
         if len(self._told) % self.config.prune_keyframes == 0:
             self._prune_misshapen(touched)
-        self._prune_unconfirmed()
+        self._prune_unconfirmed(keyframe)
 
     def seen_from(
         self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
@@ -184,16 +189,23 @@ class MapBuilder:
         """Of one piece of work: nothing to keep between two."""
         return np.random.default_rng([self.config.seed, *what])
 
-    def _fit(self, plan: Iterable[int], rates: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
+    def _fit(
+        self,
+        plan: Iterable[int],
+        rates: tuple[float, float] = (1.0, 1.0),
+        effort: float = inf,
+    ) -> np.ndarray:
         """Mask [N] of the Gaussians that changed."""
         steps_before = self._optimiser.steps(self.gaussians).copy()
         plan = list(plan)
         usable = {k for k in set(plan) if self._is_usable(k)}
-        self._dropped += sum(k not in usable for k in plan)
+        self._unusable += len(set(plan)) - len(usable)
         plan = [k for k in plan if k in usable]
         first = next(iter(self.views.poses), None)
-        self._optimiser.optimise(self.gaussians, self.views, plan, rates=rates, fixed=first)
-        self._iterations += len(plan)
+        losses = self._optimiser.optimise(
+            self.gaussians, self.views, plan, rates=rates, fixed=first, effort=effort
+        )
+        self._iterations += len(losses)
         touched = self._optimiser.steps(self.gaussians) != steps_before
         self._log.changed(touched)
         return touched
@@ -222,20 +234,20 @@ class MapBuilder:
         mask[among] = superfluous(self.gaussians.rows[among], self.config.pruning)
         self._remove(mask)
 
-    def _prune_unconfirmed(self) -> None:
-        """Of the Gaussians of one keyframe, now that others have seen the same."""
+    def _prune_unconfirmed(self, newest: int) -> None:
+        """Of the Gaussians of two keyframes: of one that others have followed by now, and of an
+        earlier one, at random, since the map goes on changing around it."""
         age, pruning = self.config.pruning.confirm_keyframes, self.config.pruning
-        keyframes = list(self.views.poses)[-1 - age :]
-        if len(keyframes) <= age or pruning.min_weight_px == 0:
+        older = [k for k in self.views.store.keyframes() if k < newest][: 1 - age or None]
+        if not older or pruning.min_weight_px == 0:
             return
-        own = np.flatnonzero(self.gaussians.anchors == keyframes[0])
-        weights_px = np.zeros(len(self.gaussians), np.float32)
-        for keyframe in (keyframes[0], keyframes[age // 2], keyframes[-1]):
-            shown = self._contributions(keyframe)
-            weights_px[shown.indices] = np.maximum(weights_px[shown.indices], shown.weights)
-        mask = np.zeros(len(self.gaussians), bool)
-        mask[own] = weights_px[own] < pruning.min_weight_px
-        self._remove(mask)
+        chosen = {older[-1], older[int(self._rng(newest, 1).integers(len(older)))]}
+        shown = np.zeros(len(self.gaussians), np.float32)
+        for keyframe in (newest, *sorted(chosen)):
+            made_by = self._contributions(keyframe)
+            shown[made_by.indices] = np.maximum(shown[made_by.indices], made_by.weights)
+        is_theirs = np.isin(self.gaussians.anchors, list(chosen))
+        self._remove(is_theirs & (shown < pruning.min_weight_px))
 
     def _contributions(self, keyframe: int) -> Contributions:
         camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
@@ -334,7 +346,7 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self._iterations,
-            "iterations_dropped": self._dropped,  # their keyframe is gone, or sees what sleeps
+            "keyframes_unusable": self._unusable,  # drawn, but gone, or they see what sleeps
             "gaussians_over_cap": self._excess,  # they may be looked at, so they do not sleep
             **self.sleeping.statistics(),
             **self.views.store.statistics(),

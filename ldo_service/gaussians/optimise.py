@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import inf
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +26,9 @@ class OptimiserConfig:
     needle_weight: float = 0.01  # of mean log(longest / middle axis) beyond max_needle_ratio
     max_needle_ratio: float = 4.0  # what insertion gives to surfaces seen at a grazing angle
 
+    # Half of an iteration's time is per pixel, half per Gaussian when it reaches so many.
+    usual_reach: int = 60_000
+
     # Per frame. 0 switches off.
     exposure_rate: float = 0.005  # step of gains and biases per iteration
     exposure_prior: float = 0.5  # pull to gain 1, bias 0: else the map's brightness drifts.
@@ -38,12 +42,23 @@ class OptimiserConfig:
         rates = (self.exposure_rate, self.rotation_rate_rad, self.translation_rate_m)
         if not (min(rates) >= 0 and self.exposure_prior >= 0 and self.needle_weight >= 0):
             raise ConfigError(f"{self}: rates and weights must not be negative.")
+        if self.usual_reach < 1:
+            raise ConfigError(f"usual_reach={self.usual_reach} must be at least 1.")
         if not self.max_needle_ratio >= 1:
             raise ConfigError(f"max_needle_ratio={self.max_needle_ratio} must be at least 1.")
 
     @property
     def refines_poses(self) -> bool:
         return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Step:
+    """What one iteration found, before it changed the map; `view` is as it left it."""
+
+    loss: ImageLoss
+    view: View
+    reached: int  # Gaussians that may touch the image
 
 
 class Views(Protocol):
@@ -77,6 +92,7 @@ class Optimiser:
         *,
         rates: tuple[float, float] = (1.0, 1.0),
         fixed: int | None = None,
+        effort: float = inf,
     ) -> list[ImageLoss]:
         """One step against each view that `plan` names; their losses before the step.
 
@@ -85,20 +101,25 @@ class Optimiser:
                the map grows, less to settle at the end
         fixed  the view whose pose and exposure stay, which fix the place and the brightness of
                the map
+        effort the plan is left when its iterations add up to this; each counts for one if it
+               reaches `usual_reach` Gaussians, for more if it reaches more
         """
-        losses = []
+        losses, spent = [], 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
+            if spent >= effort:
+                break
             view = views[keyframe]
-            loss, moved = self.step(gaussians, view, rate=rate, is_fixed=keyframe == fixed)
-            if moved is not view:
-                views[keyframe] = moved
-            losses.append(loss)
+            step = self.step(gaussians, view, rate=rate, is_fixed=keyframe == fixed)
+            if step.view is not view:
+                views[keyframe] = step.view
+            losses.append(step.loss)
+            spent += (1 + step.reached / self.config.usual_reach) / 2
         return losses
 
     def step(
         self, gaussians: GaussianMap, view: View, *, rate: float = 1.0, is_fixed: bool = False
-    ) -> tuple[ImageLoss, View]:
-        """One iteration against one view; returns it with a new exposure and pose.
+    ) -> Step:
+        """One iteration against one view.
 
         rate      factor on all steps
         is_fixed  keep exposure and pose
@@ -132,7 +153,7 @@ class Optimiser:
         if not is_fixed:
             view = self._exposed(view, loss.by_exposure, rate)
             view = self._placed(view, reached.xi, rate)
-        return loss, view
+        return Step(loss, view, len(reached.indices))
 
     def _room_for(self, planes: np.ndarray) -> np.ndarray:
         if self._by_planes.shape != planes.shape:

@@ -103,7 +103,7 @@ def test_keyframes_that_are_gone_from_the_disk_are_left_out(posed: dict, tmp_pat
         file.write_bytes(file.read_bytes()[:-20])
     builder.add(*posed[KEYFRAMES[3]], 3, 20)
     assert builder.views.store.keyframes() == [2, 3]
-    assert 0 < builder.statistics()["iterations"] - 3 * 2 < 20
+    assert builder.statistics()["keyframes_unusable"] >= 2
 
 
 def test_pruning_looks_at_what_was_fitted_alone(posed: dict) -> None:

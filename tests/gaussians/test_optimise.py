@@ -181,3 +181,12 @@ def test_gaussians_that_changed_are_those_whose_steps_grew(start: tuple) -> None
 def test_senseless_configuration_is_refused(change: dict) -> None:
     with pytest.raises(ConfigError):
         OptimiserConfig(**change)
+
+
+def test_effort_counts_iterations_by_what_they_reach(start: tuple) -> None:
+    lengths = []
+    for usual_reach in (500, 5_000, 50_000):
+        gaussians, views = copied(start[0]), list(start[1])
+        optimiser = Optimiser(OptimiserConfig(usual_reach=usual_reach))
+        lengths.append(len(optimiser.optimise(gaussians, views, in_turns(30), effort=8)))
+    assert 1 <= lengths[0] < lengths[1] < lengths[2] <= 16
