@@ -14,7 +14,8 @@ from tests.service.conftest import LDO, free_endpoint, is_running, live_service,
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 EVERY_ACTOR = ("frame_source", "tracker", "mapper", "optimizer")
-APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]")
+# A light map: what is watched here is the runtime, and a process that starts anew needs its core.
+APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]", "--set", "mapper.iterations=2")
 
 
 @pytest.mark.timeout(60)
