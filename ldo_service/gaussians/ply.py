@@ -44,11 +44,14 @@ LONGEST_LINE = 4096  # bytes of a header line; more is no header
 
 def write_ply(path: Path, rows: np.ndarray) -> None:
     """Write Gaussian rows [N, 16] (see `gaussians.model`): means in metres, log scales,
-    quaternion wxyz, logit of the opacity, colour as the constant spherical harmonic."""
+    quaternion wxyz, here of length one, logit of the opacity, colour as the constant spherical
+    harmonic."""
     table = np.zeros((len(rows), len(PROPERTIES)), "<f4")
     for name, column in COLUMNS.items():
         table[:, PROPERTIES.index(name)] = rows[:, column]
     table[:, 6:9] = harmonics(rows[:, 11:14])
+    lengths = np.linalg.norm(table[:, 13:17], axis=1, keepdims=True)
+    table[:, 13:17] /= np.where(lengths > 0, lengths, 1)
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property float {name}" for name in PROPERTIES] + ["end_header", ""]
     with path.open("wb") as file:

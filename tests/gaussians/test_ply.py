@@ -31,10 +31,15 @@ def write_with_plyfile(
     plyfile.PlyData([plyfile.PlyElement.describe(table, "vertex")], **options).write(str(path))
 
 
+def unit(quats: np.ndarray) -> np.ndarray:
+    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
+
+
 def test_every_attribute_comes_back(ply: Path, some_rows: np.ndarray) -> None:
     read = read_ply(ply)
     assert read.dtype == np.float32
-    np.testing.assert_array_equal(read[:, :11], some_rows[:, :11])
+    np.testing.assert_array_equal(read[:, [*range(6), 10]], some_rows[:, [*range(6), 10]])
+    np.testing.assert_allclose(read[:, 6:10], unit(some_rows[:, 6:10]), atol=2e-7)
     np.testing.assert_allclose(read[:, 11:], some_rows[:, 11:], atol=2e-7)
 
 
@@ -47,7 +52,7 @@ def test_another_reader_finds_what_3dgs_writes(ply: Path, some_rows: np.ndarray)
     vertices = plyfile.PlyData.read(str(ply))["vertex"]
     assert [prop.name for prop in vertices.properties] == list(PROPERTIES)
     np.testing.assert_array_equal(vertices["scale_1"], some_rows[:, 4])
-    np.testing.assert_array_equal(vertices["rot_0"], some_rows[:, 6])
+    np.testing.assert_allclose(vertices["rot_0"], unit(some_rows[:, 6:10])[:, 0], atol=2e-7)
     np.testing.assert_array_equal(vertices["opacity"], some_rows[:, 10])
     green = 0.5 + 0.28209479177387814 * vertices["f_dc_1"]
     np.testing.assert_allclose(green, some_rows[:, 12], atol=1e-6)
@@ -58,7 +63,7 @@ def test_gsply_reads_the_same_gaussians(ply: Path, some_rows: np.ndarray) -> Non
     data = gsply.plyread(str(ply))
     np.testing.assert_array_equal(data.means, some_rows[:, 0:3])
     np.testing.assert_array_equal(data.scales, some_rows[:, 3:6])
-    np.testing.assert_array_equal(data.quats, some_rows[:, 6:10])
+    np.testing.assert_allclose(data.quats, unit(some_rows[:, 6:10]), atol=2e-7)
     np.testing.assert_array_equal(data.opacities, some_rows[:, 10])
     np.testing.assert_allclose(gsply.sh2rgb(data.sh0), some_rows[:, 11:14], atol=1e-6)
 

@@ -90,7 +90,7 @@ def test_the_map_is_a_ply_with_every_gaussian(finished: Path) -> None:
     assert f"element vertex {count}".encode() in header
     table = np.frombuffer(body, "<f4").reshape(count, 17)
     assert np.isfinite(table).all()
-    assert np.linalg.norm(table[:, 13:17], axis=1).min() > 0.1
+    np.testing.assert_allclose(np.linalg.norm(table[:, 13:17], axis=1), 1, atol=1e-5)
 
 
 def test_two_runs_write_the_same_bytes(room: Sequence, finished: Path, tmp_path: Path) -> None:
