@@ -33,7 +33,9 @@ def exported(run: Path, format: str, *options: object) -> None:
 
 def test_gaussians_as_ply(run: Path) -> None:
     exported(run, "ply")
-    np.testing.assert_allclose(read_ply(run / "gaussians.ply"), read_ply(run / "map.ply"), atol=1e-6)
+    np.testing.assert_allclose(
+        read_ply(run / "gaussians.ply"), read_ply(run / "map.ply"), atol=1e-6
+    )
 
 
 def test_gaussians_as_splat(run: Path) -> None:
