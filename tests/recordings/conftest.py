@@ -20,7 +20,10 @@ from tests.runtime.cast import eventually, running, send
 
 FRAMES = 30
 ROUGH = "mapper.iterations=2"  # so few that it is quick, so many that keyframes move
-CONFIG = load_config(settings=(ROUGH,))
+REFINING = tuple(
+    f"mapper.builder.optimiser.{rate}=0.001" for rate in ("rotation_rate_rad", "translation_rate_m")
+)
+CONFIG = load_config(settings=(ROUGH, *REFINING))
 
 
 def stages(folder: Path, transport: MemoryTransport) -> list[Stage]:

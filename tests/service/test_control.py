@@ -21,7 +21,8 @@ def ldo_control(service: LiveService, verb: str) -> subprocess.CompletedProcess[
 def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:room", "--rate", "15", "--restamp")
+        tour = ("synthetic:tour", "--max-frames", "350")  # half a minute, on a busy machine, too
+        publisher = service.publisher(*tour, "--rate", "12", "--restamp")
         service.wait_for_poses(15)
         # pause: frames come and no pose goes
         assert ldo_control(service, "pause").returncode == 0
