@@ -37,6 +37,7 @@ from ldo_service.schemas import (
     MeasuredPose,
     ModelView,
 )
+from ldo_service.schemas.pose import Matrix6
 from ldo_service.schemas.topics import (
     GRAPH_CORRECTION,
     KEYFRAME_NEW,
@@ -124,7 +125,7 @@ class Mapper(Actor):
         threads = self.config.thread_count()
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
         self._poses = KeyframePoses()
-        self._links: dict[int, tuple[int, tuple[float, ...]]] = {}  # reference and information
+        self._links: dict[tuple[int, int], Matrix6] = {}  # information by keyframe and reference
         self._refinements = 0  # sent
         self._unacknowledged: dict[int, int] = {}  # the refinement that no correction knows yet
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
@@ -158,7 +159,9 @@ class Mapper(Actor):
             transform(message.T_odom_keyframe),
         )
         if message.reference is not None:
-            self._links[message.keyframe] = (message.reference, message.information)
+            self._links[message.keyframe, message.reference] = message.information
+        for pose in message.window:
+            self._links[pose.keyframe, pose.reference] = pose.information
         self._newest = (message.stamp_ns, message.keyframe)
         # map it
         frame = rgbd_of(message)
@@ -184,14 +187,14 @@ class Mapper(Actor):
         yield from self._deltas(with_changed=True)
 
     def _refinement(self) -> Iterator[KeyframeRefinement]:
-        """Keyframes that the optimiser moved, measured anew against their references; and those
-        that refer to them, against where they are now."""
+        """Keyframes that the optimiser moved, measured anew against all that they were measured
+        against; and those that were measured against them, against where they are now."""
         moved = self._map.refined()
         for keyframe, T_map_keyframe in moved.items():
             self._poses.place(keyframe, T_map_keyframe)
         poses = tuple(
             self._measured(keyframe, reference, information)
-            for keyframe, (reference, information) in self._links.items()
+            for (keyframe, reference), information in self._links.items()
             if reference in self._poses and (keyframe in moved or reference in moved)
         )
         if poses:
@@ -201,9 +204,7 @@ class Mapper(Actor):
                 stamp_ns=self._newest[0], poses=poses, number=self._refinements
             )
 
-    def _measured(
-        self, keyframe: int, reference: int, information: tuple[float, ...]
-    ) -> MeasuredPose:
+    def _measured(self, keyframe: int, reference: int, information: Matrix6) -> MeasuredPose:
         """The loss tells no information: the tracker's stands."""
         T_reference_keyframe = se3.inverse(self._poses[reference]) @ self._poses[keyframe]
         return MeasuredPose(
@@ -359,7 +360,7 @@ class Mapper(Actor):
             "refinements": self._refinements,
             "unacknowledged": list(self._unacknowledged.items()),
             "since_changed": self._since_changed,
-            "links": [(k, reference, info) for k, (reference, info) in self._links.items()],
+            "links": [(*pair, information) for pair, information in self._links.items()],
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -372,7 +373,7 @@ class Mapper(Actor):
         self._refinements = saved["refinements"]
         self._unacknowledged = dict(saved["unacknowledged"])
         self._since_changed = saved["since_changed"]
-        self._links = {k: (reference, tuple(info)) for k, reference, info in saved["links"]}
+        self._links = {(k, reference): tuple(info) for k, reference, info in saved["links"]}
 
     def facts(self) -> dict[str, float]:
         return {

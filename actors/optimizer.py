@@ -16,11 +16,11 @@ import msgspec
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig, RelativePose
+from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import Correction, Keyframe, KeyframeRefinement, MeasuredPose
 from ldo_service.schemas.topics import GRAPH_CORRECTION, KEYFRAME_NEW, KEYFRAME_REFINEMENT
-from ldo_service.wire import correction_message, transform
+from ldo_service.wire import correction_message, measured_of, measurements_of, transform
 
 log = logging.getLogger(__name__)
 
@@ -74,25 +74,22 @@ class Optimizer(Actor):
         self._early = {pair: p for pair, p in asked.items() if p.keyframe > newest}
         if known:
             self._refined += len(known)
-            self._graph.replace([_measured(pose) for pose in known.values()])
+            self._graph.replace([measured_of(pose) for pose in known.values()])
 
     def _add(self, message: Keyframe) -> None:
         T_odom_keyframe = transform(message.T_odom_keyframe)
         newest = self._graph.newest
+        known = [m for m in measurements_of(message) if m.a in self._graph]
         if newest is None:
             self._graph.add_first(message.keyframe, T_odom_keyframe)
-        elif message.reference is not None and message.reference in self._graph:
-            information = np.array(message.information).reshape(6, 6)
-            T_reference_keyframe = transform(message.T_reference_keyframe)
-            self._graph.add(
-                RelativePose(message.reference, message.keyframe, T_reference_keyframe, information)
-            )
+        elif known:
+            self._graph.add(*known)
         else:
             self._bridge(newest, message.keyframe, T_odom_keyframe)
         self._T_odom_newest = T_odom_keyframe
 
     def _bridge(self, newest: int, keyframe: int, T_odom_keyframe: np.ndarray) -> None:
-        """The reference was never received: odometry from the newest keyframe stands in."""
+        """Nothing that it was measured from was received: odometry from the newest stands in."""
         self._bridged += 1
         log.warning("keyframe %d: its reference is missing, joined to %d", keyframe, newest)
         T_newest_keyframe = se3.inverse(self._T_odom_newest) @ T_odom_keyframe
@@ -126,10 +123,3 @@ class Optimizer(Actor):
             "keyframes_bridged": self._bridged,
             "keyframes_refined": self._refined,
         }
-
-
-def _measured(pose: MeasuredPose) -> RelativePose:
-    information = np.array(pose.information).reshape(6, 6)
-    return RelativePose(
-        pose.reference, pose.keyframe, transform(pose.T_reference_keyframe), information
-    )

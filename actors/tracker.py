@@ -15,6 +15,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
@@ -24,6 +25,7 @@ from ldo_service.wire import (
     camera_message,
     keyframe_poses_of,
     matrix6_message,
+    measured_message,
     pose_message,
     rgbd_of,
 )
@@ -117,8 +119,10 @@ class Tracker(Actor):
 
     def _make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> Keyframe:
         """A new reference for tracking, or one that supports the map between two of these."""
+        window: list[RelativePose] = []
         if tracked.wants_keyframe:
             keyframe = self._odometry.make_keyframe(frame, tracked)
+            window = self._odometry.window(tracked)
         else:
             keyframe = self._odometry.make_supporting(tracked)
         self._poses.chain(
@@ -138,6 +142,7 @@ class Tracker(Actor):
             information=matrix6_message(tracked.information),
             T_odom_keyframe=pose_message(tracked.T_odom_camera),
             overlap=tracked.overlap,
+            window=tuple(map(measured_message, window)),
         )
 
     def _recent(self, keyframe: int) -> Iterator[int]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
+from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.schemas import (
     Array,
     CameraModel,
@@ -13,6 +14,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     Image,
     Keyframe,
+    MeasuredPose,
     Pose,
 )
 from ldo_service.schemas.frames import ImageEncoding
@@ -32,6 +34,35 @@ def transform(pose: Pose) -> np.ndarray:
 
 def matrix6_message(matrix: np.ndarray) -> tuple[float, ...]:
     return tuple(float(v) for v in np.asarray(matrix).ravel())
+
+
+def measured_message(measured: RelativePose) -> MeasuredPose:
+    return MeasuredPose(
+        reference=measured.a,
+        keyframe=measured.b,
+        T_reference_keyframe=pose_message(measured.T_a_b),
+        information=matrix6_message(measured.information),
+    )
+
+
+def measured_of(message: MeasuredPose) -> RelativePose:
+    return RelativePose(
+        message.reference,
+        message.keyframe,
+        transform(message.T_reference_keyframe),
+        np.array(message.information).reshape(6, 6),
+    )
+
+
+def measurements_of(keyframe: Keyframe) -> list[RelativePose]:
+    """All that a keyframe was measured from, its reference first; none for the first keyframe."""
+    window = [measured_of(pose) for pose in keyframe.window]
+    if keyframe.reference is None:
+        return window
+    T_reference_keyframe = transform(keyframe.T_reference_keyframe)
+    information = np.array(keyframe.information).reshape(6, 6)
+    first = RelativePose(keyframe.reference, keyframe.keyframe, T_reference_keyframe, information)
+    return [first, *window]
 
 
 def camera_message(camera: Camera) -> CameraModel:

@@ -8,6 +8,22 @@ from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Matrix6, Pose, require_matrix6
 
 
+class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
+    """A measured pose of one keyframe in another."""
+
+    reference: int
+    keyframe: int
+    T_reference_keyframe: Pose
+    information: Matrix6  # perturbed on the right
+
+    def __post_init__(self) -> None:
+        require_count("reference", self.reference)
+        require_count("keyframe", self.keyframe)
+        require_matrix6("information", self.information)
+        if self.reference == self.keyframe:
+            raise ValueError(f"keyframe {self.keyframe} is measured against itself")
+
+
 class Keyframe(Message, frozen=True, kw_only=True):
     """keyframe/new: a frame that the map is made from, placed relative to its reference keyframe.
 
@@ -25,6 +41,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     information: Matrix6  # of T_reference_keyframe, perturbed on the right
     T_odom_keyframe: Pose
     overlap: float = 1.0  # share of the reference's surface that this keyframe sees
+    window: tuple[MeasuredPose, ...] = ()  # this keyframe measured from others but the reference
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
@@ -36,22 +53,11 @@ class Keyframe(Message, frozen=True, kw_only=True):
             raise ValueError(
                 f"keyframe {self.keyframe} refers to {self.reference}, not an older one"
             )
-
-
-class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
-    """A measured pose of one keyframe in another."""
-
-    reference: int
-    keyframe: int
-    T_reference_keyframe: Pose
-    information: Matrix6  # perturbed on the right
-
-    def __post_init__(self) -> None:
-        require_count("reference", self.reference)
-        require_count("keyframe", self.keyframe)
-        require_matrix6("information", self.information)
-        if self.reference == self.keyframe:
-            raise ValueError(f"keyframe {self.keyframe} is measured against itself")
+        for pose in self.window:
+            if not pose.reference < pose.keyframe == self.keyframe:
+                raise ValueError(
+                    f"keyframe {self.keyframe} comes with {pose.keyframe} from {pose.reference}"
+                )
 
 
 class KeyframeRefinement(Message, frozen=True, kw_only=True):

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 
 from ldo_service.errors import ConfigError
+from ldo_service.geometry.relative_pose import RelativePose
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,16 +21,6 @@ class KeyframeGraphConfig:
     def __post_init__(self) -> None:
         if min(getattr(self, name) for name in self.__slots__) <= 0:
             raise ConfigError(f"{self}: every sigma must be positive.")
-
-
-@dataclass(frozen=True, slots=True)
-class RelativePose:
-    """Measured T_a_b with its information [6, 6]: rotation, then translation, perturbed at b."""
-
-    a: int
-    b: int
-    T_a_b: np.ndarray
-    information: np.ndarray
 
 
 class KeyframeGraph:
@@ -69,13 +60,20 @@ class KeyframeGraph:
         self._initial[keyframe] = np.array(T_map_keyframe, float)
         self._update([], [keyframe])
 
-    def add(self, measured: RelativePose) -> None:
-        """A new keyframe `b`, measured from a known one. Raises KeyError when `a` is not known."""
-        if measured.a not in self:
-            raise KeyError(measured.a)
+    def add(self, measured: RelativePose, *more: RelativePose) -> None:
+        """A new keyframe `b`, measured from a known one, and from `more` of them.
+
+        Raises KeyError for an `a` that is not known, ValueError if they measure several keyframes.
+        """
+        every = (measured, *more)
+        if any(m.b != measured.b for m in every):
+            raise ValueError(f"keyframes {sorted({m.b for m in every})} cannot be added at once.")
+        for m in every:
+            if m.a not in self:
+                raise KeyError(m.a)
         self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
-        self._measured[measured.a, measured.b] = measured
-        self._update([measured], [measured.b])
+        self._measured.update({(m.a, m.b): m for m in every})
+        self._update(every, [measured.b])
 
     def replace(self, measured: Sequence[RelativePose]) -> None:
         """Believe these in place of what was measured between the same keyframes before.

@@ -4,6 +4,7 @@
         tracked = odometry.track(frame)
         if tracked.wants_keyframe:
             odometry.make_keyframe(frame, tracked)
+            measurements = odometry.window(tracked)  # of it, from keyframes before its reference
         elif tracked.wants_mapping:
             odometry.make_supporting(tracked)
 
@@ -19,9 +20,11 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry.relative_pose import RelativePose
 
 from .align import AlignConfig, Alignment
 from .candidates import Candidate, CandidateConfig, attempt, best
+from .equations import Appearance
 from .features import FeatureConfig, detect, estimate_pose
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
@@ -29,6 +32,7 @@ from .motion import Motion, extent
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, relocalise
 from .state import State, packed, unpacked
+from .window import WindowConfig, measured_from
 
 log = logging.getLogger(__name__)
 
@@ -40,6 +44,7 @@ class OdometryConfig:
     features: FeatureConfig = field(default_factory=FeatureConfig)
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
@@ -113,6 +118,17 @@ class Odometry:
             T_odom_mapped=tracked.T_odom_camera,
         )
         return keyframe.id
+
+    def window(self, tracked: Tracked) -> list[RelativePose]:
+        """The keyframe just made of a tracked frame, measured from others than its reference."""
+        keyframe = self._state.keyframe
+        if keyframe is None or tracked.keyframe is None:
+            return []
+        earlier = [k for k in self._state.memory if k.id not in (keyframe.id, tracked.keyframe)]
+        usual = Appearance(
+            intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
+        )
+        return measured_from(earlier, keyframe, usual, self.config.align, self.config.window)
 
     def make_supporting(self, tracked: Tracked) -> int:
         """Go on against the same keyframe; the id of this frame as one that is only mapped."""

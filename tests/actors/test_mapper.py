@@ -17,7 +17,14 @@ from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import KeyframeRefinement, MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.topics import KEYFRAME_NEW
-from ldo_service.wire import correction_message, keyframe_poses_of, rgbd_of, transform
+from ldo_service.wire import (
+    correction_message,
+    keyframe_poses_of,
+    matrix6_message,
+    measurements_of,
+    rgbd_of,
+    transform,
+)
 
 CONFIG = MapperConfig(
     iterations=2,
@@ -155,10 +162,12 @@ def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
         for message in mapper.handle(keyframe):
             if isinstance(message, KeyframeRefinement):
                 for pose in message.poses:
-                    assert pose.reference == known[pose.keyframe].reference
-                    assert pose.information == known[pose.keyframe].information
-                    odometry = transform(known[pose.keyframe].T_reference_keyframe)
-                    moved = se3.log(se3.inverse(odometry) @ transform(pose.T_reference_keyframe))
+                    measured = {m.a: m for m in measurements_of(known[pose.keyframe])}
+                    before = measured[pose.reference]
+                    assert pose.information == matrix6_message(before.information)
+                    moved = se3.log(
+                        se3.inverse(before.T_a_b) @ transform(pose.T_reference_keyframe)
+                    )
                     assert 1e-5 < np.linalg.norm(moved) < 0.02
                     known[pose.keyframe, "refined"] = pose
     assert len(known) > 5, "nothing was refined"

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import se3
-from ldo_service.graph.keyframe_graph import KeyframeGraph, RelativePose
+from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.graph.keyframe_graph import KeyframeGraph
 
 INFORMATION = np.diag([1e4, 1e4, 1e4, 1e3, 1e3, 1e3])
 
@@ -135,3 +136,25 @@ def test_a_measurement_of_an_unknown_keyframe_replaces_nothing() -> None:
     graph = built(circle(4), measured(circle(4), [(0, 1)], 0.0))
     with pytest.raises(KeyError):
         graph.replace([RelativePose(0, 9, np.eye(4), INFORMATION)])
+
+
+def test_a_keyframe_may_be_measured_from_several() -> None:
+    truth = circle(3)
+    graph = built(truth, measured(truth, [(0, 1)], 0.0))
+    right = measured(truth, [(0, 2)], 0.0)[0]
+    T_wrong = se3.inverse(truth[1]) @ truth[2] @ se3.exp(np.array([0, 0, 0, 0.3, 0, 0]))
+    graph.add(RelativePose(1, 2, T_wrong, 1e-4 * INFORMATION), right)
+    np.testing.assert_allclose(graph.pose(2), truth[2], atol=5e-2)
+    resumed = KeyframeGraph()
+    resumed.restore(graph.snapshot())
+    np.testing.assert_allclose(resumed.pose(2), graph.pose(2), atol=1e-6)
+
+
+def test_keyframes_are_added_one_by_one_and_from_known_ones() -> None:
+    truth = circle(4)
+    graph = built(truth, measured(truth, [(0, 1)], 0.0))
+    with pytest.raises(ValueError, match="at once"):
+        graph.add(*measured(truth, [(0, 2), (0, 3)], 0.0))
+    with pytest.raises(KeyError):
+        graph.add(*measured(truth, [(0, 2), (3, 2)], 0.0))
+    assert 2 not in graph

@@ -99,6 +99,23 @@ EXAMPLES: dict[str, Message] = {
         T_odom_keyframe=OTHER_POSE,
         overlap=0.75,
     ),
+    "keyframe_with_a_window": Keyframe(
+        stamp_ns=3,
+        keyframe=4,
+        frame=9,
+        camera=CAMERA,
+        color=COLOR,
+        depth_m=DEPTH,
+        reference=3,
+        T_reference_keyframe=POSE,
+        information=INFORMATION,
+        T_odom_keyframe=OTHER_POSE,
+        window=(
+            MeasuredPose(
+                reference=1, keyframe=4, T_reference_keyframe=OTHER_POSE, information=INFORMATION
+            ),
+        ),
+    ),
     "tracked_pose": TrackedPose(
         stamp_ns=4,
         frame=10,

@@ -1,0 +1,80 @@
+"""Keyframes measured from several earlier ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
+from ldo_service.tracking.equations import Appearance
+from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.pyramid import build_pyramid
+from ldo_service.tracking.window import WindowConfig, measured_from
+
+USUAL = Appearance(intensity_sigma=1.0, depth_noise_scale=0.3)
+
+
+@pytest.fixture(scope="module")
+def truth(make_walk) -> list[np.ndarray]:
+    return make_walk(7, 0.05, 0.03)
+
+
+@pytest.fixture(scope="module")
+def keyframes(room, truth) -> list[Keyframe]:
+    rng = np.random.default_rng(3)  # of the odometry that their poses come from
+    return [
+        Keyframe(
+            pyramid_of(room.view(T), PyramidConfig()),
+            T @ se3.exp(rng.normal(scale=3e-3, size=6)),
+            k,
+        )
+        for k, T in enumerate(truth)
+    ]
+
+
+def test_each_measurement_is_nearer_to_the_truth_than_odometry(keyframes, truth) -> None:
+    *earlier, newest = keyframes
+    poses = measured_from(earlier, newest, USUAL, AlignConfig(), WindowConfig())
+    assert [(p.a, p.b) for p in poses] == [(5, 6), (4, 6), (3, 6)]
+    for pose in poses:
+        true = se3.inverse(truth[pose.a]) @ truth[6]
+        np.testing.assert_allclose(pose.T_a_b, true, atol=1e-3)
+        assert np.linalg.eigvalsh(pose.information)[0] > 0
+
+
+def test_keyframes_that_show_another_place_are_passed_over(keyframes, room) -> None:
+    turned = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+    elsewhere = Keyframe(pyramid_of(room.view(turned), PyramidConfig()), turned, 9)
+    *earlier, newest = keyframes
+    poses = measured_from([*earlier, elsewhere], newest, USUAL, AlignConfig(), WindowConfig())
+    assert [p.a for p in poses] == [5, 4, 3]
+
+
+def test_a_poor_fit_is_left_out(keyframes) -> None:
+    """The same place in another light, speckled: it aligns, with far more noise than usual."""
+    first, *_, newest = keyframes
+    gray = np.random.default_rng(1).integers(0, 60, first.view.gray.shape) + first.view.gray // 2
+    frame = replace_gray(first, gray.astype(np.uint8))
+    assert not measured_from([frame], newest, USUAL, AlignConfig(), WindowConfig(min_overlap=0.1))
+
+
+def replace_gray(keyframe: Keyframe, gray: np.ndarray) -> Keyframe:
+    view = keyframe.view
+    noisy = build_pyramid(gray, view.depth_m, view.camera, PyramidConfig())
+    return Keyframe(noisy, keyframe.T_odom_keyframe, keyframe.id)
+
+
+def test_none_are_measured_on_request(keyframes) -> None:
+    *earlier, newest = keyframes
+    none = WindowConfig(measurements=0)
+    assert measured_from(earlier, newest, USUAL, AlignConfig(), none) == []
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"measurements": -1}, {"min_overlap": 0.0}, {"worst_noise": 0.5}, {"iterations": ()}]
+)
+def test_a_wrong_configuration_is_refused(wrong) -> None:
+    with pytest.raises(ConfigError):
+        replace(WindowConfig(), **wrong)
