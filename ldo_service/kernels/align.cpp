@@ -17,11 +17,11 @@ constexpr float kNearest = 1e-3f;  // metres: closer points do not project
 float smaller(float a, float b) { return a < b ? a : b; }
 float larger(float a, float b) { return a > b ? a : b; }
 
-void halve_depth(const float* depth, int width, int height, float tolerance, float* out) {
+void halve(const float* values, int width, int height, float tolerance, float* out) {
   const int w = width / 2, h = height / 2;
   const float missing = 1e30f, reach = 1.0f + tolerance;
   for (int y = 0; y < h; ++y) {
-    const float* upper = depth + static_cast<std::int64_t>(2 * y) * width;
+    const float* upper = values + static_cast<std::int64_t>(2 * y) * width;
     const float* lower = upper + width;
     float* row = out + static_cast<std::int64_t>(y) * w;
     for (int x = 0; x < w; ++x) {
@@ -38,6 +38,11 @@ void halve_depth(const float* depth, int width, int height, float tolerance, flo
   }
 }
 
+// Per pixel over two; 0 where one is clipped.
+float difference(float after, float before) {
+  return (after > 0) & (before > 0) ? 0.5f * (after - before) : 0.0f;
+}
+
 void pack(const float* image, const float* depth, int width, int height, float max_depth,
           float* out) {
   std::memset(out, 0, sizeof(float) * kTexelSize * width * height);
@@ -50,8 +55,8 @@ void pack(const float* image, const float* depth, int width, int height, float m
       texel[kIntensity] = image[i];
       texel[kDepth] = depth[i] <= max_depth ? depth[i] : 0.0f;
       if (inside && x > 0 && x + 1 < width) {
-        texel[kGradientU] = 0.5f * (image[i + 1] - image[i - 1]);
-        texel[kGradientV] = 0.5f * (image[i + width] - image[i - width]);
+        texel[kGradientU] = difference(image[i + 1], image[i - 1]);
+        texel[kGradientV] = difference(image[i + width], image[i - width]);
       }
     }
   }
@@ -170,7 +175,9 @@ void sample(const Problem& p, Block& b) {
       const float lower = c[k] + du * (c[k + kTexelSize] - c[k]);
       mixed[k] = upper + dv * (lower - upper);
     }
-    b.intensity[i] = mixed[kIntensity];
+    const float darkest = smaller(smaller(a[kIntensity], a[kTexelSize + kIntensity]),
+                                  smaller(c[kIntensity], c[kTexelSize + kIntensity]));
+    b.intensity[i] = darkest > 0 ? mixed[kIntensity] : 0.0f;
     b.gradient_u[i] = mixed[kGradientU];
     b.gradient_v[i] = mixed[kGradientV];
     b.depth[i] = p.target[static_cast<std::int64_t>(kTexelSize) * b.nearest[i] + kDepth];
@@ -191,10 +198,11 @@ void weigh_photometric(const Problem& p, Block& b) {
     const float gy = b.gradient_v[i] * p.camera.fy * inverse;
     const float gz = -(gx * x + gy * y) * inverse;
     const float shade = b.point[kShade][i];
+    const float compared = (shade > 0) & (b.intensity[i] > 0) ? used : 0.0f;
     const float r = b.intensity[i] - p.gain * shade - p.bias;
     const float normalised = r * inverse_sigma, square = normalised * normalised;
     const float weight = robust_weight(square);
-    const float s = used * std::sqrt(weight) * inverse_sigma;
+    const float s = compared * std::sqrt(weight) * inverse_sigma;
     b.rows[0][i] = s * (gy * z - gz * y);
     b.rows[1][i] = s * (gz * x - gx * z);
     b.rows[2][i] = s * (gx * y - gy * x);
@@ -204,9 +212,9 @@ void weigh_photometric(const Problem& p, Block& b) {
     b.rows[6][i] = -s * shade;
     b.rows[7][i] = -s;
     b.rows[8][i] = s * r;
-    b.photometric[0][i] = used;
-    b.photometric[1][i] = square < kInlierSigma * kInlierSigma ? used : 0.0f;
-    b.photometric[2][i] = used * weight * square;
+    b.photometric[0][i] = compared;
+    b.photometric[1][i] = square < kInlierSigma * kInlierSigma ? compared : 0.0f;
+    b.photometric[2][i] = compared * weight * square;
   }
 }
 
@@ -306,7 +314,7 @@ Equations normal_equations(const Problem& problem) {
 }  // namespace
 
 const Kernels& LDO_ISA() {
-  static const Kernels kernels{halve_depth, pack, normals, points, normal_equations};
+  static const Kernels kernels{halve, pack, normals, points, normal_equations};
   return kernels;
 }
 

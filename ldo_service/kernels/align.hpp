@@ -10,6 +10,7 @@ struct Pinhole {
 };
 
 // A target image holds four floats per pixel, so that one load brings all that a sample needs.
+// An intensity of 0 says no more than a depth of 0: the pixel was clipped, black or white.
 enum Texel { kIntensity, kGradientU, kGradientV, kDepth, kTexelSize };
 
 // Reference points are stored as rows of N floats: coordinates, intensity, normal (0 0 0: none).
@@ -47,10 +48,11 @@ struct Equations {
 
 // The entry points, compiled once per instruction set.
 struct Kernels {
-  // Mean of those of each 2x2 block that are within `tolerance` (relative) of the nearest.
-  void (*halve_depth)(const float* depth, int width, int height, float tolerance, float* out);
+  // Mean of those of each 2x2 block that are within `tolerance` (relative) of the least; zeros are
+  // not measured.
+  void (*halve)(const float* values, int width, int height, float tolerance, float* out);
   // Texels of an image and its depth, which is dropped beyond `max_depth`; gradients are central
-  // differences, 0 on the border.
+  // differences, 0 on the border and beside clipped pixels.
   void (*pack)(const float* image, const float* depth, int width, int height, float max_depth,
                float* out);
   // Normals [height, width, 3] towards the camera from differences over `radius` pixels.

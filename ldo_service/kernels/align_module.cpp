@@ -88,14 +88,14 @@ nb::ndarray<nb::numpy, T> owned(std::unique_ptr<T[]> data,
 
 std::unique_ptr<float[]> floats(std::size_t n) { return std::unique_ptr<float[]>(new float[n]); }
 
-Output halve_depth(Input<2> depth, double tolerance) {
-  const std::size_t h = depth.shape(0), w = depth.shape(1);
+Output halve(Input<2> values, double tolerance) {
+  const std::size_t h = values.shape(0), w = values.shape(1);
   require_image(h, w);
   const float relative = positive(tolerance, "tolerance");
   auto out = floats((h / 2) * (w / 2));
   {
     nb::gil_scoped_release release;
-    chosen->halve_depth(depth.data(), static_cast<int>(w), static_cast<int>(h), relative,
+    chosen->halve(values.data(), static_cast<int>(w), static_cast<int>(h), relative,
                         out.get());
   }
   return owned(std::move(out), {h / 2, w / 2});
@@ -217,7 +217,7 @@ NB_MODULE(_align, m) {
   const ldo::Isa isa = ldo::chosen_isa();
   chosen = &kernels(isa);
   m.attr("isa") = ldo::name(isa);
-  m.def("halve_depth", &halve_depth, "depth_m"_a.noconvert(), "tolerance"_a);
+  m.def("halve", &halve, "values"_a.noconvert(), "tolerance"_a);
   m.def("pack", &pack, "image"_a.noconvert(), "depth_m"_a.noconvert(), "max_depth_m"_a);
   m.def("normals", &normals, "depth_m"_a.noconvert(), "intrinsics"_a, "radius"_a);
   m.def("points", &points, "texels"_a.noconvert(), "normals"_a.noconvert(), "intrinsics"_a);

@@ -38,7 +38,8 @@ def normal_equations(
     p, shade, n, u, v = p[shown], shade[shown], n[shown], u[shown], v[shown]
     column, row, depth = column[shown], row[shown], depth[shown]
 
-    r, J = photometric(target, p, shade, u, v, appearance)
+    told = (shade > 0) & is_told(target, u, v)
+    r, J = photometric(target, p[told], shade[told], u[told], v[told], appearance)
     H_color, g_color, color = _weighted(r, J, np.full(len(r), appearance.intensity_sigma))
 
     q = np.column_stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy])
@@ -65,6 +66,13 @@ def photometric(
     g = np.column_stack([gx, gy, -(gx * x + gy * y) / z])  # dI/dp
     r = intensity - appearance.gain * shade - appearance.bias
     return r, np.column_stack([np.cross(g, p), -g, -shade, -np.ones(len(r))])
+
+
+def is_told(target: Level, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Whether none of the four pixels around (u, v) [N] is clipped."""
+    column, row = u.astype(int), v.astype(int)
+    around = [target.texels[row + i, column + j, 0] for i in (0, 1) for j in (0, 1)]
+    return np.min(around, axis=0) > 0
 
 
 def geometric(p: np.ndarray, n: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,6 +17,9 @@ from ldo_service.errors import ConfigError
 from .align import Alignment
 
 
+LEAST_GAIN = 0.05  # a frame this dark shows nothing
+
+
 class Status(StrEnum):
     OK = "OK"
     WEAK = "WEAK"  # a pose, but nothing to build a map on
@@ -28,7 +31,7 @@ class JudgementConfig:
     min_overlap: float = 0.15  # visible reference points; chosen on apartment_floor1, not elsewhere
     min_paired: float = 0.05  # of the reference points met by a depth: below, colour is alone
     max_condition: float = 1e5  # of the information in median depths
-    max_gain: float = 2.0  # exposure changes more slowly than this
+    max_gain: float = 3.0  # either way: a stop and a half, as cameras that step into the light do
     weak_residual: float = 2.5  # times the running median
     lost_residual: float = 5.0  # times the running median: never accepted
     lost_overlap: float = 0.08
@@ -60,7 +63,7 @@ class History:
     def extended(self, alignment: Alignment, config: JudgementConfig) -> "History":
         keep = config.history - 1
         return History(
-            (*self.intensity_sigmas[-keep:], alignment.intensity_sigma),
+            (*self.intensity_sigmas[-keep:], exposed_sigma(alignment)),
             (*self.depth_noise_scales[-keep:], alignment.depth_noise_scale),
         )
 
@@ -70,7 +73,12 @@ class History:
         usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
         intensity = max(usual_sigma, config.least_intensity_sigma)
         depth = max(usual_scale, config.least_depth_noise_scale)
-        return max(alignment.intensity_sigma / intensity, alignment.depth_noise_scale / depth)
+        return max(exposed_sigma(alignment) / intensity, alignment.depth_noise_scale / depth)
+
+
+def exposed_sigma(alignment: Alignment) -> float:
+    """Photometric noise in grey levels of the reference: it grows with the exposure."""
+    return alignment.intensity_sigma / max(alignment.gain, LEAST_GAIN)
 
 
 def judge(

@@ -14,6 +14,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame
 from ldo_service.kernels import _align
 
+CLIPPED = 250  # grey levels: above, one of the colours is at its end and the others are near it
+ANY_DIFFERENCE = 1e3  # relative
+
 Intrinsics = tuple[float, float, float, float]
 
 
@@ -67,23 +70,30 @@ def intrinsics(camera: Camera) -> Intrinsics:
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
+def told(gray: np.ndarray) -> np.ndarray:
+    """Grey levels [H, W] float32 of an image uint8, 0 where it is clipped, black or white.
+
+    The brightness of a clipped pixel does not follow that of its surface: after a jump of the
+    exposure such pixels would speak against the right pose.
+    """
+    return np.where(gray < CLIPPED, gray, 0).astype(np.float32)
+
+
 def halved_image(image: np.ndarray) -> np.ndarray:
-    """Means [H//2, W//2] float32 of the 2x2 blocks of an image [H, W] float32."""
-    height, width = image.shape[0] // 2, image.shape[1] // 2
-    even = image[: 2 * height, : 2 * width]
-    return np.asarray(cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    """Means [H//2, W//2] float32 of what 2x2 blocks of an image [H, W] float32 tell."""
+    return _align.halve(image, ANY_DIFFERENCE)
 
 
 def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
     """Means [H//2, W//2] of 2x2 blocks, over the pixels within `tolerance` of the nearest one."""
-    return _align.halve_depth(depth_m, tolerance)
+    return _align.halve(depth_m, tolerance)
 
 
 def build_pyramid(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, config: PyramidConfig
 ) -> Pyramid:
     """The pyramid of an image [H, W] uint8 and its depth [H, W] float32."""
-    image, depth, scaled = gray.astype(np.float32), np.ascontiguousarray(depth_m), camera
+    image, depth, scaled = told(gray), np.ascontiguousarray(depth_m), camera
     levels: list[Level] = []
     while True:
         if scaled.width < 1.5 * config.working_width_px:

@@ -41,7 +41,7 @@ def test_halving_averages_what_lies_near_the_nearest() -> None:
     nearest = np.where(blocks > 0, blocks, np.inf).min(axis=-1, keepdims=True)
     near = (blocks > 0) & (blocks <= 1.03 * nearest)
     expected = np.where(near, blocks, 0).sum(axis=-1) / np.maximum(near.sum(axis=-1), 1)
-    np.testing.assert_allclose(_align.halve_depth(depth_m, 0.03), expected, rtol=1e-6)
+    np.testing.assert_allclose(_align.halve(depth_m, 0.03), expected, rtol=1e-6)
 
 
 def test_texels_hold_intensity_central_differences_and_depth() -> None:
@@ -138,8 +138,8 @@ IMAGE = np.ones((8, 8), np.float32)
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: _align.halve_depth(np.ones((1, 8), np.float32), 0.03), "2x2"),
-        (lambda: _align.halve_depth(IMAGE, float("nan")), "tolerance"),
+        (lambda: _align.halve(np.ones((1, 8), np.float32), 0.03), "2x2"),
+        (lambda: _align.halve(IMAGE, float("nan")), "tolerance"),
         (lambda: _align.pack(IMAGE, np.ones((8, 9), np.float32), 1.0), "differ in size"),
         (lambda: _align.pack(IMAGE, IMAGE, 0.0), "max_depth_m"),
         (lambda: _align.normals(IMAGE, INTRINSICS, 0), "radius"),
@@ -192,7 +192,7 @@ def test_bad_equations_are_refused(changed: dict, message: str) -> None:
 )
 def test_arrays_of_another_layout_are_not_converted_in_silence(image: np.ndarray) -> None:
     with pytest.raises(TypeError):
-        _align.halve_depth(image, 0.03)
+        _align.halve(image, 0.03)
 
 
 def run_with(isa: str, program: str) -> subprocess.CompletedProcess[str]:

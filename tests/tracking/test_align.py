@@ -64,6 +64,15 @@ def test_exposure_change_is_estimated_and_does_not_move_the_pose(room) -> None:
     assert result.bias == pytest.approx(12.0, abs=3.0)
 
 
+@pytest.mark.parametrize("gain", [0.4, 2.0])
+def test_an_exposure_that_clips_a_third_of_the_image_does_not_move_the_pose(room, gain) -> None:
+    frame = room.view(T_REFERENCE_CAMERA, gain=gain)
+    assert gain < 1 or np.mean(frame.color[..., 0] == 255) > 0.3
+    result = aligned(room.view(np.eye(4)), frame)
+    assert_close(result.T_reference_camera, T_REFERENCE_CAMERA)
+    assert result.gain == pytest.approx(gain, rel=0.03)
+
+
 def test_colour_alone_aligns_a_frame_without_depth(room) -> None:
     view = room.view(T_REFERENCE_CAMERA)
     result = aligned(room.view(np.eye(4)), replace(view, depth_m=np.zeros_like(view.depth_m)))

@@ -15,6 +15,8 @@ def test_kernel_equals_its_plain_twin(room, level: int) -> None:
     pyramid = pyramid_of(room.view(np.eye(4)), PyramidConfig())
     view = room.view(se3.inverse(T_CAMERA_REFERENCE))
     view.depth_m[30:50, 40:90] = 0  # a hole
+    view.color[60:80, 20:60] = 255  # clipped
+    view.color[100:, 100:] = 0
     target = pyramid_of(view, PyramidConfig()).levels[level]
     points = build_reference(pyramid).points[level]
     guess = se3.exp(np.array([0.004, 0.002, -0.003, 0.01, 0.01, -0.02])) @ T_CAMERA_REFERENCE

@@ -41,8 +41,8 @@ def test_sound_alignment_is_ok_whatever_came_before() -> None:
         {"paired": 0.0},
         {"condition": 1e6},
         {"condition": float("inf")},
-        {"gain": 0.0},
-        {"gain": 3.0},
+        {"gain": 0.3, "intensity_sigma": 1.2},
+        {"gain": 3.1},
         {"intensity_sigma": 11.0},
         {"depth_noise_scale": 3.0},
         {"agree": False},
@@ -50,6 +50,16 @@ def test_sound_alignment_is_ok_whatever_came_before() -> None:
 )
 def test_every_single_sign_makes_a_frame_weak(sign: dict) -> None:
     assert verdict(**sign) is Status.WEAK
+
+
+def test_noise_that_grows_with_the_exposure_is_no_sign() -> None:
+    assert verdict(gain=2.5, intensity_sigma=10.0 * 2.5) is verdict(intensity_sigma=10.0)
+    past = PAST.extended(replace(SOUND, gain=2.0, intensity_sigma=8.0), CONFIG)
+    assert past.intensity_sigmas[-1] == 4.0
+
+
+def test_a_frame_that_tells_no_brightness_is_never_accepted() -> None:
+    assert verdict(gain=0.0) is Status.LOST
 
 
 def test_residual_that_jumps_fivefold_is_never_accepted() -> None:
