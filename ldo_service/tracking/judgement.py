@@ -16,7 +16,6 @@ from ldo_service.errors import ConfigError
 
 from .align import Alignment
 
-
 LEAST_GAIN = 0.05  # a frame this dark shows nothing
 
 
