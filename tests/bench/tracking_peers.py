@@ -1,0 +1,205 @@
+"""Other people's odometry behind one call, each at its documented defaults, on one thread.
+
+A peer is a `Step`: it takes the next frame and gives T_world_camera, and whether it says that it
+found it. A frame that a peer does not find leaves its pose as it was.
+"""
+
+from collections.abc import Callable, Iterator
+from types import ModuleType
+from typing import TypeVar
+
+import cv2
+import numpy as np
+import small_gicp
+
+from ldo_service.geometry import Camera, RgbdFrame, se3
+
+Step = Callable[[RgbdFrame], tuple[np.ndarray, bool]]
+T = TypeVar("T")  # a frame made ready
+Found = tuple[np.ndarray, bool]  # T_previous_current, and whether it was found
+
+# small_gicp's defaults are for a lidar in a street: points 0.25 m apart, voxels of 1 m, partners
+# within 1 m. A room is smaller than a street by about 5.
+STREET, ROOM = 1.0, 0.2
+SPACING_M, VOXEL_M, REACH_M = 0.25, 1.0, 1.0
+
+OPEN3D_VOXEL_M, OPEN3D_BLOCKS = 3.0 / 512, 40_000  # of its dense SLAM example
+OPEN3D_DEPTH_MAX_M = 3.0  # its default
+DEPTH_SCALE = 1000.0
+
+
+def peers(camera: Camera) -> Iterator[tuple[str, Step]]:
+    """Names and steps of all that are installed; what is not is said."""
+    if hasattr(cv2, "Odometry"):
+        yield "OpenCV RGB-D, frame to frame", opencv(camera)
+    else:
+        print(f"OpenCV is left out: {cv2.__version__} has no cv2.Odometry.")
+    for scale, name in ((STREET, "defaults"), (ROOM, "a fifth of them")):
+        yield f"small_gicp, frame to frame, {name}", gicp_frames(camera, scale)
+        yield f"small_gicp, voxel map, {name}", gicp_voxels(camera, scale)
+    try:
+        import open3d
+    except ImportError as error:
+        print(f"Open3D is left out ({error}): pip install --group bench.")
+        return
+    yield "Open3D hybrid, frame to frame", open3d_frames(open3d, camera)
+    yield "Open3D hybrid tensor, frame to frame", open3d_tensors(open3d, camera)
+    yield "Open3D dense SLAM, frame to model", open3d_model(open3d, camera)
+
+
+def frame_to_frame(prepare: Callable[[RgbdFrame], T], align: Callable[[T, T], Found]) -> Step:
+    """Poses chained from `align(previous, current)`."""
+    previous: list[T] = []
+    T_world_camera = np.eye(4)
+
+    def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
+        nonlocal T_world_camera
+        current = prepare(frame)
+        found = True
+        if previous:
+            T_previous_current, found = align(previous.pop(), current)
+            T_world_camera = T_world_camera @ T_previous_current if found else T_world_camera
+        previous.append(current)
+        return T_world_camera, found
+
+    return step
+
+
+# --- OpenCV ---------------------------------------------------------------------------------------
+def opencv(camera: Camera) -> Step:
+    """cv2.Odometry with colour and depth."""
+    settings = cv2.OdometrySettings()
+    settings.setCameraMatrix(camera.matrix.astype(np.float32))
+    odometry = cv2.Odometry(cv2.OdometryType_RGB_DEPTH, settings, cv2.OdometryAlgoType_COMMON)
+
+    def prepare(frame: RgbdFrame) -> cv2.OdometryFrame:
+        depth_m = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
+        prepared = cv2.OdometryFrame(depth_m, cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+        odometry.prepareFrame(prepared)
+        return prepared
+
+    def align(previous: cv2.OdometryFrame, current: cv2.OdometryFrame) -> Found:
+        found, T_previous_current = odometry.compute(current, previous)
+        return T_previous_current, bool(found)
+
+    return frame_to_frame(prepare, align)
+
+
+# --- small_gicp -----------------------------------------------------------------------------------
+def gicp_frames(camera: Camera, scale: float) -> Step:
+    """GICP from the motion before, as its scan-to-scan example does."""
+    T_previous_current = np.eye(4)
+
+    def align(previous: tuple, current: tuple) -> Found:
+        nonlocal T_previous_current
+        found = small_gicp.align(
+            previous[0],
+            current[0],
+            previous[1],
+            init_T_target_source=T_previous_current,
+            max_correspondence_distance=scale * REACH_M,
+        )
+        T_previous_current = found.T_target_source
+        return T_previous_current, found.converged
+
+    return frame_to_frame(lambda frame: _sampled(camera, frame, scale), align)
+
+
+def gicp_voxels(camera: Camera, scale: float) -> Step:
+    """GICP against a voxel map of the last 100 frames, as its scan-to-model example does."""
+    voxels = small_gicp.GaussianVoxelMap(scale * VOXEL_M)
+    voxels.set_lru(horizon=100, clear_cycle=10)
+    T_world_camera, T_motion = np.eye(4), np.eye(4)
+
+    def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
+        nonlocal T_world_camera, T_motion
+        cloud, _ = _sampled(camera, frame, scale)
+        is_found = True
+        if voxels.size():
+            guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
+            found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
+            T_motion = se3.inverse(T_world_camera) @ found.T_target_source
+            T_world_camera, is_found = found.T_target_source, found.converged
+        voxels.insert(cloud, T_world_camera)
+        return T_world_camera, is_found
+
+    return step
+
+
+def _sampled(camera: Camera, frame: RgbdFrame, scale: float) -> tuple:
+    """Point cloud with covariances, and its tree."""
+    seen = frame.depth_m > 0
+    points = (camera.rays() * frame.depth_m[..., None])[seen]
+    return small_gicp.preprocess_points(points, scale * SPACING_M)
+
+
+# --- Open3D ---------------------------------------------------------------------------------------
+def open3d_frames(o3d: ModuleType, camera: Camera) -> Step:
+    """The RGB-D odometry of the tutorial, with the hybrid term; depth beyond 3 m is cut off."""
+    size = camera.width, camera.height
+    pinhole = o3d.camera.PinholeCameraIntrinsic(*size, camera.fx, camera.fy, camera.cx, camera.cy)
+    odometry = o3d.pipelines.odometry
+    term = odometry.RGBDOdometryJacobianFromHybridTerm()
+
+    def prepare(frame: RgbdFrame) -> object:
+        color, depth = o3d.geometry.Image(frame.color), o3d.geometry.Image(_millimetres(frame))
+        return o3d.geometry.RGBDImage.create_from_color_and_depth(color, depth)
+
+    def align(previous: object, current: object) -> Found:
+        found = odometry.compute_rgbd_odometry(current, previous, pinhole, np.eye(4), term)
+        return found[1], found[0]
+
+    return frame_to_frame(prepare, align)
+
+
+def open3d_tensors(o3d: ModuleType, camera: Camera) -> Step:
+    """The newer, multi-scale RGB-D odometry, whose default method is the hybrid one."""
+    matrix, odometry = o3d.core.Tensor(camera.matrix), o3d.t.pipelines.odometry
+
+    def prepare(frame: RgbdFrame) -> object:
+        images = (o3d.t.geometry.Image(image) for image in (frame.color, _millimetres(frame)))
+        return o3d.t.geometry.RGBDImage(*images)
+
+    def align(previous: object, current: object) -> Found:
+        return _tracked(lambda: odometry.rgbd_odometry_multi_scale(current, previous, matrix))
+
+    return frame_to_frame(prepare, align)
+
+
+def open3d_model(o3d: ModuleType, camera: Camera) -> Step:
+    """Its dense SLAM example: depth against a ray cast of the volume that was fused so far."""
+    slam, device = o3d.t.pipelines.slam, o3d.core.Device("CPU:0")
+    T_world_camera, count = np.eye(4), 0
+    start, shape = o3d.core.Tensor(T_world_camera), (camera.height, camera.width)
+    model = slam.Model(OPEN3D_VOXEL_M, 16, OPEN3D_BLOCKS, start, device)
+    matrix = o3d.core.Tensor(camera.matrix)
+    given, cast = (slam.Frame(*shape, matrix, device) for _ in range(2))
+
+    def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
+        nonlocal T_world_camera, count
+        given.set_data_from_image("depth", o3d.t.geometry.Image(_millimetres(frame)))
+        given.set_data_from_image("color", o3d.t.geometry.Image(frame.color))
+        found = True
+        if count:
+            T_cast_given, found = _tracked(lambda: model.track_frame_to_model(given, cast))
+            T_world_camera = T_world_camera @ T_cast_given if found else T_world_camera
+        model.update_frame_pose(count, o3d.core.Tensor(T_world_camera))
+        model.integrate(given)
+        model.synthesize_model_frame(cast)
+        count += 1
+        return T_world_camera, found
+
+    return step
+
+
+def _tracked(align: Callable[[], object]) -> Found:
+    """What Open3D's tensor odometry found; it raises where its system is singular."""
+    try:
+        found = align()
+    except RuntimeError:
+        return np.eye(4), False
+    return found.transformation.cpu().numpy(), found.fitness > 0
+
+
+def _millimetres(frame: RgbdFrame) -> np.ndarray:
+    return np.round(DEPTH_SCALE * frame.depth_m).astype(np.uint16)
