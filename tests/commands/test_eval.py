@@ -7,6 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from evo.core import metrics, sync
+from evo.tools import file_interface
 
 from ldo_service.runs.folder import MAP_FILES, prepare
 from tests.commands.test_cli import ldo
@@ -53,6 +55,18 @@ def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Pa
         assert row["mean"]["psnr_db"] == pytest.approx(np.mean(of_frames))
         assert row["median"]["psnr_db"] == pytest.approx(np.median(of_frames))
     assert fitted["mean"]["psnr_db"] > held_out["mean"]["psnr_db"] > 25
+
+
+def test_ate_is_what_evo_finds_in_the_files(capsys, run: Path, room_folder: Path) -> None:
+    _, out, _ = ldo(capsys, "eval", run, room_folder, "--json")
+    files = (room_folder / "groundtruth.txt", run / "trajectory.txt")
+    loaded = (file_interface.read_tum_trajectory_file(file) for file in files)
+    truth, estimate = sync.associate_trajectories(*loaded, max_diff=0.02)
+    estimate.align(truth)
+    judge = metrics.APE(metrics.PoseRelation.translation_part)
+    judge.process_data((truth, estimate))
+    theirs, ours = judge.get_all_statistics(), json.loads(out)["trajectory"]["final"]["ate_m"]
+    assert ours == pytest.approx({name: theirs[name] for name in ours}, abs=1e-6)
 
 
 def test_a_source_without_truth_has_its_map_judged(capsys, run: Path, without_truth: Path) -> None:

@@ -7,11 +7,18 @@ import numpy as np
 import pytest
 from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
+from evo.tools import file_interface
 
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
-from ldo_service.evaluation import ErrorStatistics, align, evaluate_trajectory
+from ldo_service.evaluation import (
+    ErrorStatistics,
+    TrajectoryErrors,
+    align,
+    evaluate_trajectory,
+)
 from ldo_service.geometry import Trajectory, se3
+from ldo_service.tracking import Odometry
 
 
 def random_trajectory(seed: int, count: int = 150) -> Trajectory:
@@ -40,8 +47,21 @@ def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     )
 
 
-def evo_errors(estimate: Trajectory, truth: Trajectory, delta: int) -> list[dict[str, float]]:
-    reference, other = sync.associate_trajectories(as_evo(truth), as_evo(estimate), max_diff=0.02)
+def with_gaps(trajectory: Trajectory, seed: int, share: float = 0.8) -> Trajectory:
+    """Single poses are missing, and 12 in a row."""
+    kept = np.random.default_rng(seed).random(len(trajectory)) < share
+    kept[40 + seed : 52 + seed] = False
+    return Trajectory(trajectory.stamps_s[kept], trajectory.T_world_camera[kept])
+
+
+def shifted(trajectory: Trajectory, offset_s: float) -> Trajectory:
+    return Trajectory(trajectory.stamps_s + offset_s, trajectory.T_world_camera)
+
+
+def evo_errors(
+    estimate: PoseTrajectory3D, truth: PoseTrajectory3D, delta: int
+) -> list[dict[str, float]]:
+    reference, other = sync.associate_trajectories(truth, estimate, max_diff=0.02)
     aligned = copy.deepcopy(other)
     aligned.align(reference)
     ape = metrics.APE(metrics.PoseRelation.translation_part)
@@ -59,7 +79,11 @@ def evo_errors(estimate: Trajectory, truth: Trajectory, delta: int) -> list[dict
 
 def assert_evo_agrees(estimate: Trajectory, truth: Trajectory) -> None:
     ours = evaluate_trajectory(estimate, truth)
-    theirs = evo_errors(estimate, truth, ours.rpe_poses)
+    theirs = evo_errors(as_evo(estimate), as_evo(truth), ours.rpe_poses)
+    assert_equal(ours, theirs)
+
+
+def assert_equal(ours: TrajectoryErrors, theirs: list[dict[str, float]]) -> None:
     for mine, judge in zip(
         (ours.ate_m, ours.rpe_translation_m, ours.rpe_rotation_deg), theirs, strict=True
     ):
@@ -74,17 +98,76 @@ def test_errors_agree_with_evo(seed: int) -> None:
     assert_evo_agrees(disturbed(truth, seed), truth)
 
 
-def test_errors_agree_with_evo_when_poses_are_missing() -> None:
-    truth = random_trajectory(7)
-    estimate = disturbed(truth, 7)
-    kept = np.random.default_rng(7).random(len(truth)) > 0.3
-    assert_evo_agrees(Trajectory(estimate.stamps_s[kept], estimate.T_world_camera[kept]), truth)
+@pytest.mark.parametrize("seed", range(4))
+def test_errors_agree_with_evo_when_poses_are_missing(seed: int) -> None:
+    truth = random_trajectory(seed)
+    estimate = disturbed(truth, seed)
+    for poses in ((with_gaps(estimate, seed), truth), (estimate, with_gaps(truth, seed))):
+        assert_evo_agrees(*poses)
+    assert_evo_agrees(with_gaps(estimate, seed), with_gaps(truth, seed + 9))
+
+
+@pytest.mark.parametrize("offset_s", [-0.009, 0.004, 0.009])
+def test_errors_agree_with_evo_when_clocks_differ(offset_s: float) -> None:
+    truth = random_trajectory(5)
+    late = shifted(with_gaps(disturbed(truth, 5), 5), offset_s)
+    assert_evo_agrees(late, with_gaps(truth, 6))
+
+
+def test_errors_agree_with_evo_when_the_truth_is_denser() -> None:
+    truth = random_trajectory(8, count=500)
+    truth = Trajectory(100 + np.arange(500) / 100, truth.T_world_camera)
+    estimate = disturbed(truth, 8, sigma=0.003)
+    thin = Trajectory(estimate.stamps_s[1::3], estimate.T_world_camera[1::3])
+    assert_evo_agrees(with_gaps(thin, 8), truth)
+
+
+def test_errors_of_unsorted_files_are_those_that_evo_finds_in_sorted_ones(tmp_path: Path) -> None:
+    truth = random_trajectory(9)
+    sorted_files, shuffled_files = [], []
+    for name, trajectory in (("estimate", disturbed(truth, 9)), ("truth", truth)):
+        sorted_files.append(tmp_path / f"{name}.txt")
+        trajectory.save(sorted_files[-1])
+        lines = sorted_files[-1].read_text().splitlines()
+        np.random.default_rng(9).shuffle(lines)
+        shuffled_files.append(tmp_path / f"{name}-shuffled.txt")
+        shuffled_files[-1].write_text("# stamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
+    ours = evaluate_trajectory(*(Trajectory.load(file) for file in shuffled_files))
+    judged = (file_interface.read_tum_trajectory_file(file) for file in sorted_files)
+    assert_equal(ours, evo_errors(*judged, ours.rpe_poses))
+
+
+def test_each_pose_is_used_once_where_evo_may_use_one_twice() -> None:
+    """Two late poses have the same true one nearest, because the first one's own is missing."""
+    truth = random_trajectory(3, count=60)
+    late = shifted(truth, 0.015)
+    own_is_missing = Trajectory(
+        np.delete(truth.stamps_s, 30), np.delete(truth.T_world_camera, 30, 0)
+    )
+    fewer = Trajectory(late.stamps_s[10:50], late.T_world_camera[10:50])
+    ours = evaluate_trajectory(fewer, own_is_missing)
+    _, theirs = sync.associate_trajectories(as_evo(own_is_missing), as_evo(fewer), max_diff=0.02)
+    assert (ours.poses, theirs.num_poses) == (39, 40)
 
 
 def test_errors_agree_with_evo_on_a_real_trajectory(data: Path) -> None:
     truth = open_sequence(str(data / "tum/kitchen")).truth()
     assert truth is not None
     assert_evo_agrees(disturbed(truth, 1, sigma=0.002), truth)
+
+
+def test_errors_agree_with_evo_on_the_trajectory_that_was_tracked(data: Path) -> None:
+    kitchen, odometry = open_sequence(str(data / "tum/kitchen")), Odometry()
+    poses, indices = [], range(0, 160, 4)
+    for index in indices:
+        frame = kitchen[index]
+        tracked = odometry.track(frame)
+        poses.append(tracked.T_odom_camera)
+        if tracked.wants_keyframe:
+            odometry.make_keyframe(frame, tracked)
+    truth = kitchen.truth()
+    assert truth is not None
+    assert_evo_agrees(Trajectory(kitchen.stamps_ns[indices] * 1e-9, np.array(poses)), truth)
 
 
 def test_another_world_frame_costs_nothing() -> None:
