@@ -1,6 +1,7 @@
 """Our odometry beside OpenCV's, small_gicp's and Open3D's, on the same frames, one thread each.
 
-    python tests/bench/bench_tracking.py [SOURCE] [--frames N] [--stride N] [--without NAME ...] [--json]
+    python tests/bench/bench_tracking.py [SOURCE] [--frames N] [--stride N] [--json]
+        [--without NAME ...]
 
 SOURCE: a data set or synthetic sequence; default: tum/kitchen in LDO_DATA, else synthetic:tour.
 ATE and RPE as `ldo eval` has them, over all frames, found or not. Trusted: what the method itself

@@ -99,7 +99,7 @@ def gicp_frames(camera: Camera, scale: float) -> Step:
             init_T_target_source=T_previous_current,
             max_correspondence_distance=scale * REACH_M,
         )
-        T_previous_current = found.T_target_source
+        T_previous_current = found.T_target_source if found.converged else np.eye(4)
         return T_previous_current, found.converged
 
     return frame_to_frame(lambda frame: _sampled(camera, frame, scale), align)
@@ -118,8 +118,9 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
         if voxels.size():
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
-            T_motion = se3.inverse(T_world_camera) @ found.T_target_source
-            T_world_camera, is_found = found.T_target_source, found.converged
+            is_found = found.converged
+            T_new = found.T_target_source if is_found else T_world_camera
+            T_motion, T_world_camera = se3.inverse(T_world_camera) @ T_new, T_new
         voxels.insert(cloud, T_world_camera)
         return T_world_camera, is_found
 
