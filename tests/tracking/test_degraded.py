@@ -108,9 +108,9 @@ def test_a_camera_that_turns_once_around_a_noisy_room_ends_where_it_began() -> N
     frames, poses, eye = [], [], np.array([-0.2, -0.6, 1.4])
     for k, angle_rad in enumerate(np.linspace(0, 2 * np.pi, 181)):
         T = look_at(eye, eye + np.array([np.sin(angle_rad), np.cos(angle_rad), -0.3]))
-        color, exact_m = renderer.render(camera, T)
-        depth_m = kinect_depth(exact_m, np.random.default_rng(k)).astype(np.float32)
-        frames.append(RgbdFrame(color, depth_m, camera, k * STEP_NS, k))
+        exact = renderer.render(camera, T)
+        depth_m = kinect_depth(exact.depth_m, np.random.default_rng(k)).astype(np.float32)
+        frames.append(RgbdFrame(exact.color, depth_m, camera, k * STEP_NS, k))
         poses.append(T)
     steps = Walk(frames, poses).through(dropped, range(0))
     found = outcome(steps, range(0), dict(enumerate(poses)), poses[0])

@@ -5,6 +5,7 @@ from + - * / and square roots of float64 in a fixed order, which IEEE 754 rounds
 no sine, no logarithm, no matrix product.
 
     room, tour    one furnished room, rendered when read; -noisy: with a Kinect's depth
+    person        the same room, and somebody walks through it; -noisy as above
     flat          two rooms and a corridor, hard on purpose and labelled; -exact: without noise
 """
 

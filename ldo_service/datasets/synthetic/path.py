@@ -67,6 +67,30 @@ TOUR = Path(
     ),
 )
 
+# Hardly anywhere: most of what is in view stays there.
+LINGER = Path(
+    eyes_m=np.array(
+        [
+            [-0.4, -1.2, 1.35],
+            [-0.1, -1.05, 1.42],
+            [0.15, -1.15, 1.48],
+            [0.1, -0.95, 1.38],
+            [-0.2, -0.9, 1.3],
+            [-0.45, -1.05, 1.32],
+        ]
+    ),
+    targets_m=np.array(
+        [
+            [-0.9, 1.6, 0.8],
+            [-0.4, 1.7, 0.9],
+            [0.2, 1.6, 0.85],
+            [0.7, 1.5, 0.75],
+            [0.2, 1.4, 0.7],
+            [-0.5, 1.5, 0.75],
+        ]
+    ),
+)
+
 SWAY_FRAMES = 8  # a hand moves in fractions of a second
 SWAY_EYE_M = 0.008
 SWAY_TARGET_M = 0.03

@@ -12,7 +12,8 @@ from ldo_service.geometry import Camera, RawFrame, Trajectory
 from . import path
 from .furniture import furnished_room
 from .kinect import kinect_depth
-from .render import Renderer
+from .person import person_at
+from .render import Renderer, Rendering
 
 RATE_HZ = 30
 FOCAL_PER_WIDTH = 0.8125  # 63 degrees wide, as a Kinect's colour camera
@@ -25,8 +26,9 @@ class SyntheticConfig:
     frames: int = 120
     width_px: int = 320
     height_px: int = 240
-    path: Literal["look_around", "tour"] = "look_around"
+    path: Literal["look_around", "tour", "linger"] = "look_around"
     noise: bool = False  # Kinect-like depth; exact otherwise
+    person: bool = False  # somebody walks through
     seed: int = 0  # of textures, of the hand's sway and of the noise
 
     def __post_init__(self) -> None:
@@ -39,13 +41,15 @@ class SyntheticConfig:
             raise ConfigError(f"path {self.path!r} is not one of {', '.join(PATHS)}.")
 
 
-PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR}
+PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR, "linger": path.LINGER}
 
 NAMED = {
     "room": SyntheticConfig(),
     "room-noisy": SyntheticConfig(noise=True),
     "tour": SyntheticConfig(frames=360, path="tour"),
     "tour-noisy": SyntheticConfig(frames=360, path="tour", noise=True),
+    "person": SyntheticConfig(frames=240, path="linger", person=True),
+    "person-noisy": SyntheticConfig(frames=240, path="linger", person=True, noise=True),
 }
 
 
@@ -71,11 +75,21 @@ class SyntheticSequence(Sequence):
         return SyntheticSequence(replace(NAMED[name], **changes), f"synthetic:{name}")
 
     def read(self, index: int) -> RawFrame:
-        color, depth_m = self._renderer.render(self.raw_camera, self._T_world_camera[index])
+        exact = self._rendering(index)
+        depth_m = exact.depth_m
         if self.config.noise:
             depth_m = kinect_depth(depth_m, np.random.default_rng([self.config.seed, index]))
         depth = depth_m.astype(np.float32)
-        return RawFrame(index, int(self.stamps_ns[index]), color, depth, 1.0, self.raw_camera)
+        stamp_ns = int(self.stamps_ns[index])
+        return RawFrame(index, stamp_ns, exact.color, depth, 1.0, self.raw_camera)
+
+    def person(self, index: int) -> np.ndarray:
+        """Whether each pixel [H, W] of frame `index` shows the person, exact at pixel centres."""
+        return self._rendering(index).is_visitor
+
+    def _rendering(self, index: int) -> Rendering:
+        visitors = person_at(index / RATE_HZ) if self.config.person else ()
+        return self._renderer.render(self.raw_camera, self._T_world_camera[index], visitors)
 
     def truth(self) -> Trajectory:
         return Trajectory(self.stamps_ns / 1e9, self._T_world_camera.copy())

@@ -1,0 +1,86 @@
+"""Somebody who walks through the room, built of upright solids that swing with the steps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .solids import Shape, Solid
+
+SPEED_M_S = 1.0
+STEP_M = 0.7  # from foot to foot
+SWING_M = 0.28  # of a foot, ahead of the hips and behind
+ARM_SWING_M = 0.2
+# Feet on the floor, x y, in metres: in by the wall on the left, past the sofa, out on the right.
+WAY_M = np.array([[-3.1, 0.9], [0.6, 0.9], [1.3, 0.25], [3.2, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A solid of a body that looks along x: its middle and size in metres, and how it swings, as a
+    share of the foot's or hand's swing, on the left (1), on the right (-1) or not at all (0)."""
+
+    shape: Shape
+    center_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+    texture: str
+    swing_m: float = 0.0
+
+
+def _both_sides(
+    shape: Shape,
+    center_m: tuple[float, float, float],
+    size_m: tuple[float, float, float],
+    texture: str,
+    swing_m: float,
+) -> tuple[Part, Part]:
+    x, y, z = center_m
+    return (
+        Part(shape, (x, y, z), size_m, texture, swing_m),
+        Part(shape, (x, -y, z), size_m, texture, -swing_m),
+    )
+
+
+BODY = (
+    Part("ball", (0, 0, 1.63), (0.2, 0.17, 0.25), "skin"),
+    Part("cylinder", (0, 0, 1.48), (0.11, 0.11, 0.12), "skin"),
+    Part("cylinder", (0, 0, 1.19), (0.24, 0.38, 0.52), "shirt"),
+    Part("ball", (0, 0, 0.92), (0.26, 0.36, 0.26), "trousers"),
+    *_both_sides("cylinder", (0, 0.09, 0.68), (0.17, 0.16, 0.48), "trousers", 0.4 * SWING_M),
+    *_both_sides("cylinder", (0, 0.09, 0.26), (0.13, 0.12, 0.44), "trousers", 0.85 * SWING_M),
+    *_both_sides("box", (0.05, 0.09, 0.04), (0.26, 0.1, 0.08), "shoes", SWING_M),
+    *_both_sides("cylinder", (0, 0.24, 1.26), (0.1, 0.1, 0.34), "shirt", -0.4 * ARM_SWING_M),
+    *_both_sides("cylinder", (0, 0.25, 0.97), (0.08, 0.08, 0.3), "skin", -ARM_SWING_M),
+)
+
+
+def person_at(time_s: float) -> tuple[Solid, ...]:
+    """The body after `time_s` on `WAY_M`; it waits at the end, behind the wall."""
+    foot_m, heading, walked_m = _placed(time_s)
+    swing = _swing(walked_m / STEP_M)
+    return tuple(_in_world(part, foot_m, heading, swing) for part in BODY)
+
+
+def _placed(time_s: float) -> tuple[np.ndarray, tuple[float, float], float]:
+    """Where the person stands, where it looks, and how far it walked."""
+    legs = np.diff(WAY_M, axis=0)
+    lengths = np.sqrt(legs[:, 0] * legs[:, 0] + legs[:, 1] * legs[:, 1])
+    ends = np.cumsum(lengths)
+    walked_m = min(max(SPEED_M_S * time_s, 0.0), float(ends[-1]))
+    leg = min(int(np.searchsorted(ends, walked_m)), len(legs) - 1)
+    direction = legs[leg] / lengths[leg]
+    foot_m = WAY_M[leg] + direction * (walked_m - (ends[leg] - lengths[leg]))
+    return foot_m, (float(direction[0]), float(direction[1])), walked_m
+
+
+def _swing(steps: float) -> float:
+    """-1..1..-1 over two steps: parabolas in place of a sine, which differs between machines."""
+    phase = steps % 2.0
+    side, t = (1.0, phase) if phase < 1 else (-1.0, phase - 1.0)
+    return side * 4 * t * (1 - t)
+
+
+def _in_world(part: Part, foot_m: np.ndarray, heading: tuple[float, float], swing: float) -> Solid:
+    (c, s), (x, y, z) = heading, part.center_m
+    x = x + part.swing_m * swing
+    center_m = (float(foot_m[0]) + c * x - s * y, float(foot_m[1]) + s * x + c * y, z)
+    return Solid(part.shape, center_m, part.size_m, part.texture, heading)
