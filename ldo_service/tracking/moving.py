@@ -1,0 +1,205 @@
+"""What moves, told from what stays: pixels through which a keyframe saw farther.
+
+A keyframe and a frame see each other's surfaces. Where the frame shows something in front of what
+the keyframe measured along the same ray, it came since; where it shows something behind what the
+keyframe measured, that has gone since. Either contradicts a static world, whereas something farther
+than the keyframe's surface was merely hidden. Conventions: `ldo_service.geometry`.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, se3
+
+from .noise import DepthNoise
+from .pyramid import Level, Pyramid
+
+NOTHING_M = 1e4  # the depth of a pixel without one, for minima
+
+
+@dataclass(frozen=True, slots=True)
+class MovingConfig:
+    level: int = 1  # of the pyramid that is looked at: 160 pixels wide
+    least_m: float = 0.06  # by which a surface must contradict: pose errors of a keyframe's length
+    sigmas: float = 4.0  # of the depth noise as the alignment estimated it, added to it
+    edge_px: int = 2  # a surface so near in the image may be the one that is met: outlines
+    least_share: float = 0.004  # of the image in one piece: what is smaller is noise
+    streak_px: int = 5  # a piece must touch what contradicted in the frame before, so far around
+    spread_px: int = 8  # how far around what contradicts the same thing may reach: parts of it that
+    spread_m: float = 0.12  # are as far away, but were there already, or stand on the floor
+    rim_px: int = 1  # around all of it: mixed pixels
+    gone_frames: int = 2  # that must see through a keyframe's point before it is believed gone
+
+    def __post_init__(self) -> None:
+        lengths = (self.least_m, self.sigmas, self.least_share, self.spread_m)
+        counts = (self.level, self.edge_px, self.streak_px, self.spread_px, self.rim_px)
+        if min(lengths) < 0 or min(counts) < 0 or not 1 <= self.gone_frames <= 255:
+            raise ConfigError(f"{self}: nothing negative, gone_frames within 1..255.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Suspicion:
+    """What is kept from frame to frame, at the level that is looked at.
+
+    contradicts  [h, w] bool, pixels of the last frame that contradict
+    gone         [h, w] uint8, in how many frames each point of the keyframe was seen through
+    """
+
+    contradicts: np.ndarray
+    gone: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Watched:
+    """is_moving [H, W] bool of the frame and has_moved [H, W] bool of the keyframe, both at
+    working resolution."""
+
+    is_moving: np.ndarray
+    has_moved: np.ndarray
+    suspicion: Suspicion
+
+
+def watch(
+    view: Pyramid,
+    keyframe: Pyramid,
+    has_moved: np.ndarray | None,
+    T_keyframe_camera: np.ndarray,
+    noise_scale: float,
+    before: Suspicion | None,
+    config: MovingConfig,
+    noise: DepthNoise,
+) -> Watched:
+    """What moved between a keyframe and an aligned frame.
+
+    has_moved          [H, W] bool of the keyframe as known so far, None: nothing
+    T_keyframe_camera  [4, 4]
+    noise_scale        of the depth noise, as the alignment estimated it
+    before             of the frame before, against the same keyframe or an older one; None: none
+    Deterministic. What stands still since the keyframe was made is static here.
+    """
+    now, then = _level(view, config), _level(keyframe, config)
+    known = _resized(has_moved, then.depth_m.shape)
+    # what came
+    ahead_m = gap_m(now, then, T_keyframe_camera, config)
+    limit_m = config.least_m + config.sigmas * noise_scale * noise.sigma_m(now.depth_m)
+    came = ahead_m > limit_m
+    came |= _lies_on(known, now, then, T_keyframe_camera) & (ahead_m > -limit_m)
+    is_moving = _in_pieces(came, None if before is None else before.contradicts, config)
+    # what has gone
+    behind_m = gap_m(then, now, se3.inverse(T_keyframe_camera), config)
+    limit_m = config.least_m + config.sigmas * noise_scale * noise.sigma_m(then.depth_m)
+    seen_through = cv2.morphologyEx(_bytes(behind_m > limit_m), cv2.MORPH_OPEN, _square(1))
+    gone = np.where(seen_through > 0, 1, 0).astype(np.uint8)
+    if before is not None:
+        gone = cv2.add(gone, before.gone)
+    known = known | _in_pieces(gone >= config.gone_frames, None, config)
+    return Watched(
+        _resized(is_moving, view.levels[0].depth_m.shape),
+        _resized(known, keyframe.levels[0].depth_m.shape),
+        Suspicion(came, gone),
+    )
+
+
+def spread(is_moving: np.ndarray, view: Pyramid, config: MovingConfig) -> np.ndarray:
+    """Pixels [H, W] bool to leave out: what moves, all that is as far away beside it, and a rim.
+
+    is_moving [H, W] bool at working resolution, as `watch` gives it. What this adds must not be
+    given to `watch` again, or it would spread on from frame to frame.
+    """
+    if not is_moving.any():
+        return is_moving
+    depth_m = _level(view, config).depth_m
+    seed = _resized(is_moving, depth_m.shape)
+    window = (2 * config.spread_px + 1,) * 2
+    measured = (seed & (depth_m > 0)).astype(np.float32)
+    share = cv2.boxFilter(measured, -1, window, normalize=False)
+    usual_m = cv2.boxFilter(measured * depth_m, -1, window, normalize=False) / np.maximum(share, 1)
+    is_beside = (share > 0) & (np.abs(depth_m - usual_m) < config.spread_m)
+    whole = cv2.dilate(_bytes(seed | is_beside), _square(config.rim_px)) > 0
+    return _resized(whole, is_moving.shape)
+
+
+def gap_m(view: Level, other: Level, T_other_view: np.ndarray, config: MovingConfig) -> np.ndarray:
+    """By how much [h, w] each point of `view` lies in front of what `other` measured there.
+
+    The nearest surface within `edge_px` is taken for what was measured, so that outlines that are
+    a little off do not count. Negative: behind it; NaN: either measured nothing.
+    """
+    u, v, z = _seen_from(view, other, T_other_view)
+    depth_m = np.where(other.depth_m > 0, other.depth_m, np.float32(NOTHING_M))
+    nearest_m = cv2.erode(depth_m, _square(config.edge_px))
+    nearest_m[other.depth_m <= 0] = np.nan
+    surface_m = cv2.remap(
+        nearest_m, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=np.nan
+    )
+    gap = surface_m - z
+    gap[(view.depth_m <= 0) | (z <= 0)] = np.nan
+    return gap
+
+
+def _lies_on(
+    has_moved: np.ndarray, view: Level, keyframe: Level, T_keyframe_view: np.ndarray
+) -> np.ndarray:
+    """Pixels [h, w] bool of `view` whose ray meets what moved in the keyframe."""
+    if not has_moved.any():
+        return np.zeros(view.depth_m.shape, bool)
+    u, v, _ = _seen_from(view, keyframe, T_keyframe_view)
+    return cv2.remap(_bytes(has_moved), u, v, cv2.INTER_NEAREST) > 0
+
+
+def _seen_from(
+    view: Level, other: Level, T_other_view: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where [h, w] the points of `view` lie in `other`: u, v in pixels and z in m."""
+    R, t = T_other_view[:3, :3], T_other_view[:3, 3].astype(np.float32)
+    points = cv2.transform(_rays(view.camera), R.astype(np.float32)) * view.depth_m[..., None] + t
+    z = points[..., 2]
+    scale = 1 / np.maximum(z, np.float32(1e-3))
+    camera = other.camera
+    u = np.float32(camera.fx) * points[..., 0] * scale + np.float32(camera.cx)
+    v = np.float32(camera.fy) * points[..., 1] * scale + np.float32(camera.cy)
+    return u, v, z
+
+
+@lru_cache(maxsize=8)
+def _rays(camera: Camera) -> np.ndarray:
+    return camera.rays().astype(np.float32)
+
+
+def _in_pieces(
+    contradicts: np.ndarray, before: np.ndarray | None, config: MovingConfig
+) -> np.ndarray:
+    """Pieces [h, w] bool that are large enough and touch what contradicted before."""
+    opened = cv2.morphologyEx(_bytes(contradicts), cv2.MORPH_OPEN, _square(1))
+    closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _square(2))
+    count, labels, figures, _ = cv2.connectedComponentsWithStats(closed)
+    kept = figures[:, cv2.CC_STAT_AREA] >= max(config.least_share * labels.size, 1)
+    kept[0] = False  # what does not contradict
+    if before is not None:
+        near = cv2.dilate(_bytes(before), _square(config.streak_px)) > 0
+        kept &= np.bincount(labels[near], minlength=count) > 0
+    return kept[labels]
+
+
+def _level(view: Pyramid, config: MovingConfig) -> Level:
+    return view.levels[min(config.level, len(view.levels) - 1)]
+
+
+def _resized(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    if mask is None:
+        return np.zeros(shape, bool)
+    if mask.shape == shape:
+        return mask
+    return cv2.resize(_bytes(mask), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _bytes(mask: np.ndarray) -> np.ndarray:
+    return mask.astype(np.uint8)
+
+
+def _square(radius_px: int) -> np.ndarray:
+    return np.ones((2 * radius_px + 1,) * 2, np.uint8)
