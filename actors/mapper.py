@@ -49,6 +49,7 @@ from ldo_service.schemas.topics import (
 )
 from ldo_service.wire import (
     keyframe_poses_of,
+    mask_of,
     pose_message,
     rgbd_of,
     transform,
@@ -165,7 +166,8 @@ class Mapper(Actor):
         self._newest = (message.stamp_ns, message.keyframe)
         # map it
         frame = rgbd_of(message)
-        self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations())
+        moving = mask_of(message.is_moving)
+        self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         # tell
         yield from self._refinement()
         yield from self._deltas(self._is_time_for_changed())

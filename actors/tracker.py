@@ -24,6 +24,7 @@ from ldo_service.tracking.odometry import Odometry, OdometryConfig, Tracked
 from ldo_service.wire import (
     camera_message,
     keyframe_poses_of,
+    mask_message,
     matrix6_message,
     measured_message,
     pose_message,
@@ -143,6 +144,7 @@ class Tracker(Actor):
             T_odom_keyframe=pose_message(tracked.T_odom_camera),
             overlap=tracked.overlap,
             window=tuple(map(measured_message, window)),
+            is_moving=mask_message(tracked.is_moving, frame.camera),
         )
 
     def _recent(self, keyframe: int) -> Iterator[int]:

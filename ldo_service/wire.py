@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
@@ -18,6 +19,7 @@ from ldo_service.schemas import (
     Pose,
 )
 from ldo_service.schemas.frames import ImageEncoding
+from ldo_service.schemas.keyframe import NO_MASK
 
 
 def pose_message(T: np.ndarray) -> Pose:
@@ -102,6 +104,20 @@ def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
         stamp_ns=message.stamp_ns,
         index=message.frame,
     )
+
+
+def mask_message(mask: np.ndarray | None, camera: Camera) -> Array:
+    """A mask [h, w] bool of any size as u1 [H, W] of the camera's; [0, 0] of none or an empty
+    one."""
+    if mask is None or not mask.any():
+        return NO_MASK
+    size = camera.width, camera.height
+    return Array.of(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
+
+
+def mask_of(array: Array) -> np.ndarray | None:
+    """[H, W] bool; None where there is none."""
+    return array.numpy() > 0 if array.data.nbytes else None
 
 
 def correction_message(

@@ -1,11 +1,14 @@
 """Keyframes, as the tracker makes them and the mapper places them better."""
 
 import msgspec
+import numpy as np
 
 from ldo_service.schemas.array import Array
 from ldo_service.schemas.frames import CameraModel, require_rgbd
 from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Matrix6, Pose, require_matrix6
+
+NO_MASK = Array.of(np.zeros((0, 0), np.uint8))
 
 
 class MeasuredPose(msgspec.Struct, frozen=True, kw_only=True):
@@ -42,6 +45,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     T_odom_keyframe: Pose
     overlap: float = 1.0  # share of the reference's surface that this keyframe sees
     window: tuple[MeasuredPose, ...] = ()  # this keyframe measured from others but the reference
+    is_moving: Array = NO_MASK  # u1 [H, W], 1: shows what moves, not to be mapped; [0, 0]: nothing
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
@@ -49,6 +53,8 @@ class Keyframe(Message, frozen=True, kw_only=True):
         require_rgbd(self.camera, self.color, self.depth_m)
         require_matrix6("information", self.information)
         require_finite("overlap", (self.overlap,))
+        if self.is_moving.shape != (0, 0):
+            self.is_moving.require("is_moving", "u1", (self.camera.height, self.camera.width))
         if self.reference is not None and not 0 <= self.reference < self.keyframe:
             raise ValueError(
                 f"keyframe {self.keyframe} refers to {self.reference}, not an older one"

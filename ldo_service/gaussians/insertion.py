@@ -1,6 +1,6 @@
 """How the map grows: Gaussians where it does not explain a keyframe, denser on edges."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 
 import cv2
@@ -75,14 +75,15 @@ def insert(
     config: InsertionConfig | None = None,
     *,
     before: Rendering | None = None,
+    left_out: np.ndarray | None = None,
     threads: int = 1,
 ) -> np.ndarray:
     """Add Gaussians anchored to `keyframe` where the map does not explain its frame.
 
     T_map_camera [4, 4]; `frame` at the brightness of the map; `before` is the map as it is rendered
-    there, if the caller has it. Returns the ids [M] of the new Gaussians, none where depth is
-    missing. Old Gaussians stay as they are. Deterministic: no random numbers, and the same bits
-    for any number of threads.
+    there, if the caller has it; pixels `left_out` [H, W] bool get none. Returns the ids [M] of the
+    new Gaussians, none where depth is missing. Old Gaussians stay as they are. Deterministic: no
+    random numbers, and the same bits for any number of threads.
     """
     config = config or InsertionConfig()
     T_camera_map = se3.inverse(T_map_camera)
@@ -91,8 +92,11 @@ def insert(
     before = before or render(
         gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, threads=threads
     )
+    frame = frame if left_out is None else replace(frame, depth_m=frame.depth_m * ~left_out)
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
     wanted = unexplained(frame, before, config) & (depth_m > 0)
+    if left_out is not None:
+        wanted &= ~left_out
 
     # One Gaussian per cell.
     cells = quadtree(

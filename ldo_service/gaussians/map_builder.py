@@ -94,19 +94,26 @@ class MapBuilder:
 
     # --- keyframes --------------------------------------------------------------------------------
     def add(
-        self, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int, iterations: int
+        self,
+        frame: RgbdFrame,
+        T_map_camera: np.ndarray,
+        keyframe: int,
+        iterations: int,
+        is_moving: np.ndarray | None = None,
     ) -> None:
         """Take in a keyframe, later than all before, and fit the map to its window.
 
         T_map_camera [4, 4]; `iterations` of the optimiser that reach the usual number of Gaussians:
-        fewer where more are in view, so that a keyframe costs the same however dense the map is.
+        fewer where more are in view, so that a keyframe costs the same however dense the map is;
+        `is_moving` [H, W] bool: pixels that are neither mapped nor fitted.
         Its Gaussians hang on it.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera))
         before = self.seen_from(frame.camera, T_map_camera)
-        exposure = self._exposure(frame, before)
-        self._insert(frame, T_map_camera, keyframe, before, exposure)
-        view = replace(View.of(frame, T_map_camera, keyframe), exposure=exposure)
+        exposure = self._exposure(frame, before, is_moving)
+        self._insert(frame, T_map_camera, keyframe, before, exposure, is_moving)
+        counts = None if is_moving is None else (~is_moving).astype(np.uint8)
+        view = replace(View.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts)
         self.views.add(view)
         self._told[keyframe], self._newest = T_map_camera, keyframe
         touched = self._fit(self._plan(view, MOST_PER_EFFORT * iterations), effort=iterations)
@@ -128,10 +135,13 @@ class MapBuilder:
             threads=self._threads,
         )
 
-    def _exposure(self, frame: RgbdFrame, before: Rendering) -> Exposure:
+    def _exposure(
+        self, frame: RgbdFrame, before: Rendering, is_moving: np.ndarray | None
+    ) -> Exposure:
         """Against the map; where too little of it is in view, as the keyframe before."""
         color = frame.color * np.float32(1 / 255)
-        estimated = estimated_exposure(before.color, before.opacity, color)
+        opacity = before.opacity if is_moving is None else before.opacity * ~is_moving
+        estimated = estimated_exposure(before.color, opacity, color)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
         return self.views.exposures[self._newest]
@@ -143,6 +153,7 @@ class MapBuilder:
         keyframe: int,
         before: Rendering,
         exposure: Exposure,
+        is_moving: np.ndarray | None,
     ) -> None:
         color = exposure.removed(frame.color * np.float32(1 / 255))
         insert(
@@ -152,6 +163,7 @@ class MapBuilder:
             keyframe,
             self.config.insertion,
             before=before,
+            left_out=is_moving,
             threads=self._threads,
         )
         self._log.grown(self.gaussians)

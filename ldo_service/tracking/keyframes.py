@@ -49,10 +49,12 @@ class Keyframe:
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
     id: int  # ascending, given by the odometry: a camera's frame numbers may start again
+    has_moved: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
+    left_out: np.ndarray | None = None  # [H, W] bool: what of it is not tracked against
 
     @cached_property
     def reference(self) -> Reference:
-        return build_reference(self.view)
+        return build_reference(self.view, self.left_out)
 
     def features(self, config: FeatureConfig) -> Features:
         """Detected when first asked for: most keyframes never are."""

@@ -23,6 +23,7 @@ NOTHING_M = 1e4  # the depth of a pixel without one, for minima
 
 @dataclass(frozen=True, slots=True)
 class MovingConfig:
+    is_on: bool = True  # False: the world is taken as static
     level: int = 1  # of the pyramid that is looked at: 160 pixels wide
     least_m: float = 0.06  # by which a surface must contradict: pose errors of a keyframe's length
     sigmas: float = 4.0  # of the depth noise as the alignment estimated it, added to it
@@ -33,9 +34,10 @@ class MovingConfig:
     spread_m: float = 0.12  # are as far away, but were there already, or stand on the floor
     rim_px: int = 1  # around all of it: mixed pixels
     gone_frames: int = 2  # that must see through a keyframe's point before it is believed gone
+    renewed_share: float = 0.005  # of the image that has gone from a keyframe, to prepare it anew
 
     def __post_init__(self) -> None:
-        lengths = (self.least_m, self.sigmas, self.least_share, self.spread_m)
+        lengths = (self.least_m, self.sigmas, self.spread_m, self.least_share, self.renewed_share)
         counts = (self.level, self.edge_px, self.streak_px, self.spread_px, self.rim_px)
         if min(lengths) < 0 or min(counts) < 0 or not 1 <= self.gone_frames <= 255:
             raise ConfigError(f"{self}: nothing negative, gone_frames within 1..255.")
@@ -51,6 +53,9 @@ class Suspicion:
 
     contradicts: np.ndarray
     gone: np.ndarray
+
+    def of_new_keyframe(self) -> "Suspicion":
+        return Suspicion(self.contradicts, np.zeros_like(self.gone))
 
 
 @dataclass(frozen=True, eq=False, slots=True)

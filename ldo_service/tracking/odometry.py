@@ -29,6 +29,7 @@ from .features import FeatureConfig, detect, estimate_pose
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion, extent
+from .moving import MovingConfig, spread, watch
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, relocalise
 from .state import State, packed, unpacked
@@ -47,6 +48,7 @@ class OdometryConfig:
     window: WindowConfig = field(default_factory=WindowConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
+    moving: MovingConfig = field(default_factory=MovingConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
 
     def __post_init__(self) -> None:
@@ -75,6 +77,7 @@ class Tracked:
     depth_noise_scale: float = 0.0  # geometric residual, times the sensor model
     overlap: float = 0.0  # visible fraction of the keyframe's surface
     iterations: int = 0
+    is_moving: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped
 
 
 class Odometry:
@@ -108,7 +111,8 @@ class Odometry:
             raise ValueError(f"frame {frame.index} is LOST and cannot be a keyframe.")
         before, view = self._state, self._view(frame)
         view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
-        keyframe = Keyframe(view, tracked.T_odom_camera, before.next_id)
+        moving = before.is_moving, tracked.is_moving
+        keyframe = Keyframe(view, tracked.T_odom_camera, before.next_id, *moving)
         self._state = replace(
             before,
             memory=(*before.memory, keyframe)[-self.config.relocalisation.memory :],
@@ -116,6 +120,7 @@ class Odometry:
             frames_since_keyframe=0,
             next_id=before.next_id + 1,
             T_odom_mapped=tracked.T_odom_camera,
+            suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
         )
         return keyframe.id
 
@@ -163,7 +168,9 @@ class Odometry:
     def _first(self, frame: RgbdFrame, view: Pyramid) -> Tracked:
         measured = float(np.mean(view.levels[0].depth_m > 0))
         usable = measured >= self.config.judgement.min_paired
-        self._state = replace(self._state, motion=Motion(stamp_ns=frame.stamp_ns))
+        self._state = replace(
+            self._state, motion=Motion(stamp_ns=frame.stamp_ns), is_moving=None, suspicion=None
+        )
         status, method = (Status.OK, "first") if usable else (Status.LOST, "none")
         return Tracked(np.eye(4), np.eye(4), None, status, method, usable, usable)
 
@@ -212,6 +219,7 @@ class Odometry:
     def _lost(self, keyframe: Keyframe, alignment: Alignment) -> Tracked:
         motion = self._state.motion.stopped()
         self._remember(keyframe, motion, self._state.history, Status.LOST)
+        self._state = replace(self._state, is_moving=None, suspicion=None)
         T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
         return _report(
             replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
@@ -231,6 +239,7 @@ class Odometry:
         if status is Status.OK:
             history = history.extended(alignment, config.judgement)
         self._remember(keyframe, motion if is_steady else motion.stopped(), history, status)
+        is_moving = self._watched(keyframe, self._view(frame), alignment)
         due = is_due(
             alignment.T_reference_camera,
             alignment.overlap,
@@ -249,7 +258,37 @@ class Odometry:
             candidate.method,
             wants_keyframe=due and is_sure,
             wants_mapping=(due or supports) and is_sure,
+            is_moving=is_moving,
         )
+
+    def _watched(
+        self, keyframe: Keyframe, view: Pyramid, alignment: Alignment
+    ) -> np.ndarray | None:
+        """What moves in a frame [H, W] bool; what has moved in its keyframe is left out of it."""
+        config = self.config.moving
+        if not config.is_on:
+            return None
+        seen = watch(
+            view,
+            keyframe.view,
+            keyframe.has_moved,
+            alignment.T_reference_camera,
+            alignment.depth_noise_scale,
+            self._state.suspicion,
+            config,
+            self.config.align.residuals.noise,
+        )
+        self._state = replace(self._state, is_moving=seen.is_moving, suspicion=seen.suspicion)
+        known = keyframe.has_moved
+        news = seen.has_moved if known is None else seen.has_moved & ~known
+        if np.mean(news) > config.renewed_share:
+            left_out = spread(seen.has_moved, keyframe.view, config)
+            self._exchange(keyframe, replace(keyframe, has_moved=seen.has_moved, left_out=left_out))
+        return spread(seen.is_moving, view, config)
+
+    def _exchange(self, old: Keyframe, new: Keyframe) -> None:
+        memory = tuple(new if k is old else k for k in self._state.memory)
+        self._state = replace(self._state, memory=memory, keyframe=new)
 
     def _remember(
         self, keyframe: Keyframe, motion: Motion, history: History, status: Status
@@ -276,6 +315,7 @@ def _report(
     *,
     wants_keyframe: bool = False,
     wants_mapping: bool = False,
+    is_moving: np.ndarray | None = None,
 ) -> Tracked:
     return Tracked(
         T_odom_camera,
@@ -291,4 +331,5 @@ def _report(
         depth_noise_scale=alignment.depth_noise_scale,
         overlap=alignment.overlap,
         iterations=alignment.iterations,
+        is_moving=is_moving,
     )

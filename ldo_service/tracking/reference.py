@@ -22,10 +22,22 @@ class Reference:
     median_depth_m: float
 
 
-def build_reference(pyramid: Pyramid) -> Reference:
-    points = tuple(_level_points(level, i) for i, level in enumerate(pyramid.levels))
+def build_reference(pyramid: Pyramid, left_out: np.ndarray | None = None) -> Reference:
+    """Of the pixels with depth, but for those `left_out` [H, W] bool at working resolution."""
+    levels = (_without(level, left_out) for level in pyramid.levels)
+    points = tuple(_level_points(level, i) for i, level in enumerate(levels))
     depth_m = points[0][2]
     return Reference(points, float(np.median(depth_m)) if depth_m.size else 1.0)
+
+
+def _without(level: Level, left_out: np.ndarray | None) -> Level:
+    if left_out is None or not left_out.any():
+        return level
+    size = level.camera.width, level.camera.height
+    share = cv2.resize(left_out.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    texels = level.texels.copy()
+    texels[..., 3][share > 0] = 0
+    return Level(texels, level.camera)
 
 
 def _level_points(level: Level, index: int) -> np.ndarray:

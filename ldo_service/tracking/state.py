@@ -10,6 +10,7 @@ from ldo_service.geometry import Camera
 from .judgement import History, Status
 from .keyframes import Keyframe
 from .motion import Motion
+from .moving import Suspicion
 from .pyramid import PyramidConfig, build_pyramid
 
 
@@ -23,6 +24,8 @@ class State:
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
     T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
+    is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
+    suspicion: Suspicion | None = None
 
 
 def packed(state: State) -> dict[str, Any]:
@@ -40,6 +43,8 @@ def packed(state: State) -> dict[str, Any]:
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
         "T_odom_mapped": state.T_odom_mapped,
+        "is_moving": state.is_moving,
+        "suspicion": state.suspicion and (state.suspicion.contradicts, state.suspicion.gone),
     }
 
 
@@ -55,6 +60,8 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
         T_odom_mapped=values["T_odom_mapped"],
+        is_moving=values["is_moving"],
+        suspicion=values["suspicion"] and Suspicion(*values["suspicion"]),
     )
 
 
@@ -66,10 +73,13 @@ def _packed(keyframe: Keyframe) -> dict[str, Any]:
         "camera": asdict(view.camera),
         "T_odom_keyframe": keyframe.T_odom_keyframe,
         "id": keyframe.id,
+        "has_moved": keyframe.has_moved,
+        "left_out": keyframe.left_out,
     }
 
 
 def _unpacked(kept: dict[str, Any], config: PyramidConfig) -> Keyframe:
     camera = Camera(**{**kept["camera"], "distortion": tuple(kept["camera"]["distortion"])})
     view = build_pyramid(kept["gray"], kept["depth_m"], camera, config)
-    return Keyframe(view, kept["T_odom_keyframe"], kept["id"])
+    moved = kept["has_moved"], kept["left_out"]
+    return Keyframe(view, kept["T_odom_keyframe"], kept["id"], *moved)

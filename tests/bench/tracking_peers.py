@@ -58,6 +58,7 @@ def frame_to_frame(prepare: Callable[[RgbdFrame], T], align: Callable[[T, T], Fo
         found = True
         if previous:
             T_previous_current, found = align(previous.pop(), current)
+            found = found and bool(np.isfinite(T_previous_current).all())
             T_world_camera = T_world_camera @ T_previous_current if found else T_world_camera
         previous.append(current)
         return T_world_camera, found
@@ -99,8 +100,9 @@ def gicp_frames(camera: Camera, scale: float) -> Step:
             init_T_target_source=T_previous_current,
             max_correspondence_distance=scale * REACH_M,
         )
-        T_previous_current = found.T_target_source if found.converged else np.eye(4)
-        return T_previous_current, found.converged
+        is_found = found.converged and bool(np.isfinite(found.T_target_source).all())
+        T_previous_current = found.T_target_source if is_found else np.eye(4)
+        return T_previous_current, is_found
 
     return frame_to_frame(lambda frame: _sampled(camera, frame, scale), align)
 
@@ -118,7 +120,7 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
         if voxels.size():
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
-            is_found = found.converged
+            is_found = found.converged and bool(np.isfinite(found.T_target_source).all())
             T_new = found.T_target_source if is_found else T_world_camera
             T_motion, T_world_camera = se3.inverse(T_world_camera) @ T_new, T_new
         voxels.insert(cloud, T_world_camera)
@@ -199,7 +201,8 @@ def _tracked(align: Callable[[], object]) -> Found:
         found = align()
     except RuntimeError:
         return np.eye(4), False
-    return found.transformation.cpu().numpy(), found.fitness > 0
+    T_target_source = found.transformation.cpu().numpy()
+    return T_target_source, found.fitness > 0 and bool(np.isfinite(T_target_source).all())
 
 
 def _millimetres(frame: RgbdFrame) -> np.ndarray:
