@@ -1,7 +1,8 @@
 """Other people's odometry behind one call, each at its documented defaults, on one thread.
 
 A peer is a `Step`: it takes the next frame and gives T_world_camera, and whether it says that it
-found it. A frame that a peer does not find leaves its pose as it was.
+found it. A frame that a peer does not find, or finds more than 1 m away from the last one, leaves
+its pose as it was: otherwise some run away to infinity.
 """
 
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ Found = tuple[np.ndarray, bool]  # T_previous_current, and whether it was found
 # small_gicp's defaults are for a lidar in a street: points 0.25 m apart, voxels of 1 m, partners
 # within 1 m. A room is smaller than a street by about 5.
 STREET, ROOM = 1.0, 0.2
+FARTHEST_M = 1.0  # from frame to frame
 SPACING_M, VOXEL_M, REACH_M = 0.25, 1.0, 1.0
 
 OPEN3D_VOXEL_M, OPEN3D_BLOCKS = 3.0 / 512, 40_000  # of its dense SLAM example
@@ -58,12 +60,16 @@ def frame_to_frame(prepare: Callable[[RgbdFrame], T], align: Callable[[T, T], Fo
         found = True
         if previous:
             T_previous_current, found = align(previous.pop(), current)
-            found = found and bool(np.isfinite(T_previous_current).all())
+            found = found and is_possible(T_previous_current)
             T_world_camera = T_world_camera @ T_previous_current if found else T_world_camera
         previous.append(current)
         return T_world_camera, found
 
     return step
+
+
+def is_possible(T_previous_current: np.ndarray) -> bool:
+    return bool(np.linalg.norm(T_previous_current[:3, 3]) < FARTHEST_M)  # False for NaN
 
 
 # --- OpenCV ---------------------------------------------------------------------------------------
@@ -100,7 +106,7 @@ def gicp_frames(camera: Camera, scale: float) -> Step:
             init_T_target_source=T_previous_current,
             max_correspondence_distance=scale * REACH_M,
         )
-        is_found = found.converged and bool(np.isfinite(found.T_target_source).all())
+        is_found = found.converged and is_possible(found.T_target_source)
         T_previous_current = found.T_target_source if is_found else np.eye(4)
         return T_previous_current, is_found
 
@@ -120,9 +126,10 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
         if voxels.size():
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
-            is_found = found.converged and bool(np.isfinite(found.T_target_source).all())
-            T_new = found.T_target_source if is_found else T_world_camera
-            T_motion, T_world_camera = se3.inverse(T_world_camera) @ T_new, T_new
+            T_motion = se3.inverse(T_world_camera) @ found.T_target_source
+            is_found = found.converged and is_possible(T_motion)
+            T_motion = T_motion if is_found else np.eye(4)
+            T_world_camera = T_world_camera @ T_motion
         voxels.insert(cloud, T_world_camera)
         return T_world_camera, is_found
 
@@ -202,7 +209,7 @@ def _tracked(align: Callable[[], object]) -> Found:
     except RuntimeError:
         return np.eye(4), False
     T_target_source = found.transformation.cpu().numpy()
-    return T_target_source, found.fitness > 0 and bool(np.isfinite(T_target_source).all())
+    return T_target_source, found.fitness > 0
 
 
 def _millimetres(frame: RgbdFrame) -> np.ndarray:

@@ -1,0 +1,74 @@
+"""What a detector knows to move by itself, as pixels. Conventions: `ldo_service.geometry`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import ConfigError
+
+CORE = 0.5  # of a box's width and height, in its middle: mostly the thing itself
+
+
+@dataclass(frozen=True, slots=True)
+class MovableConfig:
+    classes: tuple[str, ...] = (  # of COCO's: alive, or driven; what is carried moves with a person
+        *("person", "bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra"),
+        *("giraffe", "bicycle", "car", "motorcycle", "bus", "train", "truck", "boat", "airplane"),
+    )
+    reach_m: float = 0.4  # in depth from a thing's middle, the median of the core: a stride, an arm
+
+    def __post_init__(self) -> None:
+        if not self.reach_m > 0:
+            raise ConfigError(f"reach_m={self.reach_m:g} must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A detection: pixels left <= u < right, top <= v < bottom."""
+
+    label: str
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+def movable_pixels(boxes: Sequence[Box], depth_m: np.ndarray, config: MovableConfig) -> np.ndarray:
+    """Pixels [H, W] bool of the things in `boxes` that may move by themselves.
+
+    Of a box the pixels count that lie within `reach_m` of its foreground in depth [H, W], in m, and
+    hang together with its core; pixels without depth count where they are enclosed. A box that
+    holds no depth counts as a whole. Labels that are not among `classes` have no say.
+    """
+    out = np.zeros(depth_m.shape, bool)
+    for box in boxes:
+        if box.label in config.classes:
+            window = _window(box, depth_m.shape, 1.0)
+            core = np.zeros(depth_m.shape, bool)
+            core[_window(box, depth_m.shape, CORE)] = True
+            out[window] |= _foreground(depth_m[window], core[window], config)
+    return out
+
+
+def _foreground(depth_m: np.ndarray, core: np.ndarray, config: MovableConfig) -> np.ndarray:
+    measured = depth_m[core & (depth_m > 0)]
+    if not measured.size:
+        return np.ones(depth_m.shape, bool)
+    middle_m = float(np.median(measured))
+    near = ((depth_m > 0) & (np.abs(depth_m - middle_m) < config.reach_m)).astype(np.uint8)
+    closed = cv2.morphologyEx(near, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    count, pieces = cv2.connectedComponents(closed)
+    touching = np.bincount(pieces[core], minlength=count) > 0
+    touching[0] = False
+    return touching[pieces]
+
+
+def _window(box: Box, shape: tuple[int, ...], share: float) -> tuple[slice, slice]:
+    """Rows and columns of the middle `share` of a box, within an image."""
+    u, v = (box.left + box.right) / 2, (box.top + box.bottom) / 2
+    half_u, half_v = share * (box.right - box.left) / 2, share * (box.bottom - box.top) / 2
+    rows = np.clip([v - half_v, v + half_v], 0, shape[0]).round().astype(int)
+    columns = np.clip([u - half_u, u + half_u], 0, shape[1]).round().astype(int)
+    return slice(*rows), slice(*columns)

@@ -1,0 +1,157 @@
+"""The judge is the true mask of somebody who walks through the synthetic room."""
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets.synthetic import SyntheticConfig, SyntheticSequence
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, se3
+from ldo_service.tracking.movable import Box, MovableConfig, movable_pixels
+from ldo_service.tracking.moving import MovingConfig, Watched, gap_m, spread, watch
+from ldo_service.tracking.noise import DepthNoise
+from ldo_service.tracking.pyramid import Level, Pyramid, PyramidConfig, pyramid_of
+
+CONFIG = MovingConfig(level=0)  # images of 160 pixels, as the level that is looked at otherwise
+EMPTY, LATE = 0, 70  # frames: before anybody came, and in the middle of the way
+NOISE_SCALE = 2.0
+
+
+class Walked:
+    """Frames of the walk that tests ask for."""
+
+    def __init__(self) -> None:
+        config = SyntheticConfig(
+            frames=240, width_px=160, height_px=120, path="linger", person=True, noise=True
+        )
+        self._sequence = SyntheticSequence(config)
+        truth = self._sequence.truth()
+        self._T_world_camera = truth.T_world_camera
+        self._views: dict[int, Pyramid] = {}
+
+    def view(self, k: int) -> Pyramid:
+        if k not in self._views:
+            self._views[k] = pyramid_of(self._sequence[k], PyramidConfig())
+        return self._views[k]
+
+    def person(self, k: int) -> np.ndarray:
+        return self._sequence.person(k)
+
+    def T(self, a: int, b: int) -> np.ndarray:
+        return se3.inverse(self._T_world_camera[a]) @ self._T_world_camera[b]
+
+    def watched(
+        self, keyframe: int, frames: list[int], has_moved: np.ndarray | None = None
+    ) -> Watched:
+        """Of the last of several frames."""
+        suspicion, seen = None, None
+        for k in frames:
+            seen = watch(
+                self.view(k),
+                self.view(keyframe),
+                has_moved,
+                self.T(keyframe, k),
+                NOISE_SCALE,
+                suspicion,
+                CONFIG,
+                DepthNoise(),
+            )
+            suspicion, has_moved = seen.suspicion, seen.has_moved
+        assert seen is not None
+        return seen
+
+
+@pytest.fixture(scope="module")
+def walked() -> Walked:
+    return Walked()
+
+
+def recall_and_precision(mask: np.ndarray, true: np.ndarray) -> tuple[float, float]:
+    hit = np.count_nonzero(mask & true)
+    return hit / max(np.count_nonzero(true), 1), hit / max(np.count_nonzero(mask), 1)
+
+
+def test_who_came_since_the_keyframe_is_found(walked: Walked) -> None:
+    seen = walked.watched(EMPTY, [LATE - 1, LATE])
+    whole = spread(seen.is_moving, walked.view(LATE), CONFIG)
+    recall, precision = recall_and_precision(whole, walked.person(LATE))
+    assert recall > 0.95
+    assert precision > 0.7  # the rim is wanted
+    assert not seen.has_moved.any()
+
+
+def test_who_has_gone_since_the_keyframe_is_found_in_it(walked: Walked) -> None:
+    seen = walked.watched(LATE, [230, 231])
+    recall, precision = recall_and_precision(seen.has_moved, walked.person(LATE))
+    assert recall > 0.9
+    assert precision > 0.9
+    assert not seen.is_moving.any()
+
+
+def test_one_frame_alone_does_not_make_a_point_gone(walked: Walked) -> None:
+    assert not walked.watched(LATE, [230]).has_moved.any()
+
+
+def test_what_moved_before_stays_left_out_while_it_stands_still(walked: Walked) -> None:
+    person = walked.person(LATE)
+    assert not walked.watched(LATE, [LATE, LATE]).is_moving.any()
+    seen = walked.watched(LATE, [LATE, LATE], person)
+    assert recall_and_precision(seen.is_moving, person)[0] > 0.9
+
+
+@pytest.mark.parametrize(("keyframe", "frame"), [(0, 12), (160, 200), (200, 170)])
+def test_nothing_moves_in_a_room_where_only_the_camera_does(
+    walked: Walked, keyframe: int, frame: int
+) -> None:
+    seen = walked.watched(keyframe, [frame, frame + 1])
+    assert not seen.is_moving.any()
+    assert not seen.has_moved.any()
+
+
+def test_gap_is_the_difference_in_depth_where_surfaces_were_measured() -> None:
+    camera = Camera(24, 16, 20.0, 20.0, 11.5, 7.5)
+    texels = np.zeros((16, 24, 4), np.float32)
+    near, far = texels.copy(), texels.copy()
+    near[..., 3], far[..., 3] = 1.5, 2.0
+    far[4:8, :4, 3] = 0
+    T_far_near = np.eye(4)
+    T_far_near[2, 3] = 0.1  # the camera of `near` stands 0.1 m ahead
+    ahead = gap_m(Level(near, camera), Level(far, camera), T_far_near, CONFIG)
+    np.testing.assert_allclose(ahead[:, 12], 2.0 - 1.6, atol=1e-6)
+    assert np.isnan(ahead[6, 1])
+    behind = gap_m(Level(far, camera), Level(near, camera), se3.inverse(T_far_near), CONFIG)
+    np.testing.assert_allclose(behind[12, 12], 1.5 - 1.9, atol=1e-6)
+    assert np.isnan(behind[6, 1])
+
+
+def test_spread_takes_what_is_beside_and_as_far_away_but_no_wall_behind(walked: Walked) -> None:
+    person, view = walked.person(LATE), walked.view(LATE)
+    half = person.copy()
+    half[60:] = False  # the legs were missed
+    whole = spread(half, view, CONFIG)
+    assert recall_and_precision(whole, person)[0] > recall_and_precision(half, person)[0] + 0.05
+    assert recall_and_precision(whole, person)[1] > 0.7
+
+
+def test_boxes_of_a_detector_become_the_pixels_of_the_thing(walked: Walked) -> None:
+    person, view = walked.person(LATE), walked.view(LATE)
+    rows, columns = (np.flatnonzero(person.any(axis=axis)) for axis in (1, 0))
+    edges = (columns[0] - 2, rows[0] - 2, columns[-1] + 3, rows[-1] + 3)
+    box, other = Box("person", *edges), Box("couch", 0, 0, 160, 120)
+    mask = movable_pixels([box, other], view.levels[0].depth_m, MovableConfig())
+    recall, precision = recall_and_precision(mask, person)
+    assert recall > 0.95
+    assert precision > 0.6  # the sofa stands within reach
+    assert not movable_pixels([other], view.levels[0].depth_m, MovableConfig()).any()
+
+
+def test_a_box_without_depth_counts_as_a_whole_and_one_outside_the_image_not_at_all() -> None:
+    boxes = [Box("dog", 2, 3, 6, 8), Box("cat", -20, -20, -5, -5)]
+    mask = movable_pixels(boxes, np.zeros((12, 16), np.float32), MovableConfig())
+    assert mask[3:8, 2:6].all()
+    assert np.count_nonzero(mask) == 20
+
+
+@pytest.mark.parametrize("bad", [{"least_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
+def test_impossible_settings_are_refused(bad: dict) -> None:
+    with pytest.raises(ConfigError):
+        MovingConfig(**bad)
