@@ -92,7 +92,8 @@ def insert(
     before = before or render(
         gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, threads=threads
     )
-    frame = frame if left_out is None else replace(frame, depth_m=frame.depth_m * ~left_out)
+    if left_out is not None:
+        frame = _without(frame, left_out, before)
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
     wanted = unexplained(frame, before, config) & (depth_m > 0)
     if left_out is not None:
@@ -141,6 +142,13 @@ def unexplained(frame: RgbdFrame, rendering: Rendering, config: InsertionConfig)
         out |= error > config.max_color_error
     window = np.ones((2 * config.overlap_px + 1,) * 2, np.uint8)
     return cv2.dilate(out.astype(np.uint8), window) > 0
+
+
+def _without(frame: RgbdFrame, left_out: np.ndarray, before: Rendering) -> RgbdFrame:
+    """There it looks as the map does, and nothing was measured."""
+    shown = (255 * before.color.clip(0, 1) + 0.5).astype(np.uint8)
+    color = np.where(left_out[..., None], shown, frame.color)
+    return replace(frame, color=color, depth_m=frame.depth_m * ~left_out)
 
 
 def with_small_holes_filled(depth_m: np.ndarray, radius_px: int) -> np.ndarray:

@@ -34,7 +34,8 @@ def packed(state: State) -> dict[str, Any]:
     forgotten = () if current is None or current in state.memory else (current,)
     kept = (*forgotten, *state.memory)
     return {
-        "keyframes": [_packed(k) for k in kept],
+        "keyframes": [_packed(k) for k in kept],  # what of them never changes
+        "moved": [(k.has_moved, k.left_out) for k in kept],
         "memory": len(state.memory),
         "current": -1 if current is None else kept.index(current),
         "motion": asdict(state.motion),
@@ -50,7 +51,10 @@ def packed(state: State) -> dict[str, Any]:
 
 def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
     """The inverse of `packed`, under the same configuration."""
-    kept = tuple(_unpacked(k, config) for k in values["keyframes"])
+    kept = tuple(
+        _unpacked(k, moved, config)
+        for k, moved in zip(values["keyframes"], values["moved"], strict=True)
+    )
     return State(
         memory=kept[len(kept) - values["memory"] :],
         keyframe=kept[values["current"]] if values["current"] >= 0 else None,
@@ -73,13 +77,14 @@ def _packed(keyframe: Keyframe) -> dict[str, Any]:
         "camera": asdict(view.camera),
         "T_odom_keyframe": keyframe.T_odom_keyframe,
         "id": keyframe.id,
-        "has_moved": keyframe.has_moved,
-        "left_out": keyframe.left_out,
     }
 
 
-def _unpacked(kept: dict[str, Any], config: PyramidConfig) -> Keyframe:
+def _unpacked(
+    kept: dict[str, Any],
+    moved: tuple[np.ndarray | None, np.ndarray | None],
+    config: PyramidConfig,
+) -> Keyframe:
     camera = Camera(**{**kept["camera"], "distortion": tuple(kept["camera"]["distortion"])})
     view = build_pyramid(kept["gray"], kept["depth_m"], camera, config)
-    moved = kept["has_moved"], kept["left_out"]
     return Keyframe(view, kept["T_odom_keyframe"], kept["id"], *moved)

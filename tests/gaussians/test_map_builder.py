@@ -181,3 +181,21 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
 def test_senseless_windows_are_refused(change: dict) -> None:
     with pytest.raises(ConfigError):
         WindowConfig(**change)
+
+
+def test_what_moves_is_neither_mapped_nor_fitted(posed: dict) -> None:
+    frame, T_map_camera = posed[0]
+    is_moving = np.zeros(frame.depth_m.shape, bool)
+    is_moving[15:40, 20:50] = True
+    repainted = replace(frame, color=np.where(is_moving[..., None], 255 - frame.color, frame.color))
+    maps = []
+    for seen in (frame, repainted):
+        builder = MapBuilder()
+        builder.add(seen, T_map_camera, 0, 4, is_moving)
+        maps.append(builder.gaussians.rows)
+    assert maps[0].tobytes() == maps[1].tobytes(), "what moves has a say"
+    p_camera = se3.transform(se3.inverse(T_map_camera), maps[0][:, :3].astype(float))
+    u, v = frame.camera.project(p_camera).round().astype(int).T
+    inside = (u > 20) & (u < 49) & (v > 15) & (v < 39)
+    assert not inside.any()
+    assert len(maps[0]) > 100

@@ -1,11 +1,17 @@
 """The judge is the true mask of somebody who walks through the synthetic room."""
 
+from collections.abc import Iterable
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from ldo_service.datasets import open_sequence
 from ldo_service.datasets.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import Camera, se3
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
+from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
 from ldo_service.tracking.movable import Box, MovableConfig, movable_pixels
 from ldo_service.tracking.moving import MovingConfig, Watched, gap_m, spread, watch
 from ldo_service.tracking.noise import DepthNoise
@@ -26,12 +32,15 @@ class Walked:
         self._sequence = SyntheticSequence(config)
         truth = self._sequence.truth()
         self._T_world_camera = truth.T_world_camera
-        self._views: dict[int, Pyramid] = {}
+        self._frames: dict[int, RgbdFrame] = {}
+
+    def frame(self, k: int) -> RgbdFrame:
+        if k not in self._frames:
+            self._frames[k] = self._sequence[k]
+        return self._frames[k]
 
     def view(self, k: int) -> Pyramid:
-        if k not in self._views:
-            self._views[k] = pyramid_of(self._sequence[k], PyramidConfig())
-        return self._views[k]
+        return pyramid_of(self.frame(k), PyramidConfig())
 
     def person(self, k: int) -> np.ndarray:
         return self._sequence.person(k)
@@ -155,3 +164,72 @@ def test_a_box_without_depth_counts_as_a_whole_and_one_outside_the_image_not_at_
 def test_impossible_settings_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
         MovingConfig(**bad)
+
+
+# --- in the odometry ------------------------------------------------------------------------------
+def tracked_masks(frames: Iterable[RgbdFrame], config: OdometryConfig) -> list[Tracked]:
+    odometry, results = Odometry(config), []
+    for frame in frames:
+        results.append(odometry.track(frame))
+        if results[-1].wants_keyframe:
+            odometry.make_keyframe(frame, results[-1])
+    return results
+
+
+def test_keyframes_of_the_odometry_do_not_track_against_who_walks(walked: Walked) -> None:
+    odometry, kept = Odometry(OdometryConfig(moving=CONFIG)), []
+    for k in range(56, 76, 2):
+        frame = walked.frame(k)
+        tracked = odometry.track(frame)
+        if k == 56 or k == 68:
+            odometry.make_keyframe(frame, tracked)
+            kept.append(k)
+    parts = odometry.state()["moved"]
+    assert [left_out is not None for _, left_out in parts] == [True, True]
+    for k, (_, left_out) in zip(kept, parts, strict=True):
+        assert recall_and_precision(left_out, walked.person(k))[0] > 0.5
+    assert tracked.is_moving is not None
+    assert recall_and_precision(tracked.is_moving, walked.person(k))[0] > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
+    """ATE 0.15 cm and 16 frames WEAK without."""
+    sequence = SyntheticSequence.named("person-noisy")
+    results = tracked_masks(sequence, OdometryConfig())
+    T = np.array([r.T_odom_camera for r in results])
+    truth = sequence.truth()
+    errors = evaluate_trajectory(Trajectory(truth.stamps_s, T), truth)
+    assert {r.status for r in results} == {Status.OK}
+    assert errors.ate_m.rmse < 0.0012
+    recalls, precisions = zip(
+        *(
+            recall_and_precision(results[k].is_moving, sequence.person(k))
+            for k in range(40, 135)
+            if results[k].is_moving is not None
+        ),
+        strict=True,
+    )
+    assert np.mean(recalls) > 0.85
+    assert np.mean(precisions) > 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_hardly_anything_moves_in_a_kitchen_where_nobody_is(data: Path) -> None:
+    kitchen = open_sequence(str(data / "tum" / "kitchen"))
+    assert mean_masked(tracked_masks(map(kitchen.__getitem__, range(300)), OdometryConfig())) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_hardly_anything_moves_in_the_flat() -> None:
+    flat = open_sequence("synthetic:flat")
+    assert mean_masked(tracked_masks(map(flat.__getitem__, range(200)), OdometryConfig())) < 0.01
+
+
+def mean_masked(results: list[Tracked]) -> float:
+    masks = [r.is_moving for r in results if r.is_moving is not None]
+    assert len(masks) > 0.9 * len(results)
+    return float(np.mean([mask.mean() for mask in masks]))

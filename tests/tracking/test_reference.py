@@ -31,3 +31,17 @@ def test_blank_frame_has_no_points(room) -> None:
     reference = build_reference(pyramid_of(room.blank(), PyramidConfig()))
     assert all(points.shape == (7, 0) for points in reference.points)
     assert reference.median_depth_m == 1.0
+
+
+def test_what_is_left_out_has_no_points_on_any_level(room) -> None:
+    pyramid = pyramid_of(room.view(np.eye(4)), PyramidConfig())
+    left_out = np.zeros((120, 160), bool)
+    left_out[30:61, 41:90] = True
+    for points, level in zip(
+        build_reference(pyramid, left_out).points, pyramid.levels, strict=True
+    ):
+        column, row = level.camera.project(points[:3].T.astype(float)).round().astype(int).T
+        scale = 160 / level.camera.width
+        u, v = (column + 0.5) * scale, (row + 0.5) * scale
+        assert not ((u > 41) & (u < 90) & (v > 30) & (v < 61)).any()
+        assert len(column) > 0.7 * (level.camera.width - 2) * (level.camera.height - 2)

@@ -4,6 +4,7 @@ import numpy as np
 
 from ldo_service.tracking import PyramidConfig, pyramid_of
 from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.moving import Suspicion
 from ldo_service.tracking.state import State, packed, unpacked
 
 
@@ -35,3 +36,16 @@ def test_forgotten_current_keyframe_is_kept_beside_the_memory(room) -> None:
     assert [k.id for k in restored.memory] == [1, 2]
     assert restored.keyframe is not None
     assert restored.keyframe.id == 0
+
+
+def test_what_moved_survives_packing(room) -> None:
+    known, mask = keyframes(room, 2), np.eye(120, 160) > 0
+    moved = replace(known[0], has_moved=mask, left_out=~mask)
+    suspicion = Suspicion(mask, mask.astype(np.uint8))
+    state = State(memory=(moved, known[1]), keyframe=moved, is_moving=~mask, suspicion=suspicion)
+    restored = unpacked(packed(state), PyramidConfig())
+    assert restored.keyframe is restored.memory[0]
+    np.testing.assert_array_equal(restored.keyframe.left_out, ~mask)
+    np.testing.assert_array_equal(restored.is_moving, ~mask)
+    np.testing.assert_array_equal(restored.suspicion.gone, suspicion.gone)
+    assert restored.memory[1].has_moved is None
