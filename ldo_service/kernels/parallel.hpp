@@ -3,9 +3,13 @@
 // Every job writes its own part of the output. Where sums of floats are taken, the work is cut into
 // jobs without looking at the number of threads: then the result has the same bits for any number.
 #pragma once
+#include <pthread.h>
+#include <unistd.h>
+
 #include <algorithm>
 #include <atomic>
 #include <condition_variable>
+#include <csignal>
 #include <cstdint>
 #include <mutex>
 #include <system_error>
@@ -14,82 +18,108 @@
 
 namespace ldo::LDO_ISA {
 
-// The threads of one call, this one included: started once, joined on every way out of the scope.
-class Team {
+// Jobs that several threads take one after the other.
+class Round {
  public:
-  explicit Team(int threads) {
-    helpers_.reserve(threads - 1);
-    try {
-      for (int i = 1; i < threads; ++i) helpers_.emplace_back([this] { help(); });
-    } catch (const std::system_error&) {  // no more threads to be had: those that are do the work
-    }
-  }
-  Team(const Team&) = delete;
-  Team& operator=(const Team&) = delete;
-  ~Team() {
-    open_round(nullptr, nullptr, 0);
-    for (std::thread& helper : helpers_) helper.join();
-  }
-
-  int size() const { return static_cast<int>(helpers_.size()) + 1; }
-
-  // Calls f(job) for every job in [0, jobs); returns when all are done. f must not throw.
   template <class F>
-  void each(int64_t jobs, const F& f) {
-    if (jobs <= 1 || helpers_.empty()) {
-      for (int64_t job = 0; job < jobs; ++job) f(job);
-      return;
-    }
-    const auto call = [](const void* function, int64_t job) {
-      (*static_cast<const F*>(function))(job);
-    };
-    open_round(call, &f, jobs);
-    work();
-    close_round();
-  }
-
- private:
-  using Call = void (*)(const void* function, int64_t job);
-
-  void open_round(Call call, const void* function, int64_t jobs) {
-    {
-      const std::lock_guard<std::mutex> lock(mutex_);
-      call_ = call;
-      function_ = function;
-      jobs_ = jobs;
-      next_ = 0;
-      ++round_;
-      is_open_ = true;
-    }
-    opened_.notify_all();
-  }
-
-  // Waits for the helpers that have begun; one that wakes later finds the round closed.
-  void close_round() {
-    yield_while([this] { return working_ > 0; });
-    std::unique_lock<std::mutex> lock(mutex_);
-    is_open_ = false;
-    left_.wait(lock, [this] { return working_ == 0; });
-  }
+  Round(int64_t jobs, const F& f)
+      : call_([](const void* function, int64_t job) { (*static_cast<const F*>(function))(job); }),
+        function_(&f),
+        jobs_(jobs) {}
 
   void work() {
     for (int64_t job; (job = next_.fetch_add(1, std::memory_order_relaxed)) < jobs_;)
       call_(function_, job);
   }
 
-  void help() {
-    for (int64_t seen = 0;;) {
-      yield_while([&] { return round_ == seen; });
-      std::unique_lock<std::mutex> lock(mutex_);
-      opened_.wait(lock, [&] { return is_open_ && round_ != seen; });
-      seen = round_;
-      if (call_ == nullptr) return;
-      ++working_;
-      lock.unlock();
-      work();
-      lock.lock();
-      if (--working_ == 0) left_.notify_one();
+ private:
+  friend class Helpers;
+  void (*const call_)(const void* function, int64_t job);
+  const void* const function_;
+  const int64_t jobs_;
+  std::atomic<int64_t> next_{0};
+  std::atomic<int> working_{0};  // helpers
+  int seats_ = 0;                // for helpers that have not come yet
+  std::condition_variable left_;
+};
+
+// Threads that help with the rounds of every call in this process, and sleep in between. There are
+// as many as calls that ran at once had seats for.
+class Helpers {
+ public:
+  // A forked child has none of its parent's threads, and starts anew. Never destroyed: they sleep
+  // in here until the process ends.
+  static Helpers& of_this_process() {
+    static std::atomic<Helpers*> known{nullptr};
+    Helpers* helpers = known;
+    while (helpers == nullptr || helpers->process_ != getpid()) {
+      Helpers* fresh = new Helpers;
+      if (known.compare_exchange_strong(helpers, fresh)) return *fresh;
+      delete fresh;  // another thread was quicker
     }
+    return *helpers;
+  }
+
+  void open(Round& round, int seats) {
+    {
+      const std::lock_guard<std::mutex> lock(mutex_);
+      rounds_.push_back(&round);
+      round.seats_ = seats;
+      seats_ += seats;
+      while (idle_ < seats_ && start_one()) {
+      }
+    }
+    for (int i = 0; i < seats; ++i) opened_.notify_one();
+  }
+
+  // Waits for the helpers that have begun; one that wakes later finds the round closed.
+  void close(Round& round) {
+    yield_while([&] { return round.working_ > 0; });
+    std::unique_lock<std::mutex> lock(mutex_);
+    rounds_.erase(std::find(rounds_.begin(), rounds_.end(), &round));
+    seats_ -= round.seats_;
+    round.left_.wait(lock, [&] { return round.working_ == 0; });
+  }
+
+ private:
+  // Says whether there was a thread to be had: if not, those that are do the work.
+  bool start_one() {
+    sigset_t every, before;  // signals are for the threads of Python
+    sigfillset(&every);
+    pthread_sigmask(SIG_SETMASK, &every, &before);
+    bool is_started = true;
+    try {
+      std::thread([this] { help(); }).detach();
+      ++idle_;
+    } catch (const std::system_error&) {
+      is_started = false;
+    }
+    pthread_sigmask(SIG_SETMASK, &before, nullptr);
+    return is_started;
+  }
+
+  void help() {
+    for (;;) {
+      yield_while([this] { return seats_ == 0; });
+      std::unique_lock<std::mutex> lock(mutex_);
+      opened_.wait(lock, [this] { return seats_ > 0; });
+      Round& round = take_seat();
+      lock.unlock();
+      round.work();
+      lock.lock();
+      ++idle_;
+      if (--round.working_ == 0) round.left_.notify_one();
+    }
+  }
+
+  Round& take_seat() {
+    Round& round = **std::find_if(rounds_.begin(), rounds_.end(),
+                                  [](const Round* open) { return open->seats_ > 0; });
+    --idle_;
+    --seats_;
+    --round.seats_;
+    ++round.working_;
+    return round;
   }
 
   // The next round is mostly a few microseconds away, and sleeping costs more.
@@ -98,15 +128,37 @@ class Team {
     for (int i = 0; i < 64 && condition(); ++i) std::this_thread::yield();
   }
 
-  std::vector<std::thread> helpers_;
+  const pid_t process_ = getpid();
   std::mutex mutex_;
-  std::condition_variable opened_, left_;
-  Call call_ = nullptr;  // null: the last round
-  const void* function_ = nullptr;
-  int64_t jobs_ = 0;
-  std::atomic<int64_t> next_{0}, round_{0};
-  std::atomic<int> working_{0};
-  bool is_open_ = false;
+  std::condition_variable opened_;
+  std::vector<Round*> rounds_;
+  std::atomic<int> seats_{0};  // of all rounds
+  int idle_ = 0;               // helpers that work on nothing
+};
+
+// The threads of one call, the caller included.
+class Team {
+ public:
+  explicit Team(int threads) : size_(threads) {}
+  int size() const { return size_; }
+
+  // Calls f(job) for every job in [0, jobs); returns when all are done. f must not throw.
+  template <class F>
+  void each(int64_t jobs, const F& f) {
+    const int64_t seats = std::min<int64_t>(size_, jobs) - 1;
+    if (seats <= 0) {
+      for (int64_t job = 0; job < jobs; ++job) f(job);
+      return;
+    }
+    Round round(jobs, f);
+    Helpers& helpers = Helpers::of_this_process();
+    helpers.open(round, static_cast<int>(seats));
+    round.work();
+    helpers.close(round);
+  }
+
+ private:
+  const int size_;
 };
 
 }  // namespace ldo::LDO_ISA
