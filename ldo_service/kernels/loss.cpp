@@ -16,7 +16,7 @@ namespace ldo::LDO_ISA {
 namespace {
 
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // of SSIM, for values in 0..1
-constexpr int kBand = 240;  // rows of one job; more lose less at the seams, fewer share better
+constexpr int kBand = 240;  // most rows of one job; more lose less at the seams, fewer share better
 
 inline Floats sign(Floats x) {
   return select(x < 0.0f, -1.0f, select(Floats(0.0f) < x, 1.0f, 0.0f));
@@ -28,6 +28,32 @@ struct RowSums {  // of one channel of one row of a strip
 
 struct Part {  // of the image: what one job works on
   int channel, left, right, top, bottom;
+};
+
+// An image cut into parts of about equal size, so that they take equal time.
+struct Cut {
+  Cut(int width, int height)
+      : width(width),
+        height(height),
+        strips(ceil(width, kStrip)),
+        bands(ceil(height, kBand)),
+        strip(ceil(ceil(width, strips), kLanes) * kLanes),
+        band(ceil(height, bands)) {}
+
+  int columns() const { return 3 * strips; }  // strips of all channels
+  int parts() const { return columns() * bands; }
+  int column_of(int part) const { return part / bands; }
+  Part part(int number) const {
+    const int column = column_of(number);
+    const int left = column % strips * strip, top = number % bands * band;
+    return {column / strips, left, std::min(width, left + strip), top,
+            std::min(height, top + band)};
+  }
+
+  const int width, height, strips, bands, strip, band;  // pixels of a strip, rows of a band
+
+ private:
+  static int ceil(int n, int piece) { return (n + piece - 1) / piece; }
 };
 
 // One part of the image; `sums` has one entry for each of its rows.
@@ -254,27 +280,25 @@ void depth_loss(const LossInput& in, Team& team, LossOutput& out) {
 
 void image_loss(const LossInput& in, int threads, LossOutput& out) {
   Team team(threads);
-  const int bands = (in.height + kBand - 1) / kBand, strips = (in.width + kStrip - 1) / kStrip;
-  Buffer<RowSums> sums(static_cast<size_t>(3) * strips * in.height);
-  team.each(3 * bands * strips, [&](int64_t job) {
-    const int column = static_cast<int>(job / bands), band = static_cast<int>(job % bands);
-    const int channel = column / strips, left = column % strips * kStrip, top = band * kBand;
-    const Part part{channel, left, std::min(in.width, left + kStrip), top,
-                    std::min(in.height, top + kBand)};
-    PartLoss(in, part, out.gradients, &sums[static_cast<size_t>(column) * in.height]).run();
+  const Cut cut(in.width, in.height);
+  Buffer<RowSums> sums(static_cast<size_t>(cut.columns()) * in.height);
+  team.each(cut.parts(), [&](int64_t job) {
+    const int number = static_cast<int>(job);
+    RowSums* rows = &sums[static_cast<size_t>(cut.column_of(number)) * in.height];
+    PartLoss(in, cut.part(number), out.gradients, rows).run();
   });
   const double values = 3.0 * in.width * in.height;
   double ssim = 0.0;
   out.l1 = out.squared_error = 0.0;
   std::fill(out.exposure, out.exposure + 6, 0.0);
-  for (int column = 0; column < 3 * strips; ++column)
+  for (int column = 0; column < cut.columns(); ++column)
     for (int y = 0; y < in.height; ++y) {
       const RowSums& row = sums[static_cast<size_t>(column) * in.height + y];
       out.l1 += row.l1 / values;
       ssim += row.ssim / values;
       out.squared_error += row.squares / values;
-      out.exposure[column / strips] += row.gain;
-      out.exposure[3 + column / strips] += row.bias;
+      out.exposure[column / cut.strips] += row.gain;
+      out.exposure[3 + column / cut.strips] += row.bias;
     }
   out.d_ssim = 1.0 - ssim;
   depth_loss(in, team, out);
