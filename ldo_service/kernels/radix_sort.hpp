@@ -25,13 +25,13 @@ struct Pieces {
   int64_t n, length;
 };
 
-// Turns counts [pieces][bins] into the places where each piece starts writing each bin: bins in
-// order, and within a bin the pieces in order. Returns the total.
-inline uint32_t to_offsets(uint32_t* counts, int64_t pieces, int64_t bins) {
+// Turns counts of bins, which lie `stride` apart for each piece, into the places where each piece
+// starts writing each bin: bins in order, and within a bin the pieces in order. Returns the total.
+inline uint32_t to_offsets(uint32_t* counts, int64_t pieces, int64_t bins, int64_t stride) {
   uint32_t sum = 0;
   for (int64_t bin = 0; bin < bins; ++bin)
     for (int64_t piece = 0; piece < pieces; ++piece) {
-      uint32_t& place = counts[piece * bins + bin];
+      uint32_t& place = counts[piece * stride + bin];
       const uint32_t count = place;
       place = sum;
       sum += count;
@@ -54,7 +54,7 @@ inline void sort_by(Digit digit, const Keyed* from, Keyed* to, const Pieces& pie
     std::fill(counts, counts + digit.bins(), 0u);
     for (int64_t i = pieces.begin(piece); i < pieces.end(piece); ++i) ++counts[digit(from[i].key)];
   });
-  to_offsets(places.data(), pieces.count(), digit.bins());
+  to_offsets(places.data(), pieces.count(), digit.bins(), digit.bins());
   team.each(pieces.count(), [&](int64_t piece) {
     uint32_t* place = bins_of(piece);
     for (int64_t i = pieces.begin(piece); i < pieces.end(piece); ++i)

@@ -194,6 +194,46 @@ struct TileLists {
   Buffer<uint32_t> slots;
 };
 
+// How many splats touch each tile. Each range is added at its corners, without a loop over its
+// tiles, and the sums over rows and columns of these are the counts.
+class TileCounts {
+ public:
+  static int64_t room(const TileGrid& grid) { return int64_t{grid.columns + 1} * (grid.rows + 1); }
+
+  // `counts` has that room.
+  TileCounts(const TileGrid& grid, uint32_t* counts)
+      : grid_(grid), stride_(grid.columns + 1), counts_(counts) {
+    std::fill_n(counts_, room(grid), 0u);
+  }
+
+  [[gnu::always_inline]] inline void add(const TileRange& range) {
+    uint32_t *top = counts_ + range.y0 * stride_, *below = counts_ + (range.y1 + 1) * stride_;
+    ++top[range.x0];
+    --top[range.x1 + 1];
+    --below[range.x0];
+    ++below[range.x1 + 1];
+  }
+
+  // Leaves the counts of the wanted tiles, row by row, and zeros for the others.
+  void finish() {
+    uint32_t* out = counts_;  // never ahead of what is read
+    for (int row = 0; row < grid_.rows; ++row) {
+      uint32_t sum = 0;
+      for (int column = 0; column < grid_.columns; ++column, ++out) {
+        sum += counts_[row * stride_ + column];
+        *out = sum + (row > 0 ? out[-grid_.columns] : 0);
+      }
+    }
+    for (int64_t tile = 0; tile < grid_.count(); ++tile)
+      if (!grid_.wants(tile)) counts_[tile] = 0;
+  }
+
+ private:
+  const TileGrid& grid_;
+  const int64_t stride_;
+  uint32_t* counts_;
+};
+
 // f(place of the pair among those of the splat, tile) for the tiles of a range, row by row.
 template <class F>
 [[gnu::always_inline]] inline void each_pair(const TileRange& range, int columns, const F& f) {
@@ -224,19 +264,16 @@ inline void list_by_tile(const VisibleSplats& visible, const TileGrid& grid, Tea
                          TileLists& out) {
   out.columns = grid.columns;
   out.rows = grid.rows;
-  const int64_t tiles = grid.count();
+  const int64_t tiles = grid.count(), room = TileCounts::room(grid);
   const Pieces pieces(visible.count, team);
-  Buffer<uint32_t> places(pieces.count() * tiles);
+  Buffer<uint32_t> places(pieces.count() * room);
   team.each(pieces.count(), [&](int64_t piece) {
-    uint32_t* counts = &places[piece * tiles];
-    std::fill(counts, counts + tiles, 0u);
+    TileCounts counts(grid, &places[piece * room]);
     each_by_depth(visible, pieces.begin(piece), pieces.end(piece),
-                  [&](uint32_t, const TileRange& range) {
-                    each_pair(range, out.columns,
-                              [&](uint32_t, uint32_t tile) { counts[tile] += grid.wants(tile); });
-                  });
+                  [&](uint32_t, const TileRange& range) { counts.add(range); });
+    counts.finish();
   });
-  const uint32_t total = to_offsets(places.data(), pieces.count(), tiles);
+  const uint32_t total = to_offsets(places.data(), pieces.count(), tiles, room);
   out.start.resize(tiles + 1);
   std::fill(out.start.data(), out.start.data() + tiles + 1, total);
   if (total > 0) std::copy(places.data(), places.data() + tiles, out.start.data());
@@ -244,7 +281,7 @@ inline void list_by_tile(const VisibleSplats& visible, const TileGrid& grid, Tea
   out.splats.resize(total + kPrefetchAhead);
   std::fill(out.splats.data() + total, out.splats.data() + total + kPrefetchAhead, 0u);
   team.each(pieces.count(), [&](int64_t piece) {
-    uint32_t* place = &places[piece * tiles];
+    uint32_t* place = &places[piece * room];
     each_by_depth(visible, pieces.begin(piece), pieces.end(piece),
                   [&](uint32_t splat, const TileRange& range) {
                     uint32_t* slots = &out.slots[visible.first_pair(splat)];
