@@ -68,6 +68,7 @@ class Iteration:
         self.gaussians.move_anchors(_turned_away(range(1, 1 + len(_shares(elsewhere, n)))))
         self._rasteriser, self._adam = Rasteriser(threads=threads), Adam()
         self._color, self._depth_m = noise_frame(camera)
+        self._exposure = Exposure()
         self._planes = self.forward()
         self._by_planes = np.empty_like(self._planes)
 
@@ -80,7 +81,7 @@ class Iteration:
 
     def loss(self) -> np.ndarray:
         """Derivatives by the planes [5, H, W]."""
-        frame = self._color, self._depth_m, Exposure()
+        frame = self._color, self._depth_m, self._exposure
         image_loss(self._planes, *frame, _WEIGHTS, self._by_planes, threads=self.threads)
         return self._by_planes
 

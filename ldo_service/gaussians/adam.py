@@ -50,6 +50,7 @@ class Adam:
 
     def __init__(self, config: AdamConfig | None = None) -> None:
         self.config = config or AdamConfig()
+        self._rates = self.config.rates()
         self._ids = np.zeros(0, np.int64)
         self._moments = [aligned_rows(0), aligned_rows(0)]  # with room to grow
         self._steps = np.zeros(0, np.int32)
@@ -112,7 +113,7 @@ class Adam:
         self._follow(gaussians)
         config, n = self.config, len(gaussians)
         mean, square = (moment[:n] for moment in self._moments)
-        rates = config.rates() * np.float32(rate)
+        rates = self._rates * np.float32(rate)
         betas = config.beta1, config.beta2
         return AdamStep(gaussians.rows, mean, square, self._steps, rates, *betas, config.epsilon)
 

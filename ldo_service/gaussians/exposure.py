@@ -31,7 +31,7 @@ class Exposure:
     @property
     def matrix(self) -> np.ndarray:
         """Gains, then biases [2, 3] float32."""
-        return np.stack([self.gain, self.bias])
+        return np.array([self.gain, self.bias])
 
     def applied(self, color: np.ndarray) -> np.ndarray:
         """The image [H, W, 3] as this camera would have exposed it, in 0..1."""

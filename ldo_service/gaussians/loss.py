@@ -2,6 +2,7 @@
 `loss_reference.py`."""
 
 from dataclasses import dataclass
+from math import log10
 
 import numpy as np
 
@@ -85,8 +86,8 @@ def image_loss(
         l1,
         d_ssim,
         depth,
-        float(-10 * np.log10(max(squared, 1e-20))),
-        np.reshape(by_exposure, (2, 3)),
+        -10 * log10(max(squared, 1e-20)),
+        np.array(by_exposure).reshape(2, 3),
     )
 
 

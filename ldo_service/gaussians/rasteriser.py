@@ -10,7 +10,7 @@ from ldo_service.geometry import Camera
 from ldo_service.kernels import _rasterise
 
 from .adam_step import AdamStep
-from .model import aligned_rows
+from .model import ROW, aligned_rows
 
 PLANES = 5  # red, green, blue, weighted depth, opacity
 WEIGHT = 14  # field of a row of gradients
@@ -80,7 +80,7 @@ class Rasteriser:
             raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
         size = (PLANES, camera.height, camera.width)
         if self._planes.shape != size:
-            self._planes = np.empty(size, np.float32)
+            self._planes = _new_planes(camera.height, camera.width)
         T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
         self._visible = _rasterise.rasterise_planes(
@@ -157,3 +157,9 @@ class Rasteriser:
         if len(self._indices) < self._visible:
             self._indices = np.empty(self._visible * 5 // 4, np.uint32)
         return self._indices[: self._visible]
+
+
+def _new_planes(height: int, width: int) -> np.ndarray:
+    """Planes [5, H, W] on a cache line: where W is a multiple of 16, no two tiles share one."""
+    size = PLANES * height * width
+    return aligned_rows(-(-size // ROW)).reshape(-1)[:size].reshape(PLANES, height, width)
