@@ -226,10 +226,6 @@ class PartLoss {
   RowRing<kDerivatives> derivatives_;
 };
 
-struct DepthSums {  // of one row
-  float absolute = 0, count = 0;
-};
-
 // The depths that count, sixteen at a time; zero: not measured, or masked.
 template <class F>
 void each_depth(const LossInput& in, int64_t row, F f) {
@@ -245,45 +241,42 @@ void each_depth(const LossInput& in, int64_t row, F f) {
 }
 
 // The derivative needs the number of depths that count, so that is found first.
-void depth_loss(const LossInput& in, Team& team, LossOutput& out) {
-  Buffer<DepthSums> rows(in.height);
+void depth_loss(const LossInput& in, LossOutput& out) {
   const int64_t size = static_cast<int64_t>(in.width) * in.height;
   const float* rendered = in.planes + 3 * size;
   float *by_depth = out.gradients + 3 * size, *by_opacity = out.gradients + 4 * size;
-  team.each(in.height, [&](int64_t y) {
-    Floats count = 0.0f;
+  double count = 0.0;
+  for (int y = 0; y < in.height; ++y) {
+    Floats row = 0.0f;
     each_depth(in, y, [&](int64_t, int, Floats depth) {
-      count = count + select(Floats(0.0f) < depth, 1.0f, 0.0f);
+      row = row + select(Floats(0.0f) < depth, 1.0f, 0.0f);
     });
-    rows[y].count = sum(count);
-  });
-  double count = 0;
-  for (int y = 0; y < in.height; ++y) count += rows[y].count;
+    count += sum(row);
+  }
   const float step = count > 0 ? in.weights.depth / static_cast<float>(count) : 0.0f;
-  team.each(in.height, [&](int64_t y) {
-    Floats absolute = 0.0f;
+  out.depth = 0.0;
+  for (int y = 0; y < in.height; ++y) {
+    Floats row = 0.0f;
     each_depth(in, y, [&](int64_t pixel, int n, Floats depth) {
       const Floats error = Floats::load_first(rendered + pixel, n) - depth;
       const Floats difference = select(Floats(0.0f) < depth, error, 0.0f);
-      absolute = absolute + abs(difference);
+      row = row + abs(difference);
       (sign(difference) * step).store_first(by_depth + pixel, n);
       Floats(0.0f).store_first(by_opacity + pixel, n);
     });
-    rows[y].absolute = sum(absolute);
-  });
-  out.depth = 0.0;
-  for (int y = 0; y < in.height; ++y) out.depth += rows[y].absolute;
+    out.depth += sum(row);
+  }
   if (count > 0) out.depth /= count;
 }
 
 }  // namespace
 
 void image_loss(const LossInput& in, int threads, LossOutput& out) {
-  Team team(threads);
   const Cut cut(in.width, in.height);
   Buffer<RowSums> sums(static_cast<size_t>(cut.columns()) * in.height);
-  team.each(cut.parts(), [&](int64_t job) {
-    const int number = static_cast<int>(job);
+  Team(threads).each(1 + cut.parts(), [&](int64_t job) {
+    if (job == 0) return depth_loss(in, out);  // takes about as long as one part
+    const int number = static_cast<int>(job - 1);
     RowSums* rows = &sums[static_cast<size_t>(cut.column_of(number)) * in.height];
     PartLoss(in, cut.part(number), out.gradients, rows).run();
   });
@@ -301,7 +294,6 @@ void image_loss(const LossInput& in, int threads, LossOutput& out) {
       out.exposure[3 + column / cut.strips] += row.bias;
     }
   out.d_ssim = 1.0 - ssim;
-  depth_loss(in, team, out);
 }
 
 }  // namespace ldo::LDO_ISA
