@@ -43,6 +43,13 @@ def without_depth(frame: RgbdFrame, missing: np.ndarray) -> RgbdFrame:
     return RgbdFrame(frame.color, depth_m, frame.camera)
 
 
+def with_box(frame: RgbdFrame, columns: slice) -> RgbdFrame:
+    """A red box one metre away."""
+    depth_m, color = frame.depth_m.copy(), frame.color.copy()
+    depth_m[30:50, columns], color[30:50, columns] = 1.0, (255, 0, 0)
+    return RgbdFrame(color, depth_m, CAMERA)
+
+
 def test_inserted_frame_is_rendered_as_it_was_seen() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
     ids = insert(gaussians, frame, T_MAP_CAMERA, keyframe=7)
@@ -108,15 +115,29 @@ def test_small_holes_are_filled_with_the_depth_behind_and_large_ones_stay() -> N
 def test_surface_in_front_of_the_map_is_added() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
     insert(gaussians, frame, np.eye(4), 0)
-    depth_m, color = frame.depth_m.copy(), frame.color.copy()
-    depth_m[30:50, 40:70], color[30:50, 40:70] = 1.0, (255, 0, 0)
-    box = RgbdFrame(color, depth_m, CAMERA)
-    ids = insert(gaussians, box, np.eye(4), 1)
+    ids = insert(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 1)
     assert 30 < len(ids) < 1000
     seen = view(gaussians, np.eye(4))
     np.testing.assert_allclose(seen.median_depth_m[34:46, 44:66], 1.0, atol=0.02)
     assert seen.color[34:46, 44:66, 0].min() > 0.85
     assert seen.color[34:46, 44:66, 1].max() < 0.15
+
+
+def test_an_edge_that_noise_or_drift_displaces_adds_nothing() -> None:
+    frame, gaussians = corner_of_a_room(), GaussianMap()
+    insert(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 0)
+    displaced = with_box(frame, slice(41, 72))
+    strict = GaussianMap.restore(gaussians.snapshot())
+    assert len(insert(strict, displaced, np.eye(4), 1, InsertionConfig(edge_px=0))) > 50
+    assert len(insert(gaussians, displaced, np.eye(4), 1)) == 0
+
+
+def test_a_thin_surface_in_front_of_the_map_is_added() -> None:
+    frame, gaussians = corner_of_a_room(), GaussianMap()
+    insert(gaussians, frame, np.eye(4), 0)
+    pole = with_box(frame, slice(40, 42))
+    assert len(insert(gaussians, pole, np.eye(4), 1)) > 30
+    assert view(gaussians, np.eye(4)).color[32:48, 40:42, 1].max() < 0.3
 
 
 def test_gaussians_are_flat_and_lie_in_the_surface() -> None:
