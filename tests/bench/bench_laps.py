@@ -1,10 +1,11 @@
 """Time per keyframe and memory over laps of a closed walk: both must stay flat.
 
-    python tests/bench/bench_laps.py [SOURCE] [--laps 10] [--stride 1] [--out DIR]
+    python tests/bench/bench_laps.py [SOURCE] [--laps 10] [--stride 1] [--true-poses] [--out DIR]
 
-Every frame of SOURCE again and again, with stamps that go on. Writes keyframes.csv (keyframe,
-frame, lap, CPU ms of the mapper, Gaussians awake and asleep, resident MB) and laps.png, and prints
-the mean of each lap. CPU time is that of the mapper's thread with one thread of the renderer.
+Every frame of SOURCE again and again, with stamps that go on. Writes keyframes.csv (a line of what
+`Mapped` says of each keyframe) and laps.png, and prints each lap: means, and what was at its end.
+CPU time is that of the mapper's thread with one thread of the renderer. With --true-poses keyframes
+are those of the tracker, mapped where they really were: what then grows is not owed to drift.
 """
 
 import argparse
@@ -15,19 +16,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 
 from ldo_service.actors.graph import make_actors
-from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.pictures import save_picture
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.runtime.vitals import resident_mb
-from ldo_service.schemas import CameraRgbd, Keyframe, Message
-from ldo_service.wire import camera_rgbd_message
+from ldo_service.schemas import CameraRgbd, Correction, Keyframe, MapRefine, Message
+from ldo_service.wire import camera_rgbd_message, pose_message
 
+COLUMNS = (
+    *("lap", "keyframes", "CPU ms", "awake", "asleep", "over cap"),
+    *("inserted", "pruned", "woken", "images MB", "MB"),
+)
 PANEL_PX, MARGIN_PX = (900, 220), 60
 
 
@@ -39,36 +45,61 @@ class Mapped:
     frame: int
     lap: int
     cpu_ms: float
-    gaussians: int
+    gaussians: int  # awake
     asleep: int
+    over_cap: int  # awake because they may be looked at
+    pruned: int  # so far
+    woken: int  # so far
+    images_mb: float  # of keyframes, in memory
     resident_mb: float
 
 
 class TimedMapper(Mapper):
-    """A mapper that notes what each keyframe cost."""
+    """A mapper that notes what each keyframe cost.
 
-    def __init__(self, *args: object, frames_per_lap: int) -> None:
-        super().__init__(*args)  # type: ignore[arg-type]
-        self._frames_per_lap = frames_per_lap
+    T_world_camera [K, 4, 4] of the frames of a lap: keyframes are mapped there. None: where the
+    tracker and the optimizer say.
+    """
+
+    def __init__(
+        self, config: MapperConfig, frames_per_lap: int, T_world_camera: np.ndarray | None
+    ) -> None:
+        super().__init__(config)
+        self._frames_per_lap, self._T_world_camera = frames_per_lap, T_world_camera
         self.mapped: list[Mapped] = []
 
-    def handle(self, message: object) -> Iterator[Message]:
+    def handle(self, message: Keyframe | Correction | MapRefine) -> Iterator[Message]:
+        if self._T_world_camera is not None and isinstance(message, Correction):
+            return
+        if not isinstance(message, Keyframe):
+            yield from super().handle(message)
+            return
+        message = self._placed(message)
         started_s = time.thread_time()
-        made = list(super().handle(message))  # type: ignore[arg-type]
-        if isinstance(message, Keyframe):
-            facts = self.facts()
-            self.mapped.append(
-                Mapped(
-                    message.keyframe,
-                    message.frame,
-                    message.frame // self._frames_per_lap,
-                    1e3 * (time.thread_time() - started_s),
-                    int(facts["gaussians"]),
-                    int(facts["gaussians_asleep"]),
-                    resident_mb(),
-                )
-            )
+        made = list(super().handle(message))
+        self._note(message, 1e3 * (time.thread_time() - started_s))
         yield from made
+
+    def _placed(self, keyframe: Keyframe) -> Keyframe:
+        if self._T_world_camera is None:
+            return keyframe
+        truth = pose_message(self._T_world_camera[keyframe.frame % self._frames_per_lap])
+        return msgspec.structs.replace(keyframe, reference=None, T_odom_keyframe=truth)
+
+    def _note(self, keyframe: Keyframe, cpu_ms: float) -> None:
+        facts = self.facts()
+        names = ("gaussians", "gaussians_asleep", "gaussians_over_cap", "gaussians_pruned")
+        self.mapped.append(
+            Mapped(
+                keyframe.keyframe,
+                keyframe.frame,
+                keyframe.frame // self._frames_per_lap,
+                cpu_ms,
+                *(int(facts[name]) for name in (*names, "gaussians_woken")),
+                facts["keyframes_cache_mb"],
+                resident_mb(),
+            )
+        )
 
 
 def laps_of(sequence: Sequence, laps: int, stride: int) -> Iterator[CameraRgbd]:
@@ -124,6 +155,7 @@ def main() -> None:
     parser.add_argument("source", nargs="?", default="synthetic:flat")
     parser.add_argument("--laps", type=int, default=10)
     parser.add_argument("--stride", type=int, default=1)
+    parser.add_argument("--true-poses", action="store_true")
     parser.add_argument("--out", type=Path, default=Path("build/laps"))
     parser.add_argument("--set", action="append", default=[])
     arguments = parser.parse_args()
@@ -131,9 +163,10 @@ def main() -> None:
     config = replace(config, mapper=replace(config.mapper, threads=1))
     sequence = open_source(arguments.source)
     per_lap = len(range(0, len(sequence), arguments.stride))
-    mapper = TimedMapper(config.mapper, frames_per_lap=per_lap)
+    poses = true_poses(sequence)[:: arguments.stride] if arguments.true_poses else None
+    mapper = TimedMapper(config.mapper, per_lap, poses)
     actors = [mapper if actor.name == "mapper" else actor for actor in make_actors(config)]
-    print(f"{'lap':>4} {'keyframes':>10} {'CPU ms':>8} {'Gaussians':>10} {'asleep':>10} {'MB':>7}")
+    print("".join(f"{title:>10}" for title in COLUMNS))
     with LogicalClock(actors, config.run.latency_frames()) as clock:
         for tick in clock.run(laps_of(sequence, arguments.laps, arguments.stride)):
             if (tick + 1) % per_lap == 0:
@@ -141,15 +174,27 @@ def main() -> None:
                 write(arguments.out, mapper.mapped)
 
 
+def true_poses(sequence: Sequence) -> np.ndarray:
+    """T_world_camera [len, 4, 4]."""
+    truth = sequence.truth()
+    if truth is None or len(truth) != len(sequence):
+        raise SystemExit(f"{sequence.name} does not say where each frame was taken.")
+    return truth.T_world_camera
+
+
 def report(mapped: list[Mapped], lap: int) -> None:
+    """`inserted` and what follows are per keyframe."""
     of_lap = [m for m in mapped if m.lap == lap]
-    last = of_lap[-1]
+    first, last, count = mapped[mapped.index(of_lap[0]) - 1], of_lap[-1], len(of_lap)
     cpu_ms = float(np.mean([m.cpu_ms for m in of_lap]))
-    print(
-        f"{lap + 1:>4} {len(of_lap):>10} {cpu_ms:>8.0f} {last.gaussians:>10,} {last.asleep:>10,} "
-        f"{last.resident_mb:>7.0f}",
-        flush=True,
-    )
+    made = [m.gaussians + m.asleep + m.pruned for m in (last, first)]
+    inserted = made[0] - (made[1] if lap else 0)
+    pruned, woken = last.pruned - first.pruned * (lap > 0), last.woken - first.woken * (lap > 0)
+    per_keyframe = (f"{n / count:,.0f}" for n in (inserted, pruned, woken))
+    sizes = (f"{n:,}" for n in (last.gaussians, last.asleep, last.over_cap))
+    memory = (f"{mb:.0f}" for mb in (last.images_mb, last.resident_mb))
+    columns = (str(lap + 1), str(count), f"{cpu_ms:.0f}", *sizes, *per_keyframe, *memory)
+    print("".join(f"{column:>10}" for column in columns), flush=True)
 
 
 if __name__ == "__main__":
