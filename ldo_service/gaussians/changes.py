@@ -47,6 +47,10 @@ class ChangeLog:
         self._removed.append(ids[ids < self._next_untold])
         self._is_changed = self._is_changed[~mask]
 
+    def lost(self, ids: np.ndarray) -> None:
+        """These [L] are gone for good, from where nobody looked."""
+        self._removed.append(ids[ids < self._next_untold])
+
     def woken(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
         """Rows came back, perhaps with their anchor moved: they count as changed."""
         if len(ids) == 0:

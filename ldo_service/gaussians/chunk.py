@@ -1,13 +1,13 @@
-"""The Gaussians of one anchor, as arrays and as bytes."""
+"""Gaussians of one anchor, as arrays and as bytes."""
 
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import zstandard
 
 from ldo_service.errors import DataError
-from ldo_service.geometry import se3
 
 from .model import ROW, moved_rows
 
@@ -28,12 +28,13 @@ class Chunk:
         """[M] int32, as GaussianMap keeps them."""
         return np.full(len(self.ids), self.anchor, np.int32)
 
-    def carried(self, T_then: np.ndarray, T_now: np.ndarray) -> "Chunk":
-        """Moved with the anchor from one pose in the map [4, 4] to another: by
-        T_now @ inverse(T_then). Itself when they are equal."""
-        if np.array_equal(T_then, T_now):
-            return self
-        return replace(self, rows=moved_rows(self.rows, T_now @ se3.inverse(T_then)))
+    def moved(self, motions: Iterable[np.ndarray]) -> "Chunk":
+        """By one motion T_new_old [4, 4] of the anchor after the other, to the bits that
+        `GaussianMap.move_anchors` gives. Itself without any."""
+        rows = self.rows
+        for T_new_old in motions:
+            rows = moved_rows(rows, T_new_old)
+        return replace(self, rows=rows)
 
 
 def packed(chunk: Chunk) -> bytes:

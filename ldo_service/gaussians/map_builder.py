@@ -11,9 +11,10 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
-from .anchor_spheres import AnchorSpheres, PlacedCamera
+from .anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
 from .changes import ChangeLog, Changes
 from .exposure import Exposure, estimated_exposure
+from .horizon import Horizon
 from .insertion import InsertionConfig, insert
 from .keyframe_store import KeyframeStore, KeyframeStoreConfig
 from .keyframe_views import KeyframeViews
@@ -108,7 +109,7 @@ class MapBuilder:
         `is_moving` [H, W] bool: pixels that are neither mapped nor fitted.
         Its Gaussians hang on it.
         """
-        self._wake(PlacedCamera(frame.camera, T_map_camera))
+        self._wake(PlacedCamera(frame.camera, T_map_camera, Horizon.of(frame.depth_m)))
         before = self.seen_from(frame.camera, T_map_camera)
         exposure = self._exposure(frame, before, is_moving)
         self._insert(frame, T_map_camera, keyframe, before, exposure, is_moving)
@@ -225,8 +226,7 @@ class MapBuilder:
     def _is_usable(self, keyframe: int) -> bool:
         """Its images are there, and nothing of what it may see sleeps: or what is awake would be
         bent to stand in for it."""
-        camera = PlacedCamera(self.views.cameras[keyframe], self.views.poses[keyframe])
-        is_awake = not self.sleeping.seen_from(camera, self.views.poses, self._reach_m)
+        is_awake = not self.sleeping.seen_from(self.views.placed(keyframe), self._reach_m)
         return is_awake and self.views.is_readable(keyframe)
 
     def refine(self, iterations: int, rates: tuple[float, float] = (1.0, 1.0)) -> None:
@@ -277,8 +277,8 @@ class MapBuilder:
         return self.config.sleep.reach_m
 
     def _wake(self, camera: PlacedCamera) -> None:
-        seen = self.sleeping.seen_from(camera, self.views.poses, self._reach_m)
-        ids = self.sleeping.return_to(self.gaussians, seen, self.views.poses)
+        seen = self.sleeping.seen_from(camera, self._reach_m)
+        ids = self.sleeping.return_to(self.gaussians, seen)
         self._log.woken(self.gaussians, ids)
 
     def rest(self) -> None:
@@ -286,15 +286,14 @@ class MapBuilder:
         changed: to them sleeping Gaussians are as before."""
         if len(self.gaussians) <= self.config.sleep.max_active:
             return
-        poses = self.views.poses
-        recent = [
-            PlacedCamera(self.views.cameras[k], poses[k])
-            for k in list(poses)[-self.config.recent_cameras :]
-        ]
-        awake = AnchorSpheres.around(self.gaussians.rows, self.gaussians.anchors, poses)
-        choice = choose_sleepers(awake, poses, recent, self.config.sleep)
+        keyframes = list(self.views.poses)[-self.config.recent_cameras :]
+        recent = [self.views.placed(keyframe) for keyframe in keyframes]
+        rows, anchors = self.gaussians.rows, self.gaussians.anchors
+        clumps = clumps_of(self.gaussians.means, anchors, self.config.sleep.clump_m)
+        awake = AnchorSpheres.around(rows, anchors, clumps)
+        choice = choose_sleepers(awake, recent, self.config.sleep)
         self._excess = choice.excess
-        self.sleeping.take_from(self.gaussians, choice.anchors, poses)
+        self.sleeping.take_from(self.gaussians, clumps, choice.clumps)
         self._log.all_told(self.gaussians)
 
     def size(self) -> int:
@@ -303,11 +302,12 @@ class MapBuilder:
 
     def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """The whole map, in pieces of ids, rows and anchors; ids ascend throughout."""
-        yield from whole_map(self.gaussians, self.sleeping, self.views.poses)
+        yield from whole_map(self.gaussians, self.sleeping)
 
     # --- telling others ---------------------------------------------------------------------------
     def changes(self, *, with_changed: bool) -> Changes:
         """What followers of the map do not know yet; see `ChangeLog.take`."""
+        self._log.lost(self.sleeping.take_lost(self.gaussians))
         return self._log.take(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
@@ -327,6 +327,7 @@ class MapBuilder:
         """Keyframes were corrected: what hangs on each goes with it, and its view."""
         T_map = {k: T @ self.views.poses[k] for k, T in T_new_old.items()}
         self.gaussians.move_anchors(T_new_old)
+        self.sleeping.move(T_new_old)
         self.views.poses.update(T_map)
         self._told.update(T_map)
 
@@ -342,6 +343,10 @@ class MapBuilder:
             "newest": self._newest,
             "iterations": self._iterations,
         }
+
+    def saved(self) -> None:
+        """The last snapshot is where a successor will find it."""
+        self.sleeping.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a snapshot: followers are taken to know the whole map."""

@@ -1,14 +1,15 @@
-"""Gaussians that sleep on disk, an anchor's together, until a camera comes near."""
+"""Gaussians that sleep on disk, in chunks of one anchor's, until a camera comes near."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 
 import numpy as np
 
 from ldo_service.errors import DataError
+from ldo_service.geometry import se3
 
 from .anchor_spheres import AnchorSpheres, PlacedCamera
 from .chunk import Chunk, packed, unpacked
@@ -17,130 +18,121 @@ from .sealed_folder import SealedFolder
 
 log = logging.getLogger(__name__)
 
-Poses = Mapping[int, np.ndarray]  # T_map_anchor [4, 4] by anchor
 _DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
+MOST_MOTIONS = 32  # of a chunk that are remembered; then
+SETTLED_AT_ONCE = 16  # chunks with more are written anew, so many at a motion: 2 ms each
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Entry:
-    """What memory keeps of a chunk: its file, where its anchor stood, a sphere around it."""
+    """What memory keeps of a chunk beside the number of its file: its ids are `count` of those
+    from the first to the last, `motions` what its anchor moved since it was written."""
 
-    serial: int  # of the file
+    anchor: int
     first_id: int
+    last_id: int
     count: int
-    T_map_anchor: np.ndarray  # when it fell asleep
-    center_anchor: np.ndarray  # [3]
+    center_map: np.ndarray  # [3] of a sphere around it, now
     radius_m: float
+    motions: tuple[np.ndarray, ...] = ()  # T_new_old [4, 4]
+
+    def moved(self, T_new_old: np.ndarray) -> "_Entry":
+        center = se3.transform(T_new_old, self.center_map)
+        return replace(self, center_map=center, motions=(*self.motions, T_new_old))
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The ids from the first to the last that are nowhere else are lost."""
+
+    first_id: int
+    last_id: int
 
 
 class SleepingGaussians:
-    """Chunks of Gaussians in `folder`, as if they had never left the map.
+    """Chunks of Gaussians in `folder`, as if they had never left the map: bit for bit what they
+    would be had they moved with their anchors while awake.
 
-    A chunk is moved when it wakes, by all that its anchor moved while it slept: an anchor that
-    stands where it stood gets it back bit for bit, another to float32 rounding and the sign of
-    quaternions. A chunk takes below 1 kB of memory. Without a folder a temporary one is used, which
-    goes with this object. Not for two threads at once. Raises ConfigError for a folder that cannot
-    be used.
+    A chunk takes below 1 kB of memory. Without a folder a temporary one is used, which goes with
+    this object. Not for two threads at once. Raises ConfigError for a folder that cannot be used.
 
     The folder belongs to one state: `restore` and, without it, the first `put` remove the chunks
-    that the state does not know. Files of chunks that woke stay until the second `snapshot` after,
-    when the first is sure to be saved: who goes on from the last saved state needs them.
+    that the state does not know. Files of chunks that woke stay until a `snapshot` without them is
+    `saved`: who goes on from the last saved state needs them.
     """
 
     def __init__(self, folder: Path | None) -> None:
         self._files = SealedFolder(folder, "gaussians", _DISK_FULL)
-        self._entries: dict[int, _Entry] = {}  # by anchor
-        self._next_serial = 0
-        self._woken: list[int] = []  # serials, since the last snapshot
-        self._woken_before: list[int] = []  # between the last two snapshots
+        self._entries: dict[int, _Entry] = {}  # by number, ascending
+        self._next_number = 0
+        self._retired: list[int] = []  # since the last snapshot
+        self._retired_before: list[int] = []  # and before it
         self._spheres: AnchorSpheres | None = None  # None when the entries changed
-        self._slept = self._awoken = self._lost = 0
+        self._lost: list[Lost] = []  # that nobody was told of
+        self._slept = self._awoken = self._damaged = 0
 
     def __len__(self) -> int:
         """Gaussians that sleep."""
         return sum(entry.count for entry in self._entries.values())
 
-    def __contains__(self, anchor: int) -> bool:
-        return anchor in self._entries
-
-    def anchors(self) -> list[int]:
-        """Those that sleep, ascending."""
-        return sorted(self._entries)
+    def numbers(self) -> list[int]:
+        """Those of the chunks, ascending."""
+        return list(self._entries)
 
     # --- one chunk --------------------------------------------------------------------------------
-    def put(self, anchor: int, ids: np.ndarray, rows: np.ndarray, T_map_anchor: np.ndarray) -> bool:
-        """Write the Gaussians ids [M] ascending, rows [M, 16] of an anchor at T_map_anchor.
+    def put(self, chunk: Chunk) -> int | None:
+        """Write a chunk; its number.
 
-        False when the disk does not take them: then they must stay awake. Raises ValueError for
-        an anchor that sleeps already, no Gaussians, or ids that do not ascend.
+        None when the disk does not take it: then it must stay awake. Raises ValueError for a chunk
+        without Gaussians, or with ids that do not ascend.
         """
-        if anchor in self._entries:
-            raise ValueError(f"anchor {anchor} sleeps already.")
+        ids, rows = chunk.ids, chunk.rows
         if len(ids) == 0 or len(ids) != len(rows) or np.any(np.diff(ids) <= 0):
-            raise ValueError(f"anchor {anchor}: {len(ids)} ids, must ascend, one for each row.")
-        if self._next_serial == 0:
+            raise ValueError(f"anchor {chunk.anchor}: {len(ids)} ids, must ascend, one per row.")
+        if self._next_number == 0:
             self._remove_unknown()
-        if not self._files.write(self._next_serial, packed(Chunk(anchor, ids, rows))):
-            return False
-        anchors = np.full(len(ids), anchor, np.int32)
-        sphere = AnchorSpheres.around(rows, anchors, {anchor: T_map_anchor})
-        self._entries[anchor] = _Entry(
-            self._next_serial,
-            int(ids[0]),
-            len(ids),
-            np.array(T_map_anchor, float),
-            sphere.centers[0],
-            float(sphere.radii_m[0]),
-        )
-        self._next_serial += 1
-        self._spheres = None
-        self._slept += len(ids)
-        return True
+        sphere = AnchorSpheres.around(rows, chunk.anchors)
+        place = sphere.centers[0], float(sphere.radii_m[0])
+        entry = _Entry(chunk.anchor, int(ids[0]), int(ids[-1]), len(ids), *place)
+        return self._write(chunk, entry)
 
-    def wake(self, anchor: int, T_map_anchor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Take a chunk out: ids [M], rows [M, 16] with the anchor at T_map_anchor.
+    def wake(self, number: int) -> Chunk:
+        """Take a chunk out, as its anchor stands now.
 
-        Both are empty when its file is damaged, which is counted and logged: those Gaussians are
-        lost. Raises KeyError for an anchor that does not sleep.
+        It is empty when its file is damaged, which is counted and logged: those Gaussians are lost.
+        Raises KeyError for a number that does not sleep.
         """
-        entry = self._entries[anchor]
-        chunk = self._read(anchor, entry, T_map_anchor)
-        if anchor in self._entries:  # still: a damaged one is gone
-            self._forget(anchor)
-            self._retire(entry.serial)
-            self._awoken += entry.count
-        return chunk.ids, chunk.rows
+        chunk = self._read(number)
+        if number in self._entries:  # still: a damaged one is gone
+            self._awoken += self._entries[number].count
+            self._retire(number)
+        return chunk
 
     # --- many, between here and the map -----------------------------------------------------------
     def take_from(
-        self, gaussians: GaussianMap, anchors: Iterable[int], T_map_anchor: Poses
+        self, gaussians: GaussianMap, clumps: np.ndarray, chosen: Iterable[int]
     ) -> list[int]:
-        """Let all Gaussians of `anchors` fall asleep; the anchors that did.
+        """Let the Gaussians of the chosen clumps fall asleep; the numbers of their chunks.
 
-        The others have none, or the disk does not take them, and they stay awake. Linear in the
-        size of the map. Raises ValueError for anchors that sleep already, KeyError without a pose.
+        clumps [N] int, each of one anchor's Gaussians. Those that the disk does not take stay
+        awake. Linear in the size of the map.
         """
-        poses = {anchor: T_map_anchor[anchor] for anchor in sorted(set(anchors))}
-        if twice := poses.keys() & self._entries.keys():
-            raise ValueError(f"anchors {sorted(twice)} sleep already.")
-        mask = np.isin(gaussians.anchors, np.array(list(poses), np.int32))
-        ids, rows, hung = gaussians.take_out(mask)
-        asleep = []
-        for anchor, T in poses.items():
-            own = hung == anchor
-            if np.any(own) and self.put(anchor, ids[own], rows[own], T):
-                asleep.append(anchor)
-        refused = ~np.isin(hung, np.array(asleep, np.int32))
+        mask = np.isin(clumps, np.array(sorted(chosen), np.int64))
+        labels = clumps[mask]
+        ids, rows, anchors = gaussians.take_out(mask)
+        numbers, refused = [], np.zeros(len(ids), bool)
+        for own in _members(labels):
+            number = self.put(Chunk(int(anchors[own[0]]), ids[own], rows[own]))
+            refused[own] = number is None
+            numbers += [] if number is None else [number]
         if np.any(refused):
-            gaussians.bring_back(ids[refused], rows[refused], hung[refused])
-        return asleep
+            gaussians.bring_back(ids[refused], rows[refused], anchors[refused])
+        return numbers
 
-    def return_to(
-        self, gaussians: GaussianMap, anchors: Iterable[int], T_map_anchor: Poses
-    ) -> np.ndarray:
-        """Wake the chunks of `anchors` into the map they came from; their ids [M] ascending.
-        Linear in the size of the map."""
-        chunks = [Chunk(a, *self.wake(a, T_map_anchor[a])) for a in sorted(anchors)]
+    def return_to(self, gaussians: GaussianMap, numbers: Iterable[int]) -> np.ndarray:
+        """Wake chunks into the map they came from; their ids [M] ascending. Linear in the size of
+        the map."""
+        chunks = [self.wake(number) for number in sorted(numbers)]
         if not chunks:
             return np.zeros(0, np.int64)
         ids = np.concatenate([chunk.ids for chunk in chunks])
@@ -149,124 +141,189 @@ class SleepingGaussians:
         return np.sort(ids)
 
     # --- without waking ---------------------------------------------------------------------------
-    def seen_from(
-        self, camera: PlacedCamera, T_map_anchor: Poses, reach_m: float = inf
-    ) -> list[int]:
-        """Anchors, ascending, whose sleeping Gaussians the camera may see up to `reach_m` away,
-        with the anchors at these poses. No file is read."""
-        spheres = self._all_spheres()
-        seen = camera.may_see(spheres.centers_map(T_map_anchor), spheres.radii_m, reach_m)
-        return spheres.anchors[seen].tolist()
+    def seen_from(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
+        """Numbers, ascending, of the chunks that the camera may see up to `reach_m` away. No file
+        is read."""
+        if self._spheres is None:
+            self._spheres = self._all_spheres()
+        seen = camera.may_see(self._spheres.centers, self._spheres.radii_m, reach_m)
+        numbers = self.numbers()
+        return [numbers[k] for k in np.flatnonzero(seen)]
 
-    def chunks(self, T_map_anchor: Poses) -> Iterator[Chunk]:
-        """All that sleep, in order of their ids, at these poses; one in memory at a time."""
-        for anchor in sorted(self._entries, key=lambda k: self._entries[k].first_id):
-            chunk = self._read(anchor, self._entries[anchor], T_map_anchor[anchor])
-            if len(chunk.ids):
-                yield chunk
+    def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+        """What `GaussianMap.move_anchors` does to those that are awake."""
+        for number, entry in self._entries.items():
+            if entry.anchor in T_new_old:
+                self._entries[number] = entry.moved(T_new_old[entry.anchor])
+                self._spheres = None
+        moved_often = [n for n, entry in self._entries.items() if len(entry.motions) > MOST_MOTIONS]
+        for number in moved_often[:SETTLED_AT_ONCE]:
+            self._settle(number)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """All that sleep, by anchor, in order of their ids; those of one anchor in memory at a
+        time."""
+        by_anchor: dict[int, list[int]] = {}
+        for number in sorted(self._entries, key=lambda n: self._entries[n].first_id):
+            by_anchor.setdefault(self._entries[number].anchor, []).append(number)
+        for anchor, numbers in by_anchor.items():
+            parts = [self._read(number) for number in numbers]
+            ids = np.concatenate([part.ids for part in parts])
+            order = np.argsort(ids, kind="stable")
+            if len(ids):
+                rows = np.concatenate([part.rows for part in parts])
+                yield Chunk(anchor, ids[order], rows[order])
 
     def _all_spheres(self) -> AnchorSpheres:
-        if self._spheres is None:
-            anchors = self.anchors()
-            entries = [self._entries[k] for k in anchors]
-            self._spheres = AnchorSpheres(
-                np.array(anchors, np.int32),
-                np.array([entry.count for entry in entries], np.int64),
-                np.array([entry.center_anchor for entry in entries]).reshape(-1, 3),
-                np.array([entry.radius_m for entry in entries], float),
-            )
-        return self._spheres
+        entries = self._entries.values()
+        return AnchorSpheres(
+            np.array([entry.anchor for entry in entries], np.int32),
+            np.array([entry.count for entry in entries], np.int64),
+            np.array([entry.center_map for entry in entries]).reshape(-1, 3),
+            np.array([entry.radius_m for entry in entries], float),
+        )
+
+    # --- damage -----------------------------------------------------------------------------------
+    def take_lost(self, gaussians: GaussianMap) -> np.ndarray:
+        """Ids [L], ascending, of which some were lost since the last call, and none is there now:
+        neither awake in the map they came from, nor asleep."""
+        if not self._lost:
+            return np.zeros(0, np.int64)
+        lost, self._lost = self._lost, []
+        ids = np.unique(np.concatenate([np.arange(one.first_id, one.last_id + 1) for one in lost]))
+        asleep = [
+            self._read(number).ids
+            for number, entry in list(self._entries.items())
+            if any(entry.first_id <= o.last_id and o.first_id <= entry.last_id for o in lost)
+        ]
+        return np.setdiff1d(ids, np.concatenate([gaussians.ids, *asleep]), assume_unique=True)
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, np.ndarray]:
         """The table of what sleeps, as named arrays; the Gaussians stay in their files."""
-        for serial in self._woken_before:
-            self._files.remove(serial)
-        self._woken_before, self._woken = self._woken, []
-        anchors = self.anchors()
-        entries = [self._entries[k] for k in anchors]
+        self._retired_before, self._retired = [*self._retired_before, *self._retired], []
+        entries = list(self._entries.values())
+        spheres = self._all_spheres()
+        motions = [T for entry in entries for T in entry.motions]
         return {
-            "anchors": np.array(anchors, np.int32),
-            "serials": np.array([entry.serial for entry in entries], np.int64),
+            "numbers": np.array(self.numbers(), np.int64),
+            "anchors": spheres.anchors,
             "first_ids": np.array([entry.first_id for entry in entries], np.int64),
-            "counts": np.array([entry.count for entry in entries], np.int64),
-            "T_map_anchor": np.array([entry.T_map_anchor for entry in entries]).reshape(-1, 4, 4),
-            "centers": np.array([entry.center_anchor for entry in entries]).reshape(-1, 3),
-            "radii_m": np.array([entry.radius_m for entry in entries], float),
-            "next_serial": np.array(self._next_serial, np.int64),
+            "last_ids": np.array([entry.last_id for entry in entries], np.int64),
+            "counts": spheres.counts,
+            "centers": spheres.centers,
+            "radii_m": spheres.radii_m,
+            "motion_counts": np.array([len(entry.motions) for entry in entries], np.int64),
+            "motions": np.array(motions, float).reshape(-1, 4, 4),
+            "next_number": np.array(self._next_number, np.int64),
         }
+
+    def saved(self) -> None:
+        """The last snapshot is where a successor will find it: files that it does not name go."""
+        for number in self._retired_before:
+            self._files.remove(number)
+        self._retired_before = []
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on from a snapshot, with the files in this folder; chunks whose file is gone are
         dropped, counted and logged."""
-        names = ("serials", "first_ids", "counts", "T_map_anchor", "centers", "radii_m")
+        names = ("anchors", "first_ids", "last_ids", "counts", "centers", "radii_m")
+        columns = [state[name] if name == "centers" else state[name].tolist() for name in names]
+        motions = np.split(state["motions"], np.cumsum(state["motion_counts"]))[:-1]
+        numbers = state["numbers"].tolist()
         self._entries = {
-            int(anchor): _Entry(int(serial), int(first), int(count), T, center, float(radius))
-            for anchor, serial, first, count, T, center, radius in zip(
-                state["anchors"], *(state[name] for name in names), strict=True
-            )
+            number: _Entry(*fields, motions=tuple(own))
+            for number, *fields, own in zip(numbers, *columns, motions, strict=True)
         }
-        self._next_serial, self._spheres = int(state["next_serial"]), None
-        self._woken, self._woken_before = [], []
+        self._next_number, self._spheres = int(state["next_number"]), None
+        self._retired, self._retired_before = [], []
         self._remove_unknown()
-        for anchor, entry in list(self._entries.items()):
-            if entry.serial not in self._files.sizes:
-                self._lose(anchor, "their file is gone")
+        for number in self._entries.keys() - self._files.sizes.keys():
+            self._lose(number, "their file is gone")
 
     def statistics(self) -> dict[str, float]:
         return {
             "gaussians_asleep": len(self),
-            "anchors_asleep": len(self._entries),
+            "chunks_asleep": len(self._entries),
             "gaussians_fell_asleep": self._slept,
             "gaussians_woken": self._awoken,
-            "gaussians_lost_on_disk": self._lost,
+            "gaussians_lost_on_disk": self._damaged,
             "chunks_not_written": self._files.not_written,
         }
 
     # --- files ------------------------------------------------------------------------------------
-    def _read(self, anchor: int, entry: _Entry, T_map_anchor: np.ndarray) -> Chunk:
-        """The chunk at a pose of its anchor; an empty one, and the entry is gone, if damaged."""
+    def _write(self, chunk: Chunk, entry: _Entry) -> int | None:
+        number = self._next_number
+        if not self._files.write(number, packed(chunk)):
+            return None
+        self._entries[number] = entry
+        self._next_number += 1
+        self._spheres = None
+        self._slept += entry.count
+        return number
+
+    def _read(self, number: int) -> Chunk:
+        """The chunk as it is now; an empty one, and the entry is gone, if damaged."""
+        entry = self._entries[number]
         try:
-            chunk = unpacked(self._files.read(entry.serial))
-            if (chunk.anchor, len(chunk.ids)) != (anchor, entry.count):
+            chunk = unpacked(self._files.read(number))
+            if (chunk.anchor, len(chunk.ids)) != (entry.anchor, entry.count):
                 raise DataError(f"the file holds {len(chunk.ids)} of anchor {chunk.anchor}")
         except DataError as error:
-            self._lose(anchor, str(error))
-            return Chunk(anchor, np.zeros(0, np.int64), np.zeros((0, ROW), np.float32))
-        return chunk.carried(entry.T_map_anchor, T_map_anchor)
+            self._lose(number, str(error))
+            return Chunk(entry.anchor, np.zeros(0, np.int64), np.zeros((0, ROW), np.float32))
+        return chunk.moved(entry.motions)
 
-    def _lose(self, anchor: int, reason: str) -> None:
-        entry = self._entries[anchor]
-        log.error("anchor %d: its %d sleeping Gaussians are lost: %s", anchor, entry.count, reason)
-        self._lost += entry.count
-        self._forget(anchor)
-        self._files.remove(entry.serial)
+    def _settle(self, number: int) -> None:
+        """Write a chunk anew, as it is now, and forget how it came there."""
+        chunk, entry = self._read(number), self._entries.get(number)
+        if entry is not None and self._write(chunk, replace(entry, motions=())) is not None:
+            self._slept -= entry.count
+            self._retire(number)
 
-    def _forget(self, anchor: int) -> None:
-        del self._entries[anchor]
+    def _lose(self, number: int, reason: str) -> None:
+        entry = self._entries.pop(number)
+        count, anchor = entry.count, entry.anchor
+        log.error("anchor %d: %d of its sleeping Gaussians are lost: %s", anchor, count, reason)
+        self._damaged += count
         self._spheres = None
+        self._lost.append(Lost(entry.first_id, entry.last_id))
+        self._files.remove(number)
 
-    def _retire(self, serial: int) -> None:
+    def _retire(self, number: int) -> None:
+        del self._entries[number]
+        self._spheres = None
         if self._files.is_temporary:  # no successor will find it
-            self._files.remove(serial)
+            self._files.remove(number)
         else:
-            self._woken.append(serial)
+            self._retired.append(number)
 
     def _remove_unknown(self) -> None:
-        known = {entry.serial for entry in self._entries.values()}
-        for serial in self._files.sizes.keys() - known:
-            self._files.remove(serial)
+        for number in self._files.sizes.keys() - self._entries.keys():
+            self._files.remove(number)
+
+
+def _members(labels: np.ndarray) -> list[np.ndarray]:
+    """Places of each label in labels [N], ascending; the labels ascend."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 
 
 def whole_map(
-    gaussians: GaussianMap, sleeping: SleepingGaussians, T_map_anchor: Poses
+    gaussians: GaussianMap, sleeping: SleepingGaussians
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """All Gaussians, awake or asleep, in pieces of ids, rows and anchors; ids ascend throughout,
-    as those of one anchor follow each other. At most one chunk is in memory at a time."""
-    start = 0
-    for chunk in sleeping.chunks(T_map_anchor):
-        stop = int(np.searchsorted(gaussians.ids, chunk.ids[0]))
-        yield gaussians.ids[start:stop], gaussians.rows[start:stop], gaussians.anchors[start:stop]
-        yield chunk.ids, chunk.rows, chunk.anchors
-        start = stop
-    yield gaussians.ids[start:], gaussians.rows[start:], gaussians.anchors[start:]
+    as those of one anchor follow each other. Of those asleep, one anchor's are in memory at a
+    time."""
+    awake, start = (gaussians.ids, gaussians.rows, gaussians.anchors), 0
+    for chunk in sleeping.chunks():
+        first, last = np.searchsorted(gaussians.ids, chunk.ids[[0, -1]])
+        yield awake[0][start:first], awake[1][start:first], awake[2][start:first]
+        mixed = [
+            np.concatenate([mine[first:last], other])
+            for mine, other in zip(awake, (chunk.ids, chunk.rows, chunk.anchors), strict=True)
+        ]
+        order = np.argsort(mixed[0], kind="stable")
+        yield mixed[0][order], mixed[1][order], mixed[2][order]
+        start = int(last)
+    yield awake[0][start:], awake[1][start:], awake[2][start:]

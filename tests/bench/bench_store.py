@@ -71,16 +71,18 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
     asleep = list(range(0, len(poses), 2))
 
     def spheres() -> AnchorSpheres:
-        return AnchorSpheres.around(gaussians.rows, gaussians.anchors, poses)
+        return AnchorSpheres.around(gaussians.rows, gaussians.anchors)
 
     report("spheres", [timed_ms(spheres)])
-    report("half sleep", [timed_ms(lambda: sleeping.take_from(gaussians, asleep, poses))])
-    chunks, memory_mb = len(sleeping.anchors()), len(sleeping) * 64 / 1e6
+    report(
+        "half sleep", [timed_ms(lambda: sleeping.take_from(gaussians, gaussians.anchors, asleep))]
+    )
+    chunks, memory_mb = len(sleeping.numbers()), len(sleeping) * 64 / 1e6
     disk_mb = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
     camera = PlacedCamera(open_sequence(source).camera, poses[0])
-    sleeping.seen_from(camera, poses)
-    report("who is seen", [timed_ms(lambda: sleeping.seen_from(camera, poses)) for _ in range(9)])
-    report("half wake", [timed_ms(lambda: sleeping.return_to(gaussians, asleep, poses))])
+    sleeping.seen_from(camera)
+    report("who is seen", [timed_ms(lambda: sleeping.seen_from(camera)) for _ in range(9)])
+    report("half wake", [timed_ms(lambda: sleeping.return_to(gaussians, sleeping.numbers()))])
     if gaussians.rows.tobytes() != before.tobytes():
         sys.exit("the Gaussians did not come back: the times mean nothing.")
     print(

@@ -143,9 +143,10 @@ def elsewhere(posed: dict, x_m: float) -> dict:
     return {i: (frame, T @ pose) for i, (frame, pose) in posed.items()}
 
 
-def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
+def with_sleepers(posed: dict, **options) -> MapBuilder:
+    """A map whose first half, seen from the first keyframes, sleeps for the most part."""
     config = MapBuilderConfig(sleep=SleepConfig(max_active=2000, reach_m=20), recent_cameras=2)
-    builder, far = MapBuilder(config), elsewhere(posed, 100.0)
+    builder, far = MapBuilder(config, **options), elsewhere(posed, 100.0)
     for keyframe, i in enumerate(KEYFRAMES):
         builder.add(*posed[i], keyframe, 2)
         builder.changes(with_changed=True)
@@ -153,6 +154,11 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
         builder.add(*far[i], keyframe, 2)
         builder.changes(with_changed=True)
         builder.rest()
+    return builder
+
+
+def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
+    builder = with_sleepers(posed)
     asleep = builder.statistics()["gaussians_asleep"]
     assert asleep > 1000
     assert builder.size() == len(builder.gaussians) + asleep
@@ -167,6 +173,18 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     assert builder.statistics()["gaussians_woken"] > 1000
     assert builder.size() < 1.15 * size, "inserted a second time"
     assert mean_psnr(builder, posed, KEYFRAMES[:1]) > 20
+
+
+def test_followers_are_told_what_was_lost_on_disk(posed: dict, tmp_path: Path) -> None:
+    builder = with_sleepers(posed, folder=tmp_path)
+    before = np.concatenate([ids for ids, _, _ in builder.pieces()])
+    for file in sorted((tmp_path / "gaussians").iterdir())[:2]:
+        file.write_bytes(file.read_bytes()[:-20])
+    after = np.concatenate([ids for ids, _, _ in builder.pieces()])
+    assert len(after) < len(before)
+    removed = builder.changes(with_changed=False).removed
+    assert np.setdiff1d(before, removed).tolist() == after.tolist()
+    assert builder.changes(with_changed=False).removed.tolist() == []
 
 
 @pytest.mark.parametrize(

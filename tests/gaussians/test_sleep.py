@@ -1,7 +1,7 @@
 import errno
 import gc
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.gaussians import GaussianMap, render
-from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
+from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
 from ldo_service.gaussians.chunk import Chunk, packed, unpacked
-from ldo_service.gaussians.sleep import SleepingGaussians, whole_map
+from ldo_service.gaussians.sleep import MOST_MOTIONS, SleepingGaussians, whole_map
 from ldo_service.gaussians.sleep_choice import SleepConfig, choose_sleepers
 from ldo_service.geometry import Camera, se3
 
@@ -36,19 +36,21 @@ def map_of(*counts: int) -> GaussianMap:
     return out
 
 
-def pieces_of(
-    gaussians: GaussianMap, sleeping: SleepingGaussians, poses: dict[int, np.ndarray] = POSES
-) -> list[np.ndarray]:
+def chunk_of(anchor: int, first_id: int, n: int) -> Chunk:
+    return Chunk(anchor, np.arange(first_id, first_id + n), rows_of(n))
+
+
+def put_to_sleep(
+    gaussians: GaussianMap, sleeping: SleepingGaussians, anchors: Iterable[int]
+) -> list[int]:
+    """A chunk for each anchor."""
+    return sleeping.take_from(gaussians, gaussians.anchors, anchors)
+
+
+def pieces_of(gaussians: GaussianMap, sleeping: SleepingGaussians) -> list[np.ndarray]:
     """Ids, rows and anchors of all, awake or asleep."""
-    pieces = list(whole_map(gaussians, sleeping, poses))
+    pieces = list(whole_map(gaussians, sleeping))
     return [np.concatenate([piece[k] for piece in pieces]) for k in range(3)]
-
-
-def one_sign(rows: np.ndarray) -> np.ndarray:
-    """With w >= 0 in all quaternions: q and -q are one rotation."""
-    out = rows.copy()
-    out[:, 6:10] *= np.where(rows[:, 6:7] < 0, -1, 1)
-    return out
 
 
 def assert_whole(gaussians: GaussianMap, sleeping: SleepingGaussians, plain: GaussianMap) -> None:
@@ -77,77 +79,76 @@ def test_other_bytes_are_no_chunk(body: bytes) -> None:
 def test_gaussians_of_a_still_anchor_wake_bit_for_bit(tmp_path: Path) -> None:
     sleeping, rows_before = SleepingGaussians(tmp_path), rows_of(5)
     rows_before[:, [0, 7, 14]] = -0.0  # which no motion leaves negative
-    assert sleeping.put(2, np.arange(10, 15), rows_before, POSES[2])
-    assert 2 in sleeping
+    number = sleeping.put(Chunk(2, np.arange(10, 15), rows_before))
+    assert number is not None
+    assert sleeping.numbers() == [number]
     assert len(sleeping) == 5
-    ids, rows = sleeping.wake(2, POSES[2])
-    assert ids.tolist() == [10, 11, 12, 13, 14]
-    assert rows.tobytes() == rows_before.tobytes()
-    assert 2 not in sleeping
+    sleeping.move({1: MOTION, 3: MOTION})
+    chunk = sleeping.wake(number)
+    assert (chunk.anchor, chunk.ids.tolist()) == (2, [10, 11, 12, 13, 14])
+    assert chunk.rows.tobytes() == rows_before.tobytes()
+    assert sleeping.numbers() == []
     with pytest.raises(KeyError):
-        sleeping.wake(2, POSES[2])
+        sleeping.wake(number)
 
 
-def test_gaussians_move_with_their_anchor_while_they_sleep(tmp_path: Path) -> None:
-    moved = map_of(500)
-    moved.move_anchors({0: MOTION})
+@pytest.mark.parametrize("motions", [1, 3, MOST_MOTIONS + 3])
+def test_gaussians_move_with_their_anchor_as_if_they_were_awake(
+    tmp_path: Path, motions: int
+) -> None:
+    sleeping, gaussians, plain = SleepingGaussians(tmp_path), map_of(50, 40), map_of(50, 40)
+    put_to_sleep(gaussians, sleeping, [0])
+    for k in range(motions):
+        T_new_old = {0: se3.exp(0.1 * (k + 1) * se3.log(MOTION))}
+        sleeping.move(T_new_old)
+        gaussians.move_anchors(T_new_old)
+        plain.move_anchors(T_new_old)
+    assert np.abs(plain.rows[:50] - rows_of(50)).max() > 0.01
+    assert_whole(gaussians, sleeping, plain)
+    assert sleeping.snapshot()["motion_counts"].max() <= MOST_MOTIONS
+    successor = SleepingGaussians(tmp_path)
+    successor.restore(sleeping.snapshot())
+    assert_whole(gaussians, successor, plain)
+
+
+def test_a_chunk_has_ids_in_order(tmp_path: Path) -> None:
     sleeping = SleepingGaussians(tmp_path)
-    sleeping.put(0, np.arange(500), rows_of(500), POSES[5])
-    _, rows = sleeping.wake(0, MOTION @ POSES[5])
-    np.testing.assert_allclose(rows, moved.rows, atol=1e-6)
-    assert np.abs(rows - rows_of(500)).max() > 0.1
-
-
-def test_two_motions_in_sleep_are_their_product(tmp_path: Path) -> None:
-    sleeping, plain = SleepingGaussians(tmp_path), map_of(50)
-    sleeping.put(0, np.arange(50), rows_of(50), POSES[0])
-    T_map_anchor = POSES[0]
-    for _ in range(30):
-        plain.move_anchors({0: MOTION})
-        T_map_anchor = MOTION @ T_map_anchor
-    _, rows = sleeping.wake(0, T_map_anchor)
-    np.testing.assert_allclose(one_sign(rows), one_sign(plain.rows), atol=2e-5)
-
-
-def test_an_anchor_sleeps_once_and_with_ids_in_order(tmp_path: Path) -> None:
-    sleeping = SleepingGaussians(tmp_path)
-    sleeping.put(1, np.arange(3), rows_of(3), POSES[1])
-    with pytest.raises(ValueError, match="sleeps already"):
-        sleeping.put(1, np.arange(3, 6), rows_of(3), POSES[1])
     for ids, count in (([], 0), ([1, 1, 2], 3), ([2, 1, 3], 3), ([1, 2], 3)):
         with pytest.raises(ValueError, match="ids"):
-            sleeping.put(2, np.array(ids, int), rows_of(count), POSES[2])
-    assert sleeping.anchors() == [1]
+            sleeping.put(Chunk(2, np.array(ids, int), rows_of(count)))
+    assert sleeping.numbers() == []
 
 
 # --- beside a map -----------------------------------------------------------------------------
 def test_a_map_that_slept_equals_one_that_did_not(tmp_path: Path) -> None:
     gaussians, plain, sleeping = map_of(5, 6, 7, 8), map_of(5, 6, 7, 8), SleepingGaussians(tmp_path)
-    assert sleeping.take_from(gaussians, [2, 0, 9], POSES) == [0, 2]
+    numbers = put_to_sleep(gaussians, sleeping, [2, 0, 9])
+    assert len(numbers) == 2
     np.testing.assert_array_equal(np.unique(gaussians.anchors), [1, 3])
     assert_whole(gaussians, sleeping, plain)
-    assert sleeping.return_to(gaussians, [2, 0], POSES).tolist() == [*range(5), *range(11, 18)]
+    assert sleeping.return_to(gaussians, numbers).tolist() == [*range(5), *range(11, 18)]
     assert len(sleeping) == 0
     assert gaussians.rows.tobytes() == plain.rows.tobytes()
     assert_whole(gaussians, sleeping, plain)
 
 
+def test_a_part_of_an_anchors_gaussians_may_sleep(tmp_path: Path) -> None:
+    gaussians, plain, sleeping = map_of(9, 20, 7), map_of(9, 20, 7), SleepingGaussians(tmp_path)
+    clumps = 3 * gaussians.anchors + gaussians.ids % 3  # which interleave
+    first, second = sleeping.take_from(gaussians, clumps, [3, 5])
+    assert (len(gaussians), len(sleeping)) == (23, 13)
+    assert_whole(gaussians, sleeping, plain)
+    sleeping.return_to(gaussians, [first])
+    assert_whole(gaussians, sleeping, plain)
+    sleeping.return_to(gaussians, [second])
+    assert gaussians.rows.tobytes() == plain.rows.tobytes()
+
+
 def test_asking_for_nobody_changes_nothing(tmp_path: Path) -> None:
     gaussians, sleeping = map_of(5, 6), SleepingGaussians(tmp_path)
-    assert sleeping.take_from(gaussians, [], POSES) == []
-    assert sleeping.return_to(gaussians, [], POSES).tolist() == []
+    assert put_to_sleep(gaussians, sleeping, []) == []
+    assert sleeping.return_to(gaussians, []).tolist() == []
     assert len(gaussians) == 11
-
-
-def test_a_refused_request_leaves_the_map_as_it_was(tmp_path: Path) -> None:
-    gaussians, sleeping = map_of(5, 6), SleepingGaussians(tmp_path)
-    with pytest.raises(KeyError):
-        sleeping.take_from(gaussians, [0, 1], {0: np.eye(4)})
-    sleeping.take_from(gaussians, [0], POSES)
-    gaussians.add(rows_of(2), 0)
-    with pytest.raises(ValueError, match="sleep already"):
-        sleeping.take_from(gaussians, [0, 1], POSES)
-    assert len(gaussians) == 8
 
 
 Step = tuple[str, int, int]
@@ -168,27 +169,26 @@ def test_whatever_sleeps_and_wakes_the_whole_is_a_map_that_never_slept(
 ) -> None:
     folder = tmp_path_factory.mktemp("sleep")
     gaussians, plain, sleeping = map_of(4, 3), map_of(4, 3), SleepingGaussians(folder)
-    poses, rounded = dict(list(POSES.items())[:2]), set[int]()
+    anchors = 2
     for what, bits, seed in steps:
-        anchors = [k for k in poses if bits >> k % 6 & 1]
         rng = np.random.default_rng(seed)
         if what == "add":
-            anchor = max(poses) + 1
-            poses[anchor] = POSES[anchor % 20]
             for each in (gaussians, plain):
-                each.add(rows_of(1 + seed % 5, seed), anchor)
+                each.add(rows_of(1 + seed % 5, seed), anchors)
+            anchors += 1
         elif what == "remove":
             gone = gaussians.ids[rng.random(len(gaussians)) < 0.3]
             for each in (gaussians, plain):
                 each.remove(np.isin(each.ids, gone))
         elif what == "sleep":
-            sleeping.take_from(gaussians, [k for k in anchors if k not in sleeping], poses)
+            clumps = 2 * gaussians.anchors + gaussians.ids % 2
+            sleeping.take_from(gaussians, clumps, [k for k in clumps if bits >> k % 6 & 1])
         elif what == "wake":
-            sleeping.return_to(gaussians, [k for k in anchors if k in sleeping], poses)
+            sleeping.return_to(gaussians, [k for k in sleeping.numbers() if bits >> k % 6 & 1])
         elif what == "move":
-            motions = {k: se3.exp(rng.normal(0, 0.3, 6)) for k in anchors}
-            rounded |= {k for k in anchors if k in sleeping}
-            poses |= {k: T @ poses[k] for k, T in motions.items()}
+            moving = [k for k in range(anchors) if bits >> k % 6 & 1]
+            motions = {k: se3.exp(rng.normal(0, 0.3, 6)) for k in moving}
+            sleeping.move(motions)
             for each in (gaussians, plain):
                 each.move_anchors(motions)
         else:
@@ -197,13 +197,8 @@ def test_whatever_sleeps_and_wakes_the_whole_is_a_map_that_never_slept(
             sleeping.restore(state)
     assert len(gaussians) + len(sleeping) == len(plain)
     for _ in range(2):  # asleep, then awake
-        ids, rows, anchors = pieces_of(gaussians, sleeping, poses)
-        assert ids.tobytes() == plain.ids.tobytes()
-        assert anchors.tobytes() == plain.anchors.tobytes()
-        np.testing.assert_allclose(one_sign(rows), one_sign(plain.rows), atol=2e-5)
-        exact = ~np.isin(anchors, list(rounded))
-        assert rows[exact].tobytes() == plain.rows[exact].tobytes()
-        sleeping.return_to(gaussians, sleeping.anchors(), poses)
+        assert_whole(gaussians, sleeping, plain)
+        sleeping.return_to(gaussians, sleeping.numbers())
     assert len(sleeping) == 0
 
 
@@ -215,30 +210,31 @@ def test_sleepers_are_seen_where_their_anchors_are_now(tmp_path: Path) -> None:
         rows[:, :3] = rows[:, :3] * 0.1 + np.array([0, 0, z_m])
         rows[:, 3:6] = -5
         gaussians.add(rows, anchor)
-    sleeping.take_from(gaussians, [0, 1, 2, 3], POSES)
+    numbers = put_to_sleep(gaussians, sleeping, [0, 1, 2, 3])
     camera = PlacedCamera(CAMERA, np.eye(4))
-    assert sleeping.seen_from(camera, POSES) == [0, 1, 3]
-    assert sleeping.seen_from(camera, POSES, reach_m=20) == [0, 1]
+    assert sleeping.seen_from(camera) == [numbers[0], numbers[1], numbers[3]]
+    assert sleeping.seen_from(camera, reach_m=20) == [numbers[0], numbers[1]]
     behind = se3.exp(np.array([0, 0, 0, 0, 0, -50]))
-    moved = POSES | {1: behind @ POSES[1], 3: behind @ POSES[3]}
-    assert sleeping.seen_from(camera, moved, reach_m=20) == [0, 3]
-    sleeping.wake(0, moved[0])
-    assert sleeping.seen_from(camera, moved, reach_m=20) == [3]
+    sleeping.move({1: behind, 3: behind})
+    assert sleeping.seen_from(camera, reach_m=20) == [numbers[0], numbers[3]]
+    sleeping.wake(numbers[0])
+    assert sleeping.seen_from(camera, reach_m=20) == [numbers[3]]
 
 
 def test_sleeping_and_waking_spheres_agree(tmp_path: Path) -> None:
     gaussians, sleeping = map_of(*range(1, 15)), SleepingGaussians(tmp_path)
     gaussians.log_scales[:] -= 5
-    awake = AnchorSpheres.around(gaussians.rows, gaussians.anchors, POSES)
-    sleeping.take_from(gaussians, range(14), POSES)
-    moved = {k: T @ MOTION @ MOTION for k, T in POSES.items()}
+    for anchor, T in POSES.items():
+        gaussians.move_anchors({anchor: T})
+    awake = AnchorSpheres.around(gaussians.rows, gaussians.anchors)
+    numbers = put_to_sleep(gaussians, sleeping, range(14))
     counts = []
     for angle_rad in range(6):
         T_map_camera = se3.exp(np.array([0, angle_rad, 0, 0, 0, 0.5]))
         camera = PlacedCamera(CAMERA, T_map_camera)
-        seen = camera.may_see(awake.centers_map(moved), awake.radii_m, reach_m=9)
+        seen = camera.may_see(awake.centers, awake.radii_m, reach_m=9)
         counts.append(np.count_nonzero(seen))
-        assert sleeping.seen_from(camera, moved, reach_m=9) == np.flatnonzero(seen).tolist()
+        assert sleeping.seen_from(camera, reach_m=9) == [numbers[k] for k in np.flatnonzero(seen)]
     assert max(counts) > 2
     assert min(counts) < 12
 
@@ -267,8 +263,7 @@ def test_a_walk_and_back_shows_every_camera_the_whole_map_and_keeps_few_in_memor
         T_map_camera[:3, 3] = 0.1, 0, z_m
         recent = [*recent[-3:], PlacedCamera(CAMERA, T_map_camera)]
         # wake
-        seen = sleeping.seen_from(recent[-1], poses, config.reach_m)
-        sleeping.return_to(gaussians, seen, poses)
+        sleeping.return_to(gaussians, sleeping.seen_from(recent[-1], config.reach_m))
         # see
         near = np.isin(plain.anchors, [k for k in poses if abs(poses[k][2, 3] + 2 - z_m) < 7])
         awake = np.isin(gaussians.anchors, plain.anchors[near])
@@ -284,72 +279,76 @@ def test_a_walk_and_back_shows_every_camera_the_whole_map_and_keeps_few_in_memor
             for each in (gaussians, plain):
                 each.add(wall_at(z_m + 2, anchor), anchor)
         # sleep
-        spheres = AnchorSpheres.around(gaussians.rows, gaussians.anchors, poses)
-        choice = choose_sleepers(spheres, poses, recent, config)
-        sleeping.take_from(gaussians, choice.anchors, poses)
+        clumps = clumps_of(gaussians.means, gaussians.anchors, config.clump_m)
+        spheres = AnchorSpheres.around(gaussians.rows, gaussians.anchors, clumps)
+        choice = choose_sleepers(spheres, recent, config)
+        sleeping.take_from(gaussians, clumps, choice.clumps)
         assert choice.excess == 0
         assert len(gaussians) + len(sleeping) == len(plain)
         most = max(most, len(gaussians))
     assert len(plain) == 3200
     assert most <= config.max_active
     assert sleeping.statistics()["gaussians_woken"] > 1000
-    assert pieces_of(gaussians, sleeping, poses)[1].tobytes() == plain.rows.tobytes()
+    assert pieces_of(gaussians, sleeping)[1].tobytes() == plain.rows.tobytes()
 
 
 # --- files ------------------------------------------------------------------------------------
 def test_a_successor_goes_on_from_a_saved_state(tmp_path: Path) -> None:
     gaussians, plain, sleeping = map_of(5, 6, 7), map_of(5, 6, 7), SleepingGaussians(tmp_path)
-    sleeping.take_from(gaussians, [0, 1], POSES)
+    put_to_sleep(gaussians, sleeping, [0, 1])
     successor = SleepingGaussians(tmp_path)
     successor.restore(sleeping.snapshot())
-    assert successor.anchors() == [0, 1]
+    assert successor.numbers() == [0, 1]
     assert_whole(gaussians, successor, plain)
     camera = PlacedCamera(CAMERA, np.eye(4))
-    assert successor.seen_from(camera, POSES) == sleeping.seen_from(camera, POSES)
+    assert successor.seen_from(camera) == sleeping.seen_from(camera)
 
 
 def test_after_a_crash_the_state_saved_before_the_last_steps_is_whole(tmp_path: Path) -> None:
     gaussians, plain, sleeping = map_of(5, 6, 7), map_of(5, 6, 7), SleepingGaussians(tmp_path)
-    sleeping.take_from(gaussians, [0], POSES)
+    put_to_sleep(gaussians, sleeping, [0])
     saved = gaussians.snapshot(), sleeping.snapshot()
-    sleeping.return_to(gaussians, [0], POSES)  # these steps are lost in the crash
+    sleeping.return_to(gaussians, [0])  # these steps are lost in the crash
     gaussians.rows[:] += 1
-    sleeping.take_from(gaussians, [0, 1], POSES)
+    put_to_sleep(gaussians, sleeping, [0, 1])
     successor = SleepingGaussians(tmp_path)
     successor.restore(saved[1])
     restored = GaussianMap.restore(saved[0])
     assert_whole(restored, successor, plain)
     assert len(list(tmp_path.iterdir())) == 1
-    successor.take_from(restored, [1, 2], POSES)
+    put_to_sleep(restored, successor, [1, 2])
     assert_whole(restored, successor, plain)
 
 
-def test_files_of_the_woken_go_when_no_saved_state_needs_them(tmp_path: Path) -> None:
-    gaussians, sleeping = map_of(5, 6), SleepingGaussians(tmp_path)
-    sleeping.take_from(gaussians, [0, 1], POSES)
-    counts = []
+def test_files_of_the_woken_go_when_a_state_without_them_is_saved(tmp_path: Path) -> None:
+    gaussians, sleeping = map_of(5, 6, 7), SleepingGaussians(tmp_path)
+    numbers = put_to_sleep(gaussians, sleeping, [0, 1])
     sleeping.snapshot()
-    sleeping.return_to(gaussians, [0], POSES)
+    sleeping.saved()
+    sleeping.return_to(gaussians, numbers[:1])
+    sleeping.saved()  # the old state once more
     for _ in range(3):
-        counts.append(len(list(tmp_path.iterdir())))
-        sleeping.snapshot()
-    assert counts == [2, 2, 1]
+        sleeping.snapshot()  # which a full disk does not take
+    assert len(list(tmp_path.iterdir())) == 2
+    sleeping.return_to(gaussians, numbers[1:])
+    sleeping.saved()
+    assert [int(file.stem) for file in tmp_path.iterdir()] == numbers[1:]
 
 
 def test_what_an_earlier_run_left_is_removed(tmp_path: Path) -> None:
-    SleepingGaussians(tmp_path).put(3, np.arange(5), rows_of(5), POSES[3])
-    SleepingGaussians(tmp_path).put(4, np.arange(5), rows_of(5), POSES[3])
+    SleepingGaussians(tmp_path).put(chunk_of(3, 0, 5))
+    SleepingGaussians(tmp_path).put(chunk_of(4, 0, 5))
     for sleeping in (SleepingGaussians(tmp_path), SleepingGaussians(tmp_path)):
-        sleeping.put(5, np.arange(5), rows_of(5), POSES[3])
+        sleeping.put(chunk_of(5, 0, 5))
         assert len(list(tmp_path.iterdir())) == 1
 
 
 def test_a_temporary_folder_goes_with_the_sleepers() -> None:
     sleeping = SleepingGaussians(None)
-    sleeping.put(0, np.arange(5), rows_of(5), POSES[0])
-    sleeping.put(1, np.arange(5, 10), rows_of(5), POSES[1])
+    sleeping.put(chunk_of(0, 0, 5))
+    sleeping.put(chunk_of(1, 5, 5))
     folder = sleeping._files._folder
-    sleeping.wake(0, POSES[0])
+    sleeping.wake(0)
     assert len(list(folder.iterdir())) == 1
     del sleeping
     gc.collect()
@@ -374,15 +373,26 @@ def test_a_damaged_chunk_is_lost_with_one_line_and_the_rest_goes_on(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[Path], None]
 ) -> None:
     gaussians, sleeping = map_of(5, 6, 7), SleepingGaussians(tmp_path)
-    sleeping.take_from(gaussians, [0, 1], POSES)
+    put_to_sleep(gaussians, sleeping, [0, 1])
     spoil(min(tmp_path.iterdir()))
     with caplog.at_level(logging.WARNING):
-        woken = sleeping.return_to(gaussians, [0, 1], POSES)
+        woken = sleeping.return_to(gaussians, [0, 1])
     assert woken.tolist() == list(range(5, 11))
     assert gaussians.ids.tolist() == list(range(5, 18))
-    assert "anchor 0: its 5 sleeping Gaussians are lost" in caplog.text
+    assert "anchor 0: 5 of its sleeping Gaussians are lost" in caplog.text
     assert len(caplog.records) == 1
     assert sleeping.statistics()["gaussians_lost_on_disk"] == 5
+    assert sleeping.take_lost(gaussians).tolist() == list(range(5))
+    assert sleeping.take_lost(gaussians).tolist() == [], "once is enough"
+
+
+def test_only_what_is_nowhere_else_is_lost(tmp_path: Path) -> None:
+    gaussians, sleeping = map_of(5, 12), SleepingGaussians(tmp_path)
+    clumps = 3 * gaussians.anchors + gaussians.ids % 3
+    first, _ = sleeping.take_from(gaussians, clumps, [3, 4])
+    cut(tmp_path / f"{first:08d}.gaussians")
+    assert len(list(whole_map(gaussians, sleeping))) == 3
+    assert sleeping.take_lost(gaussians).tolist() == [6, 9, 12, 15]
 
 
 @pytest.mark.parametrize("spoil", [cut, delete])
@@ -390,13 +400,13 @@ def test_a_chunk_that_a_restored_state_misses_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[Path], None]
 ) -> None:
     gaussians, sleeping = map_of(5, 6, 7), SleepingGaussians(tmp_path)
-    sleeping.take_from(gaussians, [0, 1], POSES)
+    put_to_sleep(gaussians, sleeping, [0, 1])
     state = sleeping.snapshot()
     spoil(min(tmp_path.iterdir()))
     successor = SleepingGaussians(tmp_path)
     successor.restore(state)
     assert pieces_of(gaussians, successor)[0].tolist() == list(range(5, 18))
-    assert successor.anchors() == [1]
+    assert successor.numbers() == [1]
     assert "lost" in caplog.text
 
 
@@ -410,13 +420,13 @@ def test_on_a_full_disk_they_stay_awake_and_it_is_told_once(
 
     with monkeypatch.context() as patch, caplog.at_level(logging.WARNING):
         patch.setattr(Path, "replace", full)
-        assert sleeping.take_from(gaussians, [0, 1], POSES) == []
+        assert put_to_sleep(gaussians, sleeping, [0, 1]) == []
     assert gaussians.rows.tobytes() == plain.rows.tobytes()
     assert list(tmp_path.iterdir()) == []
     assert len(caplog.records) == 1
     assert "free some disk space" in caplog.text
     assert sleeping.statistics()["chunks_not_written"] == 2
-    assert sleeping.take_from(gaussians, [0, 1], POSES) == [0, 1]
+    assert put_to_sleep(gaussians, sleeping, [0, 1]) == [0, 1]
     assert_whole(gaussians, sleeping, plain)
 
 
@@ -428,10 +438,10 @@ def test_a_folder_that_cannot_be_used_is_a_clear_error(tmp_path: Path) -> None:
 
 def test_statistics_count_who_slept_and_woke(tmp_path: Path) -> None:
     gaussians, sleeping = map_of(5, 6, 7), SleepingGaussians(tmp_path)
-    sleeping.take_from(gaussians, [0, 1], POSES)
-    sleeping.return_to(gaussians, [1], POSES)
+    put_to_sleep(gaussians, sleeping, [0, 1])
+    sleeping.return_to(gaussians, [1])
     told = sleeping.statistics()
     assert told["gaussians_asleep"] == 5
-    assert told["anchors_asleep"] == 1
+    assert told["chunks_asleep"] == 1
     assert told["gaussians_fell_asleep"] == 11
     assert told["gaussians_woken"] == 6

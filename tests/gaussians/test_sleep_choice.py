@@ -1,13 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
-from ldo_service.gaussians.sleep_choice import SleepConfig, choose_sleepers
-from ldo_service.geometry import Camera, se3
+from ldo_service.gaussians.horizon import Horizon
+from ldo_service.gaussians.sleep_choice import SleepChoice, SleepConfig, choose_sleepers
+from ldo_service.geometry import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-AT_HOME = {k: np.eye(4) for k in range(10)}
 CONFIG = SleepConfig(max_active=100, low_water=0.6, reach_m=50)
 
 
@@ -28,43 +30,54 @@ def camera_at(z_m: float) -> PlacedCamera:
 
 
 def test_nobody_sleeps_up_to_the_cap() -> None:
-    choice = choose_sleepers(along_the_corridor(1, 2, 3, 4, 5), AT_HOME, [camera_at(30)], CONFIG)
-    assert (choice.anchors, choice.excess) == ([], 0)
+    choice = choose_sleepers(along_the_corridor(1, 2, 3, 4, 5), [camera_at(30)], CONFIG)
+    assert (choice.clumps, choice.excess) == ([], 0)
 
 
 def test_the_farthest_go_first_down_to_the_low_water_mark() -> None:
     awake = along_the_corridor(20, 2, 9, 4, 25, 31, 32)
-    choice = choose_sleepers(awake, AT_HOME, [camera_at(30)], CONFIG)
-    assert choice.anchors == [1, 3, 2, 0]  # 140 - 80 = 60
+    choice = choose_sleepers(awake, [camera_at(30)], CONFIG)
+    assert choice.clumps == [1, 3, 2, 0]  # 140 - 80 = 60
     assert choice.excess == 0
 
 
 def test_of_two_at_the_same_distance_the_older_goes() -> None:
-    choice = choose_sleepers(along_the_corridor(5, 3, 3, 3, 5, 6), AT_HOME, [camera_at(30)], CONFIG)
-    assert choice.anchors == [1, 2, 3]
+    choice = choose_sleepers(along_the_corridor(5, 3, 3, 3, 5, 6), [camera_at(30)], CONFIG)
+    assert choice.clumps == [1, 2, 3]
 
 
 def test_those_a_recent_camera_sees_and_the_newest_stay_even_over_the_cap() -> None:
     awake = along_the_corridor(1, 2, 3, 34, 35, 36, -5)
-    choice = choose_sleepers(awake, AT_HOME, [camera_at(1.8), camera_at(30)], CONFIG)
-    assert choice.anchors == [0]  # 1 and 2 are seen by the first camera, 6 is the newest
+    choice = choose_sleepers(awake, [camera_at(1.8), camera_at(30)], CONFIG)
+    assert choice.clumps == [0]  # 1 and 2 are seen by the first camera, 6 is the newest
     assert choice.excess == 20
 
 
 def test_what_is_out_of_reach_is_not_seen() -> None:
     awake = along_the_corridor(61, 62, 63, 64, 65, 66)
     near, far = camera_at(30), camera_at(0)
-    assert choose_sleepers(awake, AT_HOME, [near], CONFIG).anchors == []
-    assert choose_sleepers(awake, AT_HOME, [far], CONFIG).anchors == [4, 3, 2]
+    assert choose_sleepers(awake, [near], CONFIG).clumps == []
+    assert choose_sleepers(awake, [far], CONFIG).clumps == [4, 3, 2]
 
 
-def test_anchors_are_looked_for_where_they_are_now() -> None:
-    awake = along_the_corridor(1, 31, 31, 31, 31, 31)
-    behind = {**AT_HOME, 2: se3.exp(np.array([0, 0, 0, 0, 0, -12]))}
-    assert choose_sleepers(awake, behind, [camera_at(30)], CONFIG).anchors == [0, 2]
+def test_clumps_of_one_anchor_go_one_by_one() -> None:
+    awake = along_the_corridor(1, 31, 2, 32, 3, 33)
+    awake.anchors[:] = 0, 0, 0, 0, 0, 1
+    assert choose_sleepers(awake, [camera_at(30)], CONFIG).clumps == [0, 2, 4]
 
 
-@pytest.mark.parametrize("change", [{"max_active": 0}, {"low_water": 0}, {"reach_m": 0}])
+def test_what_is_behind_a_wall_goes() -> None:
+    """All lie ahead of the camera, which saw a wall 4 m away."""
+    awake = along_the_corridor(31, 32, 33, 40, 45, 50)
+    wall = Horizon.of(np.full((48, 64), 4, np.float32))
+    blind = replace(camera_at(30), horizon=wall)
+    assert choose_sleepers(awake, [camera_at(30)], CONFIG) == SleepChoice([], 20)
+    assert choose_sleepers(awake, [blind], CONFIG).clumps == [4, 3]
+
+
+@pytest.mark.parametrize(
+    "change", [{"max_active": 0}, {"low_water": 0}, {"reach_m": 0}, {"clump_m": 0}]
+)
 def test_senseless_configuration_is_refused(change: dict) -> None:
     with pytest.raises(ConfigError):
         SleepConfig(**change)
