@@ -353,6 +353,9 @@ class Mapper(Actor):
         self._checkpoint = {}
         return self.snapshot()
 
+    def saved(self) -> None:
+        self._map.saved()
+
     def _put_away(self) -> None:
         self._checkpoint = {
             "newest": self._newest,

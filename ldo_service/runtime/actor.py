@@ -58,6 +58,9 @@ class Actor:
         """The same with nothing left for later, however long it takes; on request."""
         return self.snapshot()
 
+    def saved(self) -> None:
+        """The last snapshot or checkpoint is where a successor will find it."""
+
     def restore(self, state: State) -> None:
         """Go on from a predecessor's snapshot."""
 

@@ -142,6 +142,7 @@ class Life:
                 message = self._message(actor, step)
                 self._compare(step, self._produce(step, actor, actor.handle(message)))
                 actor.snapshot()  # as the stage does: it may keep what it gave away
+                actor.saved()
             case "failed":
                 self._fail(step, actor, self._message(actor, step))
             case "set_aside":

@@ -277,6 +277,7 @@ class Stage:
 
     def _checkpoint(self) -> None:
         self._store.save(self.name, self._actor.checkpoint())
+        self._actor.saved()
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _handle(self, message: Message) -> list[Produced]:
@@ -291,6 +292,7 @@ class Stage:
         try:
             state = self._actor.checkpoint() if everything else self._actor.snapshot()
             self._store.save(self.name, state)
+            self._actor.saved()
         except Exception:
             self._vitals.failures += 1
             log.exception("%s: its state could not be saved", self.name)

@@ -50,7 +50,7 @@ class Adder(Actor):
 
     def __init__(self, trouble: Callable[[int], None] = lambda _value: None) -> None:
         super().__init__()
-        self._trouble, self._sum = trouble, 0
+        self._trouble, self._sum, self._saved = trouble, 0, 0
 
     def handle(self, message: Message) -> Iterator[Message]:
         assert isinstance(message, Number)
@@ -64,11 +64,14 @@ class Adder(Actor):
     def snapshot(self) -> State:
         return {"sum": self._sum}
 
+    def saved(self) -> None:
+        self._saved = self._sum
+
     def restore(self, state: State) -> None:
         self._sum = state["sum"]
 
     def facts(self) -> dict[str, float]:
-        return {"sum": float(self._sum)}
+        return {"sum": float(self._sum), "saved": float(self._saved)}
 
 
 class Trouble:
@@ -142,6 +145,12 @@ async def test_a_state_that_cannot_be_saved_is_a_failure_that_stops_nothing(
     )
     assert sums == [1, 3, 6]
     assert stage.health().failures == 3
+    assert stage.health().facts["saved"] == 0
+
+
+async def test_an_actor_is_told_when_its_state_is_saved() -> None:
+    _, stage = await run_adder(Trouble(value=-1, times=0), [1, 2, 3])
+    assert stage.health().facts["saved"] >= 3  # facts are told before the last is saved
 
 
 async def test_the_next_process_goes_on_from_the_folder(tmp_path: Path) -> None:
