@@ -24,6 +24,7 @@ from ldo_service.gaussians.model import ROW
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.runtime.process import give_back_free_memory
 from ldo_service.schemas import (
     AnchorMotion,
     Array,
@@ -264,6 +265,7 @@ class Mapper(Actor):
         if with_changed:
             self._since_changed = 0
             self._map.rest()
+            give_back_free_memory()  # copies as large as the map were made
 
     def _delta(
         self,

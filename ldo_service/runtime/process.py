@@ -1,6 +1,7 @@
 """An actor in a process of its own, seen from the process that started it."""
 
 import asyncio
+import ctypes
 import logging
 import os
 import resource
@@ -23,6 +24,14 @@ def resident_mb() -> float:
     except OSError:  # not Linux: the peak is all that can be had
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return pages * resource.getpagesize() / 1e6
+
+
+def give_back_free_memory() -> None:
+    """Hand the system what this process let go of. Without it glibc keeps what lies between what is
+    still used: 280 MB after three laps of a flat. Elsewhere than on Linux nothing is done."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
+    if trim is not None:
+        trim(0)
 
 
 async def leave_with_parent(period_s: float = 0.5) -> None:
