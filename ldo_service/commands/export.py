@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,7 +16,7 @@ from ldo_service.gaussians.splat import write_splat
 from ldo_service.gaussians.spz import write_spz
 from ldo_service.geometry import Trajectory, se3
 from ldo_service.runs.finished import MapFolder, newest_map
-from ldo_service.runs.folder import EXPORTED, MAP_FILES
+from ldo_service.runs.folder import EXPORTED, WRITTEN
 from ldo_service.volumes import (
     OccupancyConfig,
     TsdfConfig,
@@ -93,7 +93,7 @@ def export(
     source = MapFolder(folder) if online else newest_map(folder)
     out = out or folder / EXPORTED[format][0]
     written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
-    require_writable(source, [out, *written], overwrite)
+    require_writable((folder, source.folder), [out, *written], overwrite)
     job = Job(source, out, voxel, up, heights, Console(stderr=True, highlight=False))
     try:
         facts = WRITERS[format](job)
@@ -102,12 +102,13 @@ def export(
     Console(highlight=False).print(f"{out}: {facts}", soft_wrap=True)
 
 
-def require_writable(source: MapFolder, files: list[Path], overwrite: bool) -> None:
-    """Raises ConfigError for a file that is there already, or that is read."""
-    needed = {(source.folder / name).resolve() for name in MAP_FILES}
+def require_writable(runs: Iterable[Path], files: list[Path], overwrite: bool) -> None:
+    """Raises ConfigError for a file that is there already, or that `runs` left themselves."""
+    exported = {name for names in EXPORTED.values() for name in names}
+    kept = {(run / name).resolve() for run in runs for name in WRITTEN - exported}
     for file in files:
-        if file.resolve() in needed:
-            raise ConfigError(f"{file} is what would be read. Choose another --out.")
+        if file.resolve() in kept:
+            raise ConfigError(f"{file} is what a run left, not an export. Choose another --out.")
         if file.exists() and not overwrite:
             raise ConfigError(f"{file} exists. Choose another --out, or add --overwrite.")
 

@@ -97,10 +97,14 @@ def test_occupancy_for_planners(run: Path) -> None:
     assert picture.shape == grid["states"].shape[::2][::-1]  # z upwards, x to the right
 
 
-def test_the_refined_map_is_taken_where_there_is_one(run: Path) -> None:
+def refine(run: Path) -> None:
+    """As if the run had been refined to 100 Gaussians."""
     (run / "refined").mkdir()
-    rows = read_ply(run / "map.ply")[:100]
-    write_ply(run / "refined" / "map.ply", rows)
+    write_ply(run / "refined" / "map.ply", read_ply(run / "map.ply")[:100])
+
+
+def test_the_refined_map_is_taken_where_there_is_one(run: Path) -> None:
+    refine(run)
     exported(run, "ply", "--out", run / "a.ply")
     exported(run, "ply", "--out", run / "b.ply", "--online")
     assert len(read_ply(run / "a.ply")) == 100
@@ -128,9 +132,14 @@ def test_voxels_of_a_trajectory_are_refused(run: Path) -> None:
     assert (code, "--voxel has no meaning" in said) == (2, True)
 
 
-def test_the_run_itself_is_never_written_over(run: Path) -> None:
-    code, said = ldo_export(run, "--format", "mesh", "--out", run / "map.ply", "--overwrite")
+@pytest.mark.parametrize("name", ["map.ply", "summary.json", "refined/map.ply"])
+def test_the_run_itself_is_never_written_over(run: Path, name: str) -> None:
+    """Nor where its refined map would be read."""
+    refine(run)
+    before = (run / name).read_bytes()
+    code, said = ldo_export(run, "--format", "ply", "--out", run / name, "--overwrite")
     assert (code, "Choose another" in said) == (2, True)
+    assert (run / name).read_bytes() == before
 
 
 def test_a_new_run_may_replace_what_was_exported(run: Path) -> None:
