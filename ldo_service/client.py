@@ -30,13 +30,21 @@ from ldo_service.schemas import (
     ControlAnswer,
     ControlRequest,
     Image,
+    MapRefine,
     Message,
     Pose,
     TrackedPose,
     decode,
 )
 from ldo_service.schemas.pose import IDENTITY
-from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, POSE_TRACKED, Topic
+from ldo_service.schemas.topics import (
+    CONTROL,
+    FROM_OPERATORS,
+    FROM_OUTSIDE,
+    MAP_REFINE,
+    POSE_TRACKED,
+    Topic,
+)
 
 M = TypeVar("M", bound=Message)
 
@@ -46,9 +54,9 @@ class Client:
 
     def __init__(self, session: zenoh.Session, network: Network) -> None:
         self._session, self._network = session, network
-        self._sent = 0
+        self._sent = self._asked = 0
         self._epoch = time.time_ns()
-        self._cameras: dict[type[Message], Any] = {}  # publisher by message
+        self._publishers: dict[type[Message], Any] = {}  # by message
 
     def publish(
         self,
@@ -112,22 +120,23 @@ class Client:
         """Send a frame or half of one, which may be compressed. May block for some milliseconds,
         and is dropped when the network is congested."""
         header = Header("camera", self._epoch, self._sent, frame.stamp_ns)
-        self._camera(type(frame)).put(msgspec.msgpack.encode(frame), attachment=encode(header))
+        self._publisher(type(frame)).put(msgspec.msgpack.encode(frame), attachment=encode(header))
         self._sent += 1
 
-    def _camera(self, kind: type[Message]) -> Any:
-        if kind not in self._cameras:
-            (topic,) = (topic for topic in FROM_OUTSIDE if topic.message is kind)
-            self._cameras[kind] = self._session.declare_publisher(
+    def _publisher(self, kind: type[Message]) -> Any:
+        if kind not in self._publishers:
+            known = (*FROM_OUTSIDE, *FROM_OPERATORS)
+            (topic,) = (topic for topic in known if topic.message is kind)
+            self._publishers[kind] = self._session.declare_publisher(
                 self._network.expression(topic.name),
                 congestion_control=zenoh.CongestionControl.DROP,
             )
-        return self._cameras[kind]
+        return self._publishers[kind]
 
     @property
     def is_heard(self) -> bool:
         """Whether anybody subscribes to this client's camera/rgbd."""
-        return self._camera(CameraRgbd).matching_status.matching
+        return self._publisher(CameraRgbd).matching_status.matching
 
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
         """Every tracked pose as it comes, for ever; of those not taken in time the newest stay."""
@@ -184,8 +193,40 @@ class Client:
         for reply in replies:
             if reply.ok is not None:
                 return _message(reply.ok, ControlAnswer)
-        raise ConfigError(
-            f"nobody answers on {self._network.expression(CONTROL.name)}: is this the name of the "
+        raise self._nobody("answers", CONTROL)
+
+    def refine(
+        self,
+        iterations: int,
+        first_rate: float = 1.0,
+        last_rate: float = 1.0,
+        timeout_s: float = 3.0,
+    ) -> None:
+        """Ask the mapper to fit the map further to the keyframes it has, with steps that shrink
+        from one rate to the other. Returns at once; `map/delta` will tell what changed.
+
+        Raises ValueError for more than 500 iterations or rates outside (0, 1], ConfigError when
+        nobody listens.
+        """
+        message = MapRefine(
+            stamp_ns=time.time_ns(),
+            iterations=iterations,
+            first_rate=first_rate,
+            last_rate=last_rate,
+        )
+        message.check()
+        publisher, until_s = self._publisher(MapRefine), time.monotonic() + timeout_s
+        while not publisher.matching_status.matching:
+            if time.monotonic() > until_s:
+                raise self._nobody("listens", MAP_REFINE)
+            time.sleep(0.02)
+        header = Header("operator", self._epoch, self._asked, message.stamp_ns)
+        publisher.put(msgspec.msgpack.encode(message), attachment=encode(header))
+        self._asked += 1
+
+    def _nobody(self, does: str, topic: Topic) -> ConfigError:
+        return ConfigError(
+            f"nobody {does} on {self._network.expression(topic.name)}: is this the name of the "
             "robot, and is its service up? `ldo doctor` tells."
         )
 

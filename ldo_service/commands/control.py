@@ -4,32 +4,60 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ldo_service.client import connect
-from ldo_service.errors import StageError
+from ldo_service.client import Client, connect
+from ldo_service.errors import ConfigError, StageError
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
+from ldo_service.schemas.map import MOST_ITERATIONS
 
 from .options import Endpoint, Robot
 
 Verb = Annotated[
-    Literal["pause", "resume", "save", "reset"],
+    Literal["pause", "resume", "save", "reset", "refine"],
     tyro.conf.Positional,
     tyro.conf.arg(
         metavar="VERB",
         help="pause: leave frames out; resume: take them again; save: write every actor's state "
-        "now; reset: begin anew with an empty map",
+        "now; reset: begin anew with an empty map; refine: fit the map further",
     ),
+]
+Iterations = Annotated[
+    int, tyro.conf.arg(metavar="N", help=f"of refine, at most {MOST_ITERATIONS} at a time")
 ]
 
 
-def control(verb: Verb, robot: Robot = "robot", endpoint: Endpoint = DEFAULT_ENDPOINT) -> None:
+def control(
+    verb: Verb,
+    robot: Robot = "robot",
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    iterations: Iterations = 200,
+) -> None:
     """Pause, resume, save or reset a running service; done when all its actors have done it.
 
-    Exit code 4 when an actor did not; the answer names it.
+    Exit code 4 when an actor did not; the answer names it. `refine` asks the mapper alone and does
+    not wait: it fits the map to its keyframes before it takes the next one.
 
       ldo control reset
+      ldo control refine --iterations 500
     """
     with connect(robot, endpoint) as service:
-        answer = service.control(verb)
+        if verb == "refine":
+            ask_to_refine(service, iterations)
+        else:
+            obey(service, verb)
+
+
+def ask_to_refine(service: Client, iterations: int) -> None:
+    """Raises ConfigError for a number that is refused."""
+    try:
+        service.refine(iterations)
+    except ValueError as error:
+        raise ConfigError(f"--iterations {iterations}: {error}.") from error
+    print(f"the mapper was asked for {iterations} iterations.")
+
+
+def obey(service: Client, verb: str) -> None:
+    """Raises StageError when an actor does not."""
+    answer = service.control(verb)
     if not answer.ok:
         raise StageError(answer.text)
     print(answer.text)

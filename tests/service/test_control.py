@@ -11,10 +11,9 @@ from ldo_service.schemas.topics import MAP_SNAPSHOT
 from tests.service.conftest import LDO, LiveService, live_service, wait_until
 
 
-def ldo_control(service: LiveService, verb: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*LDO, "control", verb, "--endpoint", service.endpoint], capture_output=True, text=True
-    )
+def ldo_control(service: LiveService, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [*LDO, "control", *arguments, "--endpoint", service.endpoint]
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 @pytest.mark.timeout(90)
@@ -29,6 +28,11 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path) -> None:
         service.poses()
         wait_until(lambda: _paused(service) > 5, 10, "paused frames are counted")
         assert service.poses() == []
+        # refine: no keyframe comes, and the mapper iterates
+        before = _iterations(service)
+        assert ldo_control(service, "refine", "--iterations", "501").returncode == 2
+        assert ldo_control(service, "refine", "--iterations", "40").returncode == 0
+        wait_until(lambda: _iterations(service) >= before + 40, 20, "40 iterations more")
         assert service.client.control("resume").ok
         last = service.wait_for_poses(15)[-1]
         assert last.keyframe is None or last.keyframe > 0
@@ -66,6 +70,10 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path) -> None:
 
 def _paused(service: LiveService) -> int:
     return sum(count.paused for count in service.update_health()["frame_source"].inputs)
+
+
+def _iterations(service: LiveService) -> float:
+    return service.update_health()["mapper"].facts["iterations"]
 
 
 @pytest.mark.slow
