@@ -52,12 +52,9 @@ class ChangeLog:
         self._removed.append(ids[ids < self._next_untold])
 
     def woken(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
-        """Rows came back, perhaps with their anchor moved: they count as changed."""
-        if len(ids) == 0:
-            return
-        mask = np.isin(gaussians.ids, ids, assume_unique=True)
-        is_changed = mask.copy()
-        is_changed[~mask] = self._is_changed
+        """Rows came back as followers hold them."""
+        is_changed = np.zeros(len(gaussians), bool)
+        is_changed[~np.isin(gaussians.ids, ids, assume_unique=True)] = self._is_changed
         self._is_changed = is_changed
 
     def take(self, gaussians: GaussianMap, *, with_changed: bool) -> Changes:

@@ -11,6 +11,7 @@ from ldo_service.actors.optimizer import Optimizer
 from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.map_builder import MapBuilderConfig
+from ldo_service.gaussians.sleep_choice import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.map_follower import MapFollower
 from ldo_service.runtime.actor import Situation
@@ -104,6 +105,21 @@ def test_following_every_delta_gives_equal_arrays(keyframes, correction) -> None
     assert any(delta.motions for delta in deltas)
     assert any(len(delta.changed.ids.numpy()) for delta in deltas)
     assert_equal_maps(followed(deltas), mapper)
+
+
+def test_followers_hold_to_the_bit_what_sleeps_and_wakes(keyframes) -> None:
+    """Through corrections: what is 3 m away sleeps, and wakes where a camera comes near."""
+    sleep = SleepConfig(max_active=500, reach_m=3.0, clump_m=0.5)
+    builder = MapBuilderConfig(sleep=sleep, recent_cameras=1)
+    config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, least_iterations=1)
+    mapper, follower = Mapper(config), MapFollower()
+    for version, keyframe in enumerate(keyframes, 1):
+        poses = {0: se3.exp(0.01 * version * np.ones(6)) @ transform(keyframes[0].T_odom_keyframe)}
+        correction = correction_message(0, version, poses)
+        followed(deltas_of(handled(mapper, [keyframe, correction])), follower)
+    assert mapper.facts()["gaussians_asleep"] > 1000
+    assert mapper.facts()["gaussians_woken"] > 1000
+    assert_equal_maps(follower, mapper)
 
 
 def test_what_gaussians_became_is_told_now_and_then(keyframes) -> None:

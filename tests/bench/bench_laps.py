@@ -183,7 +183,8 @@ def true_poses(sequence: Sequence) -> np.ndarray:
 
 
 def report(mapped: list[Mapped], lap: int) -> None:
-    """`inserted` and what follows are per keyframe."""
+    """`inserted`, `pruned` and `woken` are per keyframe; times and `MB` are means, else what was
+    at the end."""
     of_lap = [m for m in mapped if m.lap == lap]
     first, last, count = mapped[mapped.index(of_lap[0]) - 1], of_lap[-1], len(of_lap)
     cpu_ms = float(np.mean([m.cpu_ms for m in of_lap]))
@@ -192,7 +193,8 @@ def report(mapped: list[Mapped], lap: int) -> None:
     pruned, woken = last.pruned - first.pruned * (lap > 0), last.woken - first.woken * (lap > 0)
     per_keyframe = (f"{n / count:,.0f}" for n in (inserted, pruned, woken))
     sizes = (f"{n:,}" for n in (last.gaussians, last.asleep, last.over_cap))
-    memory = (f"{mb:.0f}" for mb in (last.images_mb, last.resident_mb))
+    resident_mb = float(np.mean([m.resident_mb for m in of_lap]))
+    memory = (f"{mb:.0f}" for mb in (last.images_mb, resident_mb))
     columns = (str(lap + 1), str(count), f"{cpu_ms:.0f}", *sizes, *per_keyframe, *memory)
     print("".join(f"{column:>10}" for column in columns), flush=True)
 

@@ -76,7 +76,7 @@ def test_a_follower_ends_with_the_same_rows_whatever_happens(steps: list[tuple[s
                 log.all_told(gaussians)
             case "wake" if asleep:
                 ids, woken, anchors = asleep.pop()
-                gaussians.bring_back(ids, woken + np.float32(0.5), anchors)
+                gaussians.bring_back(ids, woken, anchors)
                 log.woken(gaussians, ids)
     while asleep:
         ids, woken, anchors = asleep.pop()
