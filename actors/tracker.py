@@ -8,6 +8,7 @@ out  keyframe/new       Keyframe      made only when every consumer has room: ne
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
+from ldo_service.schemas.message import decode, encode
 from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig, Tracked
@@ -86,19 +88,21 @@ class Tracker(Actor):
         self.config = config or TrackerConfig()
         self._T_base_camera = pose_message(self.config.T_base_camera.matrix())
         self._odometry = Odometry(self.config.odometry)
-        self._poses = KeyframePoses()  # of the keyframes that the odometry remembers
+        self._poses = KeyframePoses()  # of the last keyframes and the one tracked against
+        self._correction: Correction | None = None  # the last: places all keyframes, old ones too
+        self._saved_correction = b""
         self._made = self._without_room = 0
-        self._saved: dict[str, Any] = {}  # the remembered keyframes as they were put away
 
     def handle(self, message: FrameRgbd | Correction) -> Iterator[TrackedPose | Keyframe]:
         if isinstance(message, Correction):
-            T_map = keyframe_poses_of(message, only=self._poses)
-            self._poses.correct(message.graph_version, T_map)
+            self._correct(message)
         else:
             yield from self._track(rgbd_of(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
         tracked = self._odometry.track(frame)
+        if tracked.method == "relocalised":
+            self._recall(tracked)
         keyframe = self._make_keyframe(frame, tracked) if self._may_map(frame, tracked) else None
         if keyframe is not None:
             yield keyframe
@@ -129,7 +133,7 @@ class Tracker(Actor):
         self._poses.chain(
             keyframe, tracked.keyframe, tracked.T_keyframe_camera, tracked.T_odom_camera
         )
-        self._poses.keep_only((*self._odometry.keyframes(), *self._recent(keyframe)))
+        self._poses.keep_only(self._needed(keyframe))
         self._made += 1
         return Keyframe(
             stamp_ns=frame.stamp_ns,
@@ -147,11 +151,29 @@ class Tracker(Actor):
             is_moving=mask_message(tracked.is_moving, frame.camera),
         )
 
-    def _recent(self, keyframe: int) -> Iterator[int]:
-        """Keyframes that the optimizer may not have placed yet; their poses are small."""
-        return (k for k in self._poses if k > keyframe - RECENT_KEYFRAMES)
+    def _needed(self, newest: int) -> Iterator[int]:
+        """The one tracked against, and those that the optimizer may not have placed yet."""
+        current = self._odometry.keyframe
+        return (k for k in self._poses if k > newest - RECENT_KEYFRAMES or k == current)
 
     # --- poses ------------------------------------------------------------------------------------
+    def _correct(self, message: Correction) -> None:
+        if message.graph_version > self._poses.version:
+            self._correction, self._saved_correction = message, encode(message)
+        T_map = keyframe_poses_of(message, only=self._poses)
+        self._poses.correct(message.graph_version, T_map)
+
+    def _recall(self, tracked: Tracked) -> None:
+        """Know where in the map the keyframe is that a lost frame was found by."""
+        keyframe = tracked.keyframe
+        if keyframe is None or keyframe in self._poses:
+            return
+        T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_keyframe_camera)
+        self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe)
+        if self._correction is not None:
+            T_map = keyframe_poses_of(self._correction, only=(keyframe,))
+            self._poses.place(keyframe, T_map.get(keyframe, self._poses[keyframe]))
+
     def _tracked_pose(
         self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None
     ) -> TrackedPose:
@@ -179,19 +201,23 @@ class Tracker(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """A part for each remembered keyframe, written once, and one for what changes."""
+        """A part for each place, written once, and few for what changes."""
         state = self._odometry.state()
-        kept = {str(k["id"]): k for k in state.pop("keyframes")}
-        self._saved = {name: self._saved.get(name, kept[name]) for name in kept}
-        changing = {"odometry": state, "kept": list(kept), "poses": self._poses.snapshot()}
-        return {**{f"keyframe_{name}": part for name, part in self._saved.items()}, "now": changing}
+        places = {f"place_{place['id']}": place for place in state.pop("places")}
+        keyframe, correction = state.pop("keyframe"), self._saved_correction
+        now = {"odometry": state, "poses": self._poses.snapshot()}
+        return {**places, "keyframe": keyframe, "correction": correction, "now": now}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]
-        self._saved = {name: state[f"keyframe_{name}"] for name in now["kept"]}
-        self._odometry.restore({**now["odometry"], "keyframes": list(self._saved.values())})
+        places = [part for name, part in state.items() if name.startswith("place_")]
+        kept = {"places": sorted(places, key=itemgetter("id")), "keyframe": state["keyframe"]}
+        self._odometry.restore({**now["odometry"], **kept})
         self._odometry.skip_keyframe_id()  # one more may have been sent and not saved
         self._poses.restore(now["poses"])
+        self._saved_correction = state["correction"]
+        body = self._saved_correction
+        self._correction = decode(body, Correction) if body else None
 
     def facts(self) -> dict[str, float]:
         return {"keyframes": self._made, "keyframes_without_room": self._without_room}

@@ -1,7 +1,9 @@
 """Pinhole camera: intrinsics, projection, lens distortion. Conventions: `ldo_service.geometry`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
@@ -46,6 +48,11 @@ class Camera:
             raise DataError(
                 f"{len(self.distortion)} distortion coefficients: OpenCV's models have 4, 5 or 8."
             )
+
+    @staticmethod
+    def of(values: Mapping[str, Any]) -> "Camera":
+        """The inverse of `dataclasses.asdict`, also where a list stands for the tuple."""
+        return Camera(**{**values, "distortion": tuple(values["distortion"])})
 
     @property
     def matrix(self) -> np.ndarray:

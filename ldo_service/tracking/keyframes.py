@@ -1,16 +1,17 @@
 """When a frame becomes a keyframe, and what is kept of it. Conventions: `ldo_service.geometry`."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import radians
+from typing import Any
 
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import se3
+from ldo_service.geometry import Camera, se3
 
 from .features import FeatureConfig, Features, detect
-from .pyramid import Pyramid
+from .pyramid import Pyramid, PyramidConfig, build_pyramid
 from .reference import Reference, build_reference
 
 
@@ -51,6 +52,7 @@ class Keyframe:
     id: int  # ascending, given by the odometry: a camera's frame numbers may start again
     has_moved: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
     left_out: np.ndarray | None = None  # [H, W] bool: what of it is not tracked against
+    kept_features: Features | None = None  # of a place; its image is smaller than what they saw
 
     @cached_property
     def reference(self) -> Reference:
@@ -58,9 +60,34 @@ class Keyframe:
 
     def features(self, config: FeatureConfig) -> Features:
         """Detected when first asked for: most keyframes never are."""
+        if self.kept_features is not None:
+            return self.kept_features
         if "_features" not in self.__dict__:
             self.__dict__["_features"] = detect(self.view, config)
         return self.__dict__["_features"]
+
+    @cached_property
+    def packed(self) -> dict[str, Any]:
+        """Arrays and plain values, one and the same object each time."""
+        view, features = self.view, self.kept_features
+        return {
+            "gray": view.gray,
+            "depth_m": view.depth_m,
+            "camera": asdict(view.camera),
+            "T_odom_keyframe": self.T_odom_keyframe,
+            "id": self.id,
+            "has_moved": self.has_moved,
+            "left_out": self.left_out,
+            "features": None if features is None else asdict(features),
+        }
+
+    @staticmethod
+    def unpacked(kept: dict[str, Any], config: PyramidConfig) -> "Keyframe":
+        """The inverse of `packed`, under the same configuration."""
+        features = None if kept["features"] is None else Features(**kept["features"])
+        view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
+        moved = kept["has_moved"], kept["left_out"]
+        return Keyframe(view, kept["T_odom_keyframe"], kept["id"], *moved, features)
 
 
 def is_due(

@@ -48,14 +48,15 @@ class Suspicion:
     """What is kept from frame to frame, at the level that is looked at.
 
     contradicts  [h, w] bool, pixels of the last frame that contradict
-    gone         [h, w] uint8, in how many frames each point of the keyframe was seen through
+    gone         [h, w] uint8, in how many frames each point of the keyframe was seen through;
+                 None: in none yet
     """
 
     contradicts: np.ndarray
-    gone: np.ndarray
+    gone: np.ndarray | None
 
     def of_new_keyframe(self) -> "Suspicion":
-        return Suspicion(self.contradicts, np.zeros_like(self.gone))
+        return Suspicion(self.contradicts, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -93,13 +94,14 @@ def watch(
     limit_m = config.least_m + config.sigmas * noise_scale * noise.sigma_m(now.depth_m)
     came = ahead_m > limit_m
     came |= _lies_on(known, now, then, T_keyframe_camera) & (ahead_m > -limit_m)
-    is_moving = _in_pieces(came, None if before is None else before.contradicts, config)
+    came_before = None if before is None else _resized(before.contradicts, came.shape)
+    is_moving = _in_pieces(came, came_before, config)
     # what has gone
     behind_m = gap_m(then, now, se3.inverse(T_keyframe_camera), config)
     limit_m = config.least_m + config.sigmas * noise_scale * noise.sigma_m(then.depth_m)
     seen_through = cv2.morphologyEx(_bytes(behind_m > limit_m), cv2.MORPH_OPEN, _square(1))
     gone = np.where(seen_through > 0, 1, 0).astype(np.uint8)
-    if before is not None:
+    if before is not None and before.gone is not None:
         gone = cv2.add(gone, before.gone)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
     return Watched(

@@ -13,6 +13,7 @@ last. Conventions: `ldo_service.geometry`.
 """
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -30,8 +31,9 @@ from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion, extent
 from .moving import MovingConfig, spread, watch
+from .places import PlacesConfig, place_of
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
-from .relocalisation import RelocalisationConfig, relocalise
+from .relocalisation import RelocalisationConfig, Relocaliser
 from .state import State, packed, unpacked
 from .window import WindowConfig, measured_from
 
@@ -46,6 +48,7 @@ class OdometryConfig:
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
+    places: PlacesConfig = field(default_factory=PlacesConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
     moving: MovingConfig = field(default_factory=MovingConfig)
@@ -86,7 +89,15 @@ class Odometry:
     def __init__(self, config: OdometryConfig | None = None) -> None:
         self.config = config or OdometryConfig()
         self._state = State()
+        self._relocaliser = Relocaliser(
+            self.config.pyramid,
+            self.config.align,
+            self.config.features,
+            self.config.judgement,
+            self.config.relocalisation,
+        )
         self._viewed: tuple[RgbdFrame, Pyramid] | None = None  # the last frame, made ready
+        self._rebuilt: dict[int, Keyframe] = {}  # from places, for the window
 
     def track(self, frame: RgbdFrame) -> Tracked:
         """The pose of a frame. Never raises for what a frame shows: it may be blank."""
@@ -113,9 +124,10 @@ class Odometry:
         view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
         moving = before.is_moving, tracked.is_moving
         keyframe = Keyframe(view, tracked.T_odom_camera, before.next_id, *moving)
+        place = place_of(keyframe, self.config.features, self.config.places)
         self._state = replace(
             before,
-            memory=(*before.memory, keyframe)[-self.config.relocalisation.memory :],
+            places=before.places.added(place, self.config.places),
             keyframe=keyframe,
             frames_since_keyframe=0,
             next_id=before.next_id + 1,
@@ -129,11 +141,22 @@ class Odometry:
         keyframe = self._state.keyframe
         if keyframe is None or tracked.keyframe is None:
             return []
-        earlier = [k for k in self._state.memory if k.id not in (keyframe.id, tracked.keyframe)]
+        earlier = self._earlier(without={keyframe.id, tracked.keyframe})
         usual = Appearance(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
         return measured_from(earlier, keyframe, usual, self.config.align, self.config.window)
+
+    def _earlier(self, without: set[int]) -> Iterator[Keyframe]:
+        """The last keyframes from their places, newest first, each rebuilt once."""
+        others = [place for place in self._state.places.all if place.id not in without]
+        last = others[-self.config.window.reach :]
+        ids = {place.id for place in last}
+        self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
+        for place in reversed(last):
+            if place.id not in self._rebuilt:
+                self._rebuilt[place.id] = place.keyframe(self.config.pyramid)
+            yield self._rebuilt[place.id]
 
     def make_supporting(self, tracked: Tracked) -> int:
         """Go on against the same keyframe; the id of this frame as one that is only mapped."""
@@ -145,20 +168,23 @@ class Odometry:
         """Leave an id unused, for one that may have been given and forgotten."""
         self._state = replace(self._state, next_id=self._state.next_id + 1)
 
-    def keyframes(self) -> tuple[int, ...]:
-        """Ids of the keyframes that a frame may still be aligned to, ascending."""
-        current = self._state.keyframe
-        kept = (*self._state.memory, *(() if current is None else (current,)))
-        return tuple(sorted({keyframe.id for keyframe in kept}))
+    @property
+    def keyframe(self) -> int | None:
+        """Id of the keyframe that the next frame is aligned to."""
+        return None if self._state.keyframe is None else self._state.keyframe.id
 
     def state(self) -> dict[str, Any]:
-        """All that the next frames depend on, in arrays and plain values: 1.5 MB a keyframe."""
+        """All that the next frames depend on, in arrays and plain values.
+
+        Its `places` and `keyframe` are the same objects until they change.
+        """
         return packed(self._state)
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue where `state` was taken: the next frames give bitwise equal results."""
         self._state = unpacked(state, self.config.pyramid)
         self._viewed = None
+        self._rebuilt = {}
 
     def _view(self, frame: RgbdFrame) -> Pyramid:
         if self._viewed is None or self._viewed[0] is not frame:
@@ -205,16 +231,9 @@ class Odometry:
         return judge(candidate.alignment, agree, state.history, state.status, limits)
 
     def _relocalised(self, view: Pyramid) -> tuple[Keyframe, Candidate] | None:
-        state, config = self._state, self.config
-        return relocalise(
-            state.memory,
-            view,
-            state.history,
-            config.judgement,
-            config.features,
-            config.align,
-            config.relocalisation,
-        )
+        state = self._state
+        self._state = replace(state, searches=state.searches + 1)
+        return self._relocaliser.find(view, state.places, state.searches, state.history)
 
     def _lost(self, keyframe: Keyframe, alignment: Alignment) -> Tracked:
         motion = self._state.motion.stopped()
@@ -283,12 +302,9 @@ class Odometry:
         news = seen.has_moved if known is None else seen.has_moved & ~known
         if np.mean(news) > config.renewed_share:
             left_out = spread(seen.has_moved, keyframe.view, config)
-            self._exchange(keyframe, replace(keyframe, has_moved=seen.has_moved, left_out=left_out))
+            renewed = replace(keyframe, has_moved=seen.has_moved, left_out=left_out)
+            self._state = replace(self._state, keyframe=renewed)
         return spread(seen.is_moving, view, config)
-
-    def _exchange(self, old: Keyframe, new: Keyframe) -> None:
-        memory = tuple(new if k is old else k for k in self._state.memory)
-        self._state = replace(self._state, memory=memory, keyframe=new)
 
     def _remember(
         self, keyframe: Keyframe, motion: Motion, history: History, status: Status

@@ -5,86 +5,70 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.geometry import Camera
-
 from .judgement import History, Status
 from .keyframes import Keyframe
 from .motion import Motion
 from .moving import Suspicion
-from .pyramid import PyramidConfig, build_pyramid
+from .places import Place, Places
+from .pyramid import PyramidConfig
 
 
 @dataclass(frozen=True, slots=True)
 class State:
-    memory: tuple[Keyframe, ...] = ()  # for relocalisation, oldest first
+    places: Places = field(default_factory=Places)  # for relocalisation
     keyframe: Keyframe | None = None  # the one tracked against, usually the newest
     motion: Motion = field(default_factory=Motion)
     history: History = field(default_factory=History)
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
+    searches: int = 0  # frames that were looked for among the places
     T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
     suspicion: Suspicion | None = None
 
 
 def packed(state: State) -> dict[str, Any]:
-    """Arrays and plain values. Keyframes are grey image, depth and pose: the rest follows."""
-    current = state.keyframe
-    forgotten = () if current is None or current in state.memory else (current,)
-    kept = (*forgotten, *state.memory)
+    """Arrays and plain values. The keyframe is grey image, depth and pose: the rest follows."""
     return {
-        "keyframes": [_packed(k) for k in kept],  # what of them never changes
-        "moved": [(k.has_moved, k.left_out) for k in kept],
-        "memory": len(state.memory),
-        "current": -1 if current is None else kept.index(current),
+        "places": [place.packed for place in state.places.all],
+        "keyframe": None if state.keyframe is None else state.keyframe.packed,
         "motion": asdict(state.motion),
         "history": asdict(state.history),
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
+        "searches": state.searches,
         "T_odom_mapped": state.T_odom_mapped,
-        "is_moving": state.is_moving,
-        "suspicion": state.suspicion and (state.suspicion.contradicts, state.suspicion.gone),
+        "is_moving": _bits(state.is_moving),
+        "suspicion": state.suspicion and (_bits(state.suspicion.contradicts), state.suspicion.gone),
     }
 
 
 def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
     """The inverse of `packed`, under the same configuration."""
-    kept = tuple(
-        _unpacked(k, moved, config)
-        for k, moved in zip(values["keyframes"], values["moved"], strict=True)
-    )
+    keyframe, suspicion, is_moving = values["keyframe"], values["suspicion"], values["is_moving"]
     return State(
-        memory=kept[len(kept) - values["memory"] :],
-        keyframe=kept[values["current"]] if values["current"] >= 0 else None,
+        places=Places(tuple(Place.unpacked(place) for place in values["places"])),
+        keyframe=None if keyframe is None else Keyframe.unpacked(keyframe, config),
         motion=Motion(**values["motion"]),
         history=History(**{name: tuple(noise) for name, noise in values["history"].items()}),
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
+        searches=values["searches"],
         T_odom_mapped=values["T_odom_mapped"],
-        is_moving=values["is_moving"],
-        suspicion=values["suspicion"] and Suspicion(*values["suspicion"]),
+        is_moving=None if is_moving is None else _mask(is_moving),
+        suspicion=None if suspicion is None else Suspicion(_mask(suspicion[0]), suspicion[1]),
     )
 
 
-def _packed(keyframe: Keyframe) -> dict[str, Any]:
-    view = keyframe.view
-    return {
-        "gray": view.gray,
-        "depth_m": view.depth_m,
-        "camera": asdict(view.camera),
-        "T_odom_keyframe": keyframe.T_odom_keyframe,
-        "id": keyframe.id,
-    }
+def _bits(mask: np.ndarray | None) -> dict[str, Any] | None:
+    """A mask [H, W] bool in an eighth of its size: it is written at each frame."""
+    return None if mask is None else {"bits": np.packbits(mask), "shape": list(mask.shape)}
 
 
-def _unpacked(
-    kept: dict[str, Any],
-    moved: tuple[np.ndarray | None, np.ndarray | None],
-    config: PyramidConfig,
-) -> Keyframe:
-    camera = Camera(**{**kept["camera"], "distortion": tuple(kept["camera"]["distortion"])})
-    view = build_pyramid(kept["gray"], kept["depth_m"], camera, config)
-    return Keyframe(view, kept["T_odom_keyframe"], kept["id"], *moved)
+def _mask(packed: dict[str, Any]) -> np.ndarray:
+    height, width = packed["shape"]
+    count = height * width
+    return np.unpackbits(packed["bits"], count=count).reshape(height, width).astype(bool)

@@ -6,7 +6,7 @@ of measurements that the optimizer solves together. On `synthetic:flat-exact` th
 trajectory falls to under half.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from ldo_service.errors import ConfigError
@@ -21,14 +21,15 @@ from .keyframes import Keyframe
 @dataclass(frozen=True, slots=True)
 class WindowConfig:
     measurements: int = 3  # more per keyframe change little and cost 4 ms each; 0: none
+    reach: int = 6  # of the last keyframes, which are tried newest first
     min_overlap: float = 0.35  # of the older keyframe's surface; less is mostly its edges
     worst_noise: float = 1.5  # times that of tracking: a poorer fit is left out
     levels: int = 2  # the finest: the guess is good
     iterations: tuple[int, ...] = (10, 4)  # at most, per level, the finest first
 
     def __post_init__(self) -> None:
-        if self.measurements < 0 or self.levels < 1:
-            raise ConfigError(f"{self}: measurements must be at least 0, levels at least 1.")
+        if self.measurements < 0 or min(self.reach, self.levels) < 1:
+            raise ConfigError(f"{self}: measurements may be 0, reach and levels at least 1.")
         if not (0 < self.min_overlap <= 1 and self.worst_noise >= 1):
             raise ConfigError(f"{self}: min_overlap must be within 0..1, worst_noise at least 1.")
         if not self.iterations or min(self.iterations) < 1:
@@ -36,19 +37,19 @@ class WindowConfig:
 
 
 def measured_from(
-    earlier: Sequence[Keyframe],
+    earlier: Iterable[Keyframe],
     keyframe: Keyframe,
     usual: Appearance,
     align_config: AlignConfig,
     config: WindowConfig,
 ) -> list[RelativePose]:
-    """The pose of `keyframe` in those of `earlier`, newest first, that show the same surface.
+    """The pose of `keyframe` in the first ones of `earlier` that show the same surface.
 
     usual  how tracking sees just now: its noise starts each alignment, and judges it
     """
     measure = replace(align_config, start=usual, iterations=config.iterations)
     poses: list[RelativePose] = []
-    for other in reversed(earlier):
+    for other in earlier:
         if len(poses) == config.measurements:
             break
         alignment = _aligned(other, keyframe, measure, config.levels)

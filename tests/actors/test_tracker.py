@@ -9,6 +9,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.state_store import encode_state
 from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
@@ -147,9 +148,30 @@ def test_only_new_keyframes_are_new_objects_in_the_state(frames) -> None:
     before = tracker.snapshot()
     handled(tracker, frames[10:11])
     after = tracker.snapshot()
-    kept = [name for name in before if name.startswith("keyframe_") and name in after]
+    kept = [name for name in before if name.startswith("place_")]
     assert kept
     assert all(before[name] is after[name] for name in kept)
+    assert len(encode_state(after["now"])) < 50_000, "what is written at each frame"
+
+
+def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, keyframes) -> None:
+    """By a keyframe that was forgotten by all but the places, and moved since."""
+    shift = se3.exp(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
+    tracker, successor = Tracker(), Tracker()
+    handled(tracker, frames)
+    tracker._poses.keep_only([max(tracker._poses)])
+    new = {k.keyframe: shift @ transform(k.T_odom_keyframe) for k in keyframes}
+    handled(tracker, [correction_message(0, 7, new)])
+    successor.restore(tracker.snapshot())
+    back, again = (poses_of(handled(t, frames[2:3]))[0] for t in (tracker, successor))
+    assert back.status == "OK"
+    assert back.reference not in (None, max(new))
+    truth = room.truth()
+    assert truth is not None
+    T_map_camera = transform(back.T_map_odom) @ transform(back.T_odom_camera)
+    T_true = shift @ se3.inverse(truth.T_world_camera[0]) @ truth.T_world_camera[2]
+    np.testing.assert_allclose(T_map_camera, T_true, atol=5e-3)
+    assert back == msgspec.structs.replace(again, keyframe=back.keyframe), "one id was skipped"
 
 
 def test_a_correction_before_any_frame_is_harmless() -> None:

@@ -181,13 +181,12 @@ def test_keyframes_of_the_odometry_do_not_track_against_who_walks(walked: Walked
     for k in range(56, 76, 2):
         frame = walked.frame(k)
         tracked = odometry.track(frame)
-        if k == 56 or k == 68:
+        if k in (68, 74):  # the last frames against their keyframes
+            left_out = odometry.state()["keyframe"]["left_out"]
+            assert recall_and_precision(left_out, walked.person(kept[-1]))[0] > 0.5
+        if k in (56, 68):
             odometry.make_keyframe(frame, tracked)
             kept.append(k)
-    parts = odometry.state()["moved"]
-    assert [left_out is not None for _, left_out in parts] == [True, True]
-    for k, (_, left_out) in zip(kept, parts, strict=True):
-        assert recall_and_precision(left_out, walked.person(k))[0] > 0.5
     assert tracked.is_moving is not None
     assert recall_and_precision(tracked.is_moving, walked.person(k))[0] > 0.5
 

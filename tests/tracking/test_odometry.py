@@ -1,4 +1,3 @@
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +9,7 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
+from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
 
 T_ELSEWHERE = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
@@ -157,10 +157,34 @@ def test_restored_odometry_continues_bitwise_equal(large_room, make_walk) -> Non
     )
 
 
-def test_state_holds_only_arrays_and_plain_values(room, make_walk) -> None:
+def test_state_survives_its_form_on_disk(large_room, make_walk) -> None:
+    frames = [large_room.view(T) for T in make_walk(8, 0.05, 0.03)]
+    odometry, restored = Odometry(), Odometry()
+    track(odometry, frames[:6])
+    restored.restore(decode_state(encode_state(odometry.state())))
+    rest = [large_room.blank(), *frames[6:]]
+    assert_bitwise_equal(track(restored, rest), track(odometry, rest))
+
+
+def test_a_place_left_long_ago_is_found_again(large_room) -> None:
+    """Nine keyframes later; tracking goes on against the old one, after a restart too."""
+    turns = [se3.exp(np.array([0.0, 0.12 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
     odometry = Odometry()
-    track(odometry, [room.view(T) for T in make_walk(6)])
-    json.dumps(odometry.state(), default=lambda array: array.tolist())
+    out = track(odometry, [large_room.view(T) for T in turns])
+    assert {r.status for r in out} == {Status.OK}
+    assert sum(r.wants_keyframe for r in out) >= 9
+    walk = [se3.exp(np.array([0.0, 0.05, 0.0, 0.01 * k, 0.0, 0.02])) for k in range(8)]
+    frames = [large_room.view(T) for T in walk]
+    back = odometry.track(frames[0])
+    assert (back.status, back.method) == (Status.OK, "relocalised")
+    assert back.keyframe in (0, 1)
+    np.testing.assert_allclose(back.T_odom_camera, walk[0], atol=0.01)
+    restored = Odometry()
+    restored.restore(decode_state(encode_state(odometry.state())))
+    after = track(odometry, frames[1:])
+    assert {r.status for r in after} == {Status.OK}
+    assert largest_error_m(after, walk[1:]) < 0.01
+    assert_bitwise_equal(track(restored, frames[1:]), after)
 
 
 @pytest.mark.parametrize("size", [(161, 121), (80, 60), (128, 128), (97, 200)])

@@ -1,42 +1,90 @@
 import numpy as np
+import pytest
 
-from ldo_service.geometry import se3
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.judgement import History, JudgementConfig
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.relocalisation import RelocalisationConfig, relocalise
+from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of
+from ldo_service.tracking.relocalisation import RelocalisationConfig, Relocaliser
 
 T_AWAY = se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
 T_NEAR = se3.exp(np.array([0.03, -0.15, 0.05, 0.15, 0.05, 0.1]))
+T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
 
 
-def found(large_room, frame):
-    keyframes = [
-        Keyframe(pyramid_of(large_room.view(T), PyramidConfig()), T, index)
-        for index, T in enumerate((np.eye(4), T_AWAY))
-    ]
-    return relocalise(
-        keyframes,
-        pyramid_of(frame, PyramidConfig()),
-        History(),
-        JudgementConfig(),
-        FeatureConfig(),
+def relocaliser(config: RelocalisationConfig | None = None) -> Relocaliser:
+    return Relocaliser(
+        PyramidConfig(),
         AlignConfig(),
-        RelocalisationConfig(),
+        FeatureConfig(),
+        JudgementConfig(),
+        config or RelocalisationConfig(),
     )
 
 
-def test_right_keyframe_is_found_whatever_its_age(large_room) -> None:
-    for index, T_odom_keyframe in enumerate((np.eye(4), T_AWAY)):
-        place = found(large_room, large_room.view(T_odom_keyframe @ T_NEAR))
+def place_at(room, T_odom_keyframe: np.ndarray, number: int) -> Place:
+    view = pyramid_of(room.view(T_odom_keyframe), PyramidConfig())
+    keyframe = Keyframe(view, T_odom_keyframe, number)
+    return place_of(keyframe, FeatureConfig(), PlacesConfig())
+
+
+@pytest.fixture(scope="module")
+def places(large_room) -> Places:
+    return Places((place_at(large_room, np.eye(4), 0), place_at(large_room, T_AWAY, 1)))
+
+
+def found(places: Places, frame: RgbdFrame, turn: int = 0, **fields):
+    view = pyramid_of(frame, PyramidConfig())
+    finder = relocaliser(RelocalisationConfig(**fields))
+    return finder.find(view, places, turn, History())
+
+
+def test_right_keyframe_is_found_whatever_its_age(large_room, places) -> None:
+    for number, T_odom_keyframe in enumerate((np.eye(4), T_AWAY)):
+        place = found(places, large_room.view(T_odom_keyframe @ T_NEAR))
         assert place is not None
         keyframe, candidate = place
-        assert keyframe.id == index
+        assert keyframe.id == number
         np.testing.assert_allclose(candidate.alignment.T_reference_camera, T_NEAR, atol=1e-3)
 
 
-def test_unknown_place_is_not_recognised(large_room) -> None:
-    elsewhere = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-    assert found(large_room, large_room.view(elsewhere)) is None
-    assert found(large_room, large_room.blank()) is None
+def test_unknown_place_is_not_recognised(large_room, places) -> None:
+    assert found(places, large_room.view(T_BEHIND)) is None
+    assert found(places, large_room.blank()) is None
+
+
+def test_without_places_nothing_is_found(large_room) -> None:
+    assert found(Places(), large_room.view(np.eye(4))) is None
+
+
+def test_each_place_has_its_turn_however_unlike_its_thumbnail(large_room) -> None:
+    crowd = Places(
+        (
+            *(place_at(large_room, T_BEHIND, number) for number in range(4)),
+            place_at(large_room, np.eye(4), 4),
+        )
+    )
+    frame = large_room.view(T_NEAR)
+    turns = [found(crowd, frame, turn, alike=0, in_turn=2) for turn in range(5)]
+    assert [place is not None for place in turns] == [False, False, True, False, True]
+
+
+def test_a_place_is_refused_when_features_and_images_disagree(large_room, places) -> None:
+    assert found(places, large_room.view(T_NEAR), agreement_rad=1e-6) is None
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"alike": 0, "in_turn": 0},
+        {"attempts": 0},
+        {"min_geometric_inliers": 1.5},
+        {"agreement_rad": 0.0},
+    ],
+)
+def test_impossible_limits_are_refused(fields) -> None:
+    with pytest.raises(ConfigError):
+        RelocalisationConfig(**fields)

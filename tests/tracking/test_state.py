@@ -3,49 +3,59 @@ from dataclasses import replace
 import numpy as np
 
 from ldo_service.tracking import PyramidConfig, pyramid_of
+from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframes import Keyframe
 from ldo_service.tracking.moving import Suspicion
+from ldo_service.tracking.places import Places, PlacesConfig, place_of
 from ldo_service.tracking.state import State, packed, unpacked
 
 
-def keyframes(room, n: int) -> tuple[Keyframe, ...]:
-    view = pyramid_of(room.view(np.eye(4)), PyramidConfig())
-    return tuple(Keyframe(view, np.eye(4), index) for index in range(n))
+def keyframe_of(room, number: int = 0) -> Keyframe:
+    return Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number)
 
 
 def test_empty_state_survives_packing() -> None:
     restored = unpacked(packed(State()), PyramidConfig())
     assert restored.keyframe is None
-    assert restored.memory == ()
+    assert len(restored.places) == 0
 
 
-def test_current_keyframe_keeps_its_place_in_memory(room) -> None:
-    known = keyframes(room, 3)
-    state = State(memory=known, keyframe=known[1], frames_since_keyframe=4)
+def test_keyframe_and_places_survive_packing(room) -> None:
+    place = place_of(keyframe_of(room, 3), FeatureConfig(), PlacesConfig())
+    state = State(places=Places((place,)), keyframe=keyframe_of(room, 5), frames_since_keyframe=4)
     restored = unpacked(packed(state), PyramidConfig())
-    assert [k.id for k in restored.memory] == [0, 1, 2]
-    assert restored.keyframe is restored.memory[1]
+    assert [place.id for place in restored.places.all] == [3]
+    assert restored.keyframe is not None
+    assert restored.keyframe.id == 5
     assert restored.frames_since_keyframe == 4
 
 
-def test_forgotten_current_keyframe_is_kept_beside_the_memory(room) -> None:
-    known = keyframes(room, 3)
-    restored = unpacked(
-        packed(replace(State(), memory=known[1:], keyframe=known[0])), PyramidConfig()
-    )
-    assert [k.id for k in restored.memory] == [1, 2]
-    assert restored.keyframe is not None
-    assert restored.keyframe.id == 0
-
-
 def test_what_moved_survives_packing(room) -> None:
-    known, mask = keyframes(room, 2), np.eye(120, 160) > 0
-    moved = replace(known[0], has_moved=mask, left_out=~mask)
+    mask = np.eye(120, 160) > 0
+    moved = replace(keyframe_of(room), has_moved=mask, left_out=~mask)
     suspicion = Suspicion(mask, mask.astype(np.uint8))
-    state = State(memory=(moved, known[1]), keyframe=moved, is_moving=~mask, suspicion=suspicion)
+    state = State(keyframe=moved, is_moving=~mask, suspicion=suspicion)
     restored = unpacked(packed(state), PyramidConfig())
-    assert restored.keyframe is restored.memory[0]
+    assert restored.keyframe is not None
+    np.testing.assert_array_equal(restored.keyframe.has_moved, mask)
     np.testing.assert_array_equal(restored.keyframe.left_out, ~mask)
     np.testing.assert_array_equal(restored.is_moving, ~mask)
     np.testing.assert_array_equal(restored.suspicion.gone, suspicion.gone)
-    assert restored.memory[1].has_moved is None
+
+
+def test_a_keyframe_made_from_a_place_keeps_the_features_of_the_place(room) -> None:
+    place = place_of(keyframe_of(room), FeatureConfig(), PlacesConfig())
+    state = State(keyframe=place.keyframe(PyramidConfig()))
+    restored = unpacked(packed(state), PyramidConfig()).keyframe
+    assert restored is not None
+    kept = restored.features(FeatureConfig())
+    np.testing.assert_array_equal(kept.descriptors, place.descriptors)
+    np.testing.assert_array_equal(kept.points_camera, place.points_camera)
+
+
+def test_what_has_not_changed_is_the_same_object_when_packed_again(room) -> None:
+    place = place_of(keyframe_of(room), FeatureConfig(), PlacesConfig())
+    state = State(places=Places((place,)), keyframe=keyframe_of(room))
+    before, after = packed(state), packed(state)
+    assert before["places"][0] is after["places"][0]
+    assert before["keyframe"] is after["keyframe"]

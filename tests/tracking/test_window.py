@@ -36,7 +36,7 @@ def keyframes(room, truth) -> list[Keyframe]:
 
 def test_each_measurement_is_nearer_to_the_truth_than_odometry(keyframes, truth) -> None:
     *earlier, newest = keyframes
-    poses = measured_from(earlier, newest, USUAL, AlignConfig(), WindowConfig())
+    poses = measured_from(reversed(earlier), newest, USUAL, AlignConfig(), WindowConfig())
     assert [(p.a, p.b) for p in poses] == [(5, 6), (4, 6), (3, 6)]
     for pose in poses:
         true = se3.inverse(truth[pose.a]) @ truth[6]
@@ -48,7 +48,9 @@ def test_keyframes_that_show_another_place_are_passed_over(keyframes, room) -> N
     turned = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
     elsewhere = Keyframe(pyramid_of(room.view(turned), PyramidConfig()), turned, 9)
     *earlier, newest = keyframes
-    poses = measured_from([*earlier, elsewhere], newest, USUAL, AlignConfig(), WindowConfig())
+    poses = measured_from(
+        [elsewhere, *reversed(earlier)], newest, USUAL, AlignConfig(), WindowConfig()
+    )
     assert [p.a for p in poses] == [5, 4, 3]
 
 
@@ -69,7 +71,7 @@ def replace_gray(keyframe: Keyframe, gray: np.ndarray) -> Keyframe:
 def test_none_are_measured_on_request(keyframes) -> None:
     *earlier, newest = keyframes
     none = WindowConfig(measurements=0)
-    assert measured_from(earlier, newest, USUAL, AlignConfig(), none) == []
+    assert measured_from(reversed(earlier), newest, USUAL, AlignConfig(), none) == []
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,156 @@
+"""Every keyframe, small enough to keep: where a lost camera may be. `ldo_service.geometry`.
+
+A place is a keyframe's thumbnail, its strongest ORB features with their points, and its grey image
+and depth at the working resolution, compressed: from these it can be tracked against again.
+"""
+
+from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, codecs
+
+from .features import FeatureConfig, Features, detect
+from .keyframes import Keyframe
+from .pyramid import Pyramid, PyramidConfig, build_pyramid
+
+THUMBNAIL = (
+    20,
+    15,
+)  # columns and rows: blurred enough that a hand's width of motion matters little
+CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactly in float32
+DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
+
+
+@dataclass(frozen=True, slots=True)
+class PlacesConfig:
+    count: int = 1000  # places kept, 0.13 MB each at 640x480 (kitchen); then the path is thinned
+    features: int = 500  # of each: half of a frame's, which halves the time to match
+
+    def __post_init__(self) -> None:
+        if self.count < 3 or self.features < 1:
+            raise ConfigError("places.count must be at least 3 and places.features at least 1.")
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A keyframe in some 130 kB.
+
+    thumbnail      [300] int8, of mean 0 and one contrast
+    points_camera  [N, 3] float32 m, of the features; all were measured
+    descriptors    [N, 32] uint8
+    gray, depth    PNG and zstd, of `camera`'s size
+    """
+
+    id: int
+    T_odom_keyframe: np.ndarray  # [4, 4]
+    median_depth_m: float
+    thumbnail: np.ndarray
+    points_camera: np.ndarray
+    descriptors: np.ndarray
+    camera: Camera
+    gray: bytes
+    depth: bytes
+
+    @cached_property
+    def features(self) -> Features:
+        points = self.points_camera.astype(np.float64)
+        return Features(self.camera.project(points), points, self.descriptors)
+
+    @cached_property
+    def packed(self) -> dict[str, Any]:
+        """Arrays and plain values, one and the same object each time."""
+        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**kept, "camera": asdict(self.camera)}
+
+    @staticmethod
+    def unpacked(kept: dict[str, Any]) -> "Place":
+        """The inverse of `packed`."""
+        return Place(**{**kept, "camera": Camera.of(kept["camera"])})
+
+    @property
+    def nbytes(self) -> int:
+        arrays = (self.thumbnail, self.points_camera, self.descriptors, self.T_odom_keyframe)
+        return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
+
+    def keyframe(self, config: PyramidConfig) -> Keyframe:
+        """The keyframe as frames can be aligned to it; bitwise equal each time."""
+        camera = self.camera
+        gray = cv2.imdecode(np.frombuffer(self.gray, np.uint8), cv2.IMREAD_GRAYSCALE)
+        steps = codecs.decode_depth("z16+zstd", camera.width, camera.height, memoryview(self.depth))
+        depth_m = steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
+        view = build_pyramid(np.asarray(gray, np.uint8), depth_m, camera, config)
+        return Keyframe(view, self.T_odom_keyframe, self.id, kept_features=self.features)
+
+
+def place_of(keyframe: Keyframe, features: FeatureConfig, config: PlacesConfig) -> Place:
+    """What is kept of a keyframe."""
+    view, level = keyframe.view, keyframe.view.levels[0]
+    seen = detect(view, replace(features, count=config.features))
+    measured = seen.points_camera[:, 2] > 0
+    steps = np.rint(level.depth_m * DEPTH_STEPS_PER_M)
+    steps[steps > np.iinfo(np.uint16).max] = 0
+    _, gray = cv2.imencode(".png", np.rint(level.texels[..., 0]).astype(np.uint8))
+    return Place(
+        id=keyframe.id,
+        T_odom_keyframe=keyframe.T_odom_keyframe,
+        median_depth_m=keyframe.reference.median_depth_m,
+        thumbnail=thumbnail_of(view),
+        points_camera=seen.points_camera[measured].astype(np.float32),
+        descriptors=seen.descriptors[measured],
+        camera=level.camera,
+        gray=gray.tobytes(),
+        depth=codecs.encode_depth(steps.astype(np.uint16))[1],
+    )
+
+
+def thumbnail_of(view: Pyramid) -> np.ndarray:
+    """[300] int8: the image in 20x15, free of brightness and contrast."""
+    small = cv2.resize(view.gray, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
+    small -= small.mean()
+    steps = CONTRAST * small / max(float(small.std()), 1.0)
+    return np.rint(np.clip(steps, -127, 127)).astype(np.int8).reshape(-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Places along the path, the oldest first. Immutable: `added` makes another."""
+
+    all: tuple[Place, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    def added(self, place: Place, config: PlacesConfig) -> "Places":
+        """With one more; where there are too many, one that leaves the smallest gap is gone."""
+        kept = (*self.all, place)
+        if len(kept) > config.count:
+            spare = int(np.argmin(_gaps(kept))) + 1
+            kept = (*kept[:spare], *kept[spare + 1 :])
+        return Places(kept)
+
+    def alike(self, view: Pyramid) -> list[int]:
+        """Indices of all places, the one whose thumbnail correlates best first."""
+        correlations = self._thumbnails @ thumbnail_of(view).astype(np.float32)
+        return np.argsort(-correlations, kind="stable").tolist()
+
+    @cached_property
+    def _thumbnails(self) -> np.ndarray:
+        """[N, 300] float32 of whole numbers: their products sum exactly in any order."""
+        return np.array([place.thumbnail for place in self.all], np.float32).reshape(
+            -1, THUMBNAIL[0] * THUMBNAIL[1]
+        )
+
+
+def _gaps(path: tuple[Place, ...]) -> np.ndarray:
+    """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`."""
+    T = np.array([place.T_odom_keyframe for place in path])
+    R, t = T[:, :3, :3], T[:, :3, 3]
+    cosine = (np.einsum("nij,nij->n", R[:-2], R[2:]) - 1.0) / 2.0
+    median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
+    shift = np.linalg.norm(t[2:] - t[:-2], axis=1) / median_depth_m
+    return np.arccos(np.clip(cosine, -1.0, 1.0)) + shift

@@ -1,0 +1,143 @@
+"""Single frames looked for in maps of their own and of other places.
+
+    OMP_NUM_THREADS=1 python tests/bench/bench_relocalisation.py [SOURCE ...] [--every N]
+
+SOURCE: data sets or synthetic sequences; default: tum/kitchen in LDO_DATA, and synthetic:flat.
+Each is tracked once, and its keyframes are the places of its map. Every N-th frame of each source
+is then looked for once in each map; in that of its own source, places within 30 frames of it are
+left out. What is found is right within 10 cm and 5 degrees of the truth between frame and keyframe
+(the kitchen's truth is 3 cm off itself) and false otherwise; in another source's map all finds are
+false. CPU time is that of the search, with the pyramid of the frame.
+"""
+
+import argparse
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.tracking import Odometry, OdometryConfig, pyramid_of
+from ldo_service.tracking.judgement import History
+from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.places import Places, place_of
+from ldo_service.tracking.relocalisation import Relocaliser
+
+APART_FRAMES = 30
+RIGHT_M, RIGHT_RAD = 0.10, float(np.radians(5.0))
+CONFIG = OdometryConfig()
+SEARCH = Relocaliser(
+    CONFIG.pyramid, CONFIG.align, CONFIG.features, CONFIG.judgement, CONFIG.relocalisation
+)
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """A sequence with the places along it, whose ids are frame indices."""
+
+    sequence: Sequence
+    places: Places
+    history: History
+
+    def apart_from(self, frame: int) -> Places:
+        return Places(tuple(p for p in self.places.all if abs(p.id - frame) > APART_FRAMES))
+
+
+@dataclass
+class Tally:
+    """Of the frames of one source in one map."""
+
+    queries: int = 0
+    errors: list[tuple[float, float]] = field(default_factory=list)  # m, rad; inf: another source
+    times_ms: list[float] = field(default_factory=list)
+
+    @property
+    def right(self) -> int:
+        return sum(m <= RIGHT_M and rad <= RIGHT_RAD for m, rad in self.errors)
+
+    def row(self) -> str:
+        p50, p95 = np.percentile(self.times_ms, [50, 95])
+        distances_cm = [100 * m for m, _ in self.errors if np.isfinite(m)] or [float("nan")]
+        return (
+            f"{self.queries} | {len(self.errors)} | {self.right} | "
+            f"{len(self.errors) - self.right} | {np.median(distances_cm):.1f} | "
+            f"{max(distances_cm):.1f} | {p50:.0f} | {p95:.0f} |"
+        )
+
+
+def mapped(source: str) -> Mapped:
+    sequence, odometry, places = open_sequence(source), Odometry(), Places()
+    for frame in sequence:
+        tracked = odometry.track(frame)
+        if tracked.wants_keyframe:
+            odometry.make_keyframe(frame, tracked)
+            view = pyramid_of(frame, CONFIG.pyramid)
+            keyframe = Keyframe(view, tracked.T_odom_camera, frame.index)
+            places = places.added(place_of(keyframe, CONFIG.features, CONFIG.places), CONFIG.places)
+    return Mapped(sequence, places, History(**odometry.state()["history"]))
+
+
+def search(frame: RgbdFrame, places: Places, turn: int, history: History, tally: Tally):
+    """(frame index of the keyframe, T_keyframe_camera), or None."""
+    start_s = time.process_time()
+    found = SEARCH.find(pyramid_of(frame, CONFIG.pyramid), places, turn, history)
+    tally.times_ms.append(1e3 * (time.process_time() - start_s))
+    tally.queries += 1
+    return None if found is None else (found[0].id, found[1].alignment.T_reference_camera)
+
+
+def true_poses(sequence: Sequence) -> np.ndarray:
+    """T_world_camera [F, 4, 4] of each frame: the nearest stamp's."""
+    truth = sequence.truth()
+    assert truth is not None, f"{sequence.name} has no ground truth"
+    gaps_s = np.abs(truth.stamps_s[None] - 1e-9 * sequence.stamps_ns[:, None])
+    return truth.T_world_camera[gaps_s.argmin(axis=1)]
+
+
+def judged(query: Sequence, model: Mapped, every: int) -> Tally:
+    tally, is_own = Tally(), query is model.sequence
+    T_world = true_poses(query)
+    for turn, index in enumerate(range(0, len(query), every)):
+        places = model.apart_from(index) if is_own else model.places
+        found = search(query[index], places, turn, model.history, tally)
+        if found is None:
+            continue
+        keyframe, T_keyframe_camera = found
+        error = (np.inf, np.inf)
+        if is_own:
+            T = se3.inverse(T_world[index]) @ T_world[keyframe] @ T_keyframe_camera
+            error = float(np.linalg.norm(T[:3, 3])), se3.rotation_angle(T)
+        tally.errors.append(error)
+    return tally
+
+
+def default_sources() -> list[str]:
+    kitchen = Path(os.environ.get("LDO_DATA", "")) / "tum" / "kitchen"
+    return [*([str(kitchen)] if kitchen.is_dir() else []), "synthetic:flat"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sources", nargs="*", metavar="SOURCE")
+    parser.add_argument("--every", type=int, default=1)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    models = [mapped(source) for source in arguments.sources or default_sources()]
+    for model in models:
+        sizes = [place.nbytes for place in model.places.all]
+        name, kilobytes = model.sequence.name, np.mean(sizes) / 1e3
+        print(f"{name}: {len(sizes)} places of {kilobytes:.0f} kB on average")
+    print("\n| frames of | in the map of | searched | found | right | false ", end="")
+    print("| error cm p50 | max | CPU ms p50 | p95 |\n|" + "---|" * 10)
+    for model in models:
+        for other in models:
+            tally = judged(other.sequence, model, arguments.every)
+            print(f"| {other.sequence.name} | {model.sequence.name} | {tally.row()}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
+from ldo_service.tracking.candidates import attempt
+from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of, thumbnail_of
+
+
+def turned(angle_rad: float) -> np.ndarray:
+    return se3.exp(np.array([0.0, angle_rad, 0.0, 0.0, 0.0, 0.0]))
+
+
+def keyframe_at(room, T_odom_keyframe: np.ndarray, number: int = 0) -> Keyframe:
+    view = pyramid_of(room.view(T_odom_keyframe), PyramidConfig())
+    return Keyframe(view, T_odom_keyframe, number)
+
+
+def place_at(room, T_odom_keyframe: np.ndarray, number: int = 0) -> Place:
+    return place_of(keyframe_at(room, T_odom_keyframe, number), FeatureConfig(), PlacesConfig())
+
+
+def test_a_frame_is_aligned_to_a_place_as_to_its_keyframe(make_room) -> None:
+    room = make_room(640, 480)  # halved once to the working resolution, which a place keeps
+    keyframe, T = keyframe_at(room, np.eye(4)), se3.exp(np.array([0, 0.03, 0, 0.02, 0, 0.01]))
+    place = place_of(keyframe, FeatureConfig(), PlacesConfig())
+    view = pyramid_of(room.view(T), PyramidConfig())
+    for reference in (keyframe, place.keyframe(PyramidConfig())):
+        candidate = attempt(reference, view, np.eye(4), "direct", AlignConfig())
+        np.testing.assert_allclose(candidate.alignment.T_reference_camera, T, atol=1e-3)
+
+
+def test_a_place_is_small_and_survives_packing_bit_for_bit(make_room) -> None:
+    room = make_room(640, 480)
+    place = place_at(room, np.eye(4))
+    full = 640 * 480 * 5  # grey level and depth
+    assert place.nbytes < full / 5
+    again = Place.unpacked(place.packed)
+    assert again.keyframe(PyramidConfig()).view.gray.tobytes() == (
+        place.keyframe(PyramidConfig()).view.gray.tobytes()
+    )
+    assert again.camera == place.camera
+
+
+def test_features_of_a_place_all_have_a_point_that_projects_to_them(large_room) -> None:
+    features = place_at(large_room, np.eye(4)).features
+    assert len(features.pixels) > 100
+    assert (features.points_camera[:, 2] > 0).all()
+    assert (features.pixels > -1).all()
+    assert (features.pixels < [321, 241]).all()
+
+
+def test_a_thumbnail_knows_neither_brightness_nor_contrast(large_room) -> None:
+    plain = thumbnail_of(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()))
+    dark = thumbnail_of(pyramid_of(large_room.view(np.eye(4), 0.6, 20.0), PyramidConfig()))
+    assert np.abs(plain.astype(int) - dark).max() <= 2
+    blank = thumbnail_of(pyramid_of(large_room.blank(), PyramidConfig()))
+    assert not blank.any()
+
+
+def test_the_place_that_looks_like_the_view_comes_first(room) -> None:
+    angles = (0.0, 0.8, 1.6, 2.4, 3.2)
+    places = Places(tuple(place_at(room, turned(a), k) for k, a in enumerate(angles)))
+    for number, angle in enumerate(angles):
+        view = pyramid_of(room.view(turned(angle + 0.03), 1.2, 5.0), PyramidConfig())
+        ranked = places.alike(view)
+        assert ranked[0] == number
+        assert sorted(ranked) == list(range(len(angles)))
+
+
+def test_a_full_memory_thins_the_path_where_it_is_densest(room) -> None:
+    config, places = PlacesConfig(count=4), Places()
+    for number, angle in enumerate((0.0, 0.3, 0.6, 0.65, 0.9, 1.2)):
+        places = places.added(place_at(room, turned(angle), number), config)
+    assert len(places) == 4
+    kept = [place.id for place in places.all]
+    assert kept[0] == 0, "the first stays"
+    assert kept[-1] == 5, "and the newest"
+    assert not {2, 3} <= set(kept), "of two that are nearly one, one is enough"
+
+
+def test_a_memory_of_two_places_is_refused() -> None:
+    with pytest.raises(ConfigError, match="count"):
+        PlacesConfig(count=2)
