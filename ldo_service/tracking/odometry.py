@@ -31,7 +31,7 @@ from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion, extent
 from .moving import MovingConfig, spread, watch
-from .places import PlacesConfig, place_of
+from .places import PlacesConfig, place_of, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
 from .state import State, packed, unpacked
@@ -106,6 +106,8 @@ class Odometry:
             return self._first(frame, view)
         candidate = self._followed(keyframe, view, frame.stamp_ns)
         status = self._judged(candidate)
+        if status is Status.WEAK and not self._relocaliser.is_familiar(view, self._state.trusted):
+            status = Status.LOST
         if status is Status.LOST:
             found = self._relocalised(view)
             if found is None:
@@ -194,8 +196,9 @@ class Odometry:
     def _first(self, frame: RgbdFrame, view: Pyramid) -> Tracked:
         measured = float(np.mean(view.levels[0].depth_m > 0))
         usable = measured >= self.config.judgement.min_paired
+        motion, trusted = Motion(stamp_ns=frame.stamp_ns), thumbnail_of(view)
         self._state = replace(
-            self._state, motion=Motion(stamp_ns=frame.stamp_ns), is_moving=None, suspicion=None
+            self._state, motion=motion, trusted=trusted, is_moving=None, suspicion=None
         )
         status, method = (Status.OK, "first") if usable else (Status.LOST, "none")
         return Tracked(np.eye(4), np.eye(4), None, status, method, usable, usable)
@@ -257,6 +260,7 @@ class Odometry:
         is_steady = status is Status.OK and self._state.status is Status.OK
         if status is Status.OK:
             history = history.extended(alignment, config.judgement)
+            self._state = replace(self._state, trusted=thumbnail_of(self._view(frame)))
         self._remember(keyframe, motion if is_steady else motion.stopped(), history, status)
         is_moving = self._watched(keyframe, self._view(frame), alignment)
         due = is_due(

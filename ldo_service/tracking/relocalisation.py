@@ -3,11 +3,13 @@
 A lost frame is compared with the places whose thumbnails are most like it, and with a few more
 in turn, so that each frame costs the same however large the memory is, and every place has its
 chance. A place counts as found when features and images agree on it; no prediction speaks for it,
-so it is judged more strictly than tracking.
+so it is judged more strictly than tracking. Where two places a room apart both explain the view,
+neither does: the ends of a corridor may be furnished alike.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -20,8 +22,10 @@ from .features import FeatureConfig, FeaturePose, detect, estimate_pose
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe
 from .motion import extent
-from .places import Place, Places
+from .places import Place, Places, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig
+
+RANKED = 10  # times `alike`: places looked through for likely ones that are apart
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,14 +35,23 @@ class RelocalisationConfig:
     attempts: int = 2  # direct alignments per lost frame, the best feature poses first
     min_geometric_inliers: float = 0.85  # of the depths that meet a surface; the prototype's
     agreement_rad: float = 0.06  # rotation plus parallax between feature pose and alignment
+    variety_rad: float = 0.25  # likely places nearer to each other than this are one
+    rival_inliers: float = 0.3  # of the best place's: a place with more that says
+    rival_rad: float = 1.0  # the camera is this far elsewhere (57 degrees, or a median depth)
+    familiar: float = 0.4  # correlation with the last trusted thumbnail; below, a WEAK frame shows
+    # another place. Kitchen, frame to frame: above 0.93; against another place: 97 % below
 
     def __post_init__(self) -> None:
         if self.alike < 0 or self.in_turn < 0 or self.alike + self.in_turn < 1:
             raise ConfigError("alike and in_turn must not be negative, nor both 0.")
-        if self.attempts < 1 or not self.agreement_rad > 0:
-            raise ConfigError("attempts must be at least 1 and agreement_rad positive.")
-        if not 0 <= self.min_geometric_inliers <= 1:
-            raise ConfigError("min_geometric_inliers must be within 0..1.")
+        if self.attempts < 1:
+            raise ConfigError(f"attempts={self.attempts} must be at least 1.")
+        if not min(self.agreement_rad, self.variety_rad, self.rival_rad) > 0:
+            raise ConfigError("agreement_rad, variety_rad and rival_rad must be positive.")
+        if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.rival_inliers <= 1):
+            raise ConfigError("min_geometric_inliers and rival_inliers must be within 0..1.")
+        if not 0 <= self.familiar <= 1:
+            raise ConfigError(f"familiar={self.familiar:g}: a correlation within 0..1.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,29 +71,47 @@ class Relocaliser:
 
         `turn` counts the lost frames; it decides whose turn it is beside the likely places.
         """
-        for place, pose in self._poses(view, self._chosen(view, places, turn)):
+        poses = self._poses(view, self._chosen(view, places, turn))
+        for place, pose in poses[: self.config.attempts]:
             keyframe = place.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
             candidate = attempt(keyframe, view, guess, "relocalised", self.align)
             if self._is_sure(candidate, guess, history):
-                return keyframe, replace(candidate, features_agree=True)
+                found = keyframe, replace(candidate, features_agree=True)
+                return None if self._has_rival(place, pose, poses) else found
         return None
+
+    def is_familiar(self, view: Pyramid, trusted: np.ndarray) -> bool:
+        """Whether a view looks like the thumbnail [300] of the last trusted one."""
+        seen, trusted = thumbnail_of(view).astype(float), trusted.astype(float)
+        scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
+        return bool(seen @ trusted >= self.config.familiar * scale > 0)
 
     def _chosen(self, view: Pyramid, places: Places, turn: int) -> list[Place]:
         """The likely ones and those whose turn it is, each once."""
         if not len(places):
             return []
-        likely = places.alike(view)[: self.config.alike]
         first = turn * self.config.in_turn
         due = [number % len(places) for number in range(first, first + self.config.in_turn)]
-        return [places.all[index] for index in dict.fromkeys((*likely, *due))]
+        likely = self._likely(places.all[index] for index in places.alike(view))
+        return list(dict.fromkeys((*likely, *(places.all[index] for index in due))))
+
+    def _likely(self, ranked: Iterable[Place]) -> list[Place]:
+        """The first of each neighbourhood."""
+        likely: list[Place] = []
+        for place in islice(ranked, RANKED * self.config.alike):
+            if len(likely) == self.config.alike:
+                break
+            if all(_is_apart(place, other, self.config.variety_rad) for other in likely):
+                likely.append(place)
+        return likely
 
     def _poses(self, view: Pyramid, places: Iterable[Place]) -> list[tuple[Place, FeaturePose]]:
-        """Places with a feature pose, most inliers first, as many as may be tried."""
+        """Places with a feature pose, most inliers first."""
         seen = detect(view, self.features)
         poses = [(p, estimate_pose(p.features, seen, view.camera, self.features)) for p in places]
         found = [(place, pose) for place, pose in poses if pose is not None]
-        return sorted(found, key=lambda pp: -pp[1].inliers)[: self.config.attempts]
+        return sorted(found, key=lambda pp: -pp[1].inliers)
 
     def _is_sure(self, candidate: Candidate, guess: np.ndarray, history: History) -> bool:
         alignment = candidate.alignment
@@ -91,3 +122,25 @@ class Relocaliser:
             and alignment.geometric_inliers >= self.config.min_geometric_inliers
             and extent(difference, candidate.median_depth_m) < self.config.agreement_rad
         )
+
+    def _has_rival(
+        self, place: Place, pose: FeaturePose, poses: Iterable[tuple[Place, FeaturePose]]
+    ) -> bool:
+        """Whether another place explains the view nearly as well, from far elsewhere."""
+        T_odom_camera = _seen_from(place, pose)
+        return any(
+            rival.inliers > self.config.rival_inliers * pose.inliers
+            and extent(se3.inverse(T_odom_camera) @ _seen_from(other, rival), place.median_depth_m)
+            > self.config.rival_rad
+            for other, rival in poses
+        )
+
+
+def _seen_from(place: Place, pose: FeaturePose) -> np.ndarray:
+    """T_odom_camera [4, 4]."""
+    return place.T_odom_keyframe @ se3.inverse(pose.T_camera_reference)
+
+
+def _is_apart(place: Place, other: Place, limit_rad: float) -> bool:
+    T_other_place = se3.inverse(other.T_odom_keyframe) @ place.T_odom_keyframe
+    return extent(T_other_place, other.median_depth_m) > limit_rad

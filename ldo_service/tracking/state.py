@@ -22,6 +22,7 @@ class State:
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
+    trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
     T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
@@ -38,6 +39,7 @@ def packed(state: State) -> dict[str, Any]:
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
+        "trusted": state.trusted,
         "searches": state.searches,
         "T_odom_mapped": state.T_odom_mapped,
         "is_moving": _bits(state.is_moving),
@@ -56,6 +58,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
+        trusted=values["trusted"],
         searches=values["searches"],
         T_odom_mapped=values["T_odom_mapped"],
         is_moving=None if is_moving is None else _mask(is_moving),

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.judgement import History, JudgementConfig
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of
+from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of, thumbnail_of
 from ldo_service.tracking.relocalisation import RelocalisationConfig, Relocaliser
 
 T_AWAY = se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
@@ -74,6 +76,34 @@ def test_each_place_has_its_turn_however_unlike_its_thumbnail(large_room) -> Non
 
 def test_a_place_is_refused_when_features_and_images_disagree(large_room, places) -> None:
     assert found(places, large_room.view(T_NEAR), agreement_rad=1e-6) is None
+
+
+def test_a_view_that_two_distant_places_explain_is_not_found(large_room, places) -> None:
+    twin = replace(places.all[0], id=7, T_odom_keyframe=T_BEHIND)
+    near = replace(places.all[0], id=7, T_odom_keyframe=se3.exp(np.full(6, 0.1)))
+    frame = large_room.view(T_NEAR)
+    assert found(Places((*places.all, twin)), frame) is None
+    assert found(Places((*places.all, near)), frame) is not None, "as far as odometry drifts"
+
+
+def test_likely_places_are_of_different_neighbourhoods(large_room, places) -> None:
+    here = places.all[0]
+    crowd = [replace(here, id=k, T_odom_keyframe=se3.exp(np.full(6, 1e-3 * k))) for k in range(6)]
+    view = pyramid_of(large_room.view(T_AWAY), PyramidConfig())
+    finder = relocaliser(RelocalisationConfig(alike=2, in_turn=0))
+    chosen = finder._chosen(view, Places((*crowd, places.all[1])), turn=0)
+    assert {place.id for place in chosen} >= {1}
+    assert len(chosen) == 2
+
+
+def test_another_place_is_not_familiar_and_a_darker_image_is(large_room) -> None:
+    trusted = thumbnail_of(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()))
+    for frame, familiar in (
+        (large_room.view(np.eye(4), 0.5, 10.0), True),
+        (large_room.view(T_BEHIND), False),
+        (large_room.blank(), False),
+    ):
+        assert relocaliser().is_familiar(pyramid_of(frame, PyramidConfig()), trusted) is familiar
 
 
 @pytest.mark.parametrize(

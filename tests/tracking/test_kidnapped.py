@@ -1,0 +1,78 @@
+"""A camera that is suddenly elsewhere and later back: `slow`, on long sequences."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets import open_sequence
+from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.tracking import Odometry, Status, Tracked
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+
+def followed(frames: Iterable[RgbdFrame]) -> list[Tracked]:
+    odometry, results = Odometry(), []
+    for frame in frames:
+        results.append(odometry.track(frame))
+        if results[-1].wants_keyframe:
+            odometry.make_keyframe(frame, results[-1])
+    return results
+
+
+def distances_m(results: Sequence[Tracked], T_odom_camera: Iterable[np.ndarray]) -> np.ndarray:
+    pairs = zip(results, T_odom_camera, strict=True)
+    return np.array([np.linalg.norm(r.T_odom_camera[:3, 3] - T[:3, 3]) for r, T in pairs])
+
+
+def assert_found(back: Sequence[Tracked], distances: np.ndarray) -> None:
+    """Within 3 cm of the truth from the tenth frame on, and never wrong where it is not LOST."""
+    known = np.array([r.status is not Status.LOST for r in back])
+    assert known[10:].all(), [str(r.status) for r in back]
+    assert distances[known].max() < 0.03, distances.round(3)
+
+
+@pytest.mark.parametrize("away", [range(60), range(150, 210)])
+def test_kitchen_after_a_visit_to_an_apartment(data: Path, away: range) -> None:
+    """Judged by the track that was not interrupted: the truth itself errs by 3 cm."""
+    kitchen = open_sequence(str(data / "tum/kitchen"))
+    apartment = open_sequence(str(data / "replica/apartment_floor1"))
+    before, after = [kitchen[k] for k in range(201)], [kitchen[k] for k in range(201, 240)]
+    undisturbed = followed([*before, *after])[201:]
+    results = followed([*before, *(apartment[k] for k in away), *after])
+    gone, back = results[201 : 201 + len(away)], results[201 + len(away) :]
+    assert {r.status for r in gone} == {Status.LOST}
+    assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
+
+
+@pytest.mark.parametrize(("until", "away"), [(120, range(400, 440)), (300, range(20, 60))])
+def walked(flat, *stretches: range) -> list[list[Tracked]]:
+    """Results of each stretch of one track."""
+    results = followed(flat[k] for stretch in stretches for k in stretch)
+    ends = np.cumsum([len(stretch) for stretch in stretches])
+    return [results[end - len(s) : end] for s, end in zip(stretches, ends, strict=True)]
+
+
+def errors_m(flat, results: Sequence[Tracked], frames: range, start: int) -> np.ndarray:
+    """Against exact truth, in the frame of the first pose of the track, frame `start`."""
+    T_world = flat.truth().T_world_camera
+    return distances_m(results, se3.inverse(T_world[start]) @ T_world[frames.start : frames.stop])
+
+
+def test_flat_after_a_jump_to_a_room_never_seen() -> None:
+    flat = open_sequence("synthetic:flat")
+    _, gone, back = walked(flat, range(200, 300), range(20, 60), range(300, 330))
+    assert {r.status for r in gone} == {Status.LOST}
+    assert_found(back, errors_m(flat, back, range(300, 330), start=200))
+
+
+def test_flat_after_a_jump_to_a_room_seen_before() -> None:
+    """There the camera is found; what is found is right, and what is not found is LOST."""
+    flat = open_sequence("synthetic:flat")
+    _, gone, back = walked(flat, range(20, 120), range(400, 440), range(120, 150))
+    known = np.array([r.status is not Status.LOST for r in gone])
+    assert known.any()
+    assert errors_m(flat, gone, range(400, 440), start=20)[known].max() < 0.03
+    assert_found(back, errors_m(flat, back, range(120, 150), start=20))
