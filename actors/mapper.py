@@ -159,6 +159,7 @@ class Mapper(Actor):
             message.reference,
             transform(message.T_reference_keyframe),
             transform(message.T_odom_keyframe),
+            message.segment,
         )
         if message.reference is not None:
             self._links[message.keyframe, message.reference] = message.information

@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.geometry import se3
+from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import Correction, Keyframe, KeyframeRefinement, MeasuredPose
@@ -31,7 +32,7 @@ class OptimizerConfig:
 
 
 class Optimizer(Actor):
-    """The one owner of keyframe poses in the map."""
+    """The one owner of keyframe poses in the map, and of which segments are joined."""
 
     name = "optimizer"
     inputs = (In(KEYFRAME_NEW, Lossless(8)), In(KEYFRAME_REFINEMENT, Lossless(8)))
@@ -42,7 +43,8 @@ class Optimizer(Actor):
         self.config = config or OptimizerConfig()
         self._graph = KeyframeGraph(self.config.graph)
         self._version = 0
-        self._T_odom_newest = np.eye(4)
+        self._newest: dict[int, tuple[int, np.ndarray]] = {}  # by segment: id and T_odom_keyframe
+        self._first: dict[int, int] = {}  # keyframe of each segment
         self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
         self._waiting_number = 0  # of the last refinement that came
         self._refinements = 0  # number of the last one that all poses agree with
@@ -63,7 +65,11 @@ class Optimizer(Actor):
         if not self._early:
             self._refinements = self._waiting_number
         yield correction_message(
-            message.stamp_ns, self._version, self._graph.poses(), self._refinements
+            message.stamp_ns,
+            self._version,
+            self._graph.poses(),
+            self._refinements,
+            self._joined(),
         )
 
     def _refine(self, poses: tuple[MeasuredPose, ...]) -> None:
@@ -78,28 +84,58 @@ class Optimizer(Actor):
 
     def _add(self, message: Keyframe) -> None:
         T_odom_keyframe = transform(message.T_odom_keyframe)
-        newest = self._graph.newest
+        newest = self._newest.get(message.segment)
         known = [m for m in measurements_of(message) if m.a in self._graph]
         if newest is None:
-            self._graph.add_first(message.keyframe, T_odom_keyframe)
+            self._begin(message, T_odom_keyframe)
         elif known:
             self._graph.add(*known)
         else:
             self._bridge(newest, message.keyframe, T_odom_keyframe)
-        self._T_odom_newest = T_odom_keyframe
+        self._newest[message.segment] = (message.keyframe, T_odom_keyframe)
+        for pose in message.joins:
+            self._join(pose)
 
-    def _bridge(self, newest: int, keyframe: int, T_odom_keyframe: np.ndarray) -> None:
+    def _begin(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
+        """The first keyframe of a segment; where it is among the others, nobody knows yet."""
+        self._first[message.segment] = message.keyframe
+        T_map_keyframe = T_map_segment(message.segment) @ T_odom_keyframe
+        self._graph.add_first(message.keyframe, T_map_keyframe)
+
+    def _bridge(
+        self, newest: tuple[int, np.ndarray], keyframe: int, T_odom_keyframe: np.ndarray
+    ) -> None:
         """Nothing that it was measured from was received: odometry from the newest stands in."""
         self._bridged += 1
-        log.warning("keyframe %d: its reference is missing, joined to %d", keyframe, newest)
-        T_newest_keyframe = se3.inverse(self._T_odom_newest) @ T_odom_keyframe
-        self._graph.add(self._graph.missed_odometry(newest, keyframe, T_newest_keyframe))
+        known, T_odom_known = newest
+        log.warning("keyframe %d: its reference is missing, joined to %d", keyframe, known)
+        T_known_keyframe = se3.inverse(T_odom_known) @ T_odom_keyframe
+        self._graph.add(self._graph.missed_odometry(known, keyframe, T_known_keyframe))
+
+    def _join(self, pose: MeasuredPose) -> None:
+        """One keyframe in another, of the same segment or not."""
+        if pose.reference not in self._graph:
+            log.warning("keyframe %d joins %d, which is missing", pose.keyframe, pose.reference)
+            return
+        before = self._joined()
+        self._graph.connect(measured_of(pose))
+        for segment, older in self._joined().items() - before.items():
+            log.info("segment %d is placed in %d now", segment, older)
+
+    def _joined(self) -> dict[int, int]:
+        """Segments that are placed in an older one, and in which."""
+        segments = {first: segment for segment, first in self._first.items()}
+        placed = {s: segments[self._graph.first_of(first)] for s, first in self._first.items()}
+        return {segment: older for segment, older in placed.items() if older != segment}
 
     def snapshot(self) -> dict[str, Any]:
         if self._saved.get("version") != self._version:
             self._saved = {
                 "version": self._version,
-                "T_odom_newest": self._T_odom_newest,
+                "segments": [
+                    (segment, self._first[segment], *newest)
+                    for segment, newest in self._newest.items()
+                ],
                 "refinements": (self._waiting_number, self._refinements),
                 "graph": self._graph.snapshot(),
                 "early": [msgspec.msgpack.encode(pose) for pose in self._early.values()],
@@ -109,7 +145,8 @@ class Optimizer(Actor):
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["graph"]
         self._version = saved["version"] + 1  # one more may have been sent and not saved
-        self._T_odom_newest = saved["T_odom_newest"]
+        self._first = {segment: first for segment, first, *_ in saved["segments"]}
+        self._newest = {segment: (newest, T) for segment, _, newest, T in saved["segments"]}
         self._waiting_number, self._refinements = saved["refinements"]
         self._graph.restore(saved["graph"])
         early = [msgspec.msgpack.decode(body, type=MeasuredPose) for body in saved["early"]]
@@ -122,4 +159,5 @@ class Optimizer(Actor):
             "keyframes_repeated": self._repeated,
             "keyframes_bridged": self._bridged,
             "keyframes_refined": self._refined,
+            "segments_apart": len(self._first) - len(self._joined()),
         }

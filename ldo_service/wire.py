@@ -1,6 +1,6 @@
 """Between messages and numerics: the one place that knows both."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import cv2
 import numpy as np
@@ -125,6 +125,7 @@ def correction_message(
     graph_version: int,
     T_map_keyframe: dict[int, np.ndarray],
     refinements: int = 0,
+    joined: Mapping[int, int] | None = None,
 ) -> Correction:
     rows = [np.r_[T[:3, 3], se3.quaternion(T[:3, :3])] for T in T_map_keyframe.values()]
     return Correction(
@@ -133,6 +134,7 @@ def correction_message(
         keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
         T_map_keyframe=Array.of(np.array(rows, np.float64).reshape(-1, 7)),
         refinements=refinements,
+        joined=tuple(sorted((joined or {}).items())),
     )
 
 

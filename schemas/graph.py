@@ -14,10 +14,13 @@ class Correction(Message, frozen=True, kw_only=True):
     keyframes: Array  # i8 [K], ids, ascending
     T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
     refinements: int = 0  # number of the last keyframe/refinement that it takes into account
+    joined: tuple[tuple[int, int], ...] = ()  # segments, each with the older one it is placed in
 
     def check(self) -> None:
         require_count("graph_version", self.graph_version)
         require_count("refinements", self.refinements)
+        if any(not 0 <= older < segment for segment, older in self.joined):
+            raise ValueError(f"joined {self.joined}: a segment joins an older one")
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]
         self.T_map_keyframe.require("T_map_keyframe", "f8", (count, 7))

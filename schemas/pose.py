@@ -57,6 +57,7 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     overlap: float = 0.0  # share of the reference's surface that this frame sees
     iterations: int = 0
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera)
+    segment: int = 0  # whose frame T_map_odom leads to: 0 is the map's; others are not joined yet
 
     def check(self) -> None:
         require_count("frame", self.frame)
@@ -64,6 +65,7 @@ class TrackedPose(Message, frozen=True, kw_only=True):
         require_count("reference", self.reference or 0)
         require_count("keyframe", self.keyframe or 0)
         require_count("iterations", self.iterations)
+        require_count("segment", self.segment)
         require_matrix6("covariance", self.covariance)
         require_finite(
             "tracking quality",

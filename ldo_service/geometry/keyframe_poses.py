@@ -1,5 +1,6 @@
 """Where keyframes are in the map, as one receiver knows it. Conventions: `ldo_service.geometry`."""
 
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -7,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from . import se3
+
+APART_M = 100.0  # between segments that are not joined: farther than depth cameras see
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +19,18 @@ class Link:
     reference: int | None
     T_reference_keyframe: np.ndarray
     T_odom_keyframe: np.ndarray
+    segment: int = 0
+
+
+def T_map_segment(segment: int) -> np.ndarray:
+    """Where the odometry frame of a segment is put [4, 4] until it is joined to an older one.
+
+    Far from all others, so that their surfaces do not meet; float32 still resolves 0.1 mm in the
+    tenth of them.
+    """
+    T = np.eye(4)
+    T[0, 3] = segment * APART_M
+    return T
 
 
 class KeyframePoses:
@@ -49,13 +64,15 @@ class KeyframePoses:
         reference: int | None,
         T_reference_keyframe: np.ndarray,
         T_odom_keyframe: np.ndarray,
+        segment: int = 0,
     ) -> np.ndarray:
         """Place a new keyframe; its T_map_keyframe.
 
-        A reference that is not known was missed: odometry to the newest known one stands in.
+        A reference that is not known was missed: odometry to the newest known one of the segment
+        stands in.
         """
-        link = Link(reference, np.array(T_reference_keyframe), np.array(T_odom_keyframe))
-        self._T_map[keyframe] = self._placed(link, newest=max(self._T_map, default=None))
+        link = Link(reference, np.array(T_reference_keyframe), np.array(T_odom_keyframe), segment)
+        self._T_map[keyframe] = self._placed(link, self._newest(segment))
         self._links[keyframe] = link
         return self._T_map[keyframe]
 
@@ -83,8 +100,8 @@ class KeyframePoses:
         old = dict(self._T_map)
         self._T_map.update({k: T for k, T in T_map.items() if k in old and k not in held})
         for keyframe in sorted(k for k in old if k > newest or k in held):
-            earlier = max((k for k in old if k < keyframe), default=None)
-            self._T_map[keyframe] = self._placed(self._links[keyframe], earlier)
+            link = self._links[keyframe]
+            self._T_map[keyframe] = self._placed(link, self._newest(link.segment, keyframe))
         return {
             k: self._T_map[k] @ se3.inverse(T_old)
             for k, T_old in old.items()
@@ -98,8 +115,13 @@ class KeyframePoses:
         elif newest is not None:
             T_map = self.T_map_odom(newest) @ link.T_odom_keyframe
         else:
-            T_map = link.T_odom_keyframe
+            T_map = T_map_segment(link.segment) @ link.T_odom_keyframe
         return se3.orthonormalised(T_map)
+
+    def _newest(self, segment: int, before: float = math.inf) -> int | None:
+        """The newest keyframe of a segment among those older than `before`."""
+        known = (k for k in self._T_map if k < before and self._links[k].segment == segment)
+        return max(known, default=None)
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
         """Forget all others, for a receiver that needs a few."""
@@ -119,11 +141,13 @@ class KeyframePoses:
             "T_map": np.array(list(self._T_map.values())).reshape(-1, 4, 4),
             "reference": [link.reference for link in links],
             "T_reference": np.array([k.T_reference_keyframe for k in links]).reshape(-1, 4, 4),
+            "segment": [link.segment for link in links],
             "T_odom": np.array([link.T_odom_keyframe for link in links]).reshape(-1, 4, 4),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self.version = state["version"]
         self._T_map = dict(zip(state["keyframes"], state["T_map"], strict=True))
-        links = map(Link, state["reference"], state["T_reference"], state["T_odom"])
+        columns = (state[name] for name in ("reference", "T_reference", "T_odom", "segment"))
+        links = map(Link, *columns)
         self._links = dict(zip(state["keyframes"], links, strict=True))

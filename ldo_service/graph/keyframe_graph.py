@@ -7,12 +7,13 @@ import gtsam
 import numpy as np
 
 from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeGraphConfig:
-    first_sigma: float = 1e-6  # rad and m: the first keyframe is the origin of the map
+    first_sigma: float = 1e-6  # rad and m: the first keyframe is the origin of its component
     sigma_rotation_max_rad: float = 0.2  # a degenerate direction is believed no worse than this,
     sigma_translation_max_m: float = 0.5  # or the linear system becomes singular
     sigma_odometry_rad: float = 0.05  # of odometry over a missed keyframe
@@ -25,6 +26,9 @@ class KeyframeGraphConfig:
 
 class KeyframeGraph:
     """min over T_map_k of  sum |log(T_a_b^-1 T_map_a^-1 T_map_b)|^2_information.
+
+    Keyframes that measurements connect are a component, whose frame its first keyframe fixes; a
+    measurement between two components makes them one, in the frame of the older.
 
     iSAM2 relinearises what moved. An update that throws has already changed the object, so the
     graph is rebuilt from the kept measurements. Deterministic: the same measurements in the same
@@ -39,6 +43,7 @@ class KeyframeGraph:
         self._initial: dict[int, np.ndarray] = {}  # the value each keyframe was inserted with
         self._measured: dict[tuple[int, int], RelativePose] = {}
         self._places: dict[tuple[int, int], int] = {}  # of their factors in the solver
+        self._first_of: dict[int, int] = {}  # the first keyframe of each one's component
         self._isam = self._new_isam()
 
     def __contains__(self, keyframe: int) -> bool:
@@ -56,9 +61,14 @@ class KeyframeGraph:
         return max(self._initial, default=None)
 
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
-        """The keyframe that fixes the map's frame."""
+        """The keyframe that fixes the frame of a new component."""
         self._initial[keyframe] = np.array(T_map_keyframe, float)
+        self._first_of[keyframe] = keyframe
         self._update([], [keyframe])
+
+    def first_of(self, keyframe: int) -> int:
+        """The first keyframe of its component. Raises KeyError when it is not known."""
+        return self._first_of[keyframe]
 
     def add(self, measured: RelativePose, *more: RelativePose) -> None:
         """A new keyframe `b`, measured from a known one, and from `more` of them.
@@ -72,6 +82,7 @@ class KeyframeGraph:
             if m.a not in self:
                 raise KeyError(m.a)
         self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
+        self._first_of[measured.b] = self._first_of[measured.a]
         self._measured.update({(m.a, m.b): m for m in every})
         self._update(every, [measured.b])
 
@@ -86,6 +97,30 @@ class KeyframeGraph:
         old = [self._places[m.a, m.b] for m in measured if (m.a, m.b) in self._places]
         self._measured.update({(m.a, m.b): m for m in measured})
         self._update(measured, [], old)
+
+    def connect(self, measured: RelativePose) -> None:
+        """A measurement between two known keyframes. Raises KeyError when one is not known.
+
+        When it joins two components, the younger one moves as a whole into the older one's frame,
+        T_new_old = T_map_a T_a_b T_map_b^-1 (or its inverse), before everything is solved again.
+        """
+        first_a, first_b = self._first_of[measured.a], self._first_of[measured.b]
+        if first_a == first_b:
+            self.replace([measured])
+            return
+        T_new_old = self.pose(measured.a) @ measured.T_a_b @ se3.inverse(self.pose(measured.b))
+        if first_a > first_b:
+            T_new_old = se3.inverse(T_new_old)
+        self._move(max(first_a, first_b), min(first_a, first_b), se3.orthonormalised(T_new_old))
+        self._measured[measured.a, measured.b] = measured
+        self._rebuild()
+
+    def _move(self, younger: int, older: int, T_new_old: np.ndarray) -> None:
+        """All of a component into another."""
+        poses = self.poses()
+        for keyframe in [k for k, first in self._first_of.items() if first == younger]:
+            self._initial[keyframe] = T_new_old @ poses[keyframe]
+            self._first_of[keyframe] = older
 
     def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
         """Odometry between keyframes of which those between were missed: believed less."""
@@ -135,8 +170,9 @@ class KeyframeGraph:
             graph.add(self._factor(m))
         for keyframe in keyframes:
             values.insert(keyframe, gtsam.Pose3(self._initial[keyframe]))
-        if keyframes and keyframes[0] == next(iter(self._initial)):
-            graph.add(self._first_factor(keyframes[0]))
+        for keyframe in keyframes:
+            if self._first_of[keyframe] == keyframe:
+                graph.add(self._first_factor(keyframe))
         places = self._isam.update(graph, values, list(old_places)).getNewFactorsIndices()
         self._places.update({(m.a, m.b): place for m, place in zip(measured, places, strict=False)})
 
@@ -164,6 +200,7 @@ class KeyframeGraph:
         measured = self._measured.values()
         return {
             "keyframes": np.array(keyframes, np.int64),
+            "first_of": np.array([self._first_of[k] for k in keyframes], np.int64),
             "initial": np.array([self._initial[k] for k in keyframes]).reshape(-1, 4, 4),
             "pairs": np.array([(m.a, m.b) for m in measured], np.int64).reshape(-1, 2),
             "T_a_b": np.array([m.T_a_b for m in measured]).reshape(-1, 4, 4),
@@ -173,6 +210,7 @@ class KeyframeGraph:
     def restore(self, state: dict[str, np.ndarray]) -> None:
         keyframes = [int(k) for k in state["keyframes"]]
         self._initial = dict(zip(keyframes, state["initial"], strict=True))
+        self._first_of = dict(zip(keyframes, map(int, state["first_of"]), strict=True))
         self._measured = {
             (int(a), int(b)): RelativePose(int(a), int(b), T_a_b, information)
             for (a, b), T_a_b, information in zip(

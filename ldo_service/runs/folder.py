@@ -2,7 +2,8 @@
 
 trajectory_online.txt   what was published at the time, a line per frame that is not LOST
 trajectory.txt          the same frames after the last correction
-frames.csv              every frame: status, residuals, milliseconds
+                        (frames of segments that are not joined to the first are in neither)
+frames.csv              every frame: status, residuals, milliseconds, segment
 keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians
 config.yaml             the effective configuration
@@ -12,6 +13,7 @@ refined/                trajectory, keyframes and map after more iterations, if 
 
 import csv
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +58,7 @@ CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # of a keyframe, in pixels
 COLUMNS = (
     *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
+    "segment",
 )
 
 
@@ -90,6 +93,7 @@ class TrackedFrame:
     reference: int | None
     T_reference_camera: np.ndarray
     T_map_camera_online: np.ndarray
+    segment: int
 
 
 class RunFolder:
@@ -103,6 +107,7 @@ class RunFolder:
         self._csv.writerow(COLUMNS)
         self._tracked: list[TrackedFrame] = []
         self._poses = KeyframePoses()
+        self._joined: dict[int, int] = {}  # segments placed in an older one
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.follower = MapFollower()
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
@@ -124,6 +129,7 @@ class RunFolder:
             case Correction():
                 self.corrections += 1
                 self._poses.correct(message.graph_version, keyframe_poses_of(message))
+                self._joined = dict(message.joined)
             case MapDelta() | MapSnapshot():
                 self.follower.take(message)
 
@@ -136,14 +142,18 @@ class RunFolder:
                 *(pose.frame, pose.stamp_ns, pose.status, pose.reference, pose.keyframe),
                 int(held_out),
                 *(f"{value:.4f}" for value in quality),
-                *(pose.iterations, f"{step_ms:.3f}"),
+                *(pose.iterations, f"{step_ms:.3f}", pose.segment),
             )
         )
         if pose.status != "LOST":
             online = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
             self._tracked.append(
                 TrackedFrame(
-                    pose.stamp_ns, pose.reference, transform(pose.T_reference_camera), online
+                    pose.stamp_ns,
+                    pose.reference,
+                    transform(pose.T_reference_camera),
+                    online,
+                    pose.segment,
                 )
             )
 
@@ -153,12 +163,14 @@ class RunFolder:
             keyframe.reference,
             transform(keyframe.T_reference_keyframe),
             transform(keyframe.T_odom_keyframe),
+            keyframe.segment,
         )
         self.newest_stamp_ns = keyframe.stamp_ns
         self._keyframes[keyframe.keyframe] = {
             "keyframe": keyframe.keyframe,
             "frame_index": keyframe.frame,
             "stamp_ns": keyframe.stamp_ns,
+            "segment": keyframe.segment,
             "camera": {name: getattr(keyframe.camera, name) for name in CAMERA},
         }
 
@@ -185,32 +197,37 @@ class RunFolder:
 
     def online(self) -> Trajectory:
         """T_map_camera as published at the time."""
-        return self._trajectory([frame.T_map_camera_online for frame in self._tracked])
+        frames = [frame for frame in self._tracked if frame.segment == 0]
+        return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
         """T_map_camera from where the reference keyframes are now."""
-        return self._trajectory(
+        frames = [f for f in self._tracked if self._joined.get(f.segment, f.segment) == 0]
+        return _trajectory(
+            frames,
             [
                 frame.T_map_camera_online
                 if frame.reference is None
                 else self._poses[frame.reference] @ frame.T_reference_camera
-                for frame in self._tracked
-            ]
+                for frame in frames
+            ],
         )
-
-    def _trajectory(self, T_map_camera: list[np.ndarray]) -> Trajectory:
-        stamps_s = np.array([frame.stamp_ns for frame in self._tracked]) * 1e-9
-        return Trajectory(stamps_s, np.array(T_map_camera).reshape(-1, 4, 4))
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:
         return [
             {
                 **facts,
+                "segment": self._joined.get(facts["segment"], facts["segment"]),
                 "T_map_camera": self._poses[keyframe].tolist(),
                 "exposure": self.follower.exposure(keyframe).tolist(),
             }
             for keyframe, facts in self._keyframes.items()
         ]
+
+
+def _trajectory(frames: Sequence[TrackedFrame], T_map_camera: list[np.ndarray]) -> Trajectory:
+    stamps_s = np.array([frame.stamp_ns for frame in frames]) * 1e-9
+    return Trajectory(stamps_s, np.array(T_map_camera).reshape(-1, 4, 4))
 
 
 def write_json(path: Path, value: object) -> None:

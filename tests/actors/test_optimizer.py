@@ -5,8 +5,9 @@ import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.geometry import se3
-from ldo_service.schemas import Keyframe
-from ldo_service.wire import keyframe_poses_of, transform
+from ldo_service.geometry.keyframe_poses import T_map_segment
+from ldo_service.schemas import Keyframe, MeasuredPose, Pose
+from ldo_service.wire import keyframe_poses_of, pose_message, transform
 
 
 def handled(optimizer: Optimizer, keyframes: list[Keyframe]) -> list:
@@ -94,3 +95,70 @@ def test_two_runs_say_the_same_bytes(keyframes) -> None:
 def test_an_information_of_zero_does_not_break_the_graph(keyframes) -> None:
     blind = msgspec.structs.replace(keyframes[1], information=(0.0,) * 36)
     assert len(handled(Optimizer(), [keyframes[0], blind])) == 2
+
+
+# --- segments -------------------------------------------------------------------------------------
+def in_two_segments(keyframes: list[Keyframe], split: int) -> list[Keyframe]:
+    """As if tracking had been lost before keyframe `split`, and had begun anew."""
+    keyframes = chained(keyframes)
+    second = msgspec.structs.replace(keyframes[split], segment=1, reference=None)
+    later = [
+        msgspec.structs.replace(
+            k, segment=1, reference=split, T_reference_keyframe=between(second, k)
+        )
+        for k in keyframes[split + 1 :]
+    ]
+    return [*keyframes[:split], second, *later]
+
+
+def between(known: Keyframe, keyframe: Keyframe) -> Pose:
+    T_odom_known, T_odom_keyframe = map(
+        transform, (known.T_odom_keyframe, keyframe.T_odom_keyframe)
+    )
+    return pose_message(se3.inverse(T_odom_known) @ T_odom_keyframe)
+
+
+def joining(keyframe: Keyframe, known: Keyframe) -> Keyframe:
+    """The keyframe, which sees what an old one saw."""
+    pose = MeasuredPose(
+        reference=known.keyframe,
+        keyframe=keyframe.keyframe,
+        T_reference_keyframe=between(known, keyframe),
+        information=keyframe.information,
+    )
+    return msgspec.structs.replace(keyframe, joins=(pose,))
+
+
+def test_a_new_segment_is_placed_far_from_the_others(keyframes) -> None:
+    (*_, last) = handled(Optimizer(), in_two_segments(keyframes, 3))
+    assert last.joined == ()
+    for k in keyframes:
+        T_odom_keyframe = transform(k.T_odom_keyframe)
+        T_expected = T_odom_keyframe if k.keyframe < 3 else T_map_segment(1) @ T_odom_keyframe
+        np.testing.assert_allclose(keyframe_poses_of(last)[k.keyframe], T_expected, atol=1e-6)
+
+
+def test_a_join_brings_the_younger_segment_into_the_older_ones_frame(keyframes, caplog) -> None:
+    caplog.set_level("INFO")
+    *before, last = in_two_segments(keyframes, 3)
+    first, successor = Optimizer(), Optimizer()
+    handled(first, before)
+    successor.restore(first.snapshot())
+    for optimizer in (first, successor):
+        (correction,) = handled(optimizer, [joining(last, keyframes[1])])
+        assert correction.joined == ((1, 0),)
+        for k in keyframes:
+            np.testing.assert_allclose(
+                keyframe_poses_of(correction)[k.keyframe], transform(k.T_odom_keyframe), atol=1e-5
+            )
+    assert "segment 1 is placed in 0 now" in caplog.text
+    assert first.facts()["segments_apart"] == 1
+
+
+def test_a_join_to_a_keyframe_that_never_came_is_left_out(keyframes, caplog) -> None:
+    *before, last = in_two_segments(keyframes, 3)
+    optimizer = Optimizer()
+    handled(optimizer, [k for k in before if k.keyframe != 1])
+    (correction,) = handled(optimizer, [joining(last, keyframes[1])])
+    assert correction.joined == ()
+    assert "joins 1, which is missing" in caplog.text

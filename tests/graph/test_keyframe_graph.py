@@ -158,3 +158,51 @@ def test_keyframes_are_added_one_by_one_and_from_known_ones() -> None:
     with pytest.raises(KeyError):
         graph.add(*measured(truth, [(0, 2), (3, 2)], 0.0))
     assert 2 not in graph
+
+
+# --- components -----------------------------------------------------------------------------------
+def two_components(truth: list[np.ndarray], T_apart: np.ndarray) -> KeyframeGraph:
+    """The first half of a walk, and the second in a frame of its own."""
+    half = len(truth) // 2
+    graph = KeyframeGraph()
+    graph.add_first(0, truth[0])
+    for m in measured(truth, [(i, i + 1) for i in range(half - 1)], 0.0):
+        graph.add(m)
+    graph.add_first(half, T_apart @ truth[half])
+    for m in measured(truth, [(i, i + 1) for i in range(half, len(truth) - 1)], 0.0):
+        graph.add(m)
+    return graph
+
+
+T_APART = se3.exp(np.array([0.1, -0.4, 0.2, 100.0, 3.0, -5.0]))
+
+
+def test_components_keep_their_frames_until_they_are_joined() -> None:
+    truth = circle(12)
+    graph = two_components(truth, T_APART)
+    assert [graph.first_of(k) for k in (0, 5, 6, 11)] == [0, 0, 6, 6]
+    for keyframe, T in graph.poses().items():
+        T_expected = truth[keyframe] if keyframe < 6 else T_APART @ truth[keyframe]
+        np.testing.assert_allclose(T, T_expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("pair", [(2, 9), (9, 2)])
+def test_a_measurement_joins_the_younger_component_to_the_older(pair: tuple[int, int]) -> None:
+    truth = circle(12)
+    graph = two_components(truth, T_APART)
+    graph.connect(*measured(truth, [pair], 0.0))
+    assert {graph.first_of(k) for k in range(12)} == {0}
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, truth[keyframe], atol=1e-5)
+
+
+def test_a_joined_graph_grows_on_and_survives_a_restart() -> None:
+    truth = circle(12)
+    graph, successor = two_components(truth[:11], T_APART), KeyframeGraph()
+    graph.connect(*measured(truth, [(2, 9)], 0.0))
+    successor.restore(graph.snapshot())
+    for one in (graph, successor):
+        one.add(*measured(truth, [(10, 11)], 0.0))
+        one.connect(*measured(truth, [(0, 11)], 0.0))
+        np.testing.assert_allclose(one.pose(11), truth[11], atol=1e-5)
+        assert one.first_of(11) == 0

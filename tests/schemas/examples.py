@@ -130,6 +130,35 @@ EXAMPLES: dict[str, Message] = {
         overlap=0.75,
         is_moving=Array.of((DEPTH.numpy() > 0).astype(np.uint8)),
     ),
+    "keyframe_that_joins": Keyframe(
+        stamp_ns=3,
+        keyframe=5,
+        frame=10,
+        camera=CAMERA,
+        color=COLOR,
+        depth_m=DEPTH,
+        reference=4,
+        T_reference_keyframe=POSE,
+        information=INFORMATION,
+        T_odom_keyframe=OTHER_POSE,
+        overlap=0.5,
+        segment=1,
+        joins=(
+            MeasuredPose(
+                reference=2, keyframe=5, T_reference_keyframe=POSE, information=INFORMATION
+            ),
+        ),
+    ),
+    "correction_that_joins": Correction(
+        stamp_ns=9,
+        graph_version=4,
+        keyframes=Array.of(np.array([0, 4], np.int64)),
+        T_map_keyframe=Array.of(
+            np.array([[0, 0, 0, 1, 0, 0, 0], [1, 2, 3, 0.6, 0, 0.8, 0]], float)
+        ),
+        refinements=1,
+        joined=((1, 0), (2, 0)),
+    ),
     "tracked_pose": TrackedPose(
         stamp_ns=4,
         frame=10,
