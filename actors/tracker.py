@@ -18,11 +18,19 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.runtime import Actor, In, Latest, Out
-from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
+from ldo_service.schemas import (
+    Array,
+    Correction,
+    FrameRgbd,
+    Keyframe,
+    MeasuredPose,
+    TrackedPose,
+)
 from ldo_service.schemas.message import decode, encode
 from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig, Tracked
+from ldo_service.tracking.segments import Join
 from ldo_service.wire import (
     camera_message,
     keyframe_poses_of,
@@ -103,7 +111,11 @@ class Tracker(Actor):
         tracked = self._odometry.track(frame)
         if tracked.method == "relocalised":
             self._recall(tracked)
-        keyframe = self._make_keyframe(frame, tracked) if self._may_map(frame, tracked) else None
+        if tracked.may_begin and self._may_map(frame):
+            tracked = self._odometry.begin_segment(frame)
+        is_wanted = tracked.wants_mapping and tracked.status is Status.OK
+        is_mapped = is_wanted and self._may_map(frame)
+        keyframe = self._make_keyframe(frame, tracked) if is_mapped else None
         if keyframe is not None:
             yield keyframe
         elif tracked.method == "first":
@@ -111,10 +123,8 @@ class Tracker(Actor):
         yield self._tracked_pose(frame, tracked, None if keyframe is None else keyframe.keyframe)
 
     # --- keyframes --------------------------------------------------------------------------------
-    def _may_map(self, frame: RgbdFrame, tracked: Tracked) -> bool:
-        """Whether the frame becomes a keyframe: wanted, not held out, and everyone has room."""
-        if not tracked.wants_mapping or tracked.status is not Status.OK:
-            return False
+    def _may_map(self, frame: RgbdFrame) -> bool:
+        """Whether the frame may become a keyframe: it is not held out, and everyone has room."""
         hold_out = self.config.hold_out
         if hold_out and frame.index % hold_out == hold_out - 1:
             return False
@@ -131,7 +141,11 @@ class Tracker(Actor):
         else:
             keyframe = self._odometry.make_supporting(tracked)
         self._poses.chain(
-            keyframe, tracked.keyframe, tracked.T_keyframe_camera, tracked.T_odom_camera
+            keyframe,
+            tracked.keyframe,
+            tracked.T_keyframe_camera,
+            tracked.T_odom_camera,
+            tracked.segment,
         )
         self._poses.keep_only(self._needed(keyframe))
         self._made += 1
@@ -149,6 +163,8 @@ class Tracker(Actor):
             overlap=tracked.overlap,
             window=tuple(map(measured_message, window)),
             is_moving=mask_message(tracked.is_moving, frame.camera),
+            segment=tracked.segment,
+            joins=() if tracked.join is None else (_measured(tracked.join, keyframe),),
         )
 
     def _needed(self, newest: int) -> Iterator[int]:
@@ -169,7 +185,7 @@ class Tracker(Actor):
         if keyframe is None or keyframe in self._poses:
             return
         T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_keyframe_camera)
-        self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe)
+        self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe, tracked.segment)
         if self._correction is not None:
             T_map = keyframe_poses_of(self._correction, only=(keyframe,))
             self._poses.place(keyframe, T_map.get(keyframe, self._poses[keyframe]))
@@ -197,7 +213,13 @@ class Tracker(Actor):
             overlap=tracked.overlap,
             iterations=tracked.iterations,
             T_base_camera=self._T_base_camera,
+            segment=self._placed_in(tracked.segment),
         )
+
+    def _placed_in(self, segment: int) -> int:
+        """The oldest segment that it is joined to, as the optimizer knows."""
+        joined = () if self._correction is None else self._correction.joined
+        return dict(joined).get(segment, segment)
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -221,3 +243,12 @@ class Tracker(Actor):
 
     def facts(self) -> dict[str, float]:
         return {"keyframes": self._made, "keyframes_without_room": self._without_room}
+
+
+def _measured(join: Join, keyframe: int) -> MeasuredPose:
+    return MeasuredPose(
+        reference=join.keyframe,
+        keyframe=keyframe,
+        T_reference_keyframe=pose_message(join.T_keyframe_camera),
+        information=matrix6_message(join.information),
+    )

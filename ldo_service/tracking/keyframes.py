@@ -50,6 +50,7 @@ class Keyframe:
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
     id: int  # ascending, given by the odometry: a camera's frame numbers may start again
+    segment: int = 0  # whose odometry frame T_odom_keyframe leads to
     has_moved: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
     left_out: np.ndarray | None = None  # [H, W] bool: what of it is not tracked against
     kept_features: Features | None = None  # of a place; its image is smaller than what they saw
@@ -76,6 +77,7 @@ class Keyframe:
             "camera": asdict(view.camera),
             "T_odom_keyframe": self.T_odom_keyframe,
             "id": self.id,
+            "segment": self.segment,
             "has_moved": self.has_moved,
             "left_out": self.left_out,
             "features": None if features is None else asdict(features),
@@ -86,8 +88,15 @@ class Keyframe:
         """The inverse of `packed`, under the same configuration."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
-        moved = kept["has_moved"], kept["left_out"]
-        return Keyframe(view, kept["T_odom_keyframe"], kept["id"], *moved, features)
+        return Keyframe(
+            view,
+            kept["T_odom_keyframe"],
+            kept["id"],
+            kept["segment"],
+            kept["has_moved"],
+            kept["left_out"],
+            features,
+        )
 
 
 def is_due(

@@ -7,6 +7,8 @@
             measurements = odometry.window(tracked)  # of it, from keyframes before its reference
         elif tracked.wants_mapping:
             odometry.make_supporting(tracked)
+        elif tracked.may_begin:  # a new segment
+            odometry.make_keyframe(frame, odometry.begin_segment(frame))
 
 The caller decides whether there is room for a keyframe; without one, tracking goes on against the
 last. Conventions: `ldo_service.geometry`.
@@ -31,9 +33,10 @@ from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion, extent
 from .moving import MovingConfig, spread, watch
-from .places import PlacesConfig, place_of, thumbnail_of
+from .places import Places, PlacesConfig, place_of, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
+from .segments import Join, Look, SegmentConfig
 from .state import State, packed, unpacked
 from .window import WindowConfig, measured_from
 
@@ -50,6 +53,7 @@ class OdometryConfig:
     window: WindowConfig = field(default_factory=WindowConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
     moving: MovingConfig = field(default_factory=MovingConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
@@ -81,6 +85,9 @@ class Tracked:
     overlap: float = 0.0  # visible fraction of the keyframe's surface
     iterations: int = 0
     is_moving: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped
+    segment: int = 0  # whose odometry frame T_odom_camera leads to
+    may_begin: bool = False  # LOST for so long that a new segment is better than none
+    join: Join | None = None  # where it is in another segment; counts once it is a keyframe
 
 
 class Odometry:
@@ -103,7 +110,7 @@ class Odometry:
         """The pose of a frame. Never raises for what a frame shows: it may be blank."""
         view, keyframe = self._view(frame), self._state.keyframe
         if keyframe is None:
-            return self._first(frame, view)
+            return self._first(view)
         candidate = self._followed(keyframe, view, frame.stamp_ns)
         status = self._judged(candidate)
         if status is Status.WEAK and not self._relocaliser.is_familiar(view, self._state.trusted):
@@ -111,9 +118,22 @@ class Odometry:
         if status is Status.LOST:
             found = self._relocalised(view)
             if found is None:
-                return self._lost(keyframe, candidate.alignment)
+                return self._lost(keyframe, candidate.alignment, view)
             (keyframe, candidate), status = found, Status.OK
-        return self._accepted(frame, keyframe, candidate, status)
+        tracked = self._accepted(frame, keyframe, candidate, status)
+        return self._joining(tracked, keyframe, view)
+
+    def begin_segment(self, frame: RgbdFrame) -> Tracked:
+        """The frame just tracked, LOST, as the first of a new segment, for `make_keyframe`.
+
+        Odometry goes on where it was lost: its frame never jumps, and is wrong by what was missed.
+        """
+        segment = len(self._state.segments.roots)
+        log.info("tracking begins segment %d with frame %d", segment, frame.index)
+        T_odom_camera = self._state.motion.T_odom_camera
+        return Tracked(
+            T_odom_camera, np.eye(4), None, Status.OK, "first", True, True, segment=segment
+        )
 
     def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
         """Track against this frame, the one just tracked, from now on; its id as a keyframe.
@@ -122,10 +142,21 @@ class Odometry:
         """
         if tracked.status is Status.LOST:
             raise ValueError(f"frame {frame.index} is LOST and cannot be a keyframe.")
+        if tracked.method == "first":
+            self._begin(frame, tracked)
+        if tracked.join is not None:
+            segments = self._state.segments.joined(tracked.segment, tracked.join.segment)
+            self._state = replace(self._state, segments=segments)
         before, view = self._state, self._view(frame)
         view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
-        moving = before.is_moving, tracked.is_moving
-        keyframe = Keyframe(view, tracked.T_odom_camera, before.next_id, *moving)
+        keyframe = Keyframe(
+            view,
+            tracked.T_odom_camera,
+            before.next_id,
+            tracked.segment,
+            has_moved=before.is_moving,
+            left_out=tracked.is_moving,
+        )
         place = place_of(keyframe, self.config.features, self.config.places)
         self._state = replace(
             before,
@@ -143,15 +174,19 @@ class Odometry:
         keyframe = self._state.keyframe
         if keyframe is None or tracked.keyframe is None:
             return []
-        earlier = self._earlier(without={keyframe.id, tracked.keyframe})
+        earlier = self._earlier(keyframe.segment, without={keyframe.id, tracked.keyframe})
         usual = Appearance(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
         return measured_from(earlier, keyframe, usual, self.config.align, self.config.window)
 
-    def _earlier(self, without: set[int]) -> Iterator[Keyframe]:
-        """The last keyframes from their places, newest first, each rebuilt once."""
-        others = [place for place in self._state.places.all if place.id not in without]
+    def _earlier(self, segment: int, without: set[int]) -> Iterator[Keyframe]:
+        """The last keyframes of a segment from their places, newest first, each rebuilt once."""
+        others = [
+            place
+            for place in self._state.places.all
+            if place.segment == segment and place.id not in without
+        ]
         last = others[-self.config.window.reach :]
         ids = {place.id for place in last}
         self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
@@ -193,15 +228,26 @@ class Odometry:
             self._viewed = (frame, pyramid_of(frame, self.config.pyramid))
         return self._viewed[1]
 
-    def _first(self, frame: RgbdFrame, view: Pyramid) -> Tracked:
-        measured = float(np.mean(view.levels[0].depth_m > 0))
-        usable = measured >= self.config.judgement.min_paired
-        motion, trusted = Motion(stamp_ns=frame.stamp_ns), thumbnail_of(view)
-        self._state = replace(
-            self._state, motion=motion, trusted=trusted, is_moving=None, suspicion=None
-        )
+    def _first(self, view: Pyramid) -> Tracked:
+        usable = self._is_usable(view)
         status, method = (Status.OK, "first") if usable else (Status.LOST, "none")
         return Tracked(np.eye(4), np.eye(4), None, status, method, usable, usable)
+
+    def _is_usable(self, view: Pyramid) -> bool:
+        """Whether others could be aligned to it."""
+        measured = float(np.mean(view.levels[0].depth_m > 0))
+        return measured >= self.config.judgement.min_paired
+
+    def _begin(self, frame: RgbdFrame, tracked: Tracked) -> None:
+        self._state = replace(
+            self._state,
+            motion=Motion(tracked.T_odom_camera, stamp_ns=frame.stamp_ns),
+            status=Status.OK,
+            trusted=thumbnail_of(self._view(frame)),
+            segments=self._state.segments.begun(),
+            is_moving=None,
+            suspicion=None,
+        )
 
     def _followed(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
         """Alignment from the predicted pose; from every other guess too, where that is not sure."""
@@ -233,23 +279,44 @@ class Odometry:
         agree = candidate.features_agree
         return judge(candidate.alignment, agree, state.history, state.status, limits)
 
-    def _relocalised(self, view: Pyramid) -> tuple[Keyframe, Candidate] | None:
-        state = self._state
+    def _relocalised(
+        self, view: Pyramid, apart_from: int | None = None
+    ) -> tuple[Keyframe, Candidate] | None:
+        """Among all places, or those of segments that are not joined to one."""
+        state, places = self._state, self._state.places
+        if apart_from is not None:
+            joined = state.segments.are_joined
+            places = Places(tuple(p for p in places.all if not joined(p.segment, apart_from)))
         self._state = replace(state, searches=state.searches + 1)
-        return self._relocaliser.find(view, state.places, state.searches, state.history)
+        return self._relocaliser.find(view, places, state.searches, state.history)
 
-    def _lost(self, keyframe: Keyframe, alignment: Alignment) -> Tracked:
+    def _joining(self, tracked: Tracked, keyframe: Keyframe, view: Pyramid) -> Tracked:
+        """Now and then, whether the view is seen from another segment too."""
+        before, config = self._state.segments, self.config.segments
+        if tracked.status is not Status.OK or not before.is_time_to_look(config):
+            return tracked
+        found = self._relocalised(view, apart_from=keyframe.segment)
+        look = None if found is None else _look(tracked, found[0], found[1].alignment)
+        self._state = replace(self._state, segments=before.looked(look))
+        if found is None or look is None or not before.is_confirmed_by(look, config):
+            return tracked
+        join = _join(found[0], found[1].alignment)
+        return replace(tracked, wants_keyframe=True, wants_mapping=True, join=join)
+
+    def _lost(self, keyframe: Keyframe, alignment: Alignment, view: Pyramid) -> Tracked:
         motion = self._state.motion.stopped()
         self._remember(keyframe, motion, self._state.history, Status.LOST)
         self._state = replace(self._state, is_moving=None, suspicion=None)
         T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
-        return _report(
+        lost = _report(
             replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
             motion.T_odom_camera,
             keyframe,
             Status.LOST,
             "none",
         )
+        may_begin = self._state.segments.may_begin(self.config.segments)
+        return replace(lost, may_begin=may_begin and self._is_usable(view))
 
     def _accepted(
         self, frame: RgbdFrame, keyframe: Keyframe, candidate: Candidate, status: Status
@@ -323,6 +390,7 @@ class Odometry:
             history=history,
             status=status,
             frames_since_keyframe=before.frames_since_keyframe + 1,
+            segments=before.segments.after(status is Status.LOST),
         )
 
 
@@ -352,4 +420,15 @@ def _report(
         overlap=alignment.overlap,
         iterations=alignment.iterations,
         is_moving=is_moving,
+        segment=keyframe.segment,
     )
+
+
+def _look(tracked: Tracked, other: Keyframe, alignment: Alignment) -> Look:
+    T_there_camera = other.T_odom_keyframe @ alignment.T_reference_camera
+    T_there_here = T_there_camera @ se3.inverse(tracked.T_odom_camera)
+    return Look(tracked.segment, other.segment, T_there_here, other.reference.median_depth_m)
+
+
+def _join(other: Keyframe, alignment: Alignment) -> Join:
+    return Join(other.id, other.segment, alignment.T_reference_camera, alignment.information)

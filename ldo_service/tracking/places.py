@@ -47,6 +47,7 @@ class Place:
     """
 
     id: int
+    segment: int
     T_odom_keyframe: np.ndarray  # [4, 4]
     median_depth_m: float
     thumbnail: np.ndarray
@@ -84,7 +85,9 @@ class Place:
         steps = codecs.decode_depth("z16+zstd", camera.width, camera.height, memoryview(self.depth))
         depth_m = steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
         view = build_pyramid(np.asarray(gray, np.uint8), depth_m, camera, config)
-        return Keyframe(view, self.T_odom_keyframe, self.id, kept_features=self.features)
+        return Keyframe(
+            view, self.T_odom_keyframe, self.id, self.segment, kept_features=self.features
+        )
 
 
 def place_of(keyframe: Keyframe, features: FeatureConfig, config: PlacesConfig) -> Place:
@@ -97,6 +100,7 @@ def place_of(keyframe: Keyframe, features: FeatureConfig, config: PlacesConfig) 
     _, gray = cv2.imencode(".png", np.rint(level.texels[..., 0]).astype(np.uint8))
     return Place(
         id=keyframe.id,
+        segment=keyframe.segment,
         T_odom_keyframe=keyframe.T_odom_keyframe,
         median_depth_m=keyframe.reference.median_depth_m,
         thumbnail=thumbnail_of(view),
@@ -147,10 +151,15 @@ class Places:
 
 
 def _gaps(path: tuple[Place, ...]) -> np.ndarray:
-    """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`."""
+    """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`.
+
+    Infinite where they are of two segments.
+    """
     T = np.array([place.T_odom_keyframe for place in path])
     R, t = T[:, :3, :3], T[:, :3, 3]
     cosine = (np.einsum("nij,nij->n", R[:-2], R[2:]) - 1.0) / 2.0
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
     shift = np.linalg.norm(t[2:] - t[:-2], axis=1) / median_depth_m
-    return np.arccos(np.clip(cosine, -1.0, 1.0)) + shift
+    segment = np.array([place.segment for place in path])
+    gaps = np.arccos(np.clip(cosine, -1.0, 1.0)) + shift
+    return np.where(segment[:-2] == segment[2:], gaps, np.inf)

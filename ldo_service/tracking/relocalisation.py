@@ -4,7 +4,8 @@ A lost frame is compared with the places whose thumbnails are most like it, and 
 in turn, so that each frame costs the same however large the memory is, and every place has its
 chance. A place counts as found when features and images agree on it; no prediction speaks for it,
 so it is judged more strictly than tracking. Where two places a room apart both explain the view,
-neither does: the ends of a corridor may be furnished alike.
+neither does: the ends of a corridor may be furnished alike. Only places of one segment are compared
+so; where segments are to each other is not known here.
 """
 
 from collections.abc import Iterable
@@ -129,7 +130,8 @@ class Relocaliser:
         """Whether another place explains the view nearly as well, from far elsewhere."""
         T_odom_camera = _seen_from(place, pose)
         return any(
-            rival.inliers > self.config.rival_inliers * pose.inliers
+            other.segment == place.segment
+            and rival.inliers > self.config.rival_inliers * pose.inliers
             and extent(se3.inverse(T_odom_camera) @ _seen_from(other, rival), place.median_depth_m)
             > self.config.rival_rad
             for other, rival in poses
@@ -143,4 +145,5 @@ def _seen_from(place: Place, pose: FeaturePose) -> np.ndarray:
 
 def _is_apart(place: Place, other: Place, limit_rad: float) -> bool:
     T_other_place = se3.inverse(other.T_odom_keyframe) @ place.T_odom_keyframe
-    return extent(T_other_place, other.median_depth_m) > limit_rad
+    is_far = extent(T_other_place, other.median_depth_m) > limit_rad
+    return is_far or place.segment != other.segment

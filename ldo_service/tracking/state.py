@@ -11,6 +11,7 @@ from .motion import Motion
 from .moving import Suspicion
 from .places import Place, Places
 from .pyramid import PyramidConfig
+from .segments import Segments
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,7 @@ class State:
     next_id: int = 0  # of the next keyframe
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
+    segments: Segments = field(default_factory=Segments)
     T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
     suspicion: Suspicion | None = None
@@ -41,6 +43,7 @@ def packed(state: State) -> dict[str, Any]:
         "next_id": state.next_id,
         "trusted": state.trusted,
         "searches": state.searches,
+        "segments": state.segments.packed,
         "T_odom_mapped": state.T_odom_mapped,
         "is_moving": _bits(state.is_moving),
         "suspicion": state.suspicion and (_bits(state.suspicion.contradicts), state.suspicion.gone),
@@ -60,6 +63,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         next_id=values["next_id"],
         trusted=values["trusted"],
         searches=values["searches"],
+        segments=Segments.unpacked(values["segments"]),
         T_odom_mapped=values["T_odom_mapped"],
         is_moving=None if is_moving is None else _mask(is_moving),
         suspicion=None if suspicion is None else Suspicion(_mask(suspicion[0]), suspicion[1]),

@@ -8,11 +8,14 @@ from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.runtime.actor import Situation
-from ldo_service.runtime.state_store import encode_state
+from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
+from ldo_service.tracking import OdometryConfig
+from ldo_service.tracking.segments import SegmentConfig
 from ldo_service.wire import correction_message, rgbd_message, rgbd_of, transform
 
 
@@ -177,6 +180,78 @@ def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, key
 def test_a_correction_before_any_frame_is_harmless() -> None:
     correction: Correction = correction_message(0, 1, {0: np.eye(4)})
     assert list(Tracker().handle(correction)) == []
+
+
+# --- segments -------------------------------------------------------------------------------------
+SOON = OdometryConfig(segments=SegmentConfig(begin_after=3, look_every=3, confirm_after=2))
+
+
+@pytest.fixture(scope="session")
+def returning(room: Sequence) -> list[FrameRgbd]:
+    """Twelve frames, then suddenly far away, and step by step back to the first ones."""
+    order = [*range(12), *range(60, 4, -2)]
+    return [
+        msgspec.structs.replace(rgbd_message(room[index]), frame=k, stamp_ns=k * 33_000_000)
+        for k, index in enumerate(order)
+    ]
+
+
+def test_a_lost_camera_begins_a_segment_where_odometry_ended(returning) -> None:
+    made = handled(Tracker(TrackerConfig(odometry=SOON)), returning[:20])
+    poses = poses_of(made)
+    assert [pose.status for pose in poses[12:15]] == ["LOST", "LOST", "OK"]
+    begun = poses[14]
+    assert (begun.segment, poses[11].segment) == (1, 0)
+    assert begun.T_odom_camera == poses[11].T_odom_camera, "odometry never jumps"
+    np.testing.assert_allclose(transform(begun.T_map_odom), T_map_segment(1), atol=1e-12)
+    first = next(k for k in made if isinstance(k, Keyframe) and k.segment == 1)
+    assert (first.reference, first.keyframe) == (None, begun.reference)
+
+
+def test_without_room_for_a_first_keyframe_a_camera_stays_lost(returning) -> None:
+    tracker = Tracker(TrackerConfig(odometry=SOON))
+    handled(tracker, returning[:12])
+    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    assert {pose.status for pose in poses_of(handled(tracker, returning[12:18]))} == {"LOST"}
+    tracker.situation = Situation(room={KEYFRAME_NEW: 8})
+    assert [pose.status for pose in poses_of(handled(tracker, returning[18:20]))] == ["OK", "OK"]
+
+
+def test_a_segment_is_joined_by_what_both_see_and_moves_with_the_correction(
+    room: Sequence, returning
+) -> None:
+    tracker = Tracker(TrackerConfig(odometry=SOON))
+    made = handled(tracker, returning)
+    keyframes = [message for message in made if isinstance(message, Keyframe)]
+    (joining,) = (k for k in keyframes if k.joins)
+    (join,) = joining.joins
+    assert joining.segment == 1
+    truth = room.truth()
+    assert truth is not None
+    order = [*range(12), *range(60, 4, -2)]
+    T_world = {k.keyframe: truth.T_world_camera[order[k.frame]] for k in keyframes}
+    T_true = se3.inverse(T_world[join.reference]) @ T_world[join.keyframe]
+    np.testing.assert_allclose(transform(join.T_reference_keyframe), T_true, atol=5e-3)
+    placed = {k: se3.inverse(T_world[0]) @ T for k, T in T_world.items()}
+    handled(tracker, [correction_message(0, 1, placed, joined={1: 0})])
+    (pose,) = poses_of(handled(tracker, returning[-1:]))
+    assert pose.segment == 0
+    T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+    T_expected = se3.inverse(T_world[0]) @ truth.T_world_camera[order[-1]]
+    np.testing.assert_allclose(T_map_camera, T_expected, atol=5e-3)
+
+
+@pytest.mark.parametrize("split", [14, 30])
+def test_a_successor_begins_and_joins_segments_bit_for_bit(returning, split: int) -> None:
+    """From a state taken while LOST, and from one between two looks at the old segment."""
+    first, second, third = (Tracker(TrackerConfig(odometry=SOON)) for _ in range(3))
+    handled(first, returning[:split])
+    state = first.snapshot()
+    second.restore(state)
+    third.restore({name: decode_state(encode_state(part)) for name, part in state.items()})
+    after = handled(second, returning[split:])
+    assert bodies(after) == bodies(handled(third, returning[split:]))
+    assert any(isinstance(message, Keyframe) and message.joins for message in after)
 
 
 # --- the robot's base -----------------------------------------------------------------------------

@@ -11,8 +11,14 @@ from ldo_service.runs.source import Selection, Warn
 ROUGH = "mapper.iterations=1"  # as fast as can be, with every part of the mapper in use
 
 
-def job(sequence: Sequence, folder: Path, *settings: str, frames: int, warn: Warn = print) -> Job:
-    """Of the first frames, into a new folder."""
+def job(
+    sequence: Sequence,
+    folder: Path,
+    *settings: str,
+    frames: int | None = None,
+    warn: Warn = print,
+) -> Job:
+    """Of the first frames, or all, into a new folder."""
     prepare(folder, overwrite=False)
     config = load_config(settings=(ROUGH, *settings))
     return Job(sequence, folder, config, Selection(max_frames=frames), warn)

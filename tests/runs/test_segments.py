@@ -1,0 +1,112 @@
+"""A camera that is carried off, begins anew, and comes back: one map in the end."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.config import load_config
+from ldo_service.datasets import Sequence
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.geometry import RawFrame, Trajectory
+from ldo_service.runs.finished import MapFolder
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.simulation import simulate_graph
+from ldo_service.runs.source import Selection
+
+from .jobs import ROUGH, job
+
+SOON = tuple(
+    f"tracker.odometry.segments.{setting}"
+    for setting in ("begin_after=3", "look_every=3", "confirm_after=2")
+)
+HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
+
+
+class Rearranged(Sequence):
+    """Frames of another sequence in another order, at its stamps."""
+
+    def __init__(self, sequence: Sequence, order: list[int]) -> None:
+        super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns[: len(order)])
+        self._sequence, self._order = sequence, order
+
+    def read(self, index: int) -> RawFrame:
+        raw = self._sequence.read(self._order[index])
+        return replace(raw, index=index, stamp_ns=int(self.stamps_ns[index]))
+
+    def truth(self) -> Trajectory:
+        truth = self._sequence.truth()
+        assert truth is not None
+        return Trajectory(self.stamps_ns * 1e-9, truth.T_world_camera[self._order])
+
+
+@pytest.fixture(scope="module")
+def returning(room: Sequence) -> Rearranged:
+    return Rearranged(room, [*HERE, *AWAY, *BACK])
+
+
+@pytest.fixture(scope="module")
+def finished(returning: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("segments") / "out"
+    run_over_file(job(returning, folder, *SOON), lambda _: None)
+    return folder
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "frames.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_lost_then_apart_then_joined(finished: Path) -> None:
+    rows = rows_of(finished)
+    assert [row["status"] for row in rows[12:14]] == ["LOST", "LOST"]
+    assert {row["status"] for row in (*rows[:12], *rows[14:])} == {"OK"}
+    segments = [int(row["segment"]) for row in rows]
+    joined = segments.index(0, 14)
+    assert joined > 14
+    assert segments == [0] * 14 + [1] * (joined - 14) + [0] * (len(rows) - joined)
+
+
+def test_in_the_end_every_pose_is_in_one_frame_and_right(
+    finished: Path, returning: Rearranged
+) -> None:
+    final = Trajectory.load(finished / "trajectory.txt")
+    assert len(final) == len(returning) - 2
+    assert evaluate_trajectory(final, returning.truth()).ate_m.max < 0.01
+
+
+def test_poses_that_were_apart_are_not_among_those_published_in_the_map(finished: Path) -> None:
+    online = Trajectory.load(finished / "trajectory_online.txt")
+    apart = sum(row["segment"] == "1" for row in rows_of(finished))
+    assert apart > 0
+    assert len(online) == len(rows_of(finished)) - 2 - apart
+    assert np.abs(online.T_world_camera[:, :3, 3]).max() < 5
+
+
+def test_the_map_is_whole(finished: Path) -> None:
+    means = MapFolder(finished).gaussians()[:, :3]
+    assert np.abs(means).max() < 10, "nothing was left apart"
+    keyframes = json.loads((finished / "keyframes.json").read_text())
+    assert {keyframe["segment"] for keyframe in keyframes} == {0}
+
+
+def test_a_segment_that_never_came_back_stays_apart(room: Sequence, tmp_path: Path) -> None:
+    gone = Rearranged(room, [*HERE, *AWAY])
+    run_over_file(job(gone, tmp_path / "out", *SOON), lambda _: None)
+    final = Trajectory.load(tmp_path / "out/trajectory.txt")
+    assert len(final) == len(HERE)
+    keyframes = json.loads((tmp_path / "out/keyframes.json").read_text())
+    distances = {k["segment"]: np.abs(np.array(k["T_map_camera"])[:3, 3]).max() for k in keyframes}
+    assert distances[0] < 5
+    assert distances[1] > 50
+
+
+def test_what_every_actor_makes_of_a_return_is_the_same_each_time(returning: Rearranged) -> None:
+    config = load_config(settings=(ROUGH, *SOON))
+    one, two = (
+        simulate_graph(returning, config, Selection(), print, lambda _: None) for _ in range(2)
+    )
+    assert one == two

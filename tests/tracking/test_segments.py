@@ -1,0 +1,80 @@
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.tracking.segments import Look, SegmentConfig, Segments
+
+CONFIG = SegmentConfig(begin_after=3, look_every=4, confirm_after=2)
+T_THERE_HERE = se3.exp(np.array([0.0, 0.4, 0.0, 1.0, 0.0, 2.0]))
+
+
+def look(T_there_here: np.ndarray = T_THERE_HERE, here: int = 2, there: int = 0) -> Look:
+    return Look(here, there, T_there_here, median_depth_m=2.0)
+
+
+def begun(count: int) -> Segments:
+    segments = Segments()
+    for _ in range(count):
+        segments = segments.begun()
+    return segments
+
+
+def after(segments: Segments, frames: int, is_lost: bool = False) -> Segments:
+    for _ in range(frames):
+        segments = segments.after(is_lost)
+    return segments
+
+
+def test_a_segment_begins_after_so_many_lost_frames_in_a_row() -> None:
+    assert not after(begun(1), 2, is_lost=True).may_begin(CONFIG)
+    assert after(begun(1), 3, is_lost=True).may_begin(CONFIG)
+    found_between = after(after(begun(1), 2, is_lost=True), 1)
+    assert not after(found_between, 2, is_lost=True).may_begin(CONFIG)
+    assert not after(begun(1), 999, is_lost=True).may_begin(SegmentConfig(begin_after=0))
+
+
+def test_nobody_looks_for_other_segments_where_there_is_none_apart() -> None:
+    assert not after(begun(1), 99).is_time_to_look(CONFIG)
+    assert after(begun(2), 4).is_time_to_look(CONFIG)
+    assert not after(begun(2).joined(1, 0), 99).is_time_to_look(CONFIG)
+
+
+def test_a_find_is_looked_at_again_sooner() -> None:
+    found = begun(2).looked(look())
+    assert after(found, 2).is_time_to_look(CONFIG)
+    assert not after(begun(2).looked(None), 2).is_time_to_look(CONFIG)
+
+
+def test_two_finds_confirm_each_other_when_they_say_the_same() -> None:
+    near = T_THERE_HERE @ se3.exp(np.full(6, 0.01))
+    found = begun(3).looked(look())
+    assert found.is_confirmed_by(look(near), CONFIG)
+    assert not found.is_confirmed_by(look(T_THERE_HERE @ T_THERE_HERE), CONFIG)
+    assert not found.is_confirmed_by(look(there=1), CONFIG)
+    assert not begun(3).is_confirmed_by(look(), CONFIG)
+    assert not found.looked(None).is_confirmed_by(look(), CONFIG), "one in between found nothing"
+
+
+def test_joined_segments_share_the_oldest_as_their_root() -> None:
+    segments = begun(4).joined(3, 2).joined(2, 1)
+    assert segments.roots == (0, 1, 1, 1)
+    assert segments.are_joined(3, 1)
+    assert not segments.are_joined(3, 0)
+
+
+@pytest.mark.parametrize("segments", [Segments(), begun(3).looked(look()), begun(2).joined(0, 1)])
+def test_segments_survive_packing(segments: Segments) -> None:
+    again = Segments.unpacked(segments.packed)
+    assert again.roots == segments.roots
+    assert (again.last is None) == (segments.last is None)
+    if again.last is not None:
+        np.testing.assert_array_equal(again.last.T_there_here, T_THERE_HERE)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"begin_after": -1}, {"look_every": 0}, {"confirm_after": 0}, {"confirm_rad": 0.0}]
+)
+def test_impossible_settings_are_refused(fields) -> None:
+    with pytest.raises(ConfigError):
+        SegmentConfig(**fields)
