@@ -1,8 +1,8 @@
 """Other people's odometry behind one call, each at its documented defaults, on one thread.
 
 A peer is a `Step`: it takes the next frame and gives T_world_camera, and whether it says that it
-found it. A frame that a peer does not find, or finds more than 1 m away from the last one, leaves
-its pose as it was: otherwise some run away to infinity.
+found it. Where a peer gives no pose, or one more than 1 m from the last, the pose stays as it was:
+otherwise some run away to infinity.
 """
 
 from collections.abc import Callable, Iterator
@@ -60,8 +60,8 @@ def frame_to_frame(prepare: Callable[[RgbdFrame], T], align: Callable[[T, T], Fo
         found = True
         if previous:
             T_previous_current, found = align(previous.pop(), current)
-            found = found and is_possible(T_previous_current)
-            T_world_camera = T_world_camera @ T_previous_current if found else T_world_camera
+            if is_possible(T_previous_current):
+                T_world_camera = T_world_camera @ T_previous_current
         previous.append(current)
         return T_world_camera, found
 
@@ -87,7 +87,7 @@ def opencv(camera: Camera) -> Step:
 
     def align(previous: cv2.OdometryFrame, current: cv2.OdometryFrame) -> Found:
         found, T_previous_current = odometry.compute(current, previous)
-        return T_previous_current, bool(found)
+        return T_previous_current if found else np.eye(4), bool(found)
 
     return frame_to_frame(prepare, align)
 
@@ -106,9 +106,9 @@ def gicp_frames(camera: Camera, scale: float) -> Step:
             init_T_target_source=T_previous_current,
             max_correspondence_distance=scale * REACH_M,
         )
-        is_found = found.converged and is_possible(found.T_target_source)
-        T_previous_current = found.T_target_source if is_found else np.eye(4)
-        return T_previous_current, is_found
+        is_sane = is_possible(found.T_target_source)
+        T_previous_current = found.T_target_source if is_sane else np.eye(4)
+        return T_previous_current, found.converged and is_sane
 
     return frame_to_frame(lambda frame: _sampled(camera, frame, scale), align)
 
@@ -127,8 +127,8 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
             T_motion = se3.inverse(T_world_camera) @ found.T_target_source
-            is_found = found.converged and is_possible(T_motion)
-            T_motion = T_motion if is_found else np.eye(4)
+            is_sane = is_possible(T_motion)
+            is_found, T_motion = found.converged and is_sane, T_motion if is_sane else np.eye(4)
             T_world_camera = T_world_camera @ T_motion
         voxels.insert(cloud, T_world_camera)
         return T_world_camera, is_found
@@ -157,7 +157,7 @@ def open3d_frames(o3d: ModuleType, camera: Camera) -> Step:
 
     def align(previous: object, current: object) -> Found:
         found = odometry.compute_rgbd_odometry(current, previous, pinhole, np.eye(4), term)
-        return found[1], found[0]
+        return found[1] if found[0] else np.eye(4), found[0]
 
     return frame_to_frame(prepare, align)
 
@@ -192,7 +192,8 @@ def open3d_model(o3d: ModuleType, camera: Camera) -> Step:
         found = True
         if count:
             T_cast_given, found = _tracked(lambda: model.track_frame_to_model(given, cast))
-            T_world_camera = T_world_camera @ T_cast_given if found else T_world_camera
+            if is_possible(T_cast_given):
+                T_world_camera = T_world_camera @ T_cast_given
         model.update_frame_pose(count, o3d.core.Tensor(T_world_camera))
         model.integrate(given)
         model.synthesize_model_frame(cast)
