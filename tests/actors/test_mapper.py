@@ -3,6 +3,7 @@
 import shutil
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -21,6 +22,8 @@ from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.wire import (
     correction_message,
     keyframe_poses_of,
+    mask_message,
+    mask_of,
     matrix6_message,
     measurements_of,
     rgbd_of,
@@ -350,3 +353,21 @@ def assert_equal_maps(follower: MapFollower, mapper: Mapper) -> None:
     np.testing.assert_array_equal(follower.map.ids, snapshot.map.ids)
     np.testing.assert_array_equal(follower.map.anchors, snapshot.map.anchors)
     np.testing.assert_array_equal(follower.map.rows, snapshot.map.rows)
+
+
+def test_what_a_keyframe_says_is_moving_does_not_count_in_the_map(keyframes) -> None:
+    first = keyframes[0]
+    is_moving = np.zeros((first.camera.height, first.camera.width), bool)
+    is_moving[40:80, 30:70] = True
+    camera = rgbd_of(first).camera
+    said = msgspec.structs.replace(first, is_moving=mask_message(is_moving[::2, ::2], camera))
+    mapper = Mapper(CONFIG)
+    handled(mapper, [said])
+    (view,) = (mapper._map.views[k] for k in mapper._map.views.poses)
+    np.testing.assert_array_equal(view.mask == 0, is_moving)
+
+
+def test_nothing_that_moves_travels_as_an_empty_mask(keyframes) -> None:
+    camera = rgbd_of(keyframes[0]).camera
+    for nothing in (None, np.zeros((8, 8), bool)):
+        assert mask_of(mask_message(nothing, camera)) is None

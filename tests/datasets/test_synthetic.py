@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets.synthetic import SyntheticConfig, SyntheticSequence
+from ldo_service.datasets.synthetic.person import person_at
 from ldo_service.datasets.synthetic.solids import Solid, interval, vector
 from ldo_service.datasets.synthetic.textures import TILE_TEXELS, mipmapped
 from ldo_service.errors import ConfigError
@@ -164,3 +165,31 @@ def test_far_textures_fade_to_their_mean_and_near_ones_interpolate() -> None:
     np.testing.assert_allclose(near[0], tile[20, 10])
     np.testing.assert_allclose(far[0], tile.mean(axis=(0, 1)))
     np.testing.assert_allclose(texture.sample(at[:1] + 3, at[1:] - 2, np.array([1e-6])), near)
+
+
+def test_the_person_is_all_that_tells_the_walk_from_the_empty_room() -> None:
+    changes = {"width_px": 80, "height_px": 60}
+    walk = SyntheticSequence.named("person", **changes)
+    empty = SyntheticSequence.named("person", **changes, person=False)
+    sizes = []
+    for index in (0, 60, 100):
+        is_person = walk.person(index)
+        with_person, without = walk[index], empty[index]
+        np.testing.assert_array_equal(with_person.depth_m < without.depth_m, is_person)
+        np.testing.assert_array_equal(with_person.depth_m[~is_person], without.depth_m[~is_person])
+        beside = cv2.dilate(is_person.astype(np.uint8), np.ones((3, 3))) > 0
+        np.testing.assert_array_equal(with_person.color[~beside], without.color[~beside])
+        sizes.append(is_person.mean())
+    assert sizes[0] == 0
+    assert min(sizes[1:]) > 0.05
+
+
+def test_a_person_stands_on_the_floor_and_steps_with_each_foot() -> None:
+    lowest, leads = [], []
+    for time_s in np.arange(0, 4, 0.1):
+        solids = person_at(time_s)
+        lowest.append(min(solid.corners_m()[:, 2].min() for solid in solids))
+        left, right = (s.center_m[0] for s in solids if s.texture == "shoes")
+        leads.append(left > right)
+    np.testing.assert_allclose(lowest, 0, atol=1e-9)
+    assert 4 <= np.count_nonzero(np.diff(leads)) <= 7  # steps of 0.7 m at 1 m/s
