@@ -69,6 +69,38 @@ class Watched:
     suspicion: Suspicion
 
 
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """An aligned frame and its keyframe, at the level that is looked at."""
+
+    now: Level
+    then: Level
+    T_then_now: np.ndarray  # [4, 4]
+    noise: DepthNoise
+    noise_scale: float
+    config: MovingConfig
+
+    def limit_m(self, level: Level) -> np.ndarray:
+        """By how much [h, w] a surface may differ from a static one by errors alone."""
+        sigma_m = self.noise_scale * self.noise.sigma_m(level.depth_m)
+        return self.config.least_m + self.config.sigmas * sigma_m
+
+    def came(self, has_moved: np.ndarray) -> np.ndarray:
+        """Pixels [h, w] bool of the frame in front of what the keyframe saw, or on what moved."""
+        ahead_m = gap_m(self.now, self.then, self.T_then_now, self.config)
+        limit_m = self.limit_m(self.now)
+        on_moved = _lies_on(has_moved, self.now, self.then, self.T_then_now)
+        return (ahead_m > limit_m) | (on_moved & (ahead_m > -limit_m))
+
+    def gone(self, before: Suspicion | None) -> np.ndarray:
+        """In how many frames [h, w] uint8 each point of the keyframe was seen through."""
+        ahead_m = gap_m(self.then, self.now, se3.inverse(self.T_then_now), self.config)
+        through = _bytes(ahead_m > self.limit_m(self.then))
+        count = cv2.morphologyEx(through, cv2.MORPH_OPEN, _square(1))
+        known = None if before is None else before.gone
+        return count if known is None else cv2.add(count, known)
+
+
 def watch(
     view: Pyramid,
     keyframe: Pyramid,
@@ -84,25 +116,16 @@ def watch(
     has_moved          [H, W] bool of the keyframe as known so far, None: nothing
     T_keyframe_camera  [4, 4]
     noise_scale        of the depth noise, as the alignment estimated it
-    before             of the frame before, against the same keyframe or an older one; None: none
-    Deterministic. What stands still since the keyframe was made is static here.
+    before             of the frame before, against this keyframe or, by `of_new_keyframe`, an
+                       older one; None: none
+    Deterministic. What has stood still since the keyframe was made is static here.
     """
     now, then = _level(view, config), _level(keyframe, config)
+    pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
     known = _resized(has_moved, then.depth_m.shape)
-    # what came
-    ahead_m = gap_m(now, then, T_keyframe_camera, config)
-    limit_m = config.least_m + config.sigmas * noise_scale * noise.sigma_m(now.depth_m)
-    came = ahead_m > limit_m
-    came |= _lies_on(known, now, then, T_keyframe_camera) & (ahead_m > -limit_m)
+    came, gone = pair.came(known), pair.gone(before)
     came_before = None if before is None else _resized(before.contradicts, came.shape)
     is_moving = _in_pieces(came, came_before, config)
-    # what has gone
-    behind_m = gap_m(then, now, se3.inverse(T_keyframe_camera), config)
-    limit_m = config.least_m + config.sigmas * noise_scale * noise.sigma_m(then.depth_m)
-    seen_through = cv2.morphologyEx(_bytes(behind_m > limit_m), cv2.MORPH_OPEN, _square(1))
-    gone = np.where(seen_through > 0, 1, 0).astype(np.uint8)
-    if before is not None and before.gone is not None:
-        gone = cv2.add(gone, before.gone)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
     return Watched(
         _resized(is_moving, view.levels[0].depth_m.shape),

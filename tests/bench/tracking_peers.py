@@ -126,10 +126,11 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
         if voxels.size():
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
-            T_motion = se3.inverse(T_world_camera) @ found.T_target_source
+            # rounding would grow from guess to guess
+            T_motion = se3.orthonormalised(se3.inverse(T_world_camera) @ found.T_target_source)
             is_sane = is_possible(T_motion)
             is_found, T_motion = found.converged and is_sane, T_motion if is_sane else np.eye(4)
-            T_world_camera = T_world_camera @ T_motion
+            T_world_camera = se3.orthonormalised(T_world_camera @ T_motion)
         voxels.insert(cloud, T_world_camera)
         return T_world_camera, is_found
 
