@@ -62,7 +62,7 @@ def _foreground(depth_m: np.ndarray, core: np.ndarray, config: MovableConfig) ->
     count, pieces = cv2.connectedComponents(closed)
     touching = np.bincount(pieces[core], minlength=count) > 0
     touching[0] = False
-    return touching[np.asarray(pieces)]
+    return touching[np.asarray(pieces, np.int32)]
 
 
 def _window(box: Box, shape: tuple[int, ...], share: float) -> tuple[slice, slice]:

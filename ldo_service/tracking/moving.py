@@ -212,7 +212,7 @@ def _in_pieces(
     if before is not None:
         near = cv2.dilate(_bytes(before), _square(config.streak_px)) > 0
         kept &= np.bincount(labels[near], minlength=count) > 0
-    return kept[np.asarray(labels)]
+    return kept[np.asarray(labels, np.int32)]
 
 
 def _level(view: Pyramid, config: MovingConfig) -> Level:
