@@ -68,7 +68,7 @@ class PlacedCamera:
 class AnchorSpheres:
     """Spheres around all that is drawn of some Gaussians, each around Gaussians of one anchor.
 
-    anchors  [K] ascending; an anchor may have several
+    anchors  [K], of which one may have several
     counts   [K] Gaussians
     centers  [K, 3] in the map
     radii_m  [K]

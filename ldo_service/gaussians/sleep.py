@@ -304,7 +304,7 @@ class SleepingGaussians:
 
 
 def _members(labels: np.ndarray) -> list[np.ndarray]:
-    """Places of each label in labels [N], ascending; the labels ascend."""
+    """Where each label is in labels [N], ascending; label by label."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 

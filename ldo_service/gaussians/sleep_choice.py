@@ -12,7 +12,8 @@ from .anchor_spheres import AnchorSpheres, PlacedCamera
 
 @dataclass(frozen=True, slots=True)
 class SleepConfig:
-    max_active: int = 1_500_000  # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments
+    max_active: int = 1_500_000  # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments.
+    # Between two looks at it, every mapper.changed_keyframes, new and woken ones come on top
     low_water: float = 0.9  # share of max_active that stays: a batch of 0.1 s now and then
     reach_m: float = 20.0  # beyond, nothing counts as seen: depth cameras measure less far, so
     # nothing is inserted a second time where Gaussians sleep. Nearer, what they measured hides
@@ -45,7 +46,7 @@ def choose_sleepers(
 ) -> SleepChoice:
     """Nobody up to `max_active` Gaussians; over it, clumps until `low_water` of that is left.
 
-    awake   of all Gaussians in memory
+    awake   of all Gaussians in memory, by anchor
     recent  cameras of the last keyframes, at least the current one, which is last
 
     Those that no recent camera may see go, the farthest from the current camera first, older ones

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -16,7 +17,13 @@ import zenoh
 from ldo_service.errors import RestartsExhausted
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.ports import Out
-from ldo_service.runtime.process import PARENT_VARIABLE, ChildProcess, leave_with_parent
+from ldo_service.runtime.process import (
+    PARENT_VARIABLE,
+    ChildProcess,
+    give_back_free_memory,
+    leave_with_parent,
+    resident_mb,
+)
 from ldo_service.runtime.supervision import Stop, supervise
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport
@@ -170,3 +177,16 @@ def is_running(pid: int) -> bool:
         return " Z " not in Path(f"/proc/{pid}/stat").read_text()
     except OSError:
         return False
+
+
+@pytest.mark.skipif(
+    not platform.libc_ver()[0].startswith("glibc"), reason="needs glibc: its malloc is meant"
+)
+def test_memory_that_was_let_go_goes_back_to_the_system() -> None:
+    blocks = [bytearray(60_000) for _ in range(2000)]
+    kept = blocks[::20]  # which lie between those that go
+    del blocks
+    before_mb = resident_mb()
+    give_back_free_memory()
+    assert resident_mb() < before_mb - 60
+    assert len(kept) == 100
