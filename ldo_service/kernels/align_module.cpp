@@ -95,8 +95,7 @@ Output halve(Input<2> values, double tolerance) {
   auto out = floats((h / 2) * (w / 2));
   {
     nb::gil_scoped_release release;
-    chosen->halve(values.data(), static_cast<int>(w), static_cast<int>(h), relative,
-                        out.get());
+    chosen->halve(values.data(), static_cast<int>(w), static_cast<int>(h), relative, out.get());
   }
   return owned(std::move(out), {h / 2, w / 2});
 }
