@@ -212,6 +212,8 @@ class Tracker(Actor):
             residual_depth=tracked.depth_noise_scale,
             overlap=tracked.overlap,
             iterations=tracked.iterations,
+            method=tracked.method,
+            disagreement=tracked.disagreement_rad,
             T_base_camera=self._T_base_camera,
             segment=self._placed_in(tracked.segment),
         )

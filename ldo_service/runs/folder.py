@@ -58,7 +58,7 @@ CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # of a keyframe, in pixels
 COLUMNS = (
     *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
-    "segment",
+    *("segment", "method", "disagreement"),
 )
 
 
@@ -143,6 +143,7 @@ class RunFolder:
                 int(held_out),
                 *(f"{value:.4f}" for value in quality),
                 *(pose.iterations, f"{step_ms:.3f}", pose.segment),
+                *(pose.method, f"{pose.disagreement:.4f}"),
             )
         )
         if pose.status != "LOST":

@@ -9,7 +9,6 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
 from .align import AlignConfig, Alignment, align, evaluate
-from .features import FeaturePose
 from .keyframes import Keyframe
 from .motion import extent
 from .pyramid import Pyramid
@@ -20,7 +19,7 @@ COLOUR_ALONE = 0.05  # weight of points without a depth to compare with, against
 @dataclass(frozen=True, slots=True)
 class CandidateConfig:
     agreement_rad: float = 0.06  # rotation plus parallax; 9 of 10 ORB-PnP poses erred 3 cm or less
-    rival_support: float = 0.5  # of the best: a feature pose with less is refuted by the images
+    rival_support: float = 0.5  # of the best: a pose with less is refuted by the images
 
     def __post_init__(self) -> None:
         if not (self.agreement_rad > 0 and 0 < self.rival_support <= 1):
@@ -29,12 +28,13 @@ class CandidateConfig:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """`features_agree` is None where no feature pose spoke, or the images refute it."""
+    """`second_agrees` is None where there was no second opinion, or the images refute it."""
 
     alignment: Alignment
-    method: str  # "direct" from a motion guess, "features" from ORB
+    method: str  # "direct" from a motion guess, "features" from ORB, "shape" from point clouds
     median_depth_m: float  # of the keyframe
-    features_agree: bool | None = None
+    second_agrees: bool | None = None
+    disagreement_rad: float = 0.0  # from the farthest rival that the images support
 
 
 def attempt(
@@ -77,29 +77,32 @@ def support(
 
 def best(
     candidates: Sequence[Candidate],
-    features: FeaturePose | None,
+    T_keyframe_second: np.ndarray | None,
     keyframe: Keyframe,
     view: Pyramid,
     config: CandidateConfig,
     align_config: AlignConfig,
 ) -> Candidate:
-    """The candidate with the most support, told whether the features are with it.
+    """The candidate with the most support, told whether a second opinion is with it.
 
-    `candidates` holds the one that started at `features`, if any, last.
+    T_keyframe_second [4, 4] is the camera's pose as features or shape have it, without a guess; the
+    candidate that started there is the last. None: neither found one.
     """
     supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
-    chosen = candidates[int(np.argmax(supports))]
-    if features is None:
+    winner, least = int(np.argmax(supports)), config.rival_support * max(supports)
+    apart = [_apart(candidates[winner], c.alignment.T_reference_camera) for c in candidates]
+    farthest = max(a for a, supported in zip(apart, supports, strict=True) if supported >= least)
+    chosen = replace(candidates[winner], disagreement_rad=farthest)
+    if T_keyframe_second is None:
         return chosen
+    *unled, led = apart
+    others = unled if winner == len(unled) else [led]  # two starts that met are two witnesses
+    if min(*others, _apart(chosen, T_keyframe_second)) < config.agreement_rad:
+        return replace(chosen, second_agrees=True)
+    return replace(chosen, second_agrees=False if supports[-1] > least else None)
 
-    def is_near(T_keyframe_camera: np.ndarray) -> bool:
-        difference = se3.inverse(chosen.alignment.T_reference_camera) @ T_keyframe_camera
-        return extent(difference, chosen.median_depth_m) < config.agreement_rad
 
-    *unled, led = candidates  # two starts that met are two witnesses
-    others = unled if chosen is led else [led]
-    met = any(is_near(c.alignment.T_reference_camera) for c in others)
-    if met or is_near(se3.inverse(features.T_camera_reference)):
-        return replace(chosen, features_agree=True)
-    rivals = supports[-1] > config.rival_support * max(supports)
-    return replace(chosen, features_agree=False if rivals else None)
+def _apart(candidate: Candidate, T_keyframe_camera: np.ndarray) -> float:
+    """Rotation plus parallax, rad."""
+    difference = se3.inverse(candidate.alignment.T_reference_camera) @ T_keyframe_camera
+    return extent(difference, candidate.median_depth_m)

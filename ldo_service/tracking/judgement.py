@@ -82,17 +82,17 @@ def exposed_sigma(alignment: Alignment) -> float:
 
 def judge(
     alignment: Alignment,
-    features_agree: bool | None,
+    second_agrees: bool | None,
     history: History,
     previous: Status,
     config: JudgementConfig,
 ) -> Status:
-    """The status of an alignment; `features_agree` is None where features had no say.
+    """The status of an alignment; `second_agrees` is None where there was none.
 
     Hysteresis: limits are stricter after a WEAK frame, unless features vouch for this one, and
     strictest after a loss, from which only OK leads back.
     """
-    vouched = features_agree and previous is Status.WEAK
+    vouched = second_agrees and previous is Status.WEAK
     limits = config if vouched else _limits(previous, config)
     ratio = history.residual_ratio(alignment, config)
     if ratio > config.lost_residual or alignment.overlap < config.lost_overlap:
@@ -103,7 +103,7 @@ def judge(
         and alignment.condition <= limits.max_condition
         and abs(np.log(max(alignment.gain, 1e-6))) <= np.log(limits.max_gain)
         and ratio <= limits.weak_residual
-        and features_agree is not False
+        and second_agrees is not False
     )
     if plausible:
         return Status.OK

@@ -37,6 +37,7 @@ from .places import Places, PlacesConfig, place_of, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
 from .segments import Join, Look, SegmentConfig
+from .shape import ShapeConfig, pose_from_shape
 from .state import State, packed, unpacked
 from .window import WindowConfig, measured_from
 
@@ -48,6 +49,7 @@ class OdometryConfig:
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
     candidates: CandidateConfig = field(default_factory=CandidateConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
@@ -75,7 +77,7 @@ class Tracked:
     T_keyframe_camera: np.ndarray  # [4, 4]
     keyframe: int | None  # id of the keyframe it was aligned to; None before the first
     status: Status
-    method: str  # "first", "direct", "features", "relocalised", "none"
+    method: str  # the guess that won: "first", "direct", "features", "shape", "relocalised", "none"
     wants_keyframe: bool
     wants_mapping: bool = False  # as a supporting keyframe: mapped, and not tracked against
     information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
@@ -84,6 +86,7 @@ class Tracked:
     depth_noise_scale: float = 0.0  # geometric residual, times the sensor model
     overlap: float = 0.0  # visible fraction of the keyframe's surface
     iterations: int = 0
+    disagreement_rad: float = 0.0  # between the guesses' outcomes, where several were tried
     is_moving: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped
     segment: int = 0  # whose odometry frame T_odom_camera leads to
     may_begin: bool = False  # LOST for so long that a new segment is better than none
@@ -259,14 +262,21 @@ class Odometry:
         if self._judged(candidate) is Status.OK and not self._is_large(candidate, resting, view):
             return candidate
         again = attempt(keyframe, view, resting, "direct", config.align)
-        features = keyframe.features(config.features)
-        seen = detect(view, config.features)
-        pose = estimate_pose(features, seen, view.camera, config.features)
         candidates = [candidate, again]
+        second, method = self._second_opinion(keyframe, view, resting)
+        if second is not None:
+            candidates.append(attempt(keyframe, view, second, method, config.align))
+        return best(candidates, second, keyframe, view, config.candidates, config.align)
+
+    def _second_opinion(
+        self, keyframe: Keyframe, view: Pyramid, resting: np.ndarray
+    ) -> tuple[np.ndarray | None, str]:
+        """T_keyframe_camera [4, 4] by features; by shape, where there is too little texture."""
+        config = self.config.features
+        pose = estimate_pose(keyframe.features(config), detect(view, config), view.camera, config)
         if pose is not None:
-            guess = se3.inverse(pose.T_camera_reference)
-            candidates.append(attempt(keyframe, view, guess, "features", config.align))
-        return best(candidates, pose, keyframe, view, config.candidates, config.align)
+            return se3.inverse(pose.T_camera_reference), "features"
+        return pose_from_shape(keyframe.reference, view, resting, self.config.shape), "shape"
 
     def _is_large(self, candidate: Candidate, resting: np.ndarray, view: Pyramid) -> bool:
         """Whether the image moved so far since the last frame that a minimum may be a wrong one."""
@@ -276,7 +286,7 @@ class Odometry:
 
     def _judged(self, candidate: Candidate) -> Status:
         state, limits = self._state, self.config.judgement
-        agree = candidate.features_agree
+        agree = candidate.second_agrees
         return judge(candidate.alignment, agree, state.history, state.status, limits)
 
     def _relocalised(
@@ -348,6 +358,7 @@ class Odometry:
             candidate.method,
             wants_keyframe=due and is_sure,
             wants_mapping=(due or supports) and is_sure,
+            disagreement_rad=candidate.disagreement_rad,
             is_moving=is_moving,
         )
 
@@ -403,6 +414,7 @@ def _report(
     *,
     wants_keyframe: bool = False,
     wants_mapping: bool = False,
+    disagreement_rad: float = 0.0,
     is_moving: np.ndarray | None = None,
 ) -> Tracked:
     return Tracked(
@@ -419,6 +431,7 @@ def _report(
         depth_noise_scale=alignment.depth_noise_scale,
         overlap=alignment.overlap,
         iterations=alignment.iterations,
+        disagreement_rad=disagreement_rad,
         is_moving=is_moving,
         segment=keyframe.segment,
     )

@@ -3,20 +3,18 @@ import numpy as np
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.candidates import CandidateConfig, attempt, best
-from ldo_service.tracking.features import FeaturePose
 from ldo_service.tracking.keyframes import Keyframe
 
 T_KEYFRAME_CAMERA = se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]))
 T_ASTRAY = se3.exp(np.array([0.0, -0.4, 0.1, -0.6, 0.1, 0.0]))
 
 
-def chosen_from(room, guesses, features_at=None):
+def chosen_from(room, guesses, second=None):
     keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
     view = pyramid_of(room.view(T_KEYFRAME_CAMERA), PyramidConfig())
     align = AlignConfig()
     attempts = [attempt(keyframe, view, T, f"guess {k}", align) for k, T in enumerate(guesses)]
-    pose = None if features_at is None else FeaturePose(se3.inverse(features_at), 20)
-    return attempts, best(attempts, pose, keyframe, view, CandidateConfig(), align)
+    return attempts, best(attempts, second, keyframe, view, CandidateConfig(), align)
 
 
 def test_true_pose_wins_over_a_wrong_minimum_that_calls_itself_inliers(room) -> None:
@@ -25,7 +23,7 @@ def test_true_pose_wins_over_a_wrong_minimum_that_calls_itself_inliers(room) -> 
     off = se3.inverse(wrong.alignment.T_reference_camera) @ T_KEYFRAME_CAMERA
     assert np.linalg.norm(off[:3, 3]) > 0.1
     assert winner.method == "guess 1"
-    assert winner.features_agree is None
+    assert winner.second_agrees is None
 
 
 def test_first_of_equals_wins(room) -> None:
@@ -35,17 +33,17 @@ def test_first_of_equals_wins(room) -> None:
 
 def test_features_at_the_same_pose_agree(room) -> None:
     _, winner = chosen_from(room, [np.eye(4), T_KEYFRAME_CAMERA], T_KEYFRAME_CAMERA)
-    assert winner.features_agree is True
+    assert winner.second_agrees is True
 
 
 def test_two_starts_that_met_agree_even_where_the_raw_feature_pose_was_rough(room) -> None:
     rough = T_KEYFRAME_CAMERA @ se3.exp(np.array([0.0, 0.05, 0.0, 0.1, 0.0, 0.0]))
     for guesses in ([T_KEYFRAME_CAMERA, rough], [rough, T_KEYFRAME_CAMERA]):
         _, winner = chosen_from(room, guesses, rough)
-        assert winner.features_agree is True
+        assert winner.second_agrees is True
 
 
 def test_features_that_the_images_refute_have_no_say(room) -> None:
     _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_ASTRAY], T_ASTRAY)
     assert winner.method == "guess 0"
-    assert winner.features_agree is None
+    assert winner.second_agrees is None
