@@ -28,7 +28,7 @@ class MovingConfig:
     least_m: float = 0.06  # by which a surface must contradict: pose errors of a keyframe's length
     sigmas: float = 4.0  # of the depth noise as the alignment estimated it, added to it
     edge_px: int = 2  # a surface so near in the image may be the one that is met: outlines
-    least_share: float = 0.004  # of the image in one piece: what is smaller is noise
+    least_share: float = 0.0015  # of the image in one piece: what is smaller is noise
     streak_px: int = 5  # a piece must touch what contradicted in the frame before, so far around
     spread_px: int = 8  # how far around what contradicts the same thing may reach: parts of it that
     spread_m: float = 0.12  # are as far away, but were there already, or stand on the floor
