@@ -7,7 +7,7 @@ SOURCE: a data set or synthetic sequence; default: tum/kitchen in LDO_DATA, else
 ATE and RPE as `ldo eval` has them, over all frames, found or not. Trusted: what the method itself
 says of a frame. Time: CPU ms per frame of the whole process, decoding excluded; each frame is
 given to all methods in turn, so other load on the machine meets all alike. `tracking_peers.py`
-says what each peer is.
+says what each peer is. `keyframe graph`: our frames again, on the optimizer's final poses.
 """
 
 import argparse
@@ -23,11 +23,15 @@ import cv2
 import numpy as np
 from tracking_peers import Step, peers
 
+from ldo_service.actors.optimizer import Optimizer
+from ldo_service.actors.tracker import Tracker
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.kernels import isa
+from ldo_service.schemas import TrackedPose
 from ldo_service.tracking import Odometry, Status
+from ldo_service.wire import keyframe_poses_of, rgbd_message, transform
 
 WARM_UP = 5  # frames left out of the times
 OURS = "ours"
@@ -44,16 +48,23 @@ class Row:
     ate_cm: float
     rpe_cm: float | None
     rpe_deg: float | None
-    trusted_percent: float
-    cpu_ms_p50: float
-    cpu_ms_p95: float
+    trusted_percent: float | None = None
+    cpu_ms_p50: float | None = None
+    cpu_ms_p95: float | None = None
+
+    @classmethod
+    def of(cls, method: str, estimate: Trajectory, truth: Trajectory, **rest: float) -> "Row":
+        errors = evaluate_trajectory(estimate, truth)
+        shift, turn = errors.rpe_translation_m, errors.rpe_rotation_deg
+        rpe_cm, rpe_deg = shift and 100 * shift.rmse, turn and turn.rmse
+        return cls(method, 100 * errors.ate_m.rmse, rpe_cm, rpe_deg, **rest)
 
     def __str__(self) -> str:
-        rpe_cm, rpe_deg = ("-" if x is None else f"{x:.2f}" for x in (self.rpe_cm, self.rpe_deg))
-        return (
-            f"| {self.method} | {self.ate_cm:.2f} | {rpe_cm} | {rpe_deg} | "
-            f"{self.trusted_percent:.1f} | {self.cpu_ms_p50:.1f} | {self.cpu_ms_p95:.1f} |"
-        )
+        lengths = (self.ate_cm, self.rpe_cm, self.rpe_deg)
+        others = (self.trusted_percent, self.cpu_ms_p50, self.cpu_ms_p95)
+        figures = [(x, ".2f") for x in lengths] + [(x, ".1f") for x in others]
+        cells = ("-" if x is None else f"{x:{form}}" for x, form in figures)
+        return f"| {self.method} | " + " | ".join(cells) + " |"
 
 
 @dataclass(slots=True)
@@ -73,15 +84,14 @@ class Runner:
         self.is_trusted.append(is_trusted)
 
     def row(self, method: str, stamps_s: np.ndarray, truth: Trajectory) -> Row:
-        errors = evaluate_trajectory(Trajectory(stamps_s, np.array(self.T_world_camera)), truth)
-        shift, turn = errors.rpe_translation_m, errors.rpe_rotation_deg
-        return Row(
+        p50, p95 = np.percentile(self.cpu_ms[WARM_UP:], [50, 95])
+        return Row.of(
             method,
-            100 * errors.ate_m.rmse,
-            100 * shift.rmse if shift else None,
-            turn.rmse if turn else None,
-            100 * float(np.mean(self.is_trusted)),
-            *(float(p) for p in np.percentile(self.cpu_ms[WARM_UP:], [50, 95])),
+            Trajectory(stamps_s, np.array(self.T_world_camera)),
+            truth,
+            trusted_percent=100 * float(np.mean(self.is_trusted)),
+            cpu_ms_p50=float(p50),
+            cpu_ms_p95=float(p95),
         )
 
 
@@ -110,6 +120,28 @@ def measure(
             runner.take(frame)
     stamps_s = sequence.stamps_ns[indices] * 1e-9
     return [runner.row(name, stamps_s, truth) for name, runner in runners.items()]
+
+
+def corrected(sequence: Sequence, indices: range) -> Trajectory:
+    """T_map_camera of our tracker's frames, hung on the optimizer's last keyframe poses."""
+    tracker, optimizer = Tracker(), Optimizer()
+    poses: list[TrackedPose] = []
+    T_map: dict[int, np.ndarray] = {}
+    for index in indices:
+        for message in tracker.handle(rgbd_message(sequence[index])):
+            if isinstance(message, TrackedPose):
+                poses.append(message)
+                continue
+            for correction in optimizer.handle(message):
+                T_map = keyframe_poses_of(correction)
+                list(tracker.handle(correction))
+    placed = [T_map[_reference(pose)] @ transform(pose.T_reference_camera) for pose in poses]
+    return Trajectory(np.array([pose.stamp_ns for pose in poses]) * 1e-9, np.array(placed))
+
+
+def _reference(pose: TrackedPose) -> int:
+    """The first frame is the first keyframe, which refers to itself."""
+    return pose.keyframe or 0 if pose.reference is None else pose.reference
 
 
 def default_source() -> str:
@@ -145,6 +177,7 @@ def main() -> None:
         if not any(word in name for word in arguments.without):
             chosen.append((name, step))
     rows = measure(sequence, indices, chosen, truth)
+    rows.insert(1, Row.of(f"{OURS}, keyframe graph", corrected(sequence, indices), truth))
     if arguments.json:
         print(
             json.dumps({"source": sequence.name, "rows": [asdict(row) for row in rows]}, indent=1)

@@ -119,15 +119,17 @@ class Outcome:
     """
 
     ok_percent: float
-    ok_percent_meanwhile: float
+    ok_percent_meanwhile: float | None  # None: nothing arrived
     worst_m: float
     worst_frame: int
     ate_m: float
     recovered_after: int | None
 
     def __str__(self) -> str:
+        meanwhile = self.ok_percent_meanwhile
         return (
-            f"{self.ok_percent:.1f} | {self.ok_percent_meanwhile:.1f} | {100 * self.worst_m:.1f} "
+            f"{self.ok_percent:.1f} | {'-' if meanwhile is None else f'{meanwhile:.1f}'} | "
+            f"{100 * self.worst_m:.1f} "
             f"({self.worst_frame}) | {100 * self.ate_m:.2f} | {self.recovered_after}"
         )
 
@@ -166,7 +168,7 @@ def outcome(
     worst = int(np.argmax(errors_m))
     return Outcome(
         100 * float(np.mean([s.status is Status.OK for s in outside])),
-        100 * float(np.mean(meanwhile)) if meanwhile else 0.0,
+        100 * float(np.mean(meanwhile)) if meanwhile else None,
         float(errors_m[worst]),
         times[worst],
         float(np.sqrt(np.mean(residuals_m**2))),
