@@ -119,10 +119,11 @@ class Odometry:
         if status is Status.WEAK and not self._relocaliser.is_familiar(view, self._state.trusted):
             status = Status.LOST
         if status is Status.LOST:
-            found = self._relocalised(view)
+            found = self._found(view, self._state.places)
             if found is None:
                 return self._lost(keyframe, candidate.alignment, view)
             (keyframe, candidate), status = found, Status.OK
+            self._state = replace(self._state, history=History())  # noise is another elsewhere
         tracked = self._accepted(frame, keyframe, candidate, status)
         return self._joining(tracked, keyframe, view)
 
@@ -137,6 +138,11 @@ class Odometry:
         return Tracked(
             T_odom_camera, np.eye(4), None, Status.OK, "first", True, True, segment=segment
         )
+
+    def recognised(self, frame: RgbdFrame, places: Places) -> tuple[Keyframe, Alignment] | None:
+        """The one of these places that the frame just tracked surely shows, and where from."""
+        found = self._found(self._view(frame), places)
+        return None if found is None else (found[0], found[1].alignment)
 
     def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
         """Track against this frame, the one just tracked, from now on; its id as a keyframe.
@@ -160,7 +166,7 @@ class Odometry:
             has_moved=before.is_moving,
             left_out=tracked.is_moving,
         )
-        place = place_of(keyframe, self.config.features, self.config.places)
+        place = place_of(keyframe, self.config.features, self.config.places, before.history)
         self._state = replace(
             before,
             places=before.places.added(place, self.config.places),
@@ -247,6 +253,7 @@ class Odometry:
             motion=Motion(tracked.T_odom_camera, stamp_ns=frame.stamp_ns),
             status=Status.OK,
             trusted=thumbnail_of(self._view(frame)),
+            history=History(),
             segments=self._state.segments.begun(),
             is_moving=None,
             suspicion=None,
@@ -289,14 +296,13 @@ class Odometry:
         agree = candidate.second_agrees
         return judge(candidate.alignment, agree, state.history, state.status, limits)
 
-    def _relocalised(
-        self, view: Pyramid, apart_from: int | None = None
-    ) -> tuple[Keyframe, Candidate] | None:
-        """Among all places, or those of segments that are not joined to one."""
-        state, places = self._state, self._state.places
-        if apart_from is not None:
-            joined = state.segments.are_joined
-            places = Places(tuple(p for p in places.all if not joined(p.segment, apart_from)))
+    def _apart_from(self, segment: int) -> Places:
+        """The places of segments that are not joined to one."""
+        joined = self._state.segments.are_joined
+        return Places(tuple(p for p in self._state.places.all if not joined(p.segment, segment)))
+
+    def _found(self, view: Pyramid, places: Places) -> tuple[Keyframe, Candidate] | None:
+        state = self._state
         self._state = replace(state, searches=state.searches + 1)
         return self._relocaliser.find(view, places, state.searches, state.history)
 
@@ -305,7 +311,7 @@ class Odometry:
         before, config = self._state.segments, self.config.segments
         if tracked.status is not Status.OK or not before.is_time_to_look(config):
             return tracked
-        found = self._relocalised(view, apart_from=keyframe.segment)
+        found = self._found(view, self._apart_from(keyframe.segment))
         look = None if found is None else _look(tracked, found[0], found[1].alignment)
         self._state = replace(self._state, segments=before.looked(look))
         if found is None or look is None or not before.is_confirmed_by(look, config):

@@ -6,6 +6,7 @@ and depth at the working resolution, compressed: from these it can be tracked ag
 
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from statistics import median
 from typing import Any
 
 import cv2
@@ -15,6 +16,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
 
 from .features import FeatureConfig, Features, detect
+from .judgement import History
 from .keyframes import Keyframe
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
 
@@ -24,6 +26,7 @@ THUMBNAIL = (
 )  # columns and rows: blurred enough that a hand's width of motion matters little
 CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactly in float32
 DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
+NO_PAST = History()
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +53,8 @@ class Place:
     segment: int
     T_odom_keyframe: np.ndarray  # [4, 4]
     median_depth_m: float
+    intensity_sigma: float  # of frames tracked before it, grey levels; 0: not known
+    depth_noise_scale: float  # likewise, times the sensor model
     thumbnail: np.ndarray
     points_camera: np.ndarray
     descriptors: np.ndarray
@@ -61,6 +66,12 @@ class Place:
     def features(self) -> Features:
         points = self.points_camera.astype(np.float64)
         return Features(self.camera.project(points), points, self.descriptors)
+
+    def history(self, otherwise: History) -> History:
+        """What a frame that shows this place is judged by: scenes differ in noise."""
+        if not self.intensity_sigma:
+            return otherwise
+        return History((self.intensity_sigma,), (self.depth_noise_scale,))
 
     @cached_property
     def packed(self) -> dict[str, Any]:
@@ -90,8 +101,13 @@ class Place:
         )
 
 
-def place_of(keyframe: Keyframe, features: FeatureConfig, config: PlacesConfig) -> Place:
-    """What is kept of a keyframe."""
+def place_of(
+    keyframe: Keyframe,
+    features: FeatureConfig,
+    config: PlacesConfig,
+    history: History = NO_PAST,
+) -> Place:
+    """What is kept of a keyframe, and of the noise of frames before it."""
     view, level = keyframe.view, keyframe.view.levels[0]
     seen = detect(view, replace(features, count=config.features))
     measured = seen.points_camera[:, 2] > 0
@@ -103,6 +119,8 @@ def place_of(keyframe: Keyframe, features: FeatureConfig, config: PlacesConfig) 
         segment=keyframe.segment,
         T_odom_keyframe=keyframe.T_odom_keyframe,
         median_depth_m=keyframe.reference.median_depth_m,
+        intensity_sigma=median(history.intensity_sigmas or (0.0,)),
+        depth_noise_scale=median(history.depth_noise_scales or (0.0,)),
         thumbnail=thumbnail_of(view),
         points_camera=seen.points_camera[measured].astype(np.float32),
         descriptors=seen.descriptors[measured],

@@ -77,7 +77,7 @@ class Relocaliser:
             keyframe = place.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
             candidate = attempt(keyframe, view, guess, "relocalised", self.align)
-            if self._is_sure(candidate, guess, history):
+            if self._is_sure(candidate, guess, place.history(history)):
                 found = keyframe, replace(candidate, second_agrees=True)
                 return None if self._has_rival(place, pose, poses) else found
         return None

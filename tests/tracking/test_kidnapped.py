@@ -8,15 +8,20 @@ import pytest
 
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.tracking import Odometry, Status, Tracked
+from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
+from ldo_service.tracking.segments import SegmentConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def followed(frames: Iterable[RgbdFrame]) -> list[Tracked]:
-    odometry, results = Odometry(), []
+def followed(frames: Iterable[RgbdFrame], patience: int = 0) -> list[Tracked]:
+    """`patience`: LOST frames until a new segment begins; 0: none does."""
+    odometry = Odometry(OdometryConfig(segments=SegmentConfig(begin_after=patience)))
+    results = []
     for frame in frames:
         results.append(odometry.track(frame))
+        if results[-1].may_begin:
+            results[-1] = odometry.begin_segment(frame)
         if results[-1].wants_keyframe:
             odometry.make_keyframe(frame, results[-1])
     return results
@@ -47,7 +52,24 @@ def test_kitchen_after_a_visit_to_an_apartment(data: Path, away: range) -> None:
     assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
 
 
-@pytest.mark.parametrize(("until", "away"), [(120, range(400, 440)), (300, range(20, 60))])
+def test_the_apartment_becomes_a_segment_of_its_own_and_the_kitchen_stays(data: Path) -> None:
+    kitchen = open_sequence(str(data / "tum/kitchen"))
+    apartment = open_sequence(str(data / "replica/apartment_floor1"))
+    frames = [kitchen[k] for k in range(140, 240)]
+    undisturbed = followed(frames)[60:]
+    visit = [apartment[k] for k in range(100)]
+    results = followed([*frames[:60], *visit, *frames[60:]], patience=20)
+    gone, back = results[60:160], results[160:]
+    assert {r.status for r in gone[:19]} == {Status.LOST}
+    apart = [r for r in gone if r.segment > 0]
+    assert sum(r.status is Status.OK for r in apart) > 40
+    assert all(r.status is Status.LOST for r in gone if r.segment == 0)
+    assert not any(r.join for r in results), "two places that do not meet"
+    known = [r for r in back if r.status is not Status.LOST]
+    assert {r.segment for r in known[3:]} == {0}
+    assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
+
+
 def walked(flat, *stretches: range) -> list[list[Tracked]]:
     """Results of each stretch of one track."""
     results = followed(flat[k] for stretch in stretches for k in stretch)

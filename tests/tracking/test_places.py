@@ -6,6 +6,7 @@ from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.candidates import attempt
 from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.judgement import History
 from ldo_service.tracking.keyframes import Keyframe
 from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of, thumbnail_of
 
@@ -85,3 +86,10 @@ def test_a_full_memory_thins_the_path_where_it_is_densest(room) -> None:
 def test_a_memory_of_two_places_is_refused() -> None:
     with pytest.raises(ConfigError, match="count"):
         PlacesConfig(count=2)
+
+
+def test_a_place_knows_the_noise_of_its_surroundings(room) -> None:
+    past = History((3.0, 9.0, 4.0), (1.0, 0.5, 2.0))
+    place = place_of(keyframe_at(room, np.eye(4)), FeatureConfig(), PlacesConfig(), past)
+    assert place.history(History()) == History((4.0,), (1.0,))
+    assert place_at(room, np.eye(4)).history(past) is past, "the first of all knows none"
