@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.localiser import LocalisingTracker
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
@@ -54,7 +55,7 @@ GRAPH: tuple[Box, ...] = (
     _built(
         Tracker,
         "finds the camera's pose",
-        lambda config: Tracker(config.tracker),
+        lambda config: (LocalisingTracker if config.tracker.localise else Tracker)(config.tracker),
         later=(In(t.MAP_VIEW, Latest(1)),),
     ),
     Box(

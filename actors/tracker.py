@@ -77,6 +77,7 @@ class Mounting:
 class TrackerConfig:
     T_base_camera: Mounting = field(default_factory=Mounting)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    localise: str = ""  # folder of a finished run: track in its map, which stays as it is
     hold_out: int = 0  # every n-th frame is tracked and never mapped, to judge the map by; 0: none
 
     def __post_init__(self) -> None:
@@ -196,6 +197,18 @@ class Tracker(Actor):
         """The first keyframe refers to itself; before it nothing is known."""
         reference = keyframe if tracked.keyframe is None else tracked.keyframe
         T_map_odom = np.eye(4) if reference is None else self._poses.T_map_odom(reference)
+        segment = self._placed_in(tracked.segment)
+        return self._pose_message(frame, tracked, T_map_odom, reference, keyframe, segment)
+
+    def _pose_message(
+        self,
+        frame: RgbdFrame,
+        tracked: Tracked,
+        T_map_odom: np.ndarray,
+        reference: int | None,
+        keyframe: int | None = None,
+        segment: int = 0,
+    ) -> TrackedPose:
         return TrackedPose(
             stamp_ns=frame.stamp_ns,
             frame=frame.index,
@@ -215,7 +228,7 @@ class Tracker(Actor):
             method=tracked.method,
             disagreement=tracked.disagreement_rad,
             T_base_camera=self._T_base_camera,
-            segment=self._placed_in(tracked.segment),
+            segment=segment,
         )
 
     def _placed_in(self, segment: int) -> int:

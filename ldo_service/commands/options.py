@@ -1,9 +1,13 @@
 """Arguments that several verbs share."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+
+from ldo_service.actors.localiser import places_of
+from ldo_service.config import Config
 
 ConfigFile = Annotated[
     Path | None,
@@ -48,6 +52,13 @@ StateFolder = Annotated[
         help="where actors keep what a successor needs; default: a temporary folder",
     ),
 ]
+Localise = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="DIR",
+        help="track in the map that `ldo run` left in this folder, and do not change it",
+    ),
+]
 Robot = Annotated[
     str, tyro.conf.arg(metavar="NAME", help="second part of every topic: ldo/NAME/...")
 ]
@@ -56,3 +67,12 @@ Endpoint = Annotated[
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(help="replace an earlier run in the folder")]
 Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing else")]
+
+
+def localising(config: Config, folder: Path | None) -> Config:
+    """The configuration with --localise. Raises DataError for a folder without a map."""
+    if folder is None:
+        return config
+    places_of(folder)
+    tracker = replace(config.tracker, localise=str(folder.expanduser().resolve()))
+    return replace(config, tracker=tracker)

@@ -18,7 +18,16 @@ from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
 from ldo_service.runs.source import Selection
 
-from .options import ConfigFile, MaxFrames, Overwrite, Settings, Source, Stride
+from .options import (
+    ConfigFile,
+    Localise,
+    MaxFrames,
+    Overwrite,
+    Settings,
+    Source,
+    Stride,
+    localising,
+)
 from .progress import progress
 
 
@@ -46,6 +55,7 @@ def run(
             metavar="N", help="fit the map for N more iterations at the end, into DIR/refined"
         ),
     ] = 0,
+    localise: Localise = None,
     realtime: Annotated[
         bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
     ] = False,
@@ -58,11 +68,14 @@ def run(
 
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
+      ldo run ~/data/desk_again --out runs/again --localise runs/desk
     """
     if realtime and refine:
         raise ConfigError("--refine needs a run over a file: leave out --realtime.")
+    require_separate(localise, out, refine)
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
+    settings = localising(settings, localise)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.data.options())
@@ -88,6 +101,14 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
     if threads is not None:
         mapper = replace(mapper, threads=threads)
     return replace(config, tracker=tracker, mapper=mapper)
+
+
+def require_separate(localise: Path | None, out: Path, refine: int) -> None:
+    """A map that is localised in stays as it is."""
+    if localise and refine:
+        raise ConfigError("--localise leaves the map as it is: leave out --refine.")
+    if localise and localise.resolve() == out.resolve():
+        raise ConfigError(f"--out {out} would replace the map to localise in: choose another.")
 
 
 def require_held_out(stride: int, hold_out: int) -> None:

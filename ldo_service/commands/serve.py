@@ -10,7 +10,16 @@ from ldo_service.config import load_config
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network
 from ldo_service.service import Service, state_folder
 
-from .options import ConfigFile, Endpoint, Only, Robot, Settings, StateFolder
+from .options import (
+    ConfigFile,
+    Endpoint,
+    Localise,
+    Only,
+    Robot,
+    Settings,
+    StateFolder,
+    localising,
+)
 
 
 def serve(
@@ -20,6 +29,7 @@ def serve(
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
+    localise: Localise = None,
     record: Annotated[
         Path | None,
         tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
@@ -41,7 +51,7 @@ def serve(
     with ExitStack() as stack:
         folder = state_folder(state, stack)
         Service(
-            load_config(config, set),
+            localising(load_config(config, set), localise),
             Network(robot, endpoint),
             folder,
             tuple(only),

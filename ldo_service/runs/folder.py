@@ -6,6 +6,7 @@ trajectory.txt          the same frames after the last correction
 frames.csv              every frame: status, residuals, milliseconds, segment
 keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians
+places.msgpack          what `--localise` finds the camera by, at the newest poses
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
 refined/                trajectory, keyframes and map after more iterations, if they were asked for
@@ -20,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.actors.localiser import PLACES
+from ldo_service.actors.tracker import TrackerConfig
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.ply import write_ply
 from ldo_service.geometry import Trajectory
@@ -35,6 +38,8 @@ from ldo_service.schemas import (
 )
 from ldo_service.wire import keyframe_poses_of, transform
 
+from .places import PlaceRecord
+
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
 REFINED = "refined"  # folder in that of the run, with such files of its own
 EXPORTED = {  # by `ldo export`, per format
@@ -49,6 +54,7 @@ EXPORTED = {  # by `ldo export`, per format
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
+        PLACES,
         *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
@@ -99,8 +105,9 @@ class TrackedFrame:
 class RunFolder:
     """Observes what the actors make; `close` writes what is only known at the end."""
 
-    def __init__(self, folder: Path, config_text: str, hold_out: int = 0) -> None:
-        self.folder, self._hold_out = folder, hold_out
+    def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
+        self.folder, self._hold_out = folder, tracker.hold_out
+        self._places = PlaceRecord(tracker.odometry)
         (folder / "config.yaml").write_text(config_text)
         self._csv_file = (folder / "frames.csv").open("w", newline="")
         self._csv = csv.writer(self._csv_file)
@@ -166,6 +173,7 @@ class RunFolder:
             transform(keyframe.T_odom_keyframe),
             keyframe.segment,
         )
+        self._places.add(keyframe)
         self.newest_stamp_ns = keyframe.stamp_ns
         self._keyframes[keyframe.keyframe] = {
             "keyframe": keyframe.keyframe,
@@ -195,6 +203,7 @@ class RunFolder:
         self.final().save(folder / "trajectory.txt")
         write_json(folder / "keyframes.json", self._placed_keyframes())
         write_ply(folder / "map.ply", self.follower.map.rows)
+        self._places.save(self.folder / PLACES, self._poses, self._joined)
 
     def online(self) -> Trajectory:
         """T_map_camera as published at the time."""

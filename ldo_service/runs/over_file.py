@@ -31,7 +31,7 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
     config = with_all_cores(job.config)
     actors = {actor.name: actor for actor in make_actors(config)}
     reader = Reader(job.sequence, indices, job.warn)
-    record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker.hold_out)
+    record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
     started = Usage.now()
     is_finished = False
     with LogicalClock(

@@ -44,7 +44,7 @@ class _RealTimeRun:
         self._config = job.config.with_map_folder(folder)
         self._indices = job.selection.indices(job.sequence)
         self._reader = Reader(job.sequence, self._indices, job.warn)
-        self._record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker.hold_out)
+        self._record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
         self._step_ms: dict[str, float] = {}
 
     async def go(self) -> RunFolder:

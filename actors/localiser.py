@@ -1,0 +1,66 @@
+"""Camera pose of each RGB-D frame in a finished map.                     actors/localiser.py
+
+In the tracker's stead, with its name and its ports, when `tracker.localise` names a finished run:
+so whoever listens to poses need not know. It makes no keyframe, so the mapper and the optimizer
+have nothing to do and the map stays as it is.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ldo_service.actors.tracker import Tracker, TrackerConfig
+from ldo_service.errors import DataError
+from ldo_service.geometry import RgbdFrame
+from ldo_service.runtime.state_store import decode_state
+from ldo_service.schemas import Keyframe, TrackedPose
+from ldo_service.tracking.judgement import Status
+from ldo_service.tracking.localiser import Fix, Localiser
+from ldo_service.tracking.places import Place, Places
+
+PLACES = "places.msgpack"  # in the folder of a run
+
+
+class LocalisingTracker(Tracker):
+    """LOST until the camera is found in the map; poses are in the map's frame from then on."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        super().__init__(config)
+        self._localiser = Localiser(self._odometry, places_of(Path(config.localise)))
+
+    def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
+        tracked, T_map_odom = self._localiser.track(frame)
+        if T_map_odom is None:
+            tracked, T_map_odom = replace(tracked, status=Status.LOST), np.eye(4)
+        yield self._pose_message(frame, tracked, T_map_odom, reference=None)
+
+    def snapshot(self) -> dict[str, Any]:
+        return {**super().snapshot(), "fix": self._localiser.fix.packed}
+
+    def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        super().restore(state)
+        self._localiser.fix = Fix.unpacked(state["fix"])
+
+
+def places_of(folder: Path) -> Places:
+    """Of the map that a finished run left in its folder. Raises DataError when it left none."""
+    path = folder / PLACES
+    if not path.is_file():
+        raise DataError(
+            f"{folder} has no {PLACES}, so nothing can be localised in it. Name the folder that "
+            "`ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
+        )
+    try:
+        kept = decode_state(path.read_bytes())
+        places = Places(tuple(Place.unpacked(place) for place in kept["places"]))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is not what `ldo run` writes: {error!r}. Run it again.") from error
+    if not len(places):
+        raise DataError(f"{path} holds no place: the run made no keyframe. Run it again.")
+    return places

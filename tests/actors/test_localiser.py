@@ -1,0 +1,66 @@
+"""A camera in the map of a finished run."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from ldo_service.actors.localiser import PLACES, LocalisingTracker, places_of
+from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.datasets import Sequence
+from ldo_service.errors import DataError
+from ldo_service.geometry import se3
+from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.schemas import TrackedPose
+from ldo_service.wire import transform
+
+
+def localiser(finished_run: Path) -> LocalisingTracker:
+    return LocalisingTracker(TrackerConfig(localise=str(finished_run)))
+
+
+def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, frames) -> None:
+    """The run saw frames 0 to 15; the camera starts at the 12th and leaves."""
+    tracker = localiser(finished_run)
+    made = [out for frame in frames[12:30] for out in tracker.handle(frame)]
+    assert all(isinstance(message, TrackedPose) for message in made), "no keyframe is made"
+    assert [pose.status for pose in made[:2]] == ["LOST", "OK"]
+    truth = room.truth()
+    assert truth is not None
+    T_map_world = se3.inverse(truth.T_world_camera[0])
+    for pose in made[1:]:
+        assert pose.status == "OK"
+        T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+        T_true = T_map_world @ truth.T_world_camera[pose.frame]
+        np.testing.assert_allclose(T_map_camera[:3, 3], T_true[:3, 3], atol=0.01)
+
+
+@pytest.mark.parametrize("split", [1, 8])
+def test_a_successor_goes_on_bit_for_bit(finished_run: Path, frames, split: int) -> None:
+    first, second = localiser(finished_run), localiser(finished_run)
+    for frame in frames[: split + 1]:
+        list(first.handle(frame))
+    state = {name: decode_state(encode_state(part)) for name, part in first.snapshot().items()}
+    second.restore(state)
+    for frame in frames[split + 1 : split + 10]:
+        (mine,), (expected,) = second.handle(frame), first.handle(frame)
+        assert msgspec.msgpack.encode(mine) == msgspec.msgpack.encode(expected)
+
+
+def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no places\.msgpack.*ldo run"):
+        places_of(tmp_path)
+
+
+@pytest.mark.parametrize("body", [b"", b"nonsense", encode_state({"places": [{"id": 1}]})])
+def test_a_file_that_no_run_wrote_is_refused(tmp_path: Path, body: bytes) -> None:
+    (tmp_path / PLACES).write_bytes(body)
+    with pytest.raises(DataError, match="is not what `ldo run` writes"):
+        places_of(tmp_path)
+
+
+def test_a_run_that_made_no_keyframe_is_refused(tmp_path: Path) -> None:
+    (tmp_path / PLACES).write_bytes(encode_state({"places": []}))
+    with pytest.raises(DataError, match="no place"):
+        places_of(tmp_path)

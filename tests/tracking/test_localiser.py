@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from ldo_service.geometry import se3
+from ldo_service.tracking import Odometry, OdometryConfig, PyramidConfig, Status, pyramid_of
+from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.localiser import Fix, Localiser
+from ldo_service.tracking.places import Places, PlacesConfig, place_of
+from ldo_service.tracking.segments import SegmentConfig
+
+T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
+T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
+CONFIG = OdometryConfig(segments=SegmentConfig(begin_after=3, look_every=4, confirm_after=2))
+
+
+@pytest.fixture(scope="module")
+def places(large_room, make_walk) -> Places:
+    """A map in a frame of its own."""
+    made = []
+    for number, T_world_camera in enumerate(make_walk(3, 0.15, 0.1)):
+        view = pyramid_of(large_room.view(T_world_camera), PyramidConfig())
+        keyframe = Keyframe(view, T_MAP_WORLD @ T_world_camera, number)
+        made.append(place_of(keyframe, FeatureConfig(), PlacesConfig()))
+    return Places(tuple(made))
+
+
+def located(localiser: Localiser, room, truth: list[np.ndarray]) -> list[float | None]:
+    """Errors in the map, m; None where the camera is not found."""
+    errors: list[float | None] = []
+    for index, T_world_camera in enumerate(truth):
+        tracked, T_map_odom = localiser.track(room.view(T_world_camera, index=index))
+        if T_map_odom is None or tracked.status is Status.LOST:
+            errors.append(None)
+            continue
+        T_error = se3.inverse(T_MAP_WORLD @ T_world_camera) @ T_map_odom @ tracked.T_odom_camera
+        errors.append(float(np.linalg.norm(T_error[:3, 3])))
+    return errors
+
+
+def test_a_camera_is_found_at_the_second_look_and_followed(large_room, make_walk, places) -> None:
+    first, *rest = located(Localiser(Odometry(CONFIG), places), large_room, make_walk(14))
+    assert first is None, "one look is not believed"
+    assert max(error for error in rest if error is not None) < 5e-3
+    assert None not in rest
+
+
+def test_a_camera_in_a_strange_place_is_not_found(large_room, make_walk, places) -> None:
+    strange = [T_BEHIND @ T for T in make_walk(8)]
+    assert located(Localiser(Odometry(CONFIG), places), large_room, strange) == [None] * 8
+
+
+def test_after_a_kidnap_the_old_fix_is_forgotten(large_room, make_walk, places) -> None:
+    here, there = make_walk(6), [T_BEHIND @ T for T in make_walk(8)]
+    localiser = Localiser(Odometry(CONFIG), places)
+    errors = located(localiser, large_room, [*here, *there, *here])
+    assert errors[6:14] == [None] * 8, "the new segment of odometry was not found in the map"
+    back = [error for error in errors[14:] if error is not None]
+    assert len(back) >= 4
+    assert max(back) < 5e-3
+
+
+def test_a_fix_survives_packing(large_room, make_walk, places) -> None:
+    localiser = Localiser(Odometry(CONFIG), places)
+    located(localiser, large_room, make_walk(4))
+    again = Fix.unpacked(localiser.fix.packed)
+    np.testing.assert_array_equal(again.T_map_odom, localiser.fix.T_map_odom)
+    assert again.last is not None
+    assert again.since_look == localiser.fix.since_look
