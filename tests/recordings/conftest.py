@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.graph import RUNNING
-from ldo_service.config import load_config
+from ldo_service.config import Config, load_config
 from ldo_service.datasets import Sequence
 from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import Out
@@ -26,30 +26,32 @@ REFINING = tuple(
 CONFIG = load_config(settings=(ROUGH, *REFINING))
 
 
-def stages(folder: Path, transport: MemoryTransport) -> list[Stage]:
+def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Stage]:
     made: list[Stage] = []
     for box in RUNNING:
         assert box.make is not None
         make, topics = box.make, [out.topic.name for out in box.outputs]
         made.append(
             Stage(
-                lambda make=make: make(CONFIG),
+                lambda make=make: make(config),
                 transport,
                 expected={name: lossless_consumers(RUNNING, name) for name in topics},
-                journal=open_recorder(folder, box.name, "robot", CONFIG),
+                journal=open_recorder(folder, box.name, "robot", config),
             )
         )
     return made
 
 
-async def live(folder: Path, sequence: Sequence) -> None:
+async def live(
+    folder: Path, sequence: Sequence, config: Config = CONFIG, count: int = FRAMES
+) -> None:
     """Frame by frame, then a soft stop, producers first."""
     transport = MemoryTransport()
-    actors = stages(folder, transport)
+    actors = stages(folder, transport, config)
     camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
     async with running(*actors) as tasks:
         tracker = next(stage for stage in actors if stage.name == "tracker")
-        for index in range(FRAMES):
+        for index in range(count):
             await send(camera, camera_rgbd_message(sequence.read(index)))
             await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
         for stage, task in zip(actors, tasks, strict=True):

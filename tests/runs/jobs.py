@@ -1,9 +1,11 @@
-"""Runs whose map need not be beautiful."""
+"""Runs whose map need not be beautiful, and a camera that is carried off and comes back."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
+from ldo_service.geometry import RawFrame, Trajectory
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import Job
 from ldo_service.runs.source import Selection, Warn
@@ -22,3 +24,27 @@ def job(
     prepare(folder, overwrite=False)
     config = load_config(settings=(ROUGH, *settings))
     return Job(sequence, folder, config, Selection(max_frames=frames), warn)
+
+
+SOON = tuple(
+    f"tracker.odometry.segments.{setting}"
+    for setting in ("begin_after=3", "look_every=3", "confirm_after=2")
+)
+HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
+
+
+class Rearranged(Sequence):
+    """Frames of another sequence in another order, at its stamps."""
+
+    def __init__(self, sequence: Sequence, order: list[int]) -> None:
+        super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns[: len(order)])
+        self._sequence, self._order = sequence, order
+
+    def read(self, index: int) -> RawFrame:
+        raw = self._sequence.read(self._order[index])
+        return replace(raw, index=index, stamp_ns=int(self.stamps_ns[index]))
+
+    def truth(self) -> Trajectory:
+        truth = self._sequence.truth()
+        assert truth is not None
+        return Trajectory(self.stamps_ns * 1e-9, truth.T_world_camera[self._order])

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,36 +10,13 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.geometry import RawFrame, Trajectory
+from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import MapFolder
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.simulation import simulate_graph
 from ldo_service.runs.source import Selection
 
-from .jobs import ROUGH, job
-
-SOON = tuple(
-    f"tracker.odometry.segments.{setting}"
-    for setting in ("begin_after=3", "look_every=3", "confirm_after=2")
-)
-HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
-
-
-class Rearranged(Sequence):
-    """Frames of another sequence in another order, at its stamps."""
-
-    def __init__(self, sequence: Sequence, order: list[int]) -> None:
-        super().__init__(sequence.name, sequence.raw_camera, sequence.stamps_ns[: len(order)])
-        self._sequence, self._order = sequence, order
-
-    def read(self, index: int) -> RawFrame:
-        raw = self._sequence.read(self._order[index])
-        return replace(raw, index=index, stamp_ns=int(self.stamps_ns[index]))
-
-    def truth(self) -> Trajectory:
-        truth = self._sequence.truth()
-        assert truth is not None
-        return Trajectory(self.stamps_ns * 1e-9, truth.T_world_camera[self._order])
+from .jobs import AWAY, BACK, HERE, ROUGH, SOON, Rearranged, job
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +80,8 @@ def test_a_segment_that_never_came_back_stays_apart(room: Sequence, tmp_path: Pa
     assert distances[1] > 50
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(300)
 def test_what_every_actor_makes_of_a_return_is_the_same_each_time(returning: Rearranged) -> None:
     config = load_config(settings=(ROUGH, *SOON))
     one, two = (
