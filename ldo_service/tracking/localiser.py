@@ -91,5 +91,6 @@ class Localiser:
         keyframe, alignment = found
         T_map_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_map_odom = se3.orthonormalised(T_map_camera @ se3.inverse(tracked.T_odom_camera))
-        look = Look(tracked.segment, MAP, T_map_odom, keyframe.reference.median_depth_m)
+        median_depth_m = keyframe.reference.median_depth_m
+        look = Look(tracked.segment, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
         self.fix = self.fix.looked(look, config)

@@ -313,7 +313,7 @@ class Odometry:
             return tracked
         found = self._found(view, self._apart_from(keyframe.segment))
         look = None if found is None else _look(tracked, found[0], found[1].alignment)
-        self._state = replace(self._state, segments=before.looked(look))
+        self._state = replace(self._state, segments=before.looked(look, config))
         if found is None or look is None or not before.is_confirmed_by(look, config):
             return tracked
         join = _join(found[0], found[1].alignment)
@@ -446,7 +446,9 @@ def _report(
 def _look(tracked: Tracked, other: Keyframe, alignment: Alignment) -> Look:
     T_there_camera = other.T_odom_keyframe @ alignment.T_reference_camera
     T_there_here = T_there_camera @ se3.inverse(tracked.T_odom_camera)
-    return Look(tracked.segment, other.segment, T_there_here, other.reference.median_depth_m)
+    median_depth_m = other.reference.median_depth_m
+    T_here_camera = tracked.T_odom_camera
+    return Look(tracked.segment, other.segment, T_there_here, T_here_camera, median_depth_m)
 
 
 def _join(other: Keyframe, alignment: Alignment) -> Join:

@@ -1,8 +1,9 @@
 """Stretches of tracking without a loss, and which of them are known to meet.
 
 A camera that stays lost begins a new segment, with a first keyframe of its own. Where that is
-among the older ones is found out when a keyframe of another segment is recognised, twice and to
-the same effect: a false join would fold two places into one. Conventions: `ldo_service.geometry`.
+among the older ones is found out when keyframes of another segment are recognised, twice and to
+the same effect, in views that share nothing: a corridor's ends may look alike, and a false join
+would fold two places into one. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -22,16 +23,22 @@ class SegmentConfig:
     # Frames between looks for the other segments: twice a second at 30 Hz. A prime, so that it
     # does not meet a frame held out from mapping each time.
     look_every: int = 17
-    confirm_after: int = 7  # frames from a find to the look that confirms it
-    confirm_rad: float = 0.06  # rotation plus parallax between the two looks that join
+    confirm_after: int = 7  # frames between looks while a find is to be confirmed
+    confirm_rad: float = 0.06  # rotation plus parallax between what the two looks say
+    # How far the camera has turned from one to the other, plus a third of the parallax: as wide as
+    # a depth camera sees. Lower values join sooner and believe twins.
+    confirm_apart_rad: float = 1.0
+    misses: int = 3  # looks in a row that find nothing before a find is forgotten
 
     def __post_init__(self) -> None:
         if self.begin_after < 0 or min(self.look_every, self.confirm_after) < 1:
             raise ConfigError(
                 "begin_after must be at least 0, look_every and confirm_after at least 1."
             )
-        if not self.confirm_rad > 0:
-            raise ConfigError(f"confirm_rad={self.confirm_rad:g} must be positive.")
+        if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
+            raise ConfigError(
+                "confirm_rad must be positive, confirm_apart_rad and misses at least 0."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +58,7 @@ class Look:
     here: int
     there: int
     T_there_here: np.ndarray  # [4, 4]
+    T_here_camera: np.ndarray  # [4, 4], of the view
     median_depth_m: float  # of what was recognised
 
     def agrees(self, other: "Look", config: SegmentConfig) -> bool:
@@ -58,6 +66,11 @@ class Look:
             return False
         difference = se3.inverse(self.T_there_here) @ other.T_there_here
         return extent(difference, self.median_depth_m) < config.confirm_rad
+
+    def is_apart_from(self, other: "Look", config: SegmentConfig) -> bool:
+        """Whether the views are so different that a chance likeness of both is unlikely."""
+        moved = se3.inverse(self.T_here_camera) @ other.T_here_camera
+        return extent(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +80,8 @@ class Segments:
     roots: tuple[int, ...] = ()
     lost: int = 0  # frames in a row
     since_look: int = 0  # frames
-    last: Look | None = None  # what the last look found
+    last: Look | None = None  # the find that is to be confirmed
+    missed: int = 0  # looks in a row since it that found nothing
 
     def begun(self) -> "Segments":
         return Segments((*self.roots, len(self.roots)))
@@ -88,10 +102,19 @@ class Segments:
         return self.roots[segment] == self.roots[other]
 
     def is_confirmed_by(self, look: Look, config: SegmentConfig) -> bool:
-        return self.last is not None and self.last.agrees(look, config)
+        """Whether both say the same of different views."""
+        last = self.last
+        return last is not None and last.agrees(look, config) and last.is_apart_from(look, config)
 
-    def looked(self, found: Look | None) -> "Segments":
-        return replace(self, since_look=0, last=found)
+    def looked(self, found: Look | None, config: SegmentConfig) -> "Segments":
+        """The oldest find that nothing speaks against is kept."""
+        if found is None:
+            is_kept = self.missed < config.misses
+            return replace(
+                self, since_look=0, last=self.last if is_kept else None, missed=self.missed + 1
+            )
+        is_same = self.last is not None and self.last.agrees(found, config)
+        return replace(self, since_look=0, last=self.last if is_same else found, missed=0)
 
     def joined(self, segment: int, other: int) -> "Segments":
         older, younger = sorted((self.roots[segment], self.roots[other]))

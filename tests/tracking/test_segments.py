@@ -9,8 +9,14 @@ CONFIG = SegmentConfig(begin_after=3, look_every=4, confirm_after=2)
 T_THERE_HERE = se3.exp(np.array([0.0, 0.4, 0.0, 1.0, 0.0, 2.0]))
 
 
-def look(T_there_here: np.ndarray = T_THERE_HERE, here: int = 2, there: int = 0) -> Look:
-    return Look(here, there, T_there_here, median_depth_m=2.0)
+def turned(angle_rad: float) -> np.ndarray:
+    return se3.exp(np.array([0.0, angle_rad, 0.0, 0.0, 0.0, 0.0]))
+
+
+def look(
+    T_there_here: np.ndarray = T_THERE_HERE, here: int = 2, there: int = 0, angle_rad: float = 0.0
+) -> Look:
+    return Look(here, there, T_there_here, turned(angle_rad), median_depth_m=2.0)
 
 
 def begun(count: int) -> Segments:
@@ -41,19 +47,34 @@ def test_nobody_looks_for_other_segments_where_there_is_none_apart() -> None:
 
 
 def test_a_find_is_looked_at_again_sooner() -> None:
-    found = begun(2).looked(look())
+    found = begun(2).looked(look(), CONFIG)
     assert after(found, 2).is_time_to_look(CONFIG)
-    assert not after(begun(2).looked(None), 2).is_time_to_look(CONFIG)
+    assert not after(begun(2).looked(None, CONFIG), 2).is_time_to_look(CONFIG)
 
 
-def test_two_finds_confirm_each_other_when_they_say_the_same() -> None:
+def test_two_finds_confirm_each_other_when_they_say_the_same_of_different_views() -> None:
     near = T_THERE_HERE @ se3.exp(np.full(6, 0.01))
-    found = begun(3).looked(look())
-    assert found.is_confirmed_by(look(near), CONFIG)
-    assert not found.is_confirmed_by(look(T_THERE_HERE @ T_THERE_HERE), CONFIG)
-    assert not found.is_confirmed_by(look(there=1), CONFIG)
-    assert not begun(3).is_confirmed_by(look(), CONFIG)
-    assert not found.looked(None).is_confirmed_by(look(), CONFIG), "one in between found nothing"
+    found = begun(3).looked(look(), CONFIG)
+    assert found.is_confirmed_by(look(near, angle_rad=1.2), CONFIG)
+    assert not found.is_confirmed_by(look(near, angle_rad=0.5), CONFIG), "the same view"
+    assert not found.is_confirmed_by(look(T_THERE_HERE @ near, angle_rad=1.2), CONFIG)
+    assert not found.is_confirmed_by(look(there=1, angle_rad=1.2), CONFIG)
+    assert not begun(3).is_confirmed_by(look(angle_rad=1.2), CONFIG)
+
+
+def test_the_oldest_find_that_nothing_contradicts_is_the_one_to_be_confirmed() -> None:
+    found = begun(3).looked(look(), CONFIG).looked(look(angle_rad=0.6), CONFIG)
+    assert found.is_confirmed_by(look(angle_rad=1.2), CONFIG)
+    other = found.looked(look(T_THERE_HERE @ T_THERE_HERE, angle_rad=0.6), CONFIG)
+    assert not other.is_confirmed_by(look(angle_rad=1.2), CONFIG)
+
+
+def test_a_find_is_forgotten_after_looks_that_find_nothing() -> None:
+    found = begun(2).looked(look(), CONFIG)
+    for _ in range(CONFIG.misses):
+        found = found.looked(None, CONFIG)
+    assert found.last is not None
+    assert found.looked(None, CONFIG).last is None
 
 
 def test_joined_segments_share_the_oldest_as_their_root() -> None:
@@ -63,7 +84,9 @@ def test_joined_segments_share_the_oldest_as_their_root() -> None:
     assert not segments.are_joined(3, 0)
 
 
-@pytest.mark.parametrize("segments", [Segments(), begun(3).looked(look()), begun(2).joined(0, 1)])
+@pytest.mark.parametrize(
+    "segments", [Segments(), begun(3).looked(look(), CONFIG), begun(2).joined(0, 1)]
+)
 def test_segments_survive_packing(segments: Segments) -> None:
     again = Segments.unpacked(segments.packed)
     assert again.roots == segments.roots
