@@ -137,7 +137,7 @@ async def test_a_process_leaves_when_its_parent_is_gone(monkeypatch: pytest.Monk
     await asyncio.sleep(0.02)
     assert not waiting.done()
     monkeypatch.setattr(os, "getppid", lambda: 1)
-    await asyncio.wait_for(waiting, 5)
+    await asyncio.wait_for(waiting, 60)
 
 
 async def test_a_process_started_by_hand_stays(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -265,7 +265,7 @@ async def test_heartbeats_carry_the_counters() -> None:
         assert beats[0].state == "ready"
         for value in (1, 2, 3):
             await send(numbers, number(value))
-        await eventually(lambda: beats[-1].steps == 3)
+        await eventually(lambda: beats[-1].steps == 3 and beats[-1].state == "ready")
         last = beats[-1]
     assert (last.actor, last.stamp_ns, last.facts) == ("adder", 3, {"sum": 6.0})
     assert (last.inputs[0].topic, last.inputs[0].delivered) == (NUMBERS.name, 3)

@@ -16,7 +16,7 @@ def ldo_control(service: LiveService, *arguments: str) -> subprocess.CompletedPr
     return subprocess.run(command, capture_output=True, text=True)
 
 
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(300)
 def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -77,7 +77,7 @@ def _iterations(service: LiveService) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
     arguments = ("--set", "service.control_timeout_s=1", "--set", "service.silent_after_s=30")
     with live_service(tmp_path, *arguments) as service:
@@ -93,7 +93,7 @@ def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_a_robot_that_is_not_there_is_said(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()

@@ -18,7 +18,7 @@ EVERY_ACTOR = ("frame_source", "tracker", "mapper", "optimizer")
 APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]", "--set", "mapper.iterations=2")
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -34,7 +34,7 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
         assert "Traceback" not in service.log
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_the_examples_run_as_printed(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -65,7 +65,7 @@ def _at(endpoint: str, example: Path) -> str:
     return text.replace('connect("robot")', f'connect("robot", "{endpoint}")')
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -77,7 +77,7 @@ def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
         assert "Traceback" not in second.stderr
 
 
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(300)
 def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -118,7 +118,7 @@ def refused(state: Path) -> str:
     return done.stderr
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
@@ -130,7 +130,7 @@ def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(120)
+@pytest.mark.timeout(300)
 def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
@@ -158,7 +158,7 @@ def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(300)
 def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -175,7 +175,7 @@ def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(90)
+@pytest.mark.timeout(300)
 def test_a_sleeping_subscriber_is_its_own_problem(tmp_path: Path) -> None:
     sleeper = (
         "import time, zenoh, json, sys\n"

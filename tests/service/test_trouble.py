@@ -67,11 +67,11 @@ def followed(service: LiveService, room: Sequence, start: int, poses: int) -> li
     pytest.fail(f"{len(got)} poses (log: {service.log})")
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
     troubled: Callable, room: Sequence
 ) -> None:
-    with troubled("hang", *APART, "--set", "stage.stall_after_s=1") as service:
+    with troubled("hang", *APART, "--set", "stage.stall_after_s=4") as service:
         service.wait_for_actors()
         begin(service, room)
         tracked(service, room, range(1, 20))
@@ -85,7 +85,7 @@ def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
     troubled: Callable, room: Sequence
 ) -> None:
@@ -104,7 +104,7 @@ def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_an_actor_that_always_fails_is_given_up_with_exit_code_4(
     troubled: Callable, room: Sequence
 ) -> None:
@@ -137,7 +137,7 @@ def not_frames(good: CameraRgbd) -> Iterator[bytes]:
     yield bytes(65_000_000)  # over stage.max_message_mb
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_what_is_no_frame_is_rejected_and_counted_while_the_stream_goes_on(
     tmp_path: Path, room: Sequence
 ) -> None:
@@ -173,7 +173,7 @@ def rejected(service: LiveService) -> int:
     return service.update_health()["frame_source"].inputs[0].rejected
 
 
-@pytest.mark.timeout(60)
+@pytest.mark.timeout(300)
 def test_a_camera_that_goes_blind_and_sees_again_is_tracked_on(
     tmp_path: Path, room: Sequence
 ) -> None:
