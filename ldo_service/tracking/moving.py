@@ -55,6 +55,10 @@ class Suspicion:
     contradicts: np.ndarray
     gone: np.ndarray | None
 
+    def fits(self, now: Level, then: Level) -> bool:
+        shapes = self.contradicts.shape, self.gone.shape
+        return shapes == (now.depth_m.shape, then.depth_m.shape)
+
     def of_new_keyframe(self) -> "Suspicion":
         return Suspicion(self.contradicts, None)
 
@@ -123,6 +127,8 @@ def watch(
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
     known = _resized(has_moved, then.depth_m.shape)
+    if before is not None and not before.fits(now, then):
+        before = None  # another camera
     came, gone = pair.came(known), pair.gone(before)
     came_before = None if before is None else _resized(before.contradicts, came.shape)
     is_moving = _in_pieces(came, came_before, config)
