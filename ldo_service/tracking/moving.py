@@ -56,8 +56,8 @@ class Suspicion:
     gone: np.ndarray | None
 
     def fits(self, now: Level, then: Level) -> bool:
-        shapes = self.contradicts.shape, self.gone.shape
-        return shapes == (now.depth_m.shape, then.depth_m.shape)
+        is_of_keyframe = self.gone is None or self.gone.shape == then.depth_m.shape
+        return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
     def of_new_keyframe(self) -> "Suspicion":
         return Suspicion(self.contradicts, None)
@@ -130,8 +130,7 @@ def watch(
     if before is not None and not before.fits(now, then):
         before = None  # another camera
     came, gone = pair.came(known), pair.gone(before)
-    came_before = None if before is None else _resized(before.contradicts, came.shape)
-    is_moving = _in_pieces(came, came_before, config)
+    is_moving = _in_pieces(came, None if before is None else before.contradicts, config)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
     return Watched(
         _resized(is_moving, view.levels[0].depth_m.shape),

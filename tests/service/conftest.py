@@ -91,6 +91,7 @@ class LiveService:
         poses: list[TrackedPose] = []
 
         def enough() -> bool:
+            assert self.process.poll() is None, self.log
             poses.extend(self.poses())
             return len(poses) >= count
 

@@ -55,6 +55,15 @@ def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> lis
     return [pose for pose in poses if pose.frame]
 
 
+def soon(service: LiveService) -> list[TrackedPose]:
+    """The next poses; none after two seconds."""
+    until_s = time.monotonic() + 2
+    while not (poses := service.poses()) and time.monotonic() < until_s:
+        assert service.process.poll() is None, service.log
+        time.sleep(0.01)
+    return poses
+
+
 def followed(service: LiveService, room: Sequence, start: int, poses: int) -> list[TrackedPose]:
     """Send frames until so many have a pose: a process that just started may miss the first."""
     got: list[TrackedPose] = []
@@ -186,14 +195,19 @@ def test_a_camera_that_goes_blind_and_sees_again_is_tracked_on(
             frame, is_blind = room[index], 9 <= index < 15
             message = camera_rgbd_message(room.read(index))
             depth = np.zeros_like(frame.depth_m) if is_blind else frame.depth_m
+            poses: list[TrackedPose] = []
             stamp_ns = 1_000_000_000 + index * 33_000_000
-            service.client.publish_color(frame.color, message.camera, stamp_ns)
-            service.client.publish_depth(depth, message.camera, 1.0, stamp_ns=stamp_ns + 2_000_000)
-            statuses.append(service.wait_for_poses(1)[-1].status)
+            while not poses:  # the network drops what a busy machine does not take
+                service.client.publish_color(frame.color, message.camera, stamp_ns)
+                service.client.publish_depth(
+                    depth, message.camera, 1.0, stamp_ns=stamp_ns + 2_000_000
+                )
+                poses, stamp_ns = soon(service), stamp_ns + 5_000_000
+            statuses.append(poses[-1].status)
         assert statuses[:8] == ["OK"] * 8
         assert "OK" not in statuses[8:14]
         assert statuses[-5:] == ["OK"] * 5
-        wait_until(lambda: facts(service)["pairs"] == 24, 5, "the pairs are counted")
+        wait_until(lambda: facts(service)["pairs"] >= 24, 5, "the pairs are counted")
         assert facts(service)["skew_ms_max"] == 2.0
         assert service.stop() == 0
         assert "Traceback" not in service.log
