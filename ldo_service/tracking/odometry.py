@@ -123,7 +123,8 @@ class Odometry:
             if found is None:
                 return self._lost(keyframe, candidate.alignment, view)
             (keyframe, candidate), status = found, Status.OK
-            self._state = replace(self._state, history=History())  # noise is another elsewhere
+            # noise is another elsewhere, and what has gone is of another keyframe
+            self._state = replace(self._state, history=History(), suspicion=None)
         tracked = self._accepted(frame, keyframe, candidate, status)
         return self._joining(tracked, keyframe, view)
 
@@ -345,7 +346,9 @@ class Odometry:
             history = history.extended(alignment, config.judgement)
             self._state = replace(self._state, trusted=thumbnail_of(self._view(frame)))
         self._remember(keyframe, motion if is_steady else motion.stopped(), history, status)
-        is_moving = self._watched(keyframe, self._view(frame), alignment)
+        is_moving = None  # where a pose is unsure, surfaces contradict for that
+        if status is Status.OK:
+            is_moving = self._watched(keyframe, self._view(frame), alignment)
         due = is_due(
             alignment.T_reference_camera,
             alignment.overlap,

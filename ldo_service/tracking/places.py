@@ -107,13 +107,16 @@ def place_of(
     config: PlacesConfig,
     history: History = NO_PAST,
 ) -> Place:
-    """What is kept of a keyframe, and of the noise of frames before it."""
+    """What is kept of a keyframe without what moves in it, and of the noise of frames before it."""
     view, level = keyframe.view, keyframe.view.levels[0]
+    nothing = np.zeros(level.depth_m.shape, bool)
+    left_out = nothing if keyframe.left_out is None else keyframe.left_out
     seen = detect(view, replace(features, count=config.features))
-    measured = seen.points_camera[:, 2] > 0
+    kept = _are_still(seen.points_camera, level.camera, left_out)
     steps = np.rint(level.depth_m * DEPTH_STEPS_PER_M)
-    steps[steps > np.iinfo(np.uint16).max] = 0
-    _, gray = cv2.imencode(".png", np.rint(level.texels[..., 0]).astype(np.uint8))
+    steps[left_out | (steps > np.iinfo(np.uint16).max)] = 0
+    shades = np.where(left_out, 0, np.rint(level.texels[..., 0]))
+    _, gray = cv2.imencode(".png", shades.astype(np.uint8))
     return Place(
         id=keyframe.id,
         segment=keyframe.segment,
@@ -122,12 +125,21 @@ def place_of(
         intensity_sigma=median(history.intensity_sigmas or (0.0,)),
         depth_noise_scale=median(history.depth_noise_scales or (0.0,)),
         thumbnail=thumbnail_of(view),
-        points_camera=seen.points_camera[measured].astype(np.float32),
-        descriptors=seen.descriptors[measured],
+        points_camera=seen.points_camera[kept].astype(np.float32),
+        descriptors=seen.descriptors[kept],
         camera=level.camera,
         gray=gray.tobytes(),
         depth=codecs.encode_depth(steps.astype(np.uint16))[1],
     )
+
+
+def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.ndarray:
+    """Which of points [N, 3] bool were measured, on what does not move."""
+    kept = points[:, 2] > 0
+    pixels = np.rint(camera.project(points[kept])).astype(int)
+    column, row = np.clip(pixels, 0, [camera.width - 1, camera.height - 1]).T
+    kept[kept] = ~left_out[row, column]
+    return kept
 
 
 def thumbnail_of(view: Pyramid) -> np.ndarray:

@@ -93,3 +93,18 @@ def test_a_place_knows_the_noise_of_its_surroundings(room) -> None:
     place = place_of(keyframe_at(room, np.eye(4)), FeatureConfig(), PlacesConfig(), past)
     assert place.history(History()) == History((4.0,), (1.0,))
     assert place_at(room, np.eye(4)).history(past) is past, "the first of all knows none"
+
+
+def test_a_place_keeps_nothing_of_what_moves(room) -> None:
+    view = pyramid_of(room.view(np.eye(4)), PyramidConfig())
+    left_out = np.zeros(view.levels[0].depth_m.shape, bool)
+    left_out[:, :80] = True
+    place = place_of(
+        Keyframe(view, np.eye(4), 0, left_out=left_out), FeatureConfig(), PlacesConfig()
+    )
+    rebuilt = place.keyframe(PyramidConfig()).view.levels[0].texels
+    assert not rebuilt[:, :80].any()
+    assert rebuilt[5:-5, 90:, 3].all()
+    columns = place.camera.project(place.points_camera.astype(np.float64))[:, 0]
+    assert len(columns) > 20
+    assert columns.min() > 79
