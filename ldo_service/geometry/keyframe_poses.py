@@ -90,14 +90,15 @@ class KeyframePoses:
         """Take over a correction; T_new_old of every known keyframe that it places anew.
 
         Keyframes that are newer than the newest it names are chained again from their references,
-        and so are those `held`, whose links are better than what the correction knew. An older
-        correction than the last changes nothing.
+        and so are those `held`, whose links are better than what the correction knew; one without
+        a known reference has no such link. An older correction than the last changes nothing.
         """
         if version <= self.version or not T_map:
             return {}
         self.version = version
         newest = max(T_map)
         old = dict(self._T_map)
+        held = {k for k in held if k in old and self._links[k].reference in old}
         self._T_map.update({k: T for k, T in T_map.items() if k in old and k not in held})
         for keyframe in sorted(k for k in old if k > newest or k in held):
             link = self._links[keyframe]

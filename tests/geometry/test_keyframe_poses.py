@@ -108,6 +108,16 @@ def test_a_new_segment_is_apart_until_a_correction_joins_it(steps) -> None:
     np.testing.assert_allclose(poses[51], T_odom @ steps[1], atol=1e-12)
 
 
+def test_the_first_of_a_segment_is_joined_though_its_measurement_is_held(steps) -> None:
+    poses = chained(steps)
+    T_odom = poses[len(steps) - 1]
+    poses.chain(50, None, np.eye(4), T_odom, segment=2)
+    poses.chain(51, 50, steps[1], T_odom @ steps[1], segment=2)
+    poses.correct(1, {0: poses[0], 50: T_odom, 51: T_odom}, held=(50, 51))
+    np.testing.assert_allclose(poses[50], T_odom, atol=1e-12)
+    np.testing.assert_allclose(poses[51], T_odom @ steps[1], atol=1e-12)
+
+
 def test_a_missed_keyframe_is_bridged_within_its_segment() -> None:
     poses = KeyframePoses()
     poses.chain(0, None, np.eye(4), np.eye(4))
