@@ -85,7 +85,9 @@ def test_dropped_frames_do_not_arrive(walk: Walk) -> None:
     ]
 
 
-@pytest.mark.parametrize("name", ["left half without depth", "impossible depth"])
+@pytest.mark.parametrize(
+    "name", ["left half without depth", "impossible depth", "half as bright", "twice as bright"]
+)
 def test_tracking_goes_on_through_what_leaves_enough_to_see(walk: Walk, name: str) -> None:
     degrade, trouble = TROUBLES[name]
     steps = walk.through(degrade, trouble)
