@@ -132,9 +132,7 @@ class Mapper(Actor):
         self._unacknowledged: dict[int, int] = {}  # the refinement that no correction knows yet
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
         self._version = 0  # of the map, as followers know it
-        self._since_snapshot = (
-            self.config.snapshot_keyframes
-        )  # so that the first keyframe sends one
+        self._since_snapshot = self.config.snapshot_keyframes  # the first keyframe sends one
         self._since_changed = 0
         self._in_snapshot = 0  # Gaussians in the last one
         self._checkpoint: dict[str, Any] = {}
@@ -194,6 +192,8 @@ class Mapper(Actor):
         """Keyframes that the optimiser moved, measured anew against all that they were measured
         against; and those that were measured against them, against where they are now."""
         moved = self._map.refined()
+        if not moved:
+            return
         for keyframe, T_map_keyframe in moved.items():
             self._poses.place(keyframe, T_map_keyframe)
         poses = tuple(

@@ -126,7 +126,7 @@ class Optimizer(Actor):
         """Segments that are placed in an older one, and in which."""
         segments = {first: segment for segment, first in self._first.items()}
         placed = {s: segments[self._graph.first_of(first)] for s, first in self._first.items()}
-        return {segment: older for segment, older in placed.items() if older != segment}
+        return {segment: older for segment, older in placed.items() if older < segment}
 
     def snapshot(self) -> dict[str, Any]:
         if self._saved.get("version") != self._version:

@@ -23,14 +23,12 @@ from ldo_service.schemas import (
     Correction,
     FrameRgbd,
     Keyframe,
-    MeasuredPose,
     TrackedPose,
 )
 from ldo_service.schemas.message import decode, encode
 from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig, Tracked
-from ldo_service.tracking.segments import Join
 from ldo_service.wire import (
     camera_message,
     keyframe_poses_of,
@@ -42,8 +40,6 @@ from ldo_service.wire import (
 )
 
 UNIT_WITHIN = 1e-3  # of a quaternion's norm: four digits, as people copy them, and then normalised
-
-
 RECENT_KEYFRAMES = 32  # four windows of keyframe/new: the optimizer cannot be further behind
 
 
@@ -165,7 +161,9 @@ class Tracker(Actor):
             window=tuple(map(measured_message, window)),
             is_moving=mask_message(tracked.is_moving, frame.camera),
             segment=tracked.segment,
-            joins=() if tracked.join is None else (_measured(tracked.join, keyframe),),
+            joins=()
+            if tracked.join is None
+            else (measured_message(tracked.join.measures(keyframe)),),
         )
 
     def _needed(self, newest: int) -> Iterator[int]:
@@ -242,11 +240,17 @@ class Tracker(Actor):
         state = self._odometry.state()
         places = {f"place_{place['id']}": place for place in state.pop("places")}
         keyframe, correction = state.pop("keyframe"), self._saved_correction
-        now = {"odometry": state, "poses": self._poses.snapshot()}
+        localise = self.config.localise
+        now = {"odometry": state, "poses": self._poses.snapshot(), "localise": localise}
         return {**places, "keyframe": keyframe, "correction": correction, "now": now}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]
+        if now["localise"] != self.config.localise:
+            raise ConfigError(
+                f"the saved state is of --localise {now['localise'] or '(none)'}, this service of "
+                f"{self.config.localise or '(none)'}. Choose another folder with --state."
+            )
         places = [part for name, part in state.items() if name.startswith("place_")]
         kept = {"places": sorted(places, key=itemgetter("id")), "keyframe": state["keyframe"]}
         self._odometry.restore({**now["odometry"], **kept})
@@ -258,12 +262,3 @@ class Tracker(Actor):
 
     def facts(self) -> dict[str, float]:
         return {"keyframes": self._made, "keyframes_without_room": self._without_room}
-
-
-def _measured(join: Join, keyframe: int) -> MeasuredPose:
-    return MeasuredPose(
-        reference=join.keyframe,
-        keyframe=keyframe,
-        T_reference_keyframe=pose_message(join.T_keyframe_camera),
-        information=matrix6_message(join.information),
-    )

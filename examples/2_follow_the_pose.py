@@ -1,7 +1,7 @@
 """Where is the camera: print each pose as it comes.
 
-Start `ldo serve`, and a camera: `ldo publish synthetic:room`. `T_odom_camera` is continuous;
-multiply `T_map_odom` from the left to have the globally consistent pose.
+Start `ldo serve`, and a camera: `ldo publish synthetic:room`. `T_odom_camera` is continuous,
+but after a loss; `T_map_odom` from the left makes it the globally consistent pose.
 
     python examples/2_follow_the_pose.py [POSES]
 """

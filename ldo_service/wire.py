@@ -107,8 +107,7 @@ def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
 
 
 def mask_message(mask: np.ndarray | None, camera: Camera) -> Array:
-    """A mask [h, w] bool of any size as u1 [H, W] of the camera's; [0, 0] of none or an empty
-    one."""
+    """A mask [h, w] bool of any size as u1 [H, W] of the camera's; [0, 0] where nothing is set."""
     if mask is None or not mask.any():
         return NO_MASK
     size = camera.width, camera.height

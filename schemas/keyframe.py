@@ -48,7 +48,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
     window: tuple[MeasuredPose, ...] = ()  # this keyframe measured from others but the reference
     is_moving: Array = NO_MASK  # u1 [H, W], 1: shows what moves, not to be mapped; [0, 0]: nothing
     segment: int = 0  # which of the stretches without a loss it was made in
-    joins: tuple[MeasuredPose, ...] = ()  # its pose in older keyframes of other segments
+    joins: tuple[MeasuredPose, ...] = ()  # as window, in keyframes of segments that this one joins
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)

@@ -44,7 +44,7 @@ class TrackedPose(Message, frozen=True, kw_only=True):
 
     frame: int  # as in camera/rgbd
     status: TrackingStatus
-    T_odom_camera: Pose  # continuous, never jumps
+    T_odom_camera: Pose  # continuous, but where a lost camera is found again
     T_map_odom: Pose  # moves with corrections: T_map_camera = T_map_odom @ T_odom_camera
     graph_version: int  # of the correction that T_map_odom is built on; 0 before the first
     reference: int | None  # the keyframe it was aligned to; None before there is one

@@ -73,6 +73,7 @@ def localising(config: Config, folder: Path | None) -> Config:
     """The configuration with --localise. Raises DataError for a folder without a map."""
     if folder is None:
         return config
+    folder = folder.expanduser().resolve()
     places_of(folder)
-    tracker = replace(config.tracker, localise=str(folder.expanduser().resolve()))
+    tracker = replace(config.tracker, localise=str(folder))
     return replace(config, tracker=tracker)

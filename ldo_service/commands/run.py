@@ -107,7 +107,7 @@ def require_separate(localise: Path | None, out: Path, refine: int) -> None:
     """A map that is localised in stays as it is."""
     if localise and refine:
         raise ConfigError("--localise leaves the map as it is: leave out --refine.")
-    if localise and localise.resolve() == out.resolve():
+    if localise and localise.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(f"--out {out} would replace the map to localise in: choose another.")
 
 

@@ -46,7 +46,7 @@ def choose_sleepers(
 ) -> SleepChoice:
     """Nobody up to `max_active` Gaussians; over it, clumps until `low_water` of that is left.
 
-    awake   of all Gaussians in memory, by anchor
+    awake   of all Gaussians in memory, by clump
     recent  cameras of the last keyframes, at least the current one, which is last
 
     Those that no recent camera may see go, the farthest from the current camera first, older ones

@@ -3,7 +3,7 @@
 Transforms  `T_a_b` maps coordinates in b to coordinates in a: `p_a = T_a_b @ p_b`, so chains
             cancel by eye: `T_map_camera = T_map_keyframe @ T_keyframe_camera`. A 4x4 float64
             array in numerics; translation and quaternion wxyz on the wire.
-Frames      `camera`: x right, y down, z forward (optical). `odom`: continuous, never jumps.
+Frames      `camera`: x right, y down, z forward (optical). `odom`: continuous, but after a loss.
             `map`: globally consistent, moves with corrections. `map` and `odom` start as the
             first camera frame. (REP-105)
 Units       metres, radians, seconds; stamps are integer nanoseconds; depth is z, not range.

@@ -25,11 +25,11 @@ class Link:
 def T_map_segment(segment: int) -> np.ndarray:
     """Where the odometry frame of a segment is put [4, 4] until it is joined to an older one.
 
-    Far from all others, so that their surfaces do not meet; float32 still resolves 0.1 mm in the
-    tenth of them.
+    Below, for a building goes on sideways, and far from all others, so that their surfaces do not
+    meet; float32 still resolves 0.1 mm in the tenth of them.
     """
     T = np.eye(4)
-    T[0, 3] = segment * APART_M
+    T[1, 3] = segment * APART_M
     return T
 
 

@@ -116,8 +116,8 @@ class KeyframeGraph:
         self._rebuild()
 
     def _move(self, younger: int, older: int, T_new_old: np.ndarray) -> None:
-        """All of a component into another."""
-        poses = self.poses()
+        """All of a component into another; everything is solved from where it is now."""
+        self._initial = poses = self.poses()
         for keyframe in [k for k, first in self._first_of.items() if first == younger]:
             self._initial[keyframe] = T_new_old @ poses[keyframe]
             self._first_of[keyframe] = older

@@ -72,9 +72,9 @@ class MapFolder:
         return Trajectory.load(written(self.folder, "trajectory.txt"))
 
     def viewpoints(self) -> list[Viewpoint]:
-        """Where the keyframes were taken."""
+        """Where the keyframes were taken that are in the map's frame."""
         with self._keyframes() as (path, keyframes):
-            return [_viewpoint(path, keyframe) for keyframe in keyframes]
+            return [_viewpoint(path, k) for k in keyframes if k.get("segment", 0) == 0]
 
     def exposures(self) -> Exposures:
         """Of keyframes that have one; older versions wrote none."""

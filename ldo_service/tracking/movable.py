@@ -1,4 +1,7 @@
-"""What a detector knows to move by itself, as pixels. Conventions: `ldo_service.geometry`."""
+"""What a detector knows to move by itself, as pixels. Conventions: `ldo_service.geometry`.
+
+For the masks of `moving`, once a detector's boxes come with the frames; nothing calls it before.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -126,15 +126,15 @@ def watch(
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
-    known = _resized(has_moved, then.depth_m.shape)
+    known = resized(has_moved, then.depth_m.shape)
     if before is not None and not before.fits(now, then):
         before = None  # another camera
     came, gone = pair.came(known), pair.gone(before)
     is_moving = _in_pieces(came, None if before is None else before.contradicts, config)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
     return Watched(
-        _resized(is_moving, view.levels[0].depth_m.shape),
-        _resized(known, keyframe.levels[0].depth_m.shape),
+        resized(is_moving, view.levels[0].depth_m.shape),
+        resized(known, keyframe.levels[0].depth_m.shape),
         Suspicion(came, gone),
     )
 
@@ -148,14 +148,14 @@ def spread(is_moving: np.ndarray, view: Pyramid, config: MovingConfig) -> np.nda
     if not is_moving.any():
         return is_moving
     depth_m = _level(view, config).depth_m
-    seed = _resized(is_moving, depth_m.shape)
+    seed = resized(is_moving, depth_m.shape)
     window = (2 * config.spread_px + 1,) * 2
     measured = (seed & (depth_m > 0)).astype(np.float32)
     share = cv2.boxFilter(measured, -1, window, normalize=False)
     usual_m = cv2.boxFilter(measured * depth_m, -1, window, normalize=False) / np.maximum(share, 1)
     is_beside = (share > 0) & (np.abs(depth_m - usual_m) < config.spread_m)
     whole = cv2.dilate(_bytes(seed | is_beside), _square(config.rim_px)) > 0
-    return _resized(whole, is_moving.shape)
+    return resized(whole, is_moving.shape)
 
 
 def gap_m(view: Level, other: Level, T_other_view: np.ndarray, config: MovingConfig) -> np.ndarray:
@@ -224,7 +224,8 @@ def _level(view: Pyramid, config: MovingConfig) -> Level:
     return view.levels[min(config.level, len(view.levels) - 1)]
 
 
-def _resized(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+def resized(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+    """A mask [h, w] bool, None for nothing, in another size [H, W]."""
     if mask is None:
         return np.zeros(shape, bool)
     if mask.shape == shape:

@@ -18,12 +18,10 @@ from ldo_service.geometry import Camera, codecs
 from .features import FeatureConfig, Features, detect
 from .judgement import History
 from .keyframes import Keyframe
+from .moving import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
 
-THUMBNAIL = (
-    20,
-    15,
-)  # columns and rows: blurred enough that a hand's width of motion matters little
+THUMBNAIL = 20, 15  # columns, rows: so blurred that a hand's width of motion matters little
 CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactly in float32
 DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
 NO_PAST = History()
@@ -109,8 +107,7 @@ def place_of(
 ) -> Place:
     """What is kept of a keyframe without what moves in it, and of the noise of frames before it."""
     view, level = keyframe.view, keyframe.view.levels[0]
-    nothing = np.zeros(level.depth_m.shape, bool)
-    left_out = nothing if keyframe.left_out is None else keyframe.left_out
+    left_out = resized(keyframe.left_out, level.depth_m.shape)
     seen = detect(view, replace(features, count=config.features))
     kept = _are_still(seen.points_camera, level.camera, left_out)
     steps = np.rint(level.depth_m * DEPTH_STEPS_PER_M)

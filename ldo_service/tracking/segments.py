@@ -13,6 +13,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
+from ldo_service.geometry.relative_pose import RelativePose
 
 from .motion import extent
 
@@ -49,6 +50,10 @@ class Join:
     segment: int  # of the keyframe
     T_keyframe_camera: np.ndarray  # [4, 4]
     information: np.ndarray  # [6, 6]
+
+    def measures(self, keyframe: int) -> RelativePose:
+        """The pose of the keyframe that the camera's frame was made."""
+        return RelativePose(self.keyframe, keyframe, self.T_keyframe_camera, self.information)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,8 @@ from ldo_service.geometry import se3
 from .pyramid import Level, Pyramid
 from .reference import Reference
 
+NEIGHBOURS = 10  # that the covariance of a point is taken from, small_gicp's default
+
 
 @dataclass(frozen=True, slots=True)
 class ShapeConfig:
@@ -40,24 +42,21 @@ def pose_from_shape(
     """
     scale_m = reference.median_depth_m
     level = min(config.level, len(view.levels) - 1, len(reference.points) - 1)
-    there = _cloud(reference.points[level][:3].T, config.spacing * scale_m)
-    here = _cloud(_points(view.levels[level]), config.spacing * scale_m)
-    if min(there[0].size(), here[0].size()) < NEIGHBOURS:
+    clouds = reference.points[level][:3].T, _points(view.levels[level])
+    if min(map(len, clouds)) < NEIGHBOURS:
         return None
+    (there, tree), (here, _) = (_cloud(points, config.spacing * scale_m) for points in clouds)
     found = small_gicp.align(
-        there[0],
-        here[0],
-        there[1],
+        there,
+        here,
+        tree,
         T_reference_camera,
         max_correspondence_distance=config.reach * scale_m,
         max_iterations=config.iterations,
     )
-    if not found.converged or found.num_inliers < config.min_partners * here[0].size():
+    if not found.converged or found.num_inliers < config.min_partners * here.size():
         return None
     return se3.orthonormalised(found.T_target_source)
-
-
-NEIGHBOURS = 10  # that the covariance of a point is taken from, small_gicp's default
 
 
 def _cloud(points: np.ndarray, spacing_m: float) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.localiser import PLACES, LocalisingTracker, places_of
-from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
-from ldo_service.errors import DataError
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import TrackedPose
@@ -46,6 +46,19 @@ def test_a_successor_goes_on_bit_for_bit(finished_run: Path, frames, split: int)
     for frame in frames[split + 1 : split + 10]:
         (mine,), (expected,) = second.handle(frame), first.handle(frame)
         assert msgspec.msgpack.encode(mine) == msgspec.msgpack.encode(expected)
+
+
+def test_the_state_of_a_mapping_service_is_refused_and_the_other_way_round(
+    finished_run: Path, frames
+) -> None:
+    mapping = Tracker()
+    list(mapping.handle(frames[0]))
+    localising = LocalisingTracker(TrackerConfig(localise=str(finished_run)))
+    list(localising.handle(frames[0]))
+    with pytest.raises(ConfigError, match="--state"):
+        LocalisingTracker(localising.config).restore(mapping.snapshot())
+    with pytest.raises(ConfigError, match=str(finished_run)):
+        Tracker().restore(localising.snapshot())
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
