@@ -74,7 +74,8 @@ class MapFolder:
     def viewpoints(self) -> list[Viewpoint]:
         """Where the keyframes were taken that are in the map's frame."""
         with self._keyframes() as (path, keyframes):
-            return [_viewpoint(path, k) for k in keyframes if k.get("segment", 0) == 0]
+            mapped = [k for k in keyframes if "segment" not in k or k["segment"] == 0]
+            return [_viewpoint(path, keyframe) for keyframe in mapped]
 
     def exposures(self) -> Exposures:
         """Of keyframes that have one; older versions wrote none."""
