@@ -92,10 +92,12 @@ def insert(
     config = config or InsertionConfig()
     T_camera_map = se3.inverse(T_map_camera)
 
+    def seen() -> Rendering:
+        rows, bounds = gaussians.rows, gaussians.bounds
+        return render(rows, frame.camera, T_camera_map, bounds=bounds, threads=threads)
+
     # What is missing?
-    before = before or render(
-        gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, threads=threads
-    )
+    before = before or seen()
     if left_out is not None:
         frame = _without(frame, left_out, before)
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
@@ -128,10 +130,7 @@ def insert(
     # Undo the blur of overlapping neighbours.
     new_colors = gaussians.colors[len(gaussians) - len(ids) :]
     for _ in range(config.color_steps):
-        after = render(
-            gaussians.rows, frame.camera, T_camera_map, bounds=gaussians.bounds, threads=threads
-        )
-        correct_colors(new_colors, cells, frame, after, config.max_color_step)
+        correct_colors(new_colors, cells, frame, seen(), config.max_color_step)
         gaussians.touch(slice(len(gaussians) - len(ids), None))
     return ids
 
