@@ -28,7 +28,8 @@ from ldo_service.schemas import (
 from ldo_service.schemas.message import decode, encode
 from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
 from ldo_service.tracking.judgement import Status
-from ldo_service.tracking.odometry import Odometry, OdometryConfig, Tracked
+from ldo_service.tracking.odometry import Odometry, OdometryConfig
+from ldo_service.tracking.tracked import Tracked
 from ldo_service.wire import (
     camera_message,
     keyframe_poses_of,

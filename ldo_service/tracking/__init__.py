@@ -2,9 +2,10 @@
 
 from .align import AlignConfig, Alignment, align
 from .judgement import Status
-from .odometry import Odometry, OdometryConfig, Tracked
+from .odometry import Odometry, OdometryConfig
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .reference import Reference, build_reference
+from .tracked import Tracked
 
 __all__ = [
     "AlignConfig",

@@ -13,9 +13,10 @@ import numpy as np
 from ldo_service.geometry import RgbdFrame, se3
 
 from .judgement import Status
-from .odometry import Odometry, Tracked
+from .odometry import Odometry
 from .places import Places
 from .segments import Look, SegmentConfig
+from .tracked import Tracked
 
 MAP = -1  # stands for the map where a segment's number stands otherwise
 

@@ -26,19 +26,21 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.relative_pose import RelativePose
 
 from .align import AlignConfig, Alignment
-from .candidates import Candidate, CandidateConfig, attempt, best
+from .candidates import Candidate, CandidateConfig
 from .equations import Appearance
-from .features import FeatureConfig, detect, estimate_pose
+from .features import FeatureConfig
+from .guesses import Guesses
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
-from .motion import Motion, extent
+from .motion import Motion
 from .moving import MovingConfig, spread, watch
 from .places import Places, PlacesConfig, place_of, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
 from .segments import Join, Look, SegmentConfig
-from .shape import ShapeConfig, pose_from_shape
+from .shape import ShapeConfig
 from .state import State, packed, unpacked
+from .tracked import Tracked, report
 from .window import WindowConfig, measured_from
 
 log = logging.getLogger(__name__)
@@ -65,34 +67,6 @@ class OdometryConfig:
             raise ConfigError(f"large_motion={self.large_motion:g} must be positive.")
 
 
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """Where a frame was taken. While LOST the pose is the last trusted one.
-
-    information [6, 6] is that of T_keyframe_camera * exp(xi), rotation rad then translation m;
-    zero while LOST.
-    """
-
-    T_odom_camera: np.ndarray  # [4, 4]
-    T_keyframe_camera: np.ndarray  # [4, 4]
-    keyframe: int | None  # id of the keyframe it was aligned to; None before the first
-    status: Status
-    method: str  # the guess that won: "first", "direct", "features", "shape", "relocalised", "none"
-    wants_keyframe: bool
-    wants_mapping: bool = False  # as a supporting keyframe: mapped, and not tracked against
-    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    inlier_fraction: float = 0.0  # smaller of the photometric and the geometric
-    intensity_sigma: float = 0.0  # photometric residual, grey levels
-    depth_noise_scale: float = 0.0  # geometric residual, times the sensor model
-    overlap: float = 0.0  # visible fraction of the keyframe's surface
-    iterations: int = 0
-    disagreement_rad: float = 0.0  # between the guesses' outcomes, where several were tried
-    is_moving: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped
-    segment: int = 0  # whose odometry frame T_odom_camera leads to
-    may_begin: bool = False  # LOST for so long that a new segment is better than none
-    join: Join | None = None  # where it is in another segment; counts once it is a keyframe
-
-
 class Odometry:
     """Tracks one camera. Deterministic: equal frames give bitwise equal results."""
 
@@ -105,6 +79,13 @@ class Odometry:
             self.config.features,
             self.config.judgement,
             self.config.relocalisation,
+        )
+        self._guesses = Guesses(
+            self.config.align,
+            self.config.features,
+            self.config.shape,
+            self.config.candidates,
+            self.config.large_motion,
         )
         self._viewed: tuple[RgbdFrame, Pyramid] | None = None  # the last frame, made ready
         self._rebuilt: dict[int, Keyframe] = {}  # from places, for the window
@@ -262,35 +243,16 @@ class Odometry:
 
     def _followed(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
         """Alignment from the predicted pose; from every other guess too, where that is not sure."""
-        motion, config = self._state.motion, self.config
+        motion = self._state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
-        predicted = T_keyframe_odom @ motion.predicted(stamp_ns)
         resting = T_keyframe_odom @ motion.T_odom_camera
-        candidate = attempt(keyframe, view, predicted, "direct", config.align)
-        if self._judged(candidate) is Status.OK and not self._is_large(candidate, resting, view):
-            return candidate
-        again = attempt(keyframe, view, resting, "direct", config.align)
-        candidates = [candidate, again]
-        second, method = self._second_opinion(keyframe, view, resting)
-        if second is not None:
-            candidates.append(attempt(keyframe, view, second, method, config.align))
-        return best(candidates, second, keyframe, view, config.candidates, config.align)
-
-    def _second_opinion(
-        self, keyframe: Keyframe, view: Pyramid, resting: np.ndarray
-    ) -> tuple[np.ndarray | None, str]:
-        """T_keyframe_camera [4, 4] by features; by shape, where there is too little texture."""
-        config = self.config.features
-        pose = estimate_pose(keyframe.features(config), detect(view, config), view.camera, config)
-        if pose is not None:
-            return se3.inverse(pose.T_camera_reference), "features"
-        return pose_from_shape(keyframe.reference, view, resting, self.config.shape), "shape"
-
-    def _is_large(self, candidate: Candidate, resting: np.ndarray, view: Pyramid) -> bool:
-        """Whether the image moved so far since the last frame that a minimum may be a wrong one."""
-        moved = se3.inverse(resting) @ candidate.alignment.T_reference_camera
-        shift_rad = extent(moved, candidate.median_depth_m)
-        return shift_rad * view.camera.fx > self.config.large_motion * view.camera.width
+        predicted = self._guesses.from_motion(
+            keyframe, view, T_keyframe_odom @ motion.predicted(stamp_ns)
+        )
+        is_sure = self._judged(predicted) is Status.OK
+        if is_sure and not self._guesses.is_large_step(predicted, resting, view):
+            return predicted
+        return self._guesses.best_of_all(predicted, keyframe, view, resting)
 
     def _judged(self, candidate: Candidate) -> Status:
         state, limits = self._state, self.config.judgement
@@ -325,7 +287,7 @@ class Odometry:
         self._remember(keyframe, motion, self._state.history, Status.LOST)
         self._state = replace(self._state, is_moving=None, suspicion=None)
         T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
-        lost = _report(
+        lost = report(
             replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
             motion.T_odom_camera,
             keyframe,
@@ -359,7 +321,7 @@ class Odometry:
         T_mapped_camera = se3.inverse(self._state.T_odom_mapped) @ T_odom_camera
         supports = is_worth_mapping(T_mapped_camera, candidate.median_depth_m, config.keyframes)
         is_sure = status is Status.OK
-        return _report(
+        return report(
             alignment,
             T_odom_camera,
             keyframe,
@@ -412,38 +374,6 @@ class Odometry:
             frames_since_keyframe=before.frames_since_keyframe + 1,
             segments=before.segments.after(status is Status.LOST),
         )
-
-
-def _report(
-    alignment: Alignment,
-    T_odom_camera: np.ndarray,
-    keyframe: Keyframe,
-    status: Status,
-    method: str,
-    *,
-    wants_keyframe: bool = False,
-    wants_mapping: bool = False,
-    disagreement_rad: float = 0.0,
-    is_moving: np.ndarray | None = None,
-) -> Tracked:
-    return Tracked(
-        T_odom_camera,
-        alignment.T_reference_camera,
-        keyframe.id,
-        status,
-        method,
-        wants_keyframe,
-        wants_mapping,
-        information=alignment.information,
-        inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
-        intensity_sigma=alignment.intensity_sigma,
-        depth_noise_scale=alignment.depth_noise_scale,
-        overlap=alignment.overlap,
-        iterations=alignment.iterations,
-        disagreement_rad=disagreement_rad,
-        is_moving=is_moving,
-        segment=keyframe.segment,
-    )
 
 
 def _look(tracked: Tracked, other: Keyframe, alignment: Alignment) -> Look:
