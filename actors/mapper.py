@@ -58,11 +58,9 @@ from ldo_service.wire import (
 
 Output = ModelView | MapDelta | MapSnapshot | KeyframeRefinement
 
-
 # A successor starts from a checkpoint and must not use a version again that followers may hold:
 # more than a mapper could use up between two checkpoints.
 VERSIONS_IN_A_CHECKPOINT = 1 << 20
-
 
 NO_IDS = np.zeros(0, np.int64)
 NO_GAUSSIANS = Gaussians(

@@ -18,7 +18,7 @@ LAYOUTS = (
     "TUM RGB-D (rgb.txt and depth.txt), Replica as NICE-SLAM lays it out (results/frame*.jpg, "
     "results/depth*.png), ScanNet as SensReader exports it (color/*.jpg, depth/*.png, "
     "intrinsic/), a seq-XX of 7-Scenes (frame-*.color.png, frame-*.depth.png), or one of the "
-    "built-in synthetic:room, synthetic:tour and synthetic:flat"
+    "built-in synthetic:room, synthetic:tour, synthetic:person and synthetic:flat"
 )
 
 
