@@ -87,7 +87,7 @@ inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, floa
   return dx * (dx * s.a + dy * s.b) + (dy * dy * s.c + s.log2_opacity);
 }
 
-constexpr float kLeastPassed = 0.01001f;  // of 1 - alpha, where alpha is not capped
+constexpr float kCapped = 0.98999f;  // an alpha from here on was capped, but for rounding
 [[gnu::always_inline]] inline Floats capped_alpha(Floats log2_alpha) {
   return select(log2_alpha >= kLog2MinAlpha, exp2(min(log2_alpha, kLog2MaxAlpha)), 0.0f);
 }

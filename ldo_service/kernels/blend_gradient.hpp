@@ -51,7 +51,7 @@ struct BlockGradient {
   template <class Next>
   [[gnu::always_inline]] inline void differentiate(int count, const Next& next, FloatsRow* weights,
                                                    FloatsRow* v) {
-    alignas(64) FloatsRow passed[kLanes], mixed[kLanes], own[kLanes];  // 1 - alpha, alpha q, w q
+    alignas(64) FloatsRow alphas[kLanes], qs[kLanes];
     for (int i = 0; i < count; ++i) {
       const Splat& s = next(i);
       const Floats alpha = capped_alpha(log2_alpha_of(s, px - s.u, py - s.v));
@@ -61,19 +61,16 @@ struct BlockGradient {
            (gradient[kBlue] * s.color[2] + (gradient[kDepth] * s.z + gradient[kPlaneOpacity])));
       const Floats weight = alpha * transmittance;
       transmittance = transmittance - weight;
-      const Floats part = weight * q;
-      behind = behind - part;
+      behind = behind - weight * q;
       weight.store(weights[i]);
-      part.store(own[i]);
-      (alpha * q).store(mixed[i]);
-      (Floats(1.0f) - alpha).store(passed[i]);
+      alpha.store(alphas[i]);
+      q.store(qs[i]);
     }
     Floats mean = behind / max(transmittance, kLeastTransmittance);
     for (int i = count - 1; i >= 0; --i) {
-      const Floats pass = Floats::load(passed[i]);
-      const Floats by_log = Floats::load(own[i]) - Floats::load(weights[i]) * mean;
-      select(pass >= kLeastPassed, by_log, 0.0f).store(v[i]);
-      mean = pass * mean + Floats::load(mixed[i]);
+      const Floats alpha = Floats::load(alphas[i]), q = Floats::load(qs[i]);
+      select(alpha < kCapped, Floats::load(weights[i]) * (q - mean), 0.0f).store(v[i]);
+      mean = alpha * q + (Floats(1.0f) - alpha) * mean;
     }
   }
 
