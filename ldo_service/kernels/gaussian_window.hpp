@@ -34,7 +34,7 @@ template <class At>
 // Columns of an image that are worked on together, and as many more on each side as windows of
 // windows read, in whole vectors. A constant, so that rows lie at known distances.
 constexpr int kMargin = kLanes;
-constexpr int kStrip = 224;
+constexpr int kStrip = 320;
 constexpr int kColumns = kStrip + 2 * kMargin;
 static_assert(kMargin >= 2 * kReach && kStrip % kLanes == 0);
 

@@ -30,14 +30,15 @@ struct Part {  // of the image: what one job works on
   int channel, left, right, top, bottom;
 };
 
-// An image cut into parts of about equal size, so that they take equal time.
+// An image cut into parts of about equal size, so that they take equal time: at least two strips
+// of each channel, as six parts share better among a few threads than three.
 struct Cut {
   Cut(int width, int height)
       : width(width),
         height(height),
-        strips(ceil(width, kStrip)),
+        strip(ceil(ceil(width, std::max(2, ceil(width, kStrip))), kLanes) * kLanes),
+        strips(ceil(width, strip)),
         bands(ceil(height, kBand)),
-        strip(ceil(ceil(width, strips), kLanes) * kLanes),
         band(ceil(height, bands)) {}
 
   int columns() const { return 3 * strips; }  // strips of all channels
@@ -50,7 +51,7 @@ struct Cut {
             std::min(height, top + band)};
   }
 
-  const int width, height, strips, bands, strip, band;  // pixels of a strip, rows of a band
+  const int width, height, strip, strips, bands, band;  // pixels of a strip, rows of a band
 
  private:
   static int ceil(int n, int piece) { return (n + piece - 1) / piece; }
