@@ -56,7 +56,6 @@ GRAPH: tuple[Box, ...] = (
         Tracker,
         "finds the camera's pose",
         lambda config: (LocalisingTracker if config.tracker.localise else Tracker)(config.tracker),
-        later=(In(t.MAP_VIEW, Latest(1)),),
     ),
     Box(
         "detector",

@@ -1,0 +1,107 @@
+"""Tracking against depth as the map shows it, beside tracking against the sensor's own.
+
+    python tests/bench/bench_map_view.py [SOURCE ...] [--frames N]
+
+SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apartment_floor1 in
+LDO_DATA, and synthetic:flat. The map is that of the mapper, grown and fitted at each keyframe
+before the next frame is tracked, so that its view comes earlier than any service could send it. In
+a keyframe that is tracked against, the median depth of the map stands where the map is opaque and
+within 3 % of what the sensor measured; `mean` is half of each.
+"""
+
+import argparse
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.render import Rendering
+from ldo_service.geometry import RgbdFrame, Trajectory
+from ldo_service.tracking import Odometry, Status
+from ldo_service.tracking.tracked import Tracked
+
+LEAST_OPACITY, NEAR = 0.9, 0.03  # NEAR: share of the depth
+ITERATIONS = 10  # of the mapper, per keyframe
+MODELS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray] | None] = {
+    "sensor": None,
+    "map": lambda of_map, _of_sensor: of_map,
+    "mean": lambda of_map, of_sensor: (of_map + of_sensor) / 2,
+}
+
+
+class Tracker:
+    """Odometry that tracks against keyframes with other depth than the sensor's."""
+
+    def __init__(self, model: str) -> None:
+        self._mix = MODELS[model]
+        self._odometry, self._builder, self._mapped = Odometry(), MapBuilder(threads=2), 0
+
+    def pose_of(self, frame: RgbdFrame) -> tuple[np.ndarray, bool]:
+        """T_odom_camera [4, 4], and whether it is trusted."""
+        tracked = self._odometry.track(frame)
+        if tracked.wants_mapping and self._mix is not None:
+            self._map(frame, tracked)
+        if tracked.wants_keyframe:
+            self._odometry.make_keyframe(self._as_mapped(frame, tracked), tracked)
+        elif tracked.wants_mapping:
+            self._odometry.make_supporting(tracked)
+        return tracked.T_odom_camera, tracked.status is Status.OK
+
+    def _map(self, frame: RgbdFrame, tracked: Tracked) -> None:
+        self._builder.add(frame, tracked.T_odom_camera, self._mapped, ITERATIONS)
+        self._mapped += 1
+
+    def _as_mapped(self, frame: RgbdFrame, tracked: Tracked) -> RgbdFrame:
+        if self._mix is None:
+            return frame
+        seen = self._builder.seen_from(frame.camera, tracked.T_odom_camera)
+        mixed = self._mix(seen.median_depth_m, frame.depth_m)
+        depth_m = np.where(_agrees(seen, frame), mixed, frame.depth_m)
+        return replace(frame, depth_m=depth_m.astype(np.float32))
+
+
+def _agrees(seen: Rendering, frame: RgbdFrame) -> np.ndarray:
+    """[H, W] bool: where the map is opaque and shows the surface that the sensor measured."""
+    apart_m = np.abs(seen.median_depth_m - frame.depth_m)
+    return (seen.opacity > LEAST_OPACITY) & (frame.depth_m > 0) & (apart_m < NEAR * frame.depth_m)
+
+
+def row(sequence: Sequence, frames: int, model: str) -> str:
+    truth = sequence.truth()
+    if truth is None:
+        raise SystemExit(f"{sequence.name} has no true trajectory to compare with.")
+    tracker, poses, trusted = Tracker(model), [], 0
+    for index in range(frames):
+        T_odom_camera, is_trusted = tracker.pose_of(sequence[index])
+        poses.append(T_odom_camera)
+        trusted += is_trusted
+    stamps_s = sequence.stamps_ns[:frames] * 1e-9
+    ate_m = evaluate_trajectory(Trajectory(stamps_s, np.array(poses)), truth).ate_m.rmse
+    return f"| {sequence.name} | {frames} | {model} | {100 * ate_m:.2f} | {trusted / frames:.1%} |"
+
+
+def default_sources() -> list[str]:
+    data = os.environ.get("LDO_DATA")
+    folders = ("tum/kitchen", "replica/apartment_floor1") if data else ()
+    return [*(str(Path(data or "") / folder) for folder in folders), "synthetic:flat"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("sources", nargs="*", metavar="SOURCE")
+    parser.add_argument("--frames", type=int, default=120)
+    arguments = parser.parse_args()
+    print("| source | frames | depth of keyframes | ATE RMSE cm | trusted |\n|---|---|---|---|---|")
+    for source in arguments.sources or default_sources():
+        sequence = open_sequence(source)
+        for model in MODELS:
+            print(row(sequence, min(arguments.frames, len(sequence)), model), flush=True)
+
+
+if __name__ == "__main__":
+    main()
