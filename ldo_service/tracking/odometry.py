@@ -102,7 +102,7 @@ class Odometry:
         if status is Status.LOST:
             found = self._found(view, self._state.places)
             if found is None:
-                return self._lost(keyframe, candidate.alignment, view)
+                return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
             # noise is another elsewhere, and what has gone is of another keyframe
             self._state = replace(self._state, history=History(), suspicion=None)
@@ -282,9 +282,9 @@ class Odometry:
         join = _join(found[0], found[1].alignment)
         return replace(tracked, wants_keyframe=True, wants_mapping=True, join=join)
 
-    def _lost(self, keyframe: Keyframe, alignment: Alignment, view: Pyramid) -> Tracked:
+    def _lost(self, frame: RgbdFrame, keyframe: Keyframe, alignment: Alignment) -> Tracked:
         motion = self._state.motion.stopped()
-        self._remember(keyframe, motion, self._state.history, Status.LOST)
+        self._remember(frame, keyframe, motion, self._state.history, Status.LOST)
         self._state = replace(self._state, is_moving=None, suspicion=None)
         T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
         lost = report(
@@ -294,8 +294,8 @@ class Odometry:
             Status.LOST,
             "none",
         )
-        may_begin = self._state.segments.may_begin(self.config.segments)
-        return replace(lost, may_begin=may_begin and self._is_usable(view))
+        may_begin = self._state.segments.may_begin(frame.stamp_ns, self.config.segments)
+        return replace(lost, may_begin=may_begin and self._is_usable(self._view(frame)))
 
     def _accepted(
         self, frame: RgbdFrame, keyframe: Keyframe, candidate: Candidate, status: Status
@@ -307,7 +307,7 @@ class Odometry:
         if status is Status.OK:
             history = history.extended(alignment, config.judgement)
             self._state = replace(self._state, trusted=thumbnail_of(self._view(frame)))
-        self._remember(keyframe, motion if is_steady else motion.stopped(), history, status)
+        self._remember(frame, keyframe, motion if is_steady else motion.stopped(), history, status)
         is_moving = None  # where a pose is unsure, surfaces contradict for that
         if status is Status.OK:
             is_moving = self._watched(keyframe, self._view(frame), alignment)
@@ -360,7 +360,12 @@ class Odometry:
         return spread(seen.is_moving, view, config)
 
     def _remember(
-        self, keyframe: Keyframe, motion: Motion, history: History, status: Status
+        self,
+        frame: RgbdFrame,
+        keyframe: Keyframe,
+        motion: Motion,
+        history: History,
+        status: Status,
     ) -> None:
         before = self._state
         if status is not before.status:
@@ -372,7 +377,7 @@ class Odometry:
             history=history,
             status=status,
             frames_since_keyframe=before.frames_since_keyframe + 1,
-            segments=before.segments.after(status is Status.LOST),
+            segments=before.segments.after(status is Status.LOST, frame.stamp_ns),
         )
 
 

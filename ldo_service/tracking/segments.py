@@ -20,7 +20,7 @@ from .motion import extent
 
 @dataclass(frozen=True, slots=True)
 class SegmentConfig:
-    begin_after: int = 90  # LOST frames in a row: 3 s at 30 Hz, ORB-SLAM3's patience; 0: never
+    begin_after_s: float = 3.0  # LOST without a break: ORB-SLAM3's patience; 0: never
     # Frames between looks for the other segments: twice a second at 30 Hz. A prime, so that it
     # does not meet a frame held out from mapping each time.
     look_every: int = 17
@@ -32,9 +32,9 @@ class SegmentConfig:
     misses: int = 3  # looks in a row that find nothing before a find is forgotten
 
     def __post_init__(self) -> None:
-        if self.begin_after < 0 or min(self.look_every, self.confirm_after) < 1:
+        if not self.begin_after_s >= 0 or min(self.look_every, self.confirm_after) < 1:
             raise ConfigError(
-                "begin_after must be at least 0, look_every and confirm_after at least 1."
+                "begin_after_s must be at least 0, look_every and confirm_after at least 1."
             )
         if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
             raise ConfigError(
@@ -83,7 +83,7 @@ class Segments:
     """`roots[s]` is the oldest segment that s is joined to, itself where there is none."""
 
     roots: tuple[int, ...] = ()
-    lost: int = 0  # frames in a row
+    lost_since_ns: int | None = None  # stamp of the first frame of those LOST in a row
     since_look: int = 0  # frames
     last: Look | None = None  # the find that is to be confirmed
     missed: int = 0  # looks in a row since it that found nothing
@@ -91,12 +91,19 @@ class Segments:
     def begun(self) -> "Segments":
         return Segments((*self.roots, len(self.roots)))
 
-    def after(self, is_lost: bool) -> "Segments":
-        """One frame later."""
-        return replace(self, lost=self.lost + 1 if is_lost else 0, since_look=self.since_look + 1)
+    def after(self, is_lost: bool, stamp_ns: int) -> "Segments":
+        """One frame later; a camera that starts again may count time from an earlier point."""
+        known = self.lost_since_ns
+        since_ns = stamp_ns if known is None else min(known, stamp_ns)
+        return replace(
+            self, lost_since_ns=since_ns if is_lost else None, since_look=self.since_look + 1
+        )
 
-    def may_begin(self, config: SegmentConfig) -> bool:
-        return 0 < config.begin_after <= self.lost
+    def may_begin(self, stamp_ns: int, config: SegmentConfig) -> bool:
+        """Whether a frame of this stamp is LOST, and those before it were for long enough."""
+        if self.lost_since_ns is None or config.begin_after_s == 0:
+            return False
+        return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
     def is_time_to_look(self, config: SegmentConfig) -> bool:
         """Whether any segments are apart, and the last look was long enough ago."""

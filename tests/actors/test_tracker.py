@@ -184,7 +184,9 @@ def test_a_correction_before_any_frame_is_harmless() -> None:
 
 # --- segments -------------------------------------------------------------------------------------
 SOON = OdometryConfig(
-    segments=SegmentConfig(begin_after=3, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
+    segments=SegmentConfig(
+        begin_after_s=0.06, look_every=3, confirm_after=2, confirm_apart_rad=0.05
+    )
 )
 
 

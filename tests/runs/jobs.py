@@ -28,7 +28,12 @@ def job(
 
 SOON = tuple(
     f"tracker.odometry.segments.{setting}"
-    for setting in ("begin_after=3", "look_every=3", "confirm_after=2", "confirm_apart_rad=0.05")
+    for setting in (
+        "begin_after_s=0.06",
+        "look_every=3",
+        "confirm_after=2",
+        "confirm_apart_rad=0.05",
+    )
 )
 HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
 

@@ -14,9 +14,9 @@ from ldo_service.tracking.segments import SegmentConfig
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def followed(frames: Iterable[RgbdFrame], patience: int = 0) -> list[Tracked]:
-    """`patience`: LOST frames until a new segment begins; 0: none does."""
-    odometry = Odometry(OdometryConfig(segments=SegmentConfig(begin_after=patience)))
+def followed(frames: Iterable[RgbdFrame], patience_s: float = 0) -> list[Tracked]:
+    """`patience_s`: how long it is LOST until a new segment begins; 0: none does."""
+    odometry = Odometry(OdometryConfig(segments=SegmentConfig(begin_after_s=patience_s)))
     results = []
     for frame in frames:
         results.append(odometry.track(frame))
@@ -58,7 +58,7 @@ def test_the_apartment_becomes_a_segment_of_its_own_and_the_kitchen_stays(data: 
     frames = [kitchen[k] for k in range(140, 240)]
     undisturbed = followed(frames)[60:]
     visit = [apartment[k] for k in range(100)]
-    results = followed([*frames[:60], *visit, *frames[60:]], patience=20)
+    results = followed([*frames[:60], *visit, *frames[60:]], patience_s=0.63)
     gone, back = results[60:160], results[160:]
     assert {r.status for r in gone[:19]} == {Status.LOST}
     apart = [r for r in gone if r.segment > 0]

@@ -11,7 +11,7 @@ from ldo_service.tracking.segments import SegmentConfig
 
 T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
 T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-CONFIG = OdometryConfig(segments=SegmentConfig(begin_after=3, look_every=4, confirm_after=2))
+CONFIG = OdometryConfig(segments=SegmentConfig(begin_after_s=0.06, look_every=4, confirm_after=2))
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,8 @@ def located(localiser: Localiser, room, truth: list[np.ndarray]) -> list[float |
     """Errors in the map, m; None where the camera is not found."""
     errors: list[float | None] = []
     for index, T_world_camera in enumerate(truth):
-        tracked, T_map_odom = localiser.track(room.view(T_world_camera, index=index))
+        frame = room.view(T_world_camera, stamp_ns=index * 33_333_333, index=index)
+        tracked, T_map_odom = localiser.track(frame)
         if T_map_odom is None or tracked.status is Status.LOST:
             errors.append(None)
             continue

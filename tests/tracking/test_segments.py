@@ -5,7 +5,8 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking.segments import Look, SegmentConfig, Segments
 
-CONFIG = SegmentConfig(begin_after=3, look_every=4, confirm_after=2)
+PERIOD_NS = 33_333_333
+CONFIG = SegmentConfig(begin_after_s=0.1, look_every=4, confirm_after=2)
 T_THERE_HERE = se3.exp(np.array([0.0, 0.4, 0.0, 1.0, 0.0, 2.0]))
 
 
@@ -26,18 +27,42 @@ def begun(count: int) -> Segments:
     return segments
 
 
-def after(segments: Segments, frames: int, is_lost: bool = False) -> Segments:
-    for _ in range(frames):
-        segments = segments.after(is_lost)
+def after(segments: Segments, frames: int) -> Segments:
+    for k in range(frames):
+        segments = segments.after(is_lost=False, stamp_ns=k * PERIOD_NS)
     return segments
 
 
-def test_a_segment_begins_after_so_many_lost_frames_in_a_row() -> None:
-    assert not after(begun(1), 2, is_lost=True).may_begin(CONFIG)
-    assert after(begun(1), 3, is_lost=True).may_begin(CONFIG)
-    found_between = after(after(begun(1), 2, is_lost=True), 1)
-    assert not after(found_between, 2, is_lost=True).may_begin(CONFIG)
-    assert not after(begun(1), 999, is_lost=True).may_begin(SegmentConfig(begin_after=0))
+def begins(is_lost: list[bool], stamps_ns: list[int], config: SegmentConfig) -> list[bool]:
+    """Whether a segment may begin with each frame."""
+    segments, may_begin = begun(1), []
+    for lost, stamp_ns in zip(is_lost, stamps_ns, strict=True):
+        segments = segments.after(lost, stamp_ns)
+        may_begin.append(segments.may_begin(stamp_ns, config))
+    return may_begin
+
+
+@pytest.mark.parametrize("rate_hz", [5, 30, 200])
+def test_a_segment_begins_after_so_many_seconds_lost_at_any_rate(rate_hz: int) -> None:
+    stamps_ns = [round(1e9 * k / rate_hz) for k in range(4 * rate_hz)]
+    expected = [stamp_ns >= 3_000_000_000 for stamp_ns in stamps_ns]
+    assert begins([True] * len(stamps_ns), stamps_ns, SegmentConfig()) == expected
+
+
+def test_a_frame_that_is_not_lost_ends_the_patience_and_renews_it() -> None:
+    is_lost = [True, True, False, True, True, True, True]
+    stamps_ns = [k * 50_000_000 for k in range(7)]
+    assert begins(is_lost, stamps_ns, CONFIG) == [False] * 5 + [True] * 2
+
+
+def test_no_segment_begins_where_none_is_wanted() -> None:
+    stamps_ns = [k * 10**9 for k in range(99)]
+    assert not any(begins([True] * 99, stamps_ns, SegmentConfig(begin_after_s=0)))
+
+
+def test_a_camera_that_starts_again_while_lost_is_waited_for_by_its_new_clock() -> None:
+    stamps_ns = [10**18, 10**18 + 50_000_000, 0, 50_000_000, 100_000_000]
+    assert begins([True] * 5, stamps_ns, CONFIG) == [False] * 4 + [True]
 
 
 def test_nobody_looks_for_other_segments_where_there_is_none_apart() -> None:
@@ -96,7 +121,14 @@ def test_segments_survive_packing(segments: Segments) -> None:
 
 
 @pytest.mark.parametrize(
-    "fields", [{"begin_after": -1}, {"look_every": 0}, {"confirm_after": 0}, {"confirm_rad": 0.0}]
+    "fields",
+    [
+        {"begin_after_s": -1.0},
+        {"begin_after_s": float("nan")},
+        {"look_every": 0},
+        {"confirm_after": 0},
+        {"confirm_rad": 0.0},
+    ],
 )
 def test_impossible_settings_are_refused(fields) -> None:
     with pytest.raises(ConfigError):
