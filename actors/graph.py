@@ -133,7 +133,8 @@ def producer_of(topic: t.Topic) -> str:
         return "every stage"
     if topic is t.CONTROL:
         return "outside"
-    return "outside" if topic in (*t.FROM_OUTSIDE, *t.FROM_OPERATORS) else "nobody yet"
+    outside = (*t.FROM_OUTSIDE, *t.FROM_ODOMETRY, *t.FROM_OPERATORS)
+    return "outside" if topic in outside else "nobody yet"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
@@ -161,7 +162,7 @@ def topics_table() -> str:
 
 def drawing(boxes: Iterable[Box] = GRAPH) -> str:
     """The graph in Mermaid: solid arrows are lossless, dashed ones keep the latest."""
-    lines = ["flowchart LR", "    camera([camera])"]
+    lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
     for box in boxes:
         lines.append(f"    {box.name}{'' if box.make else ':::declared'}")
@@ -176,4 +177,6 @@ def drawing(boxes: Iterable[Box] = GRAPH) -> str:
 
 def _makers(topic: t.Topic, boxes: tuple[Box, ...]) -> list[str]:
     makers = [box.name for box in boxes if any(out.topic is topic for out in box.outputs)]
+    if topic in t.FROM_ODOMETRY:
+        return ["odometry"]
     return makers or (["camera"] if topic in t.FROM_OUTSIDE else [])

@@ -33,7 +33,7 @@ class LocalisingTracker(Tracker):
         self._localiser = Localiser(self._odometry, places_of(Path(config.localise)))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
-        tracked, T_map_odom = self._localiser.track(frame)
+        tracked, T_map_odom = self._localiser.track(frame, self._prior_of(frame))
         if T_map_odom is None:
             tracked, T_map_odom = replace(tracked, status=Status.LOST), np.eye(4)
         yield self._pose_message(frame, tracked, T_map_odom, reference=None)

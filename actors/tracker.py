@@ -2,10 +2,14 @@
 
 in   frame/rgbd         FrameRgbd     Latest(1)   a late frame is worth less than the next one
 in   graph/correction   Correction    Latest(1)   a versioned absolute state: the newest says it all
+in   odometry/prior     OdometryPrior Latest(64)  0.3 s at 200 Hz, while a frame is tracked; older
+                                                  poses are worth less, and no robot waits for us
 out  pose/tracked       TrackedPose
 out  keyframe/new       Keyframe      made only when every consumer has room: never waited for
 """
 
+import logging
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from operator import itemgetter
@@ -23,12 +27,20 @@ from ldo_service.schemas import (
     Correction,
     FrameRgbd,
     Keyframe,
+    OdometryPrior,
     TrackedPose,
 )
 from ldo_service.schemas.message import decode, encode
-from ldo_service.schemas.topics import FRAME_RGBD, GRAPH_CORRECTION, KEYFRAME_NEW, POSE_TRACKED
+from ldo_service.schemas.topics import (
+    FRAME_RGBD,
+    GRAPH_CORRECTION,
+    KEYFRAME_NEW,
+    ODOMETRY_PRIOR,
+    POSE_TRACKED,
+)
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
+from ldo_service.tracking.prior import Prior, Reading, Verdict
 from ldo_service.tracking.tracked import Tracked
 from ldo_service.wire import (
     camera_message,
@@ -38,9 +50,13 @@ from ldo_service.wire import (
     measured_message,
     pose_message,
     rgbd_of,
+    transform,
 )
 
+log = logging.getLogger(__name__)
+
 UNIT_WITHIN = 1e-3  # of a quaternion's norm: four digits, as people copy them, and then normalised
+MANY_MISSED = 30  # frames in a row that no prior reaches: a second, no hiccup any more
 RECENT_KEYFRAMES = 32  # four windows of keyframe/new: the optimizer cannot be further behind
 
 
@@ -86,27 +102,42 @@ class Tracker(Actor):
     """Odometry against the last keyframe; the map's frame hangs on the optimizer's poses."""
 
     name = "tracker"
-    inputs = (In(FRAME_RGBD, Latest(1)), In(GRAPH_CORRECTION, Latest(1)))
+    inputs = (
+        In(FRAME_RGBD, Latest(1)),
+        In(GRAPH_CORRECTION, Latest(1)),
+        In(ODOMETRY_PRIOR, Latest(64)),
+    )
     outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, never_wait=True))
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
         super().__init__()
         self.config = config or TrackerConfig()
-        self._T_base_camera = pose_message(self.config.T_base_camera.matrix())
+        self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = Odometry(self.config.odometry)
         self._poses = KeyframePoses()  # of the last keyframes and the one tracked against
         self._correction: Correction | None = None  # the last: places all keyframes, old ones too
         self._saved_correction = b""
         self._made = self._without_room = 0
+        self._prior = Prior()
+        self._verdicts: Counter[Verdict] = Counter()  # on poses of the prior
+        self._with_prior = self._without_prior = 0  # frames, since there is one
+        self._missed = 0  # frames in a row that it does not reach
+        self._parts: dict[str, Any] | None = None  # of the state; what a prior does not change
 
-    def handle(self, message: FrameRgbd | Correction) -> Iterator[TrackedPose | Keyframe]:
+    def handle(
+        self, message: FrameRgbd | Correction | OdometryPrior
+    ) -> Iterator[TrackedPose | Keyframe]:
+        if isinstance(message, OdometryPrior):
+            self._take_prior(message)
+            return
+        self._parts = None
         if isinstance(message, Correction):
             self._correct(message)
         else:
             yield from self._track(rgbd_of(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
-        tracked = self._odometry.track(frame)
+        tracked = self._odometry.track(frame, self._prior_of(frame))
         if tracked.method == "relocalised":
             self._recall(tracked)
         if tracked.may_begin and self._may_map(frame):
@@ -119,6 +150,34 @@ class Tracker(Actor):
         elif tracked.method == "first":
             return  # nobody is there to map it yet: begin with a later frame
         yield self._tracked_pose(frame, tracked, None if keyframe is None else keyframe.keyframe)
+
+    # --- the other odometry -----------------------------------------------------------------------
+    def _take_prior(self, message: OdometryPrior) -> None:
+        T_odom_base = transform(message.T_odom_base)
+        config = self.config.odometry.prior
+        self._prior, verdict = self._prior.added(message.stamp_ns, T_odom_base, config)
+        self._verdicts[verdict] += 1
+        if verdict is not Verdict.FOLLOWS and self._verdicts[verdict] == 1:
+            log.warning(
+                "odometry/prior: the pose of stamp %d %s. Further such poses are only counted.",
+                message.stamp_ns, verdict,
+            )  # fmt: skip
+
+    def _prior_of(self, frame: RgbdFrame) -> Reading | None:
+        """Where the other odometry has a frame, if there is one."""
+        if not self._prior.poses:
+            return None
+        reading = self._prior.at(frame.stamp_ns, self._T_base_camera, self.config.odometry.prior)
+        self._with_prior += reading is not None
+        self._without_prior += reading is None
+        self._missed = self._missed + 1 if reading is None else 0
+        if self._missed == MANY_MISSED:
+            log.warning(
+                "odometry/prior: %d frames were tracked without it, and its newest pose is %.3f s "
+                "older than the last of them: does it still come, and do both stamp by one clock?",
+                MANY_MISSED, 1e-9 * (frame.stamp_ns - self._prior.poses[-1].stamp_ns),
+            )  # fmt: skip
+        return reading
 
     # --- keyframes --------------------------------------------------------------------------------
     def _may_map(self, frame: RgbdFrame) -> bool:
@@ -226,7 +285,7 @@ class Tracker(Actor):
             iterations=tracked.iterations,
             method=tracked.method,
             disagreement=tracked.disagreement_rad,
-            T_base_camera=self._T_base_camera,
+            T_base_camera=pose_message(self._T_base_camera),
             segment=segment,
         )
 
@@ -238,6 +297,12 @@ class Tracker(Actor):
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
         """A part for each place, written once, and few for what changes."""
+        if self._parts is None:
+            self._parts = self._tracked_parts()
+        return {**self._parts, "prior": self._prior.packed}
+
+    def _tracked_parts(self) -> dict[str, Any]:
+        """All that does not change with each pose of a prior."""
         state = self._odometry.state()
         places = {f"place_{place['id']}": place for place in state.pop("places")}
         keyframe, correction = state.pop("keyframe"), self._saved_correction
@@ -255,6 +320,7 @@ class Tracker(Actor):
         places = [part for name, part in state.items() if name.startswith("place_")]
         kept = {"places": sorted(places, key=itemgetter("id")), "keyframe": state["keyframe"]}
         self._odometry.restore({**now["odometry"], **kept})
+        self._prior, self._parts = Prior.unpacked(state["prior"]), None
         self._odometry.skip_keyframe_id()  # one more may have been sent and not saved
         self._poses.restore(now["poses"])
         self._saved_correction = state["correction"]
@@ -262,4 +328,13 @@ class Tracker(Actor):
         self._correction = decode(body, Correction) if body else None
 
     def facts(self) -> dict[str, float]:
-        return {"keyframes": self._made, "keyframes_without_room": self._without_room}
+        refused = self._verdicts[Verdict.LATE] + self._verdicts[Verdict.BROKEN]
+        restarts = self._verdicts[Verdict.RESTARTED] + self._verdicts[Verdict.JUMPED]
+        return {
+            "keyframes": self._made,
+            "keyframes_without_room": self._without_room,
+            "frames_with_prior": self._with_prior,
+            "frames_without_prior": self._without_prior,  # since the first pose of it
+            "prior_refused": refused,
+            "prior_restarts": restarts,
+        }

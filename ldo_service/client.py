@@ -32,6 +32,7 @@ from ldo_service.schemas import (
     Image,
     MapRefine,
     Message,
+    OdometryPrior,
     Pose,
     TrackedPose,
     decode,
@@ -39,6 +40,7 @@ from ldo_service.schemas import (
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import (
     CONTROL,
+    FROM_ODOMETRY,
     FROM_OPERATORS,
     FROM_OUTSIDE,
     MAP_REFINE,
@@ -54,7 +56,7 @@ class Client:
 
     def __init__(self, session: zenoh.Session, network: Network) -> None:
         self._session, self._network = session, network
-        self._sent = self._asked = 0
+        self._sent = self._asked = self._priors = 0
         self._epoch = time.time_ns()
         self._publishers: dict[type[Message], Any] = {}  # by message
 
@@ -116,6 +118,17 @@ class Client:
         )
         self.send(message)
 
+    def publish_prior(self, T_odom_base: Pose, stamp_ns: int | None = None) -> None:
+        """Send where another odometry of the robot has its base, in a frame of its own.
+
+        stamp_ns  of the measurement, by the clock that stamps frames; default: now
+        """
+        message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_odom_base=T_odom_base)
+        header = Header("odometry", self._epoch, self._priors, message.stamp_ns)
+        body = msgspec.msgpack.encode(message)
+        self._publisher(OdometryPrior).put(body, attachment=encode(header))
+        self._priors += 1
+
     def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
         """Send a frame or half of one, which may be compressed. May block for some milliseconds,
         and is dropped when the network is congested."""
@@ -125,7 +138,7 @@ class Client:
 
     def _publisher(self, kind: type[Message]) -> Any:
         if kind not in self._publishers:
-            known = (*FROM_OUTSIDE, *FROM_OPERATORS)
+            known = (*FROM_OUTSIDE, *FROM_ODOMETRY, *FROM_OPERATORS)
             (topic,) = (topic for topic in known if topic.message is kind)
             self._publishers[kind] = self._session.declare_publisher(
                 self._network.expression(topic.name),

@@ -28,6 +28,7 @@ from ldo_service.schemas.map import (
     ModelView,
 )
 from ldo_service.schemas.message import Message, decode, encode
+from ldo_service.schemas.odometry import OdometryPrior
 from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 
 __all__ = [
@@ -53,6 +54,7 @@ __all__ = [
     "MeasuredPose",
     "Message",
     "ModelView",
+    "OdometryPrior",
     "OutputCount",
     "Pose",
     "TrackedPose",

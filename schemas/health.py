@@ -41,7 +41,7 @@ class Health(Message, frozen=True, kw_only=True):
     set_aside: int  # messages that made it fail twice
     step_age_s: float  # since the last step finished
     busy_s: float  # age of the step under way, 0 when waiting
-    step_ms_p50: float  # over the last steps
+    step_ms_p50: float  # over the last steps, but those that only took note of a message
     step_ms_p95: float
     rss_mb: float  # of the process
     inputs: tuple[InputCount, ...]

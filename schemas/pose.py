@@ -56,7 +56,8 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     residual_depth: float = 0.0  # robust sigma over that of the sensor model
     overlap: float = 0.0  # share of the reference's surface that this frame sees
     iterations: int = 0
-    method: str = ""  # the guess that won: direct, features, shape, relocalised; first; none
+    # the guess that won: direct, prior, features, shape, relocalised; first; none
+    method: str = ""
     disagreement: float = 0.0  # between where several guesses led, rad of image motion
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera)
     segment: int = 0  # whose frame T_map_odom leads to: 0 is the map's; others are not joined yet

@@ -13,6 +13,7 @@ from ldo_service.schemas.health import Health
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
 from ldo_service.schemas.map import MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.message import Message
+from ldo_service.schemas.odometry import OdometryPrior
 from ldo_service.schemas.pose import TrackedPose
 
 ROBOT_PREFIX = "ldo"
@@ -35,6 +36,9 @@ class Topic:
 CAMERA_RGBD = Topic("camera/rgbd", CameraRgbd, "one exposure, as the camera sends it")
 CAMERA_COLOR = Topic("camera/color", CameraColor, "its colour half, where colour comes apart")
 CAMERA_DEPTH = Topic("camera/depth", CameraDepth, "its depth half; paired with colour by stamp")
+ODOMETRY_PRIOR = Topic(
+    "odometry/prior", OdometryPrior, "where another odometry has the robot's base"
+)
 FRAME_RGBD = Topic("frame/rgbd", FrameRgbd, "the frame, rectified, depth in metres")
 POSE_TRACKED = Topic("pose/tracked", TrackedPose, "where the camera is", is_state=True)
 KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "a frame that the map is made from")
@@ -63,6 +67,7 @@ TOPICS: tuple[Topic, ...] = (
     CAMERA_RGBD,
     CAMERA_COLOR,
     CAMERA_DEPTH,
+    ODOMETRY_PRIOR,
     FRAME_RGBD,
     POSE_TRACKED,
     KEYFRAME_NEW,
@@ -84,4 +89,5 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs
+FROM_ODOMETRY = (ODOMETRY_PRIOR,)  # made by the robot's wheels, inertial unit or other camera
 FROM_OPERATORS = (MAP_REFINE,)

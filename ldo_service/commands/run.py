@@ -11,6 +11,7 @@ from rich.table import Table
 
 from ldo_service.config import Config, load_config
 from ldo_service.errors import ConfigError
+from ldo_service.geometry import Trajectory
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import Job
@@ -56,6 +57,14 @@ def run(
         ),
     ] = 0,
     localise: Localise = None,
+    prior: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE",
+            help="where another odometry had the robot's base, in the TUM format: a guess for the "
+            "tracker. tracker.T_base_camera says where the camera sits on it",
+        ),
+    ] = None,
     realtime: Annotated[
         bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
     ] = False,
@@ -79,7 +88,8 @@ def run(
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.data.options())
-    job = Job(sequence, out, settings, selection, console.print, refine)
+    other = None if prior is None else Trajectory.load(prior)
+    job = Job(sequence, out, settings, selection, console.print, refine, other)
     prepare(out, overwrite)
     with progress("run", job.work, console) as advance:
         go = run_in_real_time if realtime else run_over_file

@@ -7,8 +7,9 @@ from pathlib import Path
 from ldo_service.config import Config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
+from ldo_service.geometry import Trajectory
 
-from .source import Selection, Warn
+from .source import Selection, Warn, require_overlap
 
 Advance = Callable[[int], None]  # called with the number of frames and refinements done
 
@@ -18,7 +19,8 @@ REFINE_ITERATIONS = 25  # asked of the mapper at a time: about a second
 @dataclass(frozen=True, slots=True)
 class Job:
     """A sequence and which of its frames, the configuration, where the results go, who is warned,
-    and how many iterations refine the map after the last frame."""
+    how many iterations refine the map after the last frame, and where another odometry had the
+    robot's base."""
 
     sequence: Sequence
     folder: Path
@@ -26,10 +28,13 @@ class Job:
     selection: Selection
     warn: Warn
     refine: int = 0
+    prior: Trajectory | None = None  # T_odom_base, in a frame of its own
 
     def __post_init__(self) -> None:
         if self.refine < 0:
             raise ConfigError(f"--refine {self.refine} must not be negative.")
+        if self.prior is not None:
+            require_overlap(self.prior, self.sequence, self.selection.indices(self.sequence))
 
     @property
     def refinements(self) -> int:

@@ -14,7 +14,7 @@ from ldo_service.schemas import MapRefine
 
 from .folder import RunFolder
 from .job import REFINE_ITERATIONS, Advance, Job
-from .source import Reader
+from .source import Reader, with_prior
 from .summary import Usage, percentiles, summarise
 
 LAST_RATE = 0.05  # of the steps when the map is refined: they shrink so far, to settle
@@ -40,7 +40,7 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
         lambda _actor, message, step_ms: record.observe(message, step_ms),
     ) as clock:
         try:
-            for done in clock.run(reader):
+            for done in clock.run(with_prior(reader, job.prior)):
                 advance(done + 1 + reader.rejected)
             clock.finish()
             is_finished = True

@@ -16,12 +16,12 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import Stop, supervise
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Health, decode, encode
-from ldo_service.schemas.topics import CAMERA_RGBD, Topic
+from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR, Topic
 
 from .folder import RunFolder
 from .job import Advance, Job
 from .over_file import require_usable
-from .source import Reader
+from .source import Reader, with_prior
 from .summary import Usage, summarise
 
 
@@ -41,6 +41,7 @@ def run_in_real_time(job: Job, advance: Advance) -> RunFolder:
 class _RealTimeRun:
     def __init__(self, job: Job, folder: Path, advance: Advance) -> None:
         self._sequence, self._advance = job.sequence, advance
+        self._prior = job.prior
         self._config = job.config.with_map_folder(folder)
         self._indices = job.selection.indices(job.sequence)
         self._reader = Reader(job.sequence, self._indices, job.warn)
@@ -85,15 +86,21 @@ class _RealTimeRun:
         )
 
     async def _feed(self, transport: MemoryTransport) -> None:
-        """Each frame at its time."""
+        """Each frame at its time, and just before it what another odometry says of it."""
         camera = transport.publisher(data_key(CAMERA_RGBD.name))
+        odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])
         started_s = time.monotonic()
-        frames = iter(self._reader)
-        number = 0
-        while (frame := await asyncio.to_thread(next, frames, None)) is not None:
+        batches = with_prior(self._reader, self._prior)
+        number = poses = 0
+        while (batch := await asyncio.to_thread(next, batches, None)) is not None:
+            *prior, frame = batch
             due_s = started_s + (frame.stamp_ns - first_ns) * 1e-9
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+            for pose in prior:
+                header = Header("odometry", 1, poses, pose.stamp_ns)
+                await odometry.send(encode_header(header), encode(pose))
+                poses += 1
             header = Header("camera", 1, number, frame.stamp_ns)
             await camera.send(encode_header(header), encode(frame))
             number += 1

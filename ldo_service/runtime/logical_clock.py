@@ -1,5 +1,7 @@
 """The whole graph over a file, on a clock that ticks once per frame.
 
+What comes along with a frame, such as poses of another odometry, comes in the same tick, before it.
+
 What an actor makes of a message becomes visible a declared number of ticks after it took the
 message, however long it really took. Actors compute side by side, each in its own thread; a thread
 is waited for when the clock reaches the tick at which its answer is due. So the result depends on
@@ -43,7 +45,9 @@ class ActorThread:
     rank: int
     latency_ticks: int
     thread: ThreadPoolExecutor
-    step_ms: list[float] = field(default_factory=list)  # of every step so far
+    step_ms: list[float] = field(
+        default_factory=list
+    )  # of each step, but those that took note only
 
     def start(self, message: Message) -> Future[Answer]:
         return self.thread.submit(self._step, message)
@@ -53,7 +57,8 @@ class ActorThread:
 
     def _step(self, message: Message) -> Answer:
         answer = _timed(self.actor.handle(message))
-        self.step_ms.append(answer.step_ms)
+        if answer.messages or not self.actor.outputs:  # notes would hide what a frame costs
+            self.step_ms.append(answer.step_ms)
         return answer
 
 
@@ -101,14 +106,16 @@ class LogicalClock:
         for thread in self._threads:
             thread.thread.shutdown(cancel_futures=True)
 
-    def run(self, source: Iterable[Message]) -> Iterator[int]:
-        """Yield the tick after each message of the source; then everything under way is settled.
+    def run(self, source: Iterable[Message | tuple[Message, ...]]) -> Iterator[int]:
+        """Yield the tick after each item of the source; then everything under way is settled.
 
+        The messages of a tuple share a tick.
         Raises StageError, naming the actor, when a handler raises.
         """
-        for message in source:
+        for item in source:
             self._tick += 1
-            self._deliver(message, self._tick)
+            for message in item if isinstance(item, tuple) else (item,):
+                self._deliver(message, self._tick)
             self._settle(self._tick)
             yield self._tick
         self._settle_all()
@@ -120,7 +127,7 @@ class LogicalClock:
             self._settle_all()
 
     def step_ms(self) -> dict[str, list[float]]:
-        """Wall time of every step so far, by actor."""
+        """Wall time of every step so far but those that took note only, by actor."""
         return {thread.actor.name: thread.step_ms for thread in self._threads}
 
     def _deliver(self, message: Message, tick: int) -> None:

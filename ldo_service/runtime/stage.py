@@ -221,7 +221,7 @@ class Stage:
         for out in produced:
             await self._send(out)
         await self._worker.run(self._save)
-        self._vitals.finished(message)
+        self._vitals.finished(message, is_timed=bool(produced) or not self._actor.outputs)
         return True
 
     async def _send(self, out: Produced) -> None:

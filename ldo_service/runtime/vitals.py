@@ -24,7 +24,8 @@ class Vitals:
     failures: int = 0
     restarts: int = 0
     set_aside: int = 0
-    step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
+    step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))  # as `finished` has it
+    last_step_ms: float = 0.0
     last_stamp_ns: int = 0
     finished_at_s: float = field(default_factory=time.monotonic)
     started_at_s: float | None = None  # of the step under way
@@ -36,12 +37,15 @@ class Vitals:
         started_s = self.started_at_s = time.monotonic()
         try:
             yield
-            self.step_ms.append(1e3 * (time.monotonic() - started_s))
+            self.last_step_ms = 1e3 * (time.monotonic() - started_s)
         finally:
             self.started_at_s = None
 
-    def finished(self, message: Message) -> None:
+    def finished(self, message: Message, is_timed: bool) -> None:
+        """`is_timed`: not for a step that took note only, or such would hide what a frame costs."""
         self.steps += 1
+        if is_timed:
+            self.step_ms.append(self.last_step_ms)
         self.last_stamp_ns = message.stamp_ns
         self.finished_at_s = time.monotonic()
 

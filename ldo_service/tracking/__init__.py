@@ -3,6 +3,7 @@
 from .align import AlignConfig, Alignment, align
 from .judgement import Status
 from .odometry import Odometry, OdometryConfig
+from .prior import Prior, PriorConfig, Reading
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .reference import Reference, build_reference
 from .tracked import Tracked
@@ -12,8 +13,11 @@ __all__ = [
     "Alignment",
     "Odometry",
     "OdometryConfig",
+    "Prior",
+    "PriorConfig",
     "Pyramid",
     "PyramidConfig",
+    "Reading",
     "Reference",
     "Status",
     "Tracked",

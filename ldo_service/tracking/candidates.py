@@ -31,10 +31,13 @@ class Candidate:
     """`second_agrees` is None where there was no second opinion, or the images refute it."""
 
     alignment: Alignment
-    method: str  # "direct" from a motion guess, "features" from ORB, "shape" from point clouds
+    # "direct" from a motion guess, "prior" from another odometry, "features" from ORB, "shape" from
+    # point clouds
+    method: str
     median_depth_m: float  # of the keyframe
     second_agrees: bool | None = None
     disagreement_rad: float = 0.0  # from the farthest rival that the images support
+    is_expected: bool = False  # a prior has the camera there too
 
 
 def attempt(
@@ -90,19 +93,19 @@ def best(
     """
     supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
     winner, least = int(np.argmax(supports)), config.rival_support * max(supports)
-    apart = [_apart(candidates[winner], c.alignment.T_reference_camera) for c in candidates]
+    apart = [apart_rad(candidates[winner], c.alignment.T_reference_camera) for c in candidates]
     farthest = max(a for a, supported in zip(apart, supports, strict=True) if supported >= least)
     chosen = replace(candidates[winner], disagreement_rad=farthest)
     if T_keyframe_second is None:
         return chosen
     *unled, led = apart
     others = unled if winner == len(unled) else [led]  # two starts that met are two witnesses
-    if min(*others, _apart(chosen, T_keyframe_second)) < config.agreement_rad:
+    if min(*others, apart_rad(chosen, T_keyframe_second)) < config.agreement_rad:
         return replace(chosen, second_agrees=True)
     return replace(chosen, second_agrees=False if supports[-1] > least else None)
 
 
-def _apart(candidate: Candidate, T_keyframe_camera: np.ndarray) -> float:
+def apart_rad(candidate: Candidate, T_keyframe_camera: np.ndarray) -> float:
     """Rotation plus parallax, rad."""
     difference = se3.inverse(candidate.alignment.T_reference_camera) @ T_keyframe_camera
     return extent(difference, candidate.median_depth_m)

@@ -1,13 +1,13 @@
 """Where a frame may have been taken, before it is aligned. Conventions: `ldo_service.geometry`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ldo_service.geometry import se3
 
 from .align import AlignConfig
-from .candidates import Candidate, CandidateConfig, attempt, best
+from .candidates import Candidate, CandidateConfig, apart_rad, attempt, best
 from .features import FeatureConfig, detect, estimate_pose
 from .keyframes import Keyframe
 from .motion import extent
@@ -26,22 +26,38 @@ class Guesses:
     large_motion: float  # image widths per frame
 
     def from_motion(
-        self, keyframe: Keyframe, view: Pyramid, T_keyframe_camera: np.ndarray
+        self,
+        keyframe: Keyframe,
+        view: Pyramid,
+        T_keyframe_camera: np.ndarray,
+        method: str = "direct",
     ) -> Candidate:
-        return attempt(keyframe, view, T_keyframe_camera, "direct", self.align)
+        return attempt(keyframe, view, T_keyframe_camera, method, self.align)
 
     def best_of_all(
-        self, predicted: Candidate, keyframe: Keyframe, view: Pyramid, resting: np.ndarray
+        self,
+        predicted: Candidate,
+        keyframe: Keyframe,
+        view: Pyramid,
+        resting: np.ndarray,
+        carried: np.ndarray | None,
     ) -> Candidate:
         """The best of `predicted`, what rest leads to and what a second opinion leads to.
 
         resting  T_keyframe_camera [4, 4] of the frame before
+        carried  T_keyframe_camera [4, 4] by a prior; None: there is none
         """
         candidates = [predicted, self.from_motion(keyframe, view, resting)]
+        if carried is not None:
+            candidates.append(self.from_motion(keyframe, view, carried, "prior"))
         second, method = self._second_opinion(keyframe, view, resting)
         if second is not None:
             candidates.append(attempt(keyframe, view, second, method, self.align))
-        return best(candidates, second, keyframe, view, self.candidates, self.align)
+        chosen = best(candidates, second, keyframe, view, self.candidates, self.align)
+        if carried is None:
+            return chosen
+        is_expected = apart_rad(chosen, carried) < self.candidates.agreement_rad
+        return replace(chosen, is_expected=is_expected)
 
     def is_large_step(self, candidate: Candidate, resting: np.ndarray, view: Pyramid) -> bool:
         """Whether the image moved so far since the last frame that a minimum may be a wrong one."""

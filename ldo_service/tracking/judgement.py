@@ -86,13 +86,14 @@ def judge(
     history: History,
     previous: Status,
     config: JudgementConfig,
+    is_expected: bool = False,
 ) -> Status:
     """The status of an alignment; `second_agrees` is None where there was none.
 
     Hysteresis: limits are stricter after a WEAK frame, unless features vouch for this one, and
-    strictest after a loss, from which only OK leads back.
+    strictest after a loss, from which only OK leads back: there a prior must expect it too.
     """
-    vouched = second_agrees and previous is Status.WEAK
+    vouched = second_agrees and (previous is Status.WEAK or is_expected)
     limits = config if vouched else _limits(previous, config)
     ratio = history.residual_ratio(alignment, config)
     if ratio > config.lost_residual or alignment.overlap < config.lost_overlap:

@@ -15,6 +15,7 @@ from ldo_service.geometry import RgbdFrame, se3
 from .judgement import Status
 from .odometry import Odometry
 from .places import Places
+from .prior import Reading
 from .segments import Look, SegmentConfig
 from .tracked import Tracked
 
@@ -66,17 +67,19 @@ class Localiser:
         self._odometry, self._places = odometry, places
         self.fix = Fix()
 
-    def track(self, frame: RgbdFrame) -> tuple[Tracked, np.ndarray | None]:
+    def track(
+        self, frame: RgbdFrame, prior: Reading | None = None
+    ) -> tuple[Tracked, np.ndarray | None]:
         """The frame in odometry, and T_map_odom [4, 4]; None until the camera is found."""
-        tracked = self._followed(frame)
+        tracked = self._followed(frame, prior)
         self.fix = self.fix.after(tracked)
         config = self._odometry.config.segments
         if tracked.status is Status.OK and self.fix.is_time_to_look(config):
             self._look(frame, tracked)
         return tracked, self.fix.T_map_odom
 
-    def _followed(self, frame: RgbdFrame) -> Tracked:
-        tracked = self._odometry.track(frame)
+    def _followed(self, frame: RgbdFrame, prior: Reading | None) -> Tracked:
+        tracked = self._odometry.track(frame, prior)
         if tracked.may_begin:
             tracked = self._odometry.begin_segment(frame)
         if tracked.wants_keyframe:

@@ -35,6 +35,7 @@ from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion
 from .moving import MovingConfig, spread, watch
 from .places import Places, PlacesConfig, place_of, thumbnail_of
+from .prior import Anchor, PriorConfig, Reading
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
 from .segments import Join, Look, SegmentConfig
@@ -60,6 +61,7 @@ class OdometryConfig:
     segments: SegmentConfig = field(default_factory=SegmentConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
     moving: MovingConfig = field(default_factory=MovingConfig)
+    prior: PriorConfig = field(default_factory=PriorConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
 
     def __post_init__(self) -> None:
@@ -88,11 +90,17 @@ class Odometry:
             self.config.large_motion,
         )
         self._viewed: tuple[RgbdFrame, Pyramid] | None = None  # the last frame, made ready
+        self._prior: Reading | None = None  # of the last frame
         self._rebuilt: dict[int, Keyframe] = {}  # from places, for the window
 
-    def track(self, frame: RgbdFrame) -> Tracked:
-        """The pose of a frame. Never raises for what a frame shows: it may be blank."""
+    def track(self, frame: RgbdFrame, prior: Reading | None = None) -> Tracked:
+        """The pose of a frame. Never raises for what a frame shows: it may be blank.
+
+        prior  where another odometry has the frame. It is one guess more, and while tracking is
+               LOST the motion that it tells is added up. No status is better for it.
+        """
         view, keyframe = self._view(frame), self._state.keyframe
+        self._prior = prior
         if keyframe is None:
             return self._first(view)
         candidate = self._followed(keyframe, view, frame.stamp_ns)
@@ -113,10 +121,12 @@ class Odometry:
         """The frame just tracked, LOST, as the first of a new segment, for `make_keyframe`.
 
         Odometry goes on where it was lost: its frame never jumps, and is wrong by what was missed.
+        With a prior it goes on where that has the camera now.
         """
         segment = len(self._state.segments.roots)
         log.info("tracking begins segment %d with frame %d", segment, frame.index)
-        T_odom_camera = self._state.motion.T_odom_camera
+        carried = self._carried()
+        T_odom_camera = self._state.motion.T_odom_camera if carried is None else carried
         return Tracked(
             T_odom_camera, np.eye(4), None, Status.OK, "first", True, True, segment=segment
         )
@@ -239,6 +249,7 @@ class Odometry:
             segments=self._state.segments.begun(),
             is_moving=None,
             suspicion=None,
+            anchor=self._prior and Anchor(tracked.T_odom_camera, self._prior),
         )
 
     def _followed(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
@@ -252,12 +263,27 @@ class Odometry:
         is_sure = self._judged(predicted) is Status.OK
         if is_sure and not self._guesses.is_large_step(predicted, resting, view):
             return predicted
-        return self._guesses.best_of_all(predicted, keyframe, view, resting)
+        T_odom_carried = self._carried()
+        carried = None if T_odom_carried is None else T_keyframe_odom @ T_odom_carried
+        return self._guesses.best_of_all(predicted, keyframe, view, resting, carried)
+
+    def _carried(self) -> np.ndarray | None:
+        """T_odom_camera [4, 4] of the last frame, by a prior's motion since the last OK one."""
+        anchor, now = self._state.anchor, self._prior
+        if anchor is None or now is None:
+            return None
+        return anchor.carried_to(now, self.config.prior)
 
     def _judged(self, candidate: Candidate) -> Status:
         state, limits = self._state, self.config.judgement
-        agree = candidate.second_agrees
-        return judge(candidate.alignment, agree, state.history, state.status, limits)
+        return judge(
+            candidate.alignment,
+            candidate.second_agrees,
+            state.history,
+            state.status,
+            limits,
+            candidate.is_expected,
+        )
 
     def _apart_from(self, segment: int) -> Places:
         """The places of segments that are not joined to one."""
@@ -306,7 +332,9 @@ class Odometry:
         is_steady = status is Status.OK and self._state.status is Status.OK
         if status is Status.OK:
             history = history.extended(alignment, config.judgement)
-            self._state = replace(self._state, trusted=thumbnail_of(self._view(frame)))
+            anchor = self._prior and Anchor(T_odom_camera, self._prior)
+            trusted = thumbnail_of(self._view(frame))
+            self._state = replace(self._state, trusted=trusted, anchor=anchor)
         self._remember(frame, keyframe, motion if is_steady else motion.stopped(), history, status)
         is_moving = None  # where a pose is unsure, surfaces contradict for that
         if status is Status.OK:

@@ -10,6 +10,7 @@ from .keyframes import Keyframe
 from .motion import Motion
 from .moving import Suspicion
 from .places import Place, Places
+from .prior import Anchor
 from .pyramid import PyramidConfig
 from .segments import Segments
 
@@ -29,6 +30,7 @@ class State:
     T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
     suspicion: Suspicion | None = None
+    anchor: Anchor | None = None  # the last OK frame, where a prior says where it was too
 
 
 def packed(state: State) -> dict[str, Any]:
@@ -47,12 +49,14 @@ def packed(state: State) -> dict[str, Any]:
         "T_odom_mapped": state.T_odom_mapped,
         "is_moving": _bits(state.is_moving),
         "suspicion": state.suspicion and (_bits(state.suspicion.contradicts), state.suspicion.gone),
+        "anchor": state.anchor and state.anchor.packed,
     }
 
 
 def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
     """The inverse of `packed`, under the same configuration."""
     keyframe, suspicion, is_moving = values["keyframe"], values["suspicion"], values["is_moving"]
+    anchor = values["anchor"]
     return State(
         places=Places(tuple(Place.unpacked(place) for place in values["places"])),
         keyframe=None if keyframe is None else Keyframe.unpacked(keyframe, config),
@@ -67,6 +71,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         T_odom_mapped=values["T_odom_mapped"],
         is_moving=None if is_moving is None else _mask(is_moving),
         suspicion=None if suspicion is None else Suspicion(_mask(suspicion[0]), suspicion[1]),
+        anchor=None if anchor is None else Anchor.unpacked(anchor),
     )
 
 

@@ -22,7 +22,7 @@ class Tracked:
     T_keyframe_camera: np.ndarray  # [4, 4]
     keyframe: int | None  # id of the keyframe it was aligned to; None before the first
     status: Status
-    method: str  # the guess that won: "first", "direct", "features", "shape", "relocalised", "none"
+    method: str  # the guess that won: "first", "direct", "prior", "features", "shape", ...
     wants_keyframe: bool
     wants_mapping: bool = False  # as a supporting keyframe: mapped, and not tracked against
     information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))

@@ -11,12 +11,12 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.state_store import decode_state, encode_state
-from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, TrackedPose
+from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, OdometryPrior, TrackedPose
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.segments import SegmentConfig
-from ldo_service.wire import correction_message, rgbd_message, rgbd_of, transform
+from ldo_service.wire import correction_message, pose_message, rgbd_message, rgbd_of, transform
 
 
 def poses_of(messages) -> list[TrackedPose]:
@@ -298,6 +298,96 @@ def test_a_quaternion_of_four_digits_is_normalised() -> None:
 def test_an_impossible_mounting_is_refused(fields) -> None:
     with pytest.raises(ConfigError, match="T_base_camera"):
         Mounting(**fields)
+
+
+# --- another odometry -----------------------------------------------------------------------------
+T_BASE_CAMERA = Mounting(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
+T_PRIOR_WORLD = se3.exp(np.array([0.2, 1.0, -0.3, 4.0, -1.0, 2.0]))
+
+
+@pytest.fixture(scope="session")
+def helped(room: Sequence, frames) -> list[FrameRgbd | OdometryPrior]:
+    """A fast camera, ten frames of it covered, and between frames where a base has it mounted."""
+    truth = room.truth()
+    assert truth is not None
+    T_camera_base = se3.inverse(T_BASE_CAMERA.matrix())
+    messages: list[FrameRgbd | OdometryPrior] = []
+    for frame in frames[::2]:
+        T_base = T_PRIOR_WORLD @ truth.T_world_camera[frame.frame] @ T_camera_base
+        messages.append(OdometryPrior(stamp_ns=frame.stamp_ns, T_odom_base=pose_message(T_base)))
+        is_covered = 10 <= frame.frame < 20
+        messages.append(without_anything(frame) if is_covered else frame)
+    return messages
+
+
+def without_anything(message: FrameRgbd) -> FrameRgbd:
+    color = np.zeros_like(message.color.numpy())
+    return msgspec.structs.replace(without_depth(message), color=Array.of(color))
+
+
+def test_a_prior_says_nothing_by_itself_and_is_read_at_each_frame(helped) -> None:
+    tracker = Tracker(TrackerConfig(T_base_camera=T_BASE_CAMERA))
+    for message in helped:
+        made = list(tracker.handle(message))
+        assert bool(made) == isinstance(message, FrameRgbd)
+    facts = tracker.facts()
+    assert (facts["frames_with_prior"], facts["frames_without_prior"]) == (20, 0)
+    assert (facts["prior_refused"], facts["prior_restarts"]) == (0, 0)
+
+
+def test_a_covered_frame_is_never_ok_by_a_prior(helped) -> None:
+    tracker = Tracker(TrackerConfig(T_base_camera=T_BASE_CAMERA))
+    poses = poses_of(handled(tracker, helped))
+    assert [pose.status for pose in poses] == ["OK"] * 5 + ["LOST"] * 5 + ["OK"] * 10
+
+
+@pytest.mark.parametrize("split", [11, 16])
+def test_a_successor_goes_on_with_the_same_prior_bit_for_bit(helped, split: int) -> None:
+    """From a state taken behind a pose of the prior, and from one while the camera is covered."""
+    first, second, third = (Tracker(TrackerConfig(T_base_camera=T_BASE_CAMERA)) for _ in range(3))
+    handled(first, helped[:split])
+    state = first.snapshot()
+    second.restore(state)
+    third.restore({name: decode_state(encode_state(part)) for name, part in state.items()})
+    after = handled(second, helped[split:])
+    assert bodies(after) == bodies(handled(third, helped[split:]))
+    assert any(pose.status == "OK" for pose in poses_of(after))
+
+
+def test_a_pose_of_a_prior_writes_little(helped) -> None:
+    tracker = Tracker(TrackerConfig(T_base_camera=T_BASE_CAMERA))
+    handled(tracker, helped[:40])
+    before = tracker.snapshot()
+    last = helped[-2]
+    handled(tracker, [msgspec.structs.replace(last, stamp_ns=last.stamp_ns + 10_000_000)])
+    after = tracker.snapshot()
+    assert [name for name in after if after[name] is not before[name]] == ["prior"]
+    assert len(encode_state(after["prior"])) < 15_000
+
+
+def test_poses_that_cannot_be_used_are_counted_and_the_first_is_said(helped, caplog) -> None:
+    tracker = Tracker()
+    prior = [message for message in helped if isinstance(message, OdometryPrior)]
+    handled(tracker, [*prior[:5], *prior[:5]])
+    jump = pose_message(se3.exp(np.array([0.0, 0.0, 0.0, 900.0, 0.0, 0.0])))
+    handled(tracker, [msgspec.structs.replace(prior[6], T_odom_base=jump), prior[7]])
+    facts = tracker.facts()
+    assert (facts["prior_refused"], facts["prior_restarts"]) == (5, 2)
+    warnings = [record.getMessage() for record in caplog.records]
+    assert len(warnings) == 2
+    assert f"stamp {prior[0].stamp_ns} has a stamp that is not after the last one's" in warnings[0]
+    assert "has jumped" in warnings[1]
+
+
+def test_a_prior_of_another_clock_changes_nothing_and_is_said_once(frames, helped, caplog) -> None:
+    tracker = Tracker()
+    stale = msgspec.structs.replace(helped[0], stamp_ns=0)
+    later = [msgspec.structs.replace(f, stamp_ns=f.stamp_ns + 10**12) for f in frames]
+    expected = handled(Tracker(), later)
+    assert bodies(handled(tracker, [stale, *later])) == bodies(expected)
+    assert tracker.facts()["frames_without_prior"] == len(frames)
+    (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
+    assert "do both stamp by one clock?" in warning
 
 
 # --- frames that are not what they should be ------------------------------------------------------

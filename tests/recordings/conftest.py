@@ -8,14 +8,16 @@ import pytest
 from ldo_service.actors.graph import RUNNING
 from ldo_service.config import Config, load_config
 from ldo_service.datasets import Sequence
+from ldo_service.geometry import Trajectory
 from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import Out
 from ldo_service.runtime.graph import lossless_consumers
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.transport import MemoryTransport
-from ldo_service.schemas.topics import CAMERA_RGBD
-from ldo_service.wire import camera_rgbd_message
+from ldo_service.schemas import OdometryPrior
+from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR
+from ldo_service.wire import camera_rgbd_message, pose_message
 from tests.runtime.cast import eventually, running, send
 
 FRAMES = 30
@@ -43,15 +45,24 @@ def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Sta
 
 
 async def live(
-    folder: Path, sequence: Sequence, config: Config = CONFIG, count: int = FRAMES
+    folder: Path,
+    sequence: Sequence,
+    config: Config = CONFIG,
+    count: int = FRAMES,
+    prior: Trajectory | None = None,
 ) -> None:
-    """Frame by frame, then a soft stop, producers first."""
+    """Frame by frame, each behind its prior, then a soft stop, producers first."""
     transport = MemoryTransport()
     actors = stages(folder, transport, config)
     camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
+    odometry = Outlet(Out(ODOMETRY_PRIOR), "odometry", 1, transport)
     async with running(*actors) as tasks:
         tracker = next(stage for stage in actors if stage.name == "tracker")
         for index in range(count):
+            if prior is not None:
+                stamp_ns = round(1e9 * prior.stamps_s[index])
+                pose = pose_message(prior.T_world_camera[index])
+                await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_odom_base=pose))
             await send(camera, camera_rgbd_message(sequence.read(index)))
             await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
         for stage, task in zip(actors, tasks, strict=True):

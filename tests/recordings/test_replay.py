@@ -1,5 +1,6 @@
 """The real actors, replayed: the same bytes, or exit code 5."""
 
+import asyncio
 import os
 import re
 import subprocess
@@ -12,6 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ldo_service import kernels
+from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
 from ldo_service.recordings.replay import open_recording
 from ldo_service.runtime.journal import Step, checksum
@@ -19,7 +21,7 @@ from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
 from tests.commands.test_cli import assert_one_paragraph, ldo
 
-from .conftest import FRAMES
+from .conftest import FRAMES, live
 
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "replay_test.py"
 
@@ -35,6 +37,12 @@ def test_every_actor_replays(recording: Path) -> None:
     refinements = replayed["mapper"].made["keyframe/refinement"]
     assert refinements > 0
     assert replayed["optimizer"].made["graph/correction"] == keyframes + refinements
+
+
+def test_a_tracker_with_a_prior_replays(room: Sequence, tmp_path: Path) -> None:
+    asyncio.run(live(tmp_path, room, count=8, prior=room.truth()))
+    (tracker,) = replay_recording(tmp_path, "tracker").values()
+    assert (tracker.taken["odometry/prior"], tracker.made["pose/tracked"]) == (8, 8)
 
 
 @pytest.mark.parametrize("threads", [1, 3])

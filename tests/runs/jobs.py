@@ -19,11 +19,12 @@ def job(
     *settings: str,
     frames: int | None = None,
     warn: Warn = print,
+    prior: Trajectory | None = None,
 ) -> Job:
     """Of the first frames, or all, into a new folder."""
     prepare(folder, overwrite=False)
     config = load_config(settings=(ROUGH, *settings))
-    return Job(sequence, folder, config, Selection(max_frames=frames), warn)
+    return Job(sequence, folder, config, Selection(max_frames=frames), warn, prior=prior)
 
 
 SOON = tuple(

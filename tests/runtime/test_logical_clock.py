@@ -174,3 +174,10 @@ def test_a_cycle_is_refused_before_anything_starts() -> None:
 
     with pytest.raises(LosslessCycle):
         LogicalClock([Loop()], {})
+
+
+def test_messages_that_come_together_share_a_tick() -> None:
+    mixer = Mixer()
+    with LogicalClock([Doubler(), mixer], {"doubler": 1}) as clock:
+        assert list(clock.run([(number(0), number(1)), number(2)])) == [0, 1]
+    assert mixer.seen == ["N0", "N1", "N2", "D0", "D2", "D4"]

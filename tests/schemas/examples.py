@@ -35,6 +35,7 @@ from ldo_service.schemas import (
     MeasuredPose,
     Message,
     ModelView,
+    OdometryPrior,
     OutputCount,
     Pose,
     TrackedPose,
@@ -85,6 +86,7 @@ EXAMPLES: dict[str, Message] = {
         depth_scale=1000.0,
         T_color_depth=POSE,
     ),
+    "odometry_prior": OdometryPrior(stamp_ns=1_700_000_000_000_000_004, T_odom_base=POSE),
     "frame_rgbd": FrameRgbd(stamp_ns=2, frame=8, camera=CAMERA, color=COLOR, depth_m=DEPTH),
     "keyframe": Keyframe(
         stamp_ns=3,

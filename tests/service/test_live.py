@@ -59,6 +59,26 @@ def test_the_examples_run_as_printed(tmp_path: Path) -> None:
         camera.communicate()
 
 
+@pytest.mark.timeout(300)
+def test_the_example_of_an_odometry_is_taken(tmp_path: Path) -> None:
+    poses = tmp_path / "odometry.txt"
+    poses.write_text(
+        "# stamp tx ty tz qx qy qz qw\n1.00 0 0 0 0 0 0 1\n1.02 0 0 0.01 0 0 0.6 0.8\n"
+    )
+    with live_service(tmp_path) as service:
+        service.wait_for_actors()
+        example = _at(service.endpoint, EXAMPLES / "4_publish_odometry.py")
+        done = subprocess.run([sys.executable, "-c", example, str(poses)], timeout=60)
+        assert done.returncode == 0
+
+        def taken() -> int:
+            inputs = service.update_health()["tracker"].inputs
+            return sum(i.delivered for i in inputs if i.topic == "odometry/prior")
+
+        wait_until(lambda: taken() == 2, 10, "both poses are taken")
+        assert "rejected" not in service.log
+
+
 def _at(endpoint: str, example: Path) -> str:
     """The example's text with the service's address in place of the default."""
     text = example.read_text().replace("tcp/127.0.0.1:7447", endpoint)

@@ -1,0 +1,301 @@
+"""A prior helps where it is right, and changes nothing where it is wrong."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.tracking import Odometry, OdometryConfig, Prior, PriorConfig, Status, Tracked
+from ldo_service.tracking.prior import KEPT, Anchor, Reading, Verdict
+from ldo_service.tracking.segments import SegmentConfig
+
+CONFIG = PriorConfig()
+PERIOD_NS = 33_333_333
+MS = 1_000_000
+FORWARD = np.array([0.0, 0.1, 0.0, 0.2, 0.0, 0.5])  # a turn and a step
+IDENTITY = np.eye(4)
+
+
+def prior_of(stamps_ns: list[int], poses: list[np.ndarray]) -> Prior:
+    prior = Prior()
+    for stamp_ns, T in zip(stamps_ns, poses, strict=True):
+        prior, verdict = prior.added(stamp_ns, T, CONFIG)
+        assert verdict is Verdict.FOLLOWS
+    return prior
+
+
+def at(prior: Prior, stamp_ns: int) -> np.ndarray | None:
+    reading = prior.at(stamp_ns, IDENTITY, CONFIG)
+    return None if reading is None else reading.T_prior_camera
+
+
+# --- a pose at any stamp --------------------------------------------------------------------------
+def test_between_two_poses_rotation_is_scipys_slerp_and_translation_a_line() -> None:
+    a, b = se3.exp(np.array([0.2, -0.4, 0.1, 1.0, 0.0, 2.0])), se3.exp(FORWARD)
+    prior = prior_of([0, 200 * MS], [a, b])
+    slerp = Slerp([0, 200], Rotation.from_matrix([a[:3, :3], b[:3, :3]]))
+    for ms in (0, 1, 70, 199, 200):
+        T = at(prior, ms * MS)
+        assert T is not None
+        np.testing.assert_allclose(T[:3, :3], slerp(ms).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(T[:3, 3], a[:3, 3] + ms / 200 * (b - a)[:3, 3], atol=1e-12)
+
+
+def test_a_pose_is_extrapolated_at_its_velocity_and_not_beyond_the_limit() -> None:
+    stamps_ns = [k * 20 * MS for k in range(10)]
+    twist = np.array([0.0, 0.01, 0.0, 0.0, 0.0, 0.0])
+    prior = prior_of(stamps_ns, [se3.exp(k * twist) for k in range(10)])
+    T = at(prior, 180 * MS + 40 * MS)
+    assert T is not None
+    np.testing.assert_allclose(T, se3.exp(11 * twist), atol=1e-12)
+    assert at(prior, 180 * MS + 51 * MS) is None
+    assert at(prior_of([0], [IDENTITY]), 10 * MS) is None, "one pose has no velocity"
+
+
+def test_noise_of_near_poses_is_not_multiplied_by_extrapolation() -> None:
+    """At 200 Hz: 1 mm of noise on the newest pose is not 1 cm after 50 ms."""
+    stamps_ns = [k * 5 * MS for k in range(60)]
+    poses = [IDENTITY.copy() for _ in stamps_ns]
+    poses[-1][0, 3] = 1e-3
+    T = at(prior_of(stamps_ns, poses), stamps_ns[-1] + 50 * MS)
+    assert T is not None
+    assert abs(T[0, 3]) < 1.5e-3
+
+
+def test_nothing_is_known_across_a_gap_before_the_first_pose_or_without_any() -> None:
+    prior = prior_of([0, 260 * MS], [IDENTITY, se3.exp(FORWARD)])
+    assert at(prior, 100 * MS) is None
+    assert at(prior, -1) is None
+    assert at(Prior(), 0) is None
+    assert at(prior, 260 * MS) is not None
+
+
+def test_memory_is_bounded() -> None:
+    prior = prior_of([k * MS for k in range(3 * KEPT)], [IDENTITY] * (3 * KEPT))
+    assert len(prior.poses) == KEPT
+    assert prior.poses[-1].stamp_ns == (3 * KEPT - 1) * MS
+
+
+# --- poses that cannot be used --------------------------------------------------------------------
+JUMP = se3.exp(np.array([0.0, 0.0, 0.0, 3.0, 0.0, 0.0]))
+SPIN = se3.exp(np.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ("stamp_ns", "T", "verdict"),
+    [
+        (2_000 * MS, IDENTITY, Verdict.LATE),
+        (1_900 * MS, IDENTITY, Verdict.LATE),
+        (2_100 * MS, np.full((4, 4), np.nan), Verdict.BROKEN),
+        (900 * MS, IDENTITY, Verdict.RESTARTED),
+        (2_100 * MS, JUMP, Verdict.JUMPED),
+        (2_100 * MS, SPIN, Verdict.JUMPED),
+    ],
+)
+def test_what_does_not_follow_is_refused_or_begins_a_new_stretch(stamp_ns, T, verdict) -> None:
+    before = prior_of([1_900 * MS, 2_000 * MS], [IDENTITY, IDENTITY])
+    after, found = before.added(stamp_ns, T, CONFIG)
+    assert found is verdict
+    if verdict in (Verdict.LATE, Verdict.BROKEN):
+        assert after is before
+    else:
+        assert [pose.stamp_ns for pose in after.poses] == [stamp_ns]
+        assert after.stretch == before.stretch + 1
+
+
+@pytest.mark.parametrize(
+    "fields", [{"max_gap_s": 0.0}, {"max_extrapolation_s": -1.0}, {"max_carried_s": float("nan")}]
+)
+def test_impossible_settings_are_refused(fields) -> None:
+    with pytest.raises(ConfigError):
+        PriorConfig(**fields)
+
+
+# --- motion between two readings ------------------------------------------------------------------
+def test_the_camera_moves_as_the_base_does_whatever_the_frame_and_the_mounting() -> None:
+    T_base_camera = se3.exp(np.array([0.3, -1.2, 0.4, 0.2, 0.0, 0.5]))
+    T_prior_world = se3.exp(np.array([1.0, 0.5, -0.2, 7.0, 3.0, -2.0]))
+    T_world_camera = [IDENTITY, se3.exp(FORWARD)]
+    T_prior_base = [T_prior_world @ T @ se3.inverse(T_base_camera) for T in T_world_camera]
+    prior = prior_of([0, 200 * MS], T_prior_base)
+    then, now = (prior.at(ns, T_base_camera, CONFIG) for ns in (0, 200 * MS))
+    assert then is not None
+    assert now is not None
+    T_odom_camera = se3.exp(np.array([0.1, 0.0, 0.2, 1.0, 2.0, 3.0]))
+    carried = Anchor(T_odom_camera, then).carried_to(now, CONFIG)
+    np.testing.assert_allclose(carried, T_odom_camera @ T_world_camera[1], atol=1e-12)
+
+
+def test_nothing_is_carried_from_one_stretch_to_another_or_for_too_long() -> None:
+    anchor = Anchor(IDENTITY, Reading(0, IDENTITY, stretch=1))
+    assert anchor.carried_to(Reading(10 * MS, IDENTITY, stretch=2), CONFIG) is None
+    assert anchor.carried_to(Reading(31_000 * MS, IDENTITY, stretch=1), CONFIG) is None
+    assert anchor.carried_to(Reading(29_000 * MS, IDENTITY, stretch=1), CONFIG) is not None
+
+
+# --- tracking through a covered stretch -----------------------------------------------------------
+BEFORE, COVERED, AFTER = 8, 22, 6
+
+
+@dataclass(frozen=True)
+class Covered:
+    """A walk, in the middle of which a hand is over the lens; only its motion is gone after it."""
+
+    frames: list[RgbdFrame]
+    T_world_camera: list[np.ndarray]
+
+    def followed(
+        self, poses: list[np.ndarray] | None, config: OdometryConfig | None = None
+    ) -> list[Tracked]:
+        odometry, prior, results = Odometry(config), Prior(), []
+        for k, frame in enumerate(self.frames):
+            if poses is not None:
+                prior, _ = prior.added(frame.stamp_ns, poses[k], CONFIG)
+            tracked = odometry.track(frame, prior.at(frame.stamp_ns, IDENTITY, CONFIG))
+            if tracked.may_begin:
+                tracked = odometry.begin_segment(frame)
+            if tracked.wants_keyframe:
+                odometry.make_keyframe(frame, tracked)
+            results.append(tracked)
+        return results
+
+
+@pytest.fixture(scope="module")
+def covered(room, make_walk) -> Covered:
+    truth = make_walk(BEFORE + COVERED + AFTER, 0.03, 0.015)
+    frames = [
+        room.blank(k, k * PERIOD_NS)
+        if BEFORE <= k < BEFORE + COVERED
+        else room.view(T, stamp_ns=k * PERIOD_NS, index=k)
+        for k, T in enumerate(truth)
+    ]
+    return Covered(frames, truth)
+
+
+def drifting(truth: list[np.ndarray], drift: float = 0.02, noise: float = 0.0) -> list[np.ndarray]:
+    """Each step too long by a share, and noisy; in a frame of its own."""
+    rng, poses = np.random.default_rng(0), [se3.exp(np.array([0.0, 1.0, 0.0, 5.0, 0.0, 0.0]))]
+    for a, b in pairwise(truth):
+        step = (1 + drift) * se3.log(se3.inverse(a) @ b) + noise * rng.normal(size=6)
+        poses.append(poses[-1] @ se3.exp(step))
+    return poses
+
+
+RIGHT: dict[str, Callable[[list[np.ndarray]], list[np.ndarray]]] = {
+    "true": lambda truth: truth,
+    "2 % of drift": drifting,
+    "10 % of drift": lambda truth: drifting(truth, 0.10),
+    "noisy": lambda truth: drifting(truth, noise=0.003),
+}
+WRONG: dict[str, Callable[[list[np.ndarray]], list[np.ndarray]]] = {
+    "stands still": lambda truth: [truth[0]] * len(truth),
+    "goes backwards": lambda truth: [se3.inverse(T) for T in truth],
+    "jumps": lambda truth: [T @ JUMP if k % 2 else T for k, T in enumerate(truth)],
+    "is random": lambda truth: drifting(truth, 0.0, noise=0.1),
+    "is broken": lambda truth: [np.full((4, 4), np.nan)] * len(truth),
+}
+
+
+def statuses(results: list[Tracked]) -> list[Status]:
+    return [tracked.status for tracked in results]
+
+
+def largest_error_m(covered: Covered, results: list[Tracked]) -> float:
+    return max(
+        float(np.linalg.norm(tracked.T_odom_camera[:3, 3] - T[:3, 3]))
+        for tracked, T in zip(results, covered.T_world_camera, strict=True)
+        if tracked.status is Status.OK
+    )
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_a_covered_camera_is_found_at_once_by_a_prior(covered: Covered, name: str) -> None:
+    alone = covered.followed(None)
+    assert statuses(alone)[BEFORE:] == [Status.LOST] * (COVERED + AFTER)
+    results = covered.followed(RIGHT[name](covered.T_world_camera))
+    assert statuses(results)[BEFORE:] == [Status.LOST] * COVERED + [Status.OK] * AFTER
+    assert "prior" in {tracked.method for tracked in results}
+    assert largest_error_m(covered, results) < 5e-3
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_prior_changes_no_status_and_no_pose(covered: Covered, name: str) -> None:
+    alone = covered.followed(None)
+    results = covered.followed(WRONG[name](covered.T_world_camera))
+    assert statuses(results) == statuses(alone)
+    assert largest_error_m(covered, results) < 5e-3
+
+
+def test_no_covered_frame_is_ok_by_a_prior_and_its_pose_stays_the_last_trusted(
+    covered: Covered,
+) -> None:
+    results = covered.followed(covered.T_world_camera)
+    last = results[BEFORE - 1].T_odom_camera
+    for tracked in results[BEFORE : BEFORE + COVERED]:
+        assert (tracked.status, tracked.method) == (Status.LOST, "none")
+        np.testing.assert_array_equal(tracked.T_odom_camera, last)
+        assert not tracked.information.any()
+
+
+def test_a_new_segment_begins_where_a_prior_has_the_camera(room, make_walk) -> None:
+    """Turned around while covered, to where nothing was ever seen."""
+    truth, turn = make_walk(BEFORE), np.array([0.0, np.pi, 0.0, 0.3, 0.0, 0.0])
+    truth += [truth[-1] @ se3.exp(min(k / COVERED, 1.0) * turn) for k in range(1, COVERED + AFTER)]
+    frames = [
+        room.blank(k, k * PERIOD_NS)
+        if BEFORE <= k < BEFORE + COVERED
+        else room.view(T, stamp_ns=k * PERIOD_NS, index=k)
+        for k, T in enumerate(truth)
+    ]
+    turned = Covered(frames, truth)
+    config = OdometryConfig(segments=SegmentConfig(begin_after_s=0.3))
+    alone, helped = turned.followed(None, config), turned.followed(drifting(truth), config)
+    for results in (alone, helped):
+        assert {tracked.segment for tracked in results[BEFORE + COVERED :]} == {1}
+    assert largest_error_m(turned, helped) < 0.02
+    assert largest_error_m(turned, alone) > 0.1, "odometry goes on where it was lost"
+
+
+def test_a_fast_camera_is_followed_by_a_prior(room, make_walk) -> None:
+    """Five frames a second, 12 cm apart."""
+    truth = make_walk(6, 0.12, 0.08)
+    frames = [room.view(T, stamp_ns=k * 200 * MS, index=k) for k, T in enumerate(truth)]
+    walk = Covered(frames, truth)
+    assert Status.LOST in statuses(walk.followed(None))
+    assert statuses(walk.followed(drifting(truth))) == [Status.OK] * 6
+
+
+# --- state ----------------------------------------------------------------------------------------
+def test_prior_and_anchor_come_back_bit_for_bit_from_disk() -> None:
+    prior = prior_of([0, 100 * MS], [IDENTITY, se3.exp(FORWARD)])
+    again = Prior.unpacked(decode_state(encode_state(prior.packed)))
+    assert encode_state(again.packed) == encode_state(prior.packed)
+    reading = prior.at(50 * MS, IDENTITY, CONFIG)
+    assert reading is not None
+    anchor = Anchor(se3.exp(FORWARD), reading)
+    kept = Anchor.unpacked(decode_state(encode_state(anchor.packed)))
+    assert encode_state(kept.packed) == encode_state(anchor.packed)
+
+
+def test_a_successor_that_begins_while_covered_resumes_bit_for_bit(covered: Covered) -> None:
+    prior = prior_of([k * PERIOD_NS for k in range(36)], covered.T_world_camera)
+    first, second = Odometry(), Odometry()
+    for k, frame in enumerate(covered.frames):
+        if k == BEFORE + 5:
+            second.restore(decode_state(encode_state(first.state())))
+        reading = prior.at(frame.stamp_ns, IDENTITY, CONFIG)
+        expected = first.track(frame, reading)
+        if k >= BEFORE + 5:
+            tracked = second.track(frame, reading)
+            assert tracked.T_odom_camera.tobytes() == expected.T_odom_camera.tobytes()
+            assert (tracked.status, tracked.method) == (expected.status, expected.method)
+        if expected.wants_keyframe:
+            for odometry in (first, second):
+                odometry.make_keyframe(frame, expected)
+    assert expected.status is Status.OK
