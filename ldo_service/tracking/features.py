@@ -1,5 +1,10 @@
-"""Pose from sparse features: ORB and PnP RANSAC, for large motions and relocalisation."""
+"""Pose from sparse features and PnP RANSAC, for large motions and relocalisation.
 
+ORB is fast and enough from frame to frame. SIFT costs ten times as much and knows again what is
+seen from twice as near or far.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -10,6 +15,8 @@ from ldo_service.geometry import Camera, se3
 
 from .pyramid import Pyramid
 
+SIFT_SIZE = 128
+
 
 @dataclass(frozen=True, slots=True)
 class FeatureConfig:
@@ -17,22 +24,27 @@ class FeatureConfig:
     fast_threshold: int = 7  # grey levels; ORB-SLAM3's lower one: blurred images have no more
     ratio: float = 0.8  # of the best to the second distance (Lowe 2004, 7.1, at 0.8)
     max_distance: int = 64  # bits of 256 (ORB-SLAM3's loose threshold is 100, its tight one 50)
+    count_across_scales: int = 1000  # SIFT's of a frame, the strongest; half as many of a place
+    contrast: float = 0.01  # SIFT's least, of the grey range; OpenCV's 0.04 finds little indoors
     reprojection_px: float = 3.0  # at 640 pixels wide; scaled with the image
     ransac_iterations: int = 200
     min_inliers: int = 15  # ORB-SLAM3 relocalises from 15 RANSAC inliers
 
     def __post_init__(self) -> None:
-        if min(self.count, self.fast_threshold, self.ransac_iterations) < 1 or self.min_inliers < 6:
-            raise ConfigError(
-                "count, fast_threshold, ransac_iterations must be positive, min_inliers at least 6."
-            )
-        if not (0 < self.ratio <= 1 and self.reprojection_px > 0):
-            raise ConfigError("ratio must be within 0..1 and reprojection_px positive.")
+        if min(self.count, self.count_across_scales, self.fast_threshold) < 1:
+            raise ConfigError("count, count_across_scales and fast_threshold must be positive.")
+        if self.ransac_iterations < 1 or self.min_inliers < 6:
+            raise ConfigError("ransac_iterations must be positive, min_inliers at least 6.")
+        if not (0 < self.ratio <= 1 and min(self.reprojection_px, self.contrast) > 0):
+            raise ConfigError("ratio must be within 0..1, reprojection_px and contrast positive.")
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """pixels [N, 2]; points_camera [N, 3] m, z = 0 where unmeasured; descriptors [N, 32]."""
+    """pixels [N, 2]; points_camera [N, 3] m, z = 0 where unmeasured.
+
+    descriptors [N, 32] uint8 are bits of ORB, [N, 128] uint8 are gradients of SIFT.
+    """
 
     pixels: np.ndarray
     points_camera: np.ndarray
@@ -51,12 +63,28 @@ def detect(view: Pyramid, config: FeatureConfig) -> Features:
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:
         keypoints, descriptors = (), np.zeros((0, 32), np.uint8)
+    return _measured(keypoints, descriptors, view.depth_m, view.camera)
+
+
+def detect_across_scales(
+    gray: np.ndarray, depth_m: np.ndarray, camera: Camera, count: int, config: FeatureConfig
+) -> Features:
+    """The strongest SIFT features (Lowe 2004) of a grey image [H, W] uint8, as `detect` has ORB."""
+    sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=config.contrast)
+    keypoints, descriptors = sift.detectAndCompute(gray, None)
+    if descriptors is None:
+        keypoints, descriptors = (), np.zeros((0, SIFT_SIZE))
+    return _measured(keypoints, descriptors.astype(np.uint8), depth_m, camera)  # whole numbers
+
+
+def _measured(
+    keypoints: Sequence[cv2.KeyPoint], descriptors: np.ndarray, depth_m: np.ndarray, camera: Camera
+) -> Features:
     pixels = np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2)
     column, row = np.rint(pixels).astype(int).T
-    depth_m = view.depth_m[row, column].astype(np.float64)
-    camera = view.camera
+    measured_m = depth_m[row, column].astype(np.float64)
     rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = np.column_stack([rays, np.ones(len(rays))]) * depth_m[:, None]
+    points = np.column_stack([rays, np.ones(len(rays))]) * measured_m[:, None]
     return Features(pixels, points, descriptors)
 
 
@@ -64,14 +92,35 @@ def match(reference: Features, frame: Features, config: FeatureConfig) -> np.nda
     """Index pairs [M, 2] (reference, frame) that pass the ratio test, each feature used once."""
     if min(len(reference.pixels), len(frame.pixels)) < 2:
         return np.zeros((0, 2), int)
-    matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
-    closest: dict[int, tuple[float, int]] = {}  # of each frame feature: distance, reference
-    for best, second in matcher.knnMatch(reference.descriptors, frame.descriptors, k=2):
-        if best.distance < min(config.ratio * second.distance, config.max_distance):
-            known = closest.get(best.trainIdx, (np.inf, -1))
-            closest[best.trainIdx] = min(known, (best.distance, best.queryIdx))
-    pairs = [(there, here) for here, (_, there) in sorted(closest.items())]
-    return np.array(pairs, int).reshape(-1, 2)
+    is_sift = frame.descriptors.shape[1] == SIFT_SIZE
+    nearest = _nearest_gradients if is_sift else _nearest_bits
+    there, distance, second = nearest(reference.descriptors, frame.descriptors)
+    farthest = np.inf if is_sift else config.max_distance
+    here = np.flatnonzero(distance < np.minimum(config.ratio * second, farthest))
+    order = here[np.lexsort((here, distance[here], there[here]))]
+    _, first = np.unique(there[order], return_index=True)  # the nearest of each frame feature
+    return np.column_stack([order[first], there[order[first]]])
+
+
+def _nearest_bits(
+    reference: np.ndarray, frame: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each reference descriptor: the nearest in the frame, its distance, and the second's."""
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(reference, frame, k=2)
+    distances = np.array([(best.distance, second.distance) for best, second in pairs])
+    return np.array([best.trainIdx for best, _ in pairs]), *distances.T
+
+
+def _nearest_gradients(
+    reference: np.ndarray, frame: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Likewise; squares of whole numbers below 2^24 are exact in float32, in any order."""
+    a, b = reference.astype(np.float32), frame.astype(np.float32)
+    squares = np.sum(a * a, axis=1)[:, None] + np.sum(b * b, axis=1) - 2.0 * (a @ b.T)
+    rows, nearest = np.arange(len(a)), squares.argmin(axis=1)
+    best = squares[rows, nearest]
+    squares[rows, nearest] = np.inf
+    return nearest, np.sqrt(best), np.sqrt(squares.min(axis=1))
 
 
 def estimate_pose(

@@ -108,7 +108,7 @@ class Odometry:
         if status is Status.WEAK and not self._relocaliser.is_familiar(view, self._state.trusted):
             status = Status.LOST
         if status is Status.LOST:
-            found = self._found(view, self._state.places)
+            found = self._found(view, self._state.places, is_lost=True)
             if found is None:
                 return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
@@ -133,7 +133,7 @@ class Odometry:
 
     def recognised(self, frame: RgbdFrame, places: Places) -> tuple[Keyframe, Alignment] | None:
         """The one of these places that the frame just tracked surely shows, and where from."""
-        found = self._found(self._view(frame), places)
+        found = self._found(self._view(frame), places, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
 
     def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
@@ -290,17 +290,21 @@ class Odometry:
         joined = self._state.segments.are_joined
         return Places(tuple(p for p in self._state.places.all if not joined(p.segment, segment)))
 
-    def _found(self, view: Pyramid, places: Places) -> tuple[Keyframe, Candidate] | None:
+    def _found(
+        self, view: Pyramid, places: Places, *, is_lost: bool
+    ) -> tuple[Keyframe, Candidate] | None:
+        if not self._is_usable(view):
+            return None
         state = self._state
         self._state = replace(state, searches=state.searches + 1)
-        return self._relocaliser.find(view, places, state.searches, state.history)
+        return self._relocaliser.find(view, places, state.searches, state.history, is_lost=is_lost)
 
     def _joining(self, tracked: Tracked, keyframe: Keyframe, view: Pyramid) -> Tracked:
         """Now and then, whether the view is seen from another segment too."""
         before, config = self._state.segments, self.config.segments
         if tracked.status is not Status.OK or not before.is_time_to_look(config):
             return tracked
-        found = self._found(view, self._apart_from(keyframe.segment))
+        found = self._found(view, self._apart_from(keyframe.segment), is_lost=False)
         look = None if found is None else _look(tracked, found[0], found[1].alignment)
         self._state = replace(self._state, segments=before.looked(look, config))
         if found is None or look is None or not before.is_confirmed_by(look, config):

@@ -15,7 +15,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
 
-from .features import FeatureConfig, Features, detect
+from .features import FeatureConfig, Features, detect, detect_across_scales
 from .judgement import History
 from .keyframes import Keyframe
 from .moving import resized
@@ -65,6 +65,14 @@ class Place:
         points = self.points_camera.astype(np.float64)
         return Features(self.camera.project(points), points, self.descriptors)
 
+    def features_across_scales(self, config: FeatureConfig) -> Features:
+        """SIFT of the small image, detected when first asked for; half as many as of a frame."""
+        if "_across_scales" not in self.__dict__:
+            image = self._gray, self._depth_m, self.camera
+            seen = detect_across_scales(*image, config.count_across_scales // 2, config)
+            self.__dict__["_across_scales"] = seen
+        return self.__dict__["_across_scales"]
+
     def history(self, otherwise: History) -> History:
         """What a frame that shows this place is judged by: scenes differ in noise."""
         if not self.intensity_sigma:
@@ -89,14 +97,21 @@ class Place:
 
     def keyframe(self, config: PyramidConfig) -> Keyframe:
         """The keyframe as frames can be aligned to it; bitwise equal each time."""
-        camera = self.camera
-        gray = cv2.imdecode(np.frombuffer(self.gray, np.uint8), cv2.IMREAD_GRAYSCALE)
-        steps = codecs.decode_depth("z16+zstd", camera.width, camera.height, memoryview(self.depth))
-        depth_m = steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
-        view = build_pyramid(np.asarray(gray, np.uint8), depth_m, camera, config)
+        view = build_pyramid(self._gray, self._depth_m, self.camera, config)
         return Keyframe(
             view, self.T_odom_keyframe, self.id, self.segment, kept_features=self.features
         )
+
+    @property
+    def _gray(self) -> np.ndarray:
+        gray = cv2.imdecode(np.frombuffer(self.gray, np.uint8), cv2.IMREAD_GRAYSCALE)
+        return np.asarray(gray, np.uint8)
+
+    @property
+    def _depth_m(self) -> np.ndarray:
+        width, height = self.camera.width, self.camera.height
+        steps = codecs.decode_depth("z16+zstd", width, height, memoryview(self.depth))
+        return steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
 
 
 def place_of(

@@ -8,9 +8,9 @@ neither does: the ends of a corridor may be furnished alike. Only places of one 
 so; where segments are to each other is not known here.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -19,13 +19,21 @@ from ldo_service.geometry import se3
 
 from .align import AlignConfig
 from .candidates import Candidate, attempt
-from .features import FeatureConfig, FeaturePose, detect, estimate_pose
+from .features import (
+    FeatureConfig,
+    FeaturePose,
+    Features,
+    detect,
+    detect_across_scales,
+    estimate_pose,
+)
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe
 from .motion import extent
 from .places import Place, Places, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig
 
+PosedPlace = tuple[Place, FeaturePose]
 RANKED = 10  # times `alike`: places looked through for likely ones that are apart
 
 
@@ -33,7 +41,8 @@ RANKED = 10  # times `alike`: places looked through for likely ones that are apa
 class RelocalisationConfig:
     alike: int = 5  # places per lost frame, by thumbnail: the prototype's number
     in_turn: int = 3  # further ones: 1000 places in 11 s at 30 Hz
-    attempts: int = 2  # direct alignments per lost frame, the best feature poses first
+    across_scales: int = 8  # further ones in turn, by features that know near from far; 0: none
+    attempts: int = 3  # direct alignments per search, the best feature poses first
     min_geometric_inliers: float = 0.85  # of the depths that meet a surface; the prototype's
     agreement_rad: float = 0.06  # rotation plus parallax between feature pose and alignment
     variety_rad: float = 0.25  # likely places nearer to each other than this are one
@@ -66,36 +75,31 @@ class Relocaliser:
     config: RelocalisationConfig
 
     def find(
-        self, view: Pyramid, places: Places, turn: int, history: History
+        self, view: Pyramid, places: Places, turn: int, history: History, *, is_lost: bool = True
     ) -> tuple[Keyframe, Candidate] | None:
         """The keyframe that a view surely shows, and its alignment to it.
 
-        `turn` counts the lost frames; it decides whose turn it is beside the likely places.
+        `turn` counts the searches; it decides whose turn it is beside the likely places. Without
+        haste, a camera that is not lost is looked for by what is fast alone.
         """
-        poses = self._poses(view, self._chosen(view, places, turn))
-        for place, pose in poses[: self.config.attempts]:
-            keyframe = place.keyframe(self.pyramid)
-            guess = se3.inverse(pose.T_camera_reference)
-            candidate = attempt(keyframe, view, guess, "relocalised", self.align)
-            if self._is_sure(candidate, guess, place.history(history)):
-                found = keyframe, replace(candidate, second_agrees=True)
-                return None if self._has_rival(place, pose, poses) else found
-        return None
+        if not len(places):
+            return None
+        likely = self._likely(places.all[index] for index in places.alike(view))
+        poses = self._poses(view, _each_once(likely, _due(places, turn, self.config.in_turn)))
+        sure = self._surest(view, poses, history)
+        if sure is None and is_lost and self.config.across_scales:
+            newest, due = places.all[:-3:-1], _due(places, turn, self.config.across_scales)
+            others = self._poses_across_scales(view, _each_once(newest, due))
+            sure, poses = self._surest(view, others, history), [*poses, *others]
+        if sure is None or self._has_rival(*sure[0], poses):
+            return None
+        return sure[1]
 
     def is_familiar(self, view: Pyramid, trusted: np.ndarray) -> bool:
         """Whether a view looks like the thumbnail [300] of the last trusted one."""
         seen, trusted = thumbnail_of(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
-
-    def _chosen(self, view: Pyramid, places: Places, turn: int) -> list[Place]:
-        """The likely ones and those whose turn it is, each once."""
-        if not len(places):
-            return []
-        first = turn * self.config.in_turn
-        due = [number % len(places) for number in range(first, first + self.config.in_turn)]
-        likely = self._likely(places.all[index] for index in places.alike(view))
-        return list(dict.fromkeys((*likely, *(places.all[index] for index in due))))
 
     def _likely(self, ranked: Iterable[Place]) -> list[Place]:
         """The first of each neighbourhood."""
@@ -107,12 +111,37 @@ class Relocaliser:
                 likely.append(place)
         return likely
 
-    def _poses(self, view: Pyramid, places: Iterable[Place]) -> list[tuple[Place, FeaturePose]]:
+    def _poses(self, view: Pyramid, places: Iterable[Place]) -> list[PosedPlace]:
         """Places with a feature pose, most inliers first."""
         seen = detect(view, self.features)
-        poses = [(p, estimate_pose(p.features, seen, view.camera, self.features)) for p in places]
+        return self._posed(view, seen, ((place, place.features) for place in places))
+
+    def _poses_across_scales(self, view: Pyramid, places: Iterable[Place]) -> list[PosedPlace]:
+        """Likewise, of a camera that has come much nearer or gone farther."""
+        config = self.features
+        image = view.gray, view.depth_m, view.camera
+        seen = detect_across_scales(*image, config.count_across_scales, config)
+        known = ((place, place.features_across_scales(config)) for place in places)
+        return self._posed(view, seen, known)
+
+    def _posed(
+        self, view: Pyramid, seen: Features, known: Iterable[tuple[Place, Features]]
+    ) -> list[PosedPlace]:
+        poses = [(p, estimate_pose(there, seen, view.camera, self.features)) for p, there in known]
         found = [(place, pose) for place, pose in poses if pose is not None]
         return sorted(found, key=lambda pp: -pp[1].inliers)
+
+    def _surest(
+        self, view: Pyramid, poses: Sequence[PosedPlace], history: History
+    ) -> tuple[PosedPlace, tuple[Keyframe, Candidate]] | None:
+        """The first that the images confirm."""
+        for place, pose in poses[: self.config.attempts]:
+            keyframe = place.keyframe(self.pyramid)
+            guess = se3.inverse(pose.T_camera_reference)
+            candidate = attempt(keyframe, view, guess, "relocalised", self.align)
+            if self._is_sure(candidate, guess, place.history(history)):
+                return (place, pose), (keyframe, replace(candidate, second_agrees=True))
+        return None
 
     def _is_sure(self, candidate: Candidate, guess: np.ndarray, history: History) -> bool:
         alignment = candidate.alignment
@@ -124,9 +153,7 @@ class Relocaliser:
             and extent(difference, candidate.median_depth_m) < self.config.agreement_rad
         )
 
-    def _has_rival(
-        self, place: Place, pose: FeaturePose, poses: Iterable[tuple[Place, FeaturePose]]
-    ) -> bool:
+    def _has_rival(self, place: Place, pose: FeaturePose, poses: Iterable[PosedPlace]) -> bool:
         """Whether another place explains the view nearly as well, from far elsewhere."""
         T_odom_camera = _seen_from(place, pose)
         return any(
@@ -136,6 +163,16 @@ class Relocaliser:
             > self.config.rival_rad
             for other, rival in poses
         )
+
+
+def _due(places: Places, turn: int, count: int) -> list[Place]:
+    """Those whose turn it is: `count` each time, and from the first again."""
+    numbers = range(turn * count, (turn + 1) * count)
+    return [places.all[number % len(places)] for number in numbers]
+
+
+def _each_once(*groups: Iterable[Place]) -> list[Place]:
+    return list(dict.fromkeys(chain(*groups)))
 
 
 def _seen_from(place: Place, pose: FeaturePose) -> np.ndarray:

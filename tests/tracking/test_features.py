@@ -1,10 +1,17 @@
+import cv2
 import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import PyramidConfig, pyramid_of
-from ldo_service.tracking.features import FeatureConfig, detect, estimate_pose, match
+from ldo_service.tracking.features import (
+    FeatureConfig,
+    detect,
+    detect_across_scales,
+    estimate_pose,
+    match,
+)
 
 CONFIG = FeatureConfig()
 T_REFERENCE_CAMERA = se3.exp(np.array([0.05, -0.2, 0.05, 0.2, 0.1, 0.15]))  # 12 degrees, 27 cm
@@ -32,6 +39,21 @@ def test_points_are_the_surface_under_the_pixels(large_room) -> None:
     np.testing.assert_allclose(
         large_room.camera.project(features.points_camera), features.pixels, atol=1e-6
     )
+
+
+def test_gradients_are_matched_as_opencv_matches_them(large_room) -> None:
+    there, here = (
+        detect_across_scales(view.gray, view.depth_m, view.camera, 300, CONFIG)
+        for view in (
+            pyramid_of(large_room.view(T), PyramidConfig()) for T in (np.eye(4), T_REFERENCE_CAMERA)
+        )
+    )
+    pairs = match(there, here, CONFIG)
+    nearest = cv2.BFMatcher(cv2.NORM_L2).knnMatch(there.descriptors, here.descriptors, k=2)
+    told = {(m.queryIdx, m.trainIdx) for m, n in nearest if m.distance < CONFIG.ratio * n.distance}
+    assert len(pairs) > 100
+    assert set(map(tuple, pairs.tolist())) <= told
+    assert len(set(pairs[:, 1])) == len({index for _, index in told})
 
 
 def test_every_feature_is_matched_at_most_once(large_room) -> None:

@@ -70,8 +70,23 @@ def test_each_place_has_its_turn_however_unlike_its_thumbnail(large_room) -> Non
         )
     )
     frame = large_room.view(T_NEAR)
-    turns = [found(crowd, frame, turn, alike=0, in_turn=2) for turn in range(5)]
+    options = {"alike": 0, "in_turn": 2, "across_scales": 0}
+    turns = [found(crowd, frame, turn, **options) for turn in range(5)]
     assert [place is not None for place in turns] == [False, False, True, False, True]
+
+
+def test_a_place_is_known_again_from_far_behind_it(large_room, places) -> None:
+    T_far = se3.exp(np.array([0.0, 0.05, 0.0, 0.0, 0.0, -2.4]))
+    frame = large_room.view(T_far)
+    place = found(places, frame)
+    assert place is not None
+    np.testing.assert_allclose(place[1].alignment.T_reference_camera, T_far, atol=1e-3)
+    assert found(places, frame, across_scales=0) is None, "ORB is enough"
+
+
+def test_who_is_not_lost_is_looked_for_by_what_is_fast(large_room, places) -> None:
+    view = pyramid_of(large_room.view(se3.exp(np.array([0, 0.05, 0, 0, 0, -2.4]))), PyramidConfig())
+    assert relocaliser().find(view, places, 0, History(), is_lost=False) is None
 
 
 def test_a_place_is_refused_when_features_and_images_disagree(large_room, places) -> None:
@@ -90,8 +105,8 @@ def test_likely_places_are_of_different_neighbourhoods(large_room, places) -> No
     here = places.all[0]
     crowd = [replace(here, id=k, T_odom_keyframe=se3.exp(np.full(6, 1e-3 * k))) for k in range(6)]
     view = pyramid_of(large_room.view(T_AWAY), PyramidConfig())
-    finder = relocaliser(RelocalisationConfig(alike=2, in_turn=0))
-    chosen = finder._chosen(view, Places((*crowd, places.all[1])), turn=0)
+    finder, crowded = relocaliser(RelocalisationConfig(alike=2)), Places((*crowd, places.all[1]))
+    chosen = finder._likely(crowded.all[index] for index in crowded.alike(view))
     assert {place.id for place in chosen} >= {1}
     assert len(chosen) == 2
 
