@@ -23,6 +23,7 @@ from .progress import progress
 
 WIDTH = 120  # of the tables in a file
 NO_TRUTH = "The source has no ground truth, so trajectories are not judged."
+NO_MAP = "The run localised in {folder} and made no map, so renderings are not judged."
 NO_LPIPS = "LPIPS is left out; --lpips FILE.onnx adds it."
 
 
@@ -53,14 +54,16 @@ def evaluate(
     config = run_config(folder)
     threads = config.mapper.thread_count()
     distance = Lpips(lpips, threads=threads) if lpips else None
-    run, sequence = read_run(folder), open_source(source, config.data.options())
+    localised = config.tracker.localise
+    run = read_run(folder, has_map=not localised)
+    sequence = open_source(source, config.data.options())
     run.require_source(sequence)
     with progress("eval", len(Judged.of(run.frames).posed), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:
         print(json.dumps({**plain(results), "lpips": lpips and str(lpips)}, indent=1))
     else:
-        print_results(results, lpips)
+        print_results(results, lpips, localised)
 
 
 def run_config(folder: Path) -> Config:
@@ -68,19 +71,27 @@ def run_config(folder: Path) -> Config:
     return load_config(written(folder, "config.yaml"))
 
 
-def print_results(results: Results, lpips: Path | None) -> None:
+def print_results(results: Results, lpips: Path | None, localised: str = "") -> None:
+    """`localised` is the folder of the map of a run that made none."""
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
     if results.trajectories is None:
         console.print(NO_TRUTH)
     else:
         console.print(trajectory.PROTOCOL, style="dim")
         console.print(trajectory_table(results.trajectories))
+    if localised:
+        console.print(NO_MAP.format(folder=localised), soft_wrap=True)
+    else:
+        _print_renderings(console, results, lpips)
+    console.print("Pictures: " + ", ".join(map(str, results.pictures)), soft_wrap=True)
+
+
+def _print_renderings(console: Console, results: Results, lpips: Path | None) -> None:
     console.print(views.PROTOCOL, style="dim")
     console.print(results.judged.counts(), style="dim")
     console.print(f"LPIPS by {lpips}." if lpips else NO_LPIPS, style="dim")
     if results.renderings:
         console.print(rendering_table(results.renderings, has_lpips=lpips is not None))
-    console.print("Pictures: " + ", ".join(map(str, results.pictures)), soft_wrap=True)
 
 
 def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:

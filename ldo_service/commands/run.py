@@ -101,6 +101,17 @@ def run(
                 "folder; what is there is incomplete."
             ) from error
     Console().print(summary_table(record.summary, out))
+    if record.summary["gaussians_apart"]:
+        Console().print(apart(record.summary["gaussians_apart"]), style="dim")
+    if localise:
+        Console().print(f"The map is that of {localise}, as it was.", style="dim")
+
+
+def apart(gaussians: int) -> str:
+    return (
+        f"map.ply leaves out {gaussians:,} Gaussians: the camera was lost, went on, and nothing it "
+        "saw from then on was recognised, so where they belong is not known."
+    )
 
 
 def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:

@@ -75,7 +75,8 @@ class FinishedRun:
     folder: Path
     frames: tuple[RunFrame, ...]  # every frame that was tracked
     estimates: dict[str, Trajectory]
-    maps: tuple[PosedMap, ...]  # one of the final poses, perhaps one of the refined
+    # one of the final poses, perhaps one of the refined; none of a run that localised
+    maps: tuple[PosedMap, ...]
 
     def frame(self, index: int) -> RunFrame:
         return next(frame for frame in self.frames if frame.index == index)

@@ -41,10 +41,11 @@ def evaluate_run(
     not fit or nothing can be judged, ConfigError when a picture cannot be written.
     """
     judged, truth = Judged.of(run.frames), sequence.truth()
-    if truth is None and not judged.posed:
+    if truth is None and not (judged.posed and run.maps):
+        missing = "pose to render from" if run.maps else "map"
         raise DataError(
-            f"{sequence.name} has no ground truth and {run.folder} no pose to render from, so "
-            "there is nothing to judge."
+            f"{sequence.name} has no ground truth and {run.folder} no {missing}, so there is "
+            "nothing to judge."
         )
     trajectories = None if truth is None else compare(run, truth)
     renderings = views.evaluate_rendering(

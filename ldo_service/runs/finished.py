@@ -22,12 +22,16 @@ from ldo_service.volumes import Viewpoint
 from .folder import CAMERA, REFINED
 
 
-def read_run(folder: Path) -> FinishedRun:
-    """All that is judged of a run."""
+def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
+    """All that is judged of a run; one that localised has no map of its own."""
     frames = _frames(written(folder, "frames.csv"))
-    online = Trajectory.load(written(folder, "trajectory_online.txt"))
+    estimates = {
+        "online": Trajectory.load(written(folder, "trajectory_online.txt")),
+        "final": Trajectory.load(written(folder, "trajectory.txt")),
+    }
+    if not has_map:
+        return FinishedRun(folder, frames, estimates, ())
     maps = [MapFolder(folder).posed("online")]
-    estimates = {"online": online, "final": maps[0].trajectory}
     if has_refined(folder):
         maps.append(MapFolder(folder / REFINED).posed("refined"))
         estimates["refined"] = maps[1].trajectory
@@ -61,7 +65,11 @@ class MapFolder:
     folder: Path
 
     def __post_init__(self) -> None:
-        written(self.folder, "map.ply")
+        if not (self.folder / "map.ply").is_file():
+            raise DataError(
+                f"{self.folder} has no map.ply: name the folder of a finished `ldo run`; one with "
+                "--localise makes no map."
+            )
 
     def gaussians(self) -> np.ndarray:
         """Rows [N, 16], see `gaussians.model`."""

@@ -5,11 +5,15 @@ trajectory.txt          the same frames after the last correction
                         (frames of segments that are not joined to the first are in neither)
 frames.csv              every frame: status, residuals, milliseconds, segment
 keyframes.json          id, frame, stamp, camera and pose of every keyframe
-map.ply                 the Gaussians
+map.ply                 the Gaussians that hang on keyframes in the map's frame
+                        (those of segments that are not joined to the first are nowhere: left out)
 places.msgpack          what `--localise` finds the camera by, at the newest poses
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
 refined/                trajectory, keyframes and map after more iterations, if they were asked for
+
+A run with `--localise` makes no map: keyframes.json, map.ply and places.msgpack stay in the folder
+that config.yaml names in tracker.localise.
 """
 
 import csv
@@ -107,6 +111,7 @@ class RunFolder:
 
     def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
         self.folder, self._hold_out = folder, tracker.hold_out
+        self._makes_map = not tracker.localise
         self._places = PlaceRecord(tracker.odometry)
         (folder / "config.yaml").write_text(config_text)
         self._csv_file = (folder / "frames.csv").open("w", newline="")
@@ -191,6 +196,11 @@ class RunFolder:
         self._write_map(self.folder)
         write_json(self.folder / "summary.json", summary)
 
+    def in_map(self) -> np.ndarray:
+        """Which Gaussians [N] bool hang on keyframes in the map's frame."""
+        placed = [k for k, facts in self._keyframes.items() if self._root(facts["segment"]) == 0]
+        return np.isin(self.follower.map.anchors, placed)
+
     def write_refined(self, iterations: int) -> None:
         """The map as it is now, and where its keyframes are."""
         folder = self.folder / REFINED
@@ -201,8 +211,10 @@ class RunFolder:
 
     def _write_map(self, folder: Path) -> None:
         self.final().save(folder / "trajectory.txt")
+        if not self._makes_map:
+            return
         write_json(folder / "keyframes.json", self._placed_keyframes())
-        write_ply(folder / "map.ply", self.follower.map.rows)
+        write_ply(folder / "map.ply", self.follower.map.rows[self.in_map()])
         self._places.save(self.folder / PLACES, self._poses, self._joined)
 
     def online(self) -> Trajectory:
@@ -212,7 +224,7 @@ class RunFolder:
 
     def final(self) -> Trajectory:
         """T_map_camera from where the reference keyframes are now."""
-        frames = [f for f in self._tracked if self._joined.get(f.segment, f.segment) == 0]
+        frames = [frame for frame in self._tracked if self._root(frame.segment) == 0]
         return _trajectory(
             frames,
             [
@@ -223,11 +235,15 @@ class RunFolder:
             ],
         )
 
+    def _root(self, segment: int) -> int:
+        """The oldest that it is joined to, itself where there is none."""
+        return self._joined.get(segment, segment)
+
     def _placed_keyframes(self) -> list[dict[str, Any]]:
         return [
             {
                 **facts,
-                "segment": self._joined.get(facts["segment"], facts["segment"]),
+                "segment": self._root(facts["segment"]),
                 "T_map_camera": self._poses[keyframe].tolist(),
                 "exposure": self.follower.exposure(keyframe).tolist(),
             }

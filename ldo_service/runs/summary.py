@@ -43,12 +43,14 @@ def summarise(
 
     FPS counts everything from the first read to the last step; nothing is excluded as warm-up.
     """
+    in_map = record.in_map()
     return {
         "frames": frames,
         "frames_rejected": rejected,
         "status": record.statuses,
         "keyframes": record.keyframes,
-        "gaussians": len(record.follower.map),
+        "gaussians": int(in_map.sum()),
+        "gaussians_apart": int((~in_map).sum()),  # of segments never joined: in no file
         "fps": round((frames - rejected) / used.wall_s, 3),
         "wall_s": round(used.wall_s, 3),
         "cpu_s": round(used.cpu_s, 3),

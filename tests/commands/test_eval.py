@@ -10,6 +10,7 @@ import pytest
 from evo.core import metrics, sync
 from evo.tools import file_interface
 
+from ldo_service.actors.localiser import PLACES
 from ldo_service.runs.folder import MAP_FILES, prepare
 from tests.commands.test_cli import ldo
 
@@ -38,6 +39,39 @@ def test_the_protocol_stands_above_the_figures(capsys, run: Path, room_folder: P
     sheet = cv2.imread(str(run / "rendering.png"))
     assert sheet is not None
     assert sheet.shape[0] > 3 * 240, "a row for each held-out frame"
+
+
+def test_a_run_that_localised_has_no_map_and_its_trajectory_is_judged(
+    capsys, run: Path, room_folder: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again"
+    code, out, _ = ldo(
+        *(capsys, "run", room_folder, "--out", again, "--localise", run, "--max-frames", "6")
+    )
+    assert code == 0
+    assert f"The map is that of {run}" in " ".join(out.split())
+    assert not {path.name for path in again.iterdir()} & {"map.ply", "keyframes.json", PLACES}
+    code, out, _ = ldo(capsys, "eval", again, room_folder)
+    assert code == 0
+    assert "renderings are not judged" in out
+    assert "PSNR" not in out
+    for arguments in (
+        ("export", again, "--format", "ply"),
+        ("run", room_folder, "--out", tmp_path / "x", "--localise", again),
+    ):
+        code, _, err = ldo(capsys, *arguments)
+        assert code == 3
+        assert f"{again} has no" in err
+
+
+def test_a_source_without_truth_says_nothing_about_a_run_without_a_map(
+    capsys, run: Path, without_truth: Path, tmp_path: Path
+) -> None:
+    again = tmp_path / "again"
+    ldo(capsys, "run", without_truth, "--out", again, "--localise", run, "--max-frames", "3")
+    code, _, err = ldo(capsys, "eval", again, without_truth)
+    assert code == 3
+    assert "no map, so there is nothing to judge" in " ".join(err.split())
 
 
 def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Path) -> None:

@@ -75,6 +75,11 @@ def test_a_segment_that_never_came_back_stays_apart(room: Sequence, tmp_path: Pa
     final = Trajectory.load(tmp_path / "out/trajectory.txt")
     assert len(final) == len(HERE)
     keyframes = json.loads((tmp_path / "out/keyframes.json").read_text())
+    summary = json.loads((tmp_path / "out/summary.json").read_text())
+    means = MapFolder(tmp_path / "out").gaussians()[:, :3]
+    assert len(means) == summary["gaussians"] > 1000
+    assert summary["gaussians_apart"] > 1000
+    assert np.abs(means).max() < 10, "what is apart is not in the map's file"
     distances = {k["segment"]: np.abs(np.array(k["T_map_camera"])[:3, 3]).max() for k in keyframes}
     assert distances[0] < 5
     assert distances[1] > 50
