@@ -2,10 +2,12 @@
 
 A lost frame is compared with the places whose thumbnails are most like it, and with a few more
 in turn, so that each frame costs the same however large the memory is, and every place has its
-chance. A place counts as found when features and images agree on it; no prediction speaks for it,
-so it is judged more strictly than tracking. Where two places a room apart both explain the view,
-neither does: the ends of a corridor may be furnished alike. Only places of one segment are compared
-so; where segments are to each other is not known here.
+chance. Where its fast features find nothing, SIFT looks at others in turn, and at the newest: it
+knows a room again from twice as far, for ten times the price. A place counts as found when features
+and images agree on it; no prediction speaks for it, so it is judged more strictly than tracking.
+Where two places a room apart both explain the view, neither does: the ends of a corridor may be
+furnished alike. Only places of one segment are compared so; where segments are to each other is not
+known here.
 """
 
 from collections.abc import Iterable, Sequence
@@ -34,6 +36,7 @@ from .places import Place, Places, thumbnail_of
 from .pyramid import Pyramid, PyramidConfig
 
 PosedPlace = tuple[Place, FeaturePose]
+NEWEST = 2  # places that a lost camera is looked for at each time: it may not have gone far
 RANKED = 10  # times `alike`: places looked through for likely ones that are apart
 
 
@@ -54,8 +57,8 @@ class RelocalisationConfig:
     def __post_init__(self) -> None:
         if self.alike < 0 or self.in_turn < 0 or self.alike + self.in_turn < 1:
             raise ConfigError("alike and in_turn must not be negative, nor both 0.")
-        if self.attempts < 1:
-            raise ConfigError(f"attempts={self.attempts} must be at least 1.")
+        if self.attempts < 1 or self.across_scales < 0:
+            raise ConfigError("attempts must be at least 1, across_scales at least 0.")
         if not min(self.agreement_rad, self.variety_rad, self.rival_rad) > 0:
             raise ConfigError("agreement_rad, variety_rad and rival_rad must be positive.")
         if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.rival_inliers <= 1):
@@ -79,8 +82,8 @@ class Relocaliser:
     ) -> tuple[Keyframe, Candidate] | None:
         """The keyframe that a view surely shows, and its alignment to it.
 
-        `turn` counts the searches; it decides whose turn it is beside the likely places. Without
-        haste, a camera that is not lost is looked for by what is fast alone.
+        `turn` counts the searches; it decides whose turn it is beside the likely places. A camera
+        that is not lost must not wait: it is looked for by what is fast alone.
         """
         if not len(places):
             return None
@@ -88,7 +91,7 @@ class Relocaliser:
         poses = self._poses(view, _each_once(likely, _due(places, turn, self.config.in_turn)))
         sure = self._surest(view, poses, history)
         if sure is None and is_lost and self.config.across_scales:
-            newest, due = places.all[:-3:-1], _due(places, turn, self.config.across_scales)
+            newest, due = places.all[-NEWEST:], _due(places, turn, self.config.across_scales)
             others = self._poses_across_scales(view, _each_once(newest, due))
             sure, poses = self._surest(view, others, history), [*poses, *others]
         if sure is None or self._has_rival(*sure[0], poses):
