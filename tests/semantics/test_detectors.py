@@ -304,7 +304,7 @@ def test_plain_loops_and_opencv_read_yolox_the_same(data: Path, real: OnnxDetect
     for stride in (8, 16, 32):
         for y, x in np.ndindex(416 // stride, 416 // stride):
             row = next(rows)
-            center = (row[:2] + [x, y]) * stride / scale
+            center = (row[:2] + np.array([x, y])) * stride / scale
             sides = np.exp(row[2:4]) * stride / scale
             boxes.append([*(center - sides / 2), *sides])
             class_ids.append(int(row[5:].argmax()))
