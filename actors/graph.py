@@ -6,6 +6,7 @@ The drawing and the table of topics in README are printed from here (`ldo topics
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.localiser import LocalisingTracker
 from ldo_service.actors.mapper import Mapper
@@ -57,11 +58,10 @@ GRAPH: tuple[Box, ...] = (
         "finds the camera's pose",
         lambda config: (LocalisingTracker if config.tracker.localise else Tracker)(config.tracker),
     ),
-    Box(
-        "detector",
+    _built(
+        Detector,
         "finds objects of known classes",
-        inputs=(In(t.KEYFRAME_NEW, Lossless(8)),),
-        outputs=(Out(t.DETECTION_BOXES),),
+        lambda config: Detector(config.detector),
     ),
     Box(
         "vlm_labeller",

@@ -24,6 +24,7 @@ import msgspec
 import numpy as np
 import yaml
 
+from ldo_service.actors.detector import DetectorConfig
 from ldo_service.actors.frame_source import FrameSourceConfig
 from ldo_service.actors.mapper import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
@@ -74,23 +75,29 @@ class RunConfig:
 
     mapper_latency_frames: int = 3  # a keyframe is in the map so many frames later, on any machine
     optimizer_latency_frames: int = 3
+    detector_latency_frames: int = 3
     max_rejected: float = 0.1  # share of unreadable frames over which the data is called bad
 
     def __post_init__(self) -> None:
-        if min(self.mapper_latency_frames, self.optimizer_latency_frames) < 0:
+        if min(self.latency_frames().values()) < 0:
             raise ConfigError(f"{self}: latencies must be at least 0 frames.")
         if not 0 <= self.max_rejected <= 1:
             raise ConfigError(f"run.max_rejected={self.max_rejected:g} must be within 0..1.")
 
     def latency_frames(self) -> dict[str, int]:
         """By actor; the others answer within the frame."""
-        return {"mapper": self.mapper_latency_frames, "optimizer": self.optimizer_latency_frames}
+        return {
+            "detector": self.detector_latency_frames,
+            "mapper": self.mapper_latency_frames,
+            "optimizer": self.optimizer_latency_frames,
+        }
 
 
 @dataclass(frozen=True, slots=True)
 class Config:
     frame_source: FrameSourceConfig = field(default_factory=FrameSourceConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     data: DataConfig = field(default_factory=DataConfig)

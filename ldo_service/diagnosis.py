@@ -52,6 +52,7 @@ def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
             )
         yield from _of_steps(seen.health)
         yield from _of_failures(seen.health)
+        yield from _of_networks(seen.health)
 
 
 def _silent(how_long: str) -> Trouble:
@@ -85,6 +86,19 @@ def _of_failures(health: Health) -> Iterator[Trouble]:
         )
 
 
+def _of_networks(health: Health) -> Iterator[Trouble]:
+    if health.facts.get("networks_missing"):
+        yield Trouble(
+            "goes on without the network that it was told to use",
+            "the log of `ldo serve` says why; `ldo models list` shows those there are",
+        )
+    if failed := health.facts.get("inferences_failed"):
+        yield Trouble(
+            f"had {failed:.0f} inferences fail, and these keyframes have no labels",
+            "the log of `ldo serve` has the first of them; try detector.network.providers=[cpu]",
+        )
+
+
 def remarks(seen: Seen) -> Iterator[str]:
     """What a person wants to know and nobody has to mend."""
     health = seen.health
@@ -101,3 +115,5 @@ def remarks(seen: Seen) -> Iterator[str]:
         )
     elif from_camera and health.step_age_s > IDLE_S:
         yield f"had its last frame {health.step_age_s:.0f} s ago"
+    if health.facts.get("networks") == 0 and not health.facts.get("networks_missing"):
+        yield "has no model: nothing is detected until detector.model names one of `ldo models`"

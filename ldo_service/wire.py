@@ -1,6 +1,6 @@
 """Between messages and numerics: the one place that knows both."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -12,6 +12,8 @@ from ldo_service.schemas import (
     CameraModel,
     CameraRgbd,
     Correction,
+    Detection,
+    DetectionBoxes,
     FrameRgbd,
     Image,
     Keyframe,
@@ -20,6 +22,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
+from ldo_service.semantics.detectors import Detections
 
 
 def pose_message(T: np.ndarray) -> Pose:
@@ -117,6 +120,27 @@ def mask_message(mask: np.ndarray | None, camera: Camera) -> Array:
 def mask_of(array: Array) -> np.ndarray | None:
     """[H, W] bool; None where there is none."""
     return array.numpy() > 0 if array.data.nbytes else None
+
+
+def boxes_message(
+    keyframe: Keyframe, found: Detections | None, labels: Sequence[str], network: str
+) -> DetectionBoxes:
+    """What a network found in a keyframe; `labels` are the names of its classes. None: it did not
+    look."""
+    rows = () if found is None else zip(found.boxes_px, found.scores, found.class_ids, strict=True)
+    return DetectionBoxes(
+        stamp_ns=keyframe.stamp_ns,
+        keyframe=keyframe.keyframe,
+        width=keyframe.camera.width,
+        height=keyframe.camera.height,
+        detections=tuple(
+            Detection(
+                label=labels[int(class_id)], score=float(score), box_px=tuple(box_px.tolist())
+            )
+            for box_px, score, class_id in rows
+        ),
+        network="" if found is None else network,
+    )
 
 
 def correction_message(

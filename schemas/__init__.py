@@ -8,6 +8,7 @@ default; what a field means never changes. Conventions of frames and units are t
 
 from ldo_service.schemas.array import Array
 from ldo_service.schemas.control import ControlAnswer, ControlRequest
+from ldo_service.schemas.detections import Detection, DetectionBoxes
 from ldo_service.schemas.frames import (
     CameraColor,
     CameraDepth,
@@ -41,6 +42,8 @@ __all__ = [
     "ControlAnswer",
     "ControlRequest",
     "Correction",
+    "Detection",
+    "DetectionBoxes",
     "FrameRgbd",
     "Gaussians",
     "Health",

@@ -7,6 +7,7 @@ topic without a message type is declared, and has neither producer nor format ye
 from dataclasses import dataclass
 
 from ldo_service.schemas.control import ControlAnswer, ControlRequest
+from ldo_service.schemas.detections import DetectionBoxes
 from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health
@@ -45,6 +46,9 @@ KEYFRAME_NEW = Topic("keyframe/new", Keyframe, "a frame that the map is made fro
 KEYFRAME_REFINEMENT = Topic(
     "keyframe/refinement", KeyframeRefinement, "better poses between keyframes"
 )
+DETECTION_BOXES = Topic(
+    "detection/boxes", DetectionBoxes, "boxes with class and score, per keyframe"
+)
 MAP_VIEW = Topic("map/view", ModelView, "the map rendered at the newest keyframe")
 MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last version")
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
@@ -55,7 +59,6 @@ CONTROL = Topic(
     "control", ControlRequest, "asked: pause, resume, save or reset", answer=ControlAnswer
 )
 
-DETECTION_BOXES = Topic("detection/boxes", None, "boxes with class and score, per keyframe")
 LABEL_REQUEST = Topic("label/request", None, "image crops of a region to be named", key="region")
 LABEL_OPEN = Topic("label/open", None, "the name of a region, late by design", key="region")
 MAP_OBJECTS = Topic("map/objects", None, "the named objects", is_state=True)

@@ -51,6 +51,8 @@ def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
         (seen(health(busy_s=12.0, inputs=inputs(waiting=1))), "busy with one message for 12 s"),
         (seen(health(step_age_s=20.0, inputs=inputs(waiting=4))), "none of 4 waiting messages"),
         (seen(health(set_aside=1, failures=2, restarts=2)), "1 messages aside"),
+        (seen(health(facts={"networks_missing": 1.0, "networks": 0.0})), "without the network"),
+        (seen(health(facts={"inferences_failed": 3.0})), "3 inferences fail"),
     ],
 )
 def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
@@ -71,3 +73,11 @@ def test_what_is_no_fault_is_a_remark(of: Health, says: str) -> None:
     (remark,) = remarks(seen(of))
     assert says in remark
     assert list(troubles(seen(of))) == []
+
+
+def test_a_detector_without_a_model_is_no_trouble_and_is_remarked_upon() -> None:
+    actor = seen(health(facts={"networks": 0.0, "networks_missing": 0.0}))
+    assert list(troubles(actor)) == []
+    (remark,) = remarks(actor)
+    assert "ldo models" in remark
+    assert list(remarks(seen(health(facts={"networks": 1.0})))) == []

@@ -17,8 +17,8 @@ def test_every_topic_of_the_design_has_a_producer() -> None:
 
 
 def test_only_actors_that_run_hold_a_window() -> None:
-    assert lossless_consumers(RUNNING, "keyframe/new") == {"mapper", "optimizer"}
-    assert len(consumers_of(t.KEYFRAME_NEW)) == 4, "the design has two more"
+    assert lossless_consumers(RUNNING, "keyframe/new") == {"detector", "mapper", "optimizer"}
+    assert len(consumers_of(t.KEYFRAME_NEW)) == 4, "the design has one more"
 
 
 def test_what_runs_uses_topics_with_a_format_only() -> None:

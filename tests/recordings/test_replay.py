@@ -28,7 +28,7 @@ EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "replay_test.py"
 
 def test_every_actor_replays(recording: Path) -> None:
     replayed = replay_recording(recording)
-    assert set(replayed) == {"frame_source", "tracker", "mapper", "optimizer"}
+    assert set(replayed) == {"frame_source", "tracker", "detector", "mapper", "optimizer"}
     assert replayed["frame_source"].steps == FRAMES + 1
     assert replayed["tracker"].made["pose/tracked"] >= FRAMES - 1
     keyframes = replayed["tracker"].made["keyframe/new"]

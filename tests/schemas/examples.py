@@ -22,6 +22,8 @@ from ldo_service.schemas import (
     ControlAnswer,
     ControlRequest,
     Correction,
+    Detection,
+    DetectionBoxes,
     FrameRgbd,
     Gaussians,
     Health,
@@ -241,6 +243,17 @@ EXAMPLES: dict[str, Message] = {
                 reference=3, keyframe=4, T_reference_keyframe=POSE, information=INFORMATION
             ),
         ),
+    ),
+    "detection_boxes": DetectionBoxes(
+        stamp_ns=3,
+        keyframe=4,
+        width=3,
+        height=2,
+        detections=(
+            Detection(label="potted plant", score=0.75, box_px=(-0.5, 0.25, 1.5, 1.5)),
+            Detection(label="cup", score=0.5, box_px=(0.5, -0.5, 2.5, 1.0)),
+        ),
+        network="tiny 0123456789ab",
     ),
     "health": Health(
         stamp_ns=9,

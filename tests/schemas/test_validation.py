@@ -12,6 +12,8 @@ from ldo_service.schemas import (
     CameraModel,
     CameraRgbd,
     Correction,
+    Detection,
+    DetectionBoxes,
     FrameRgbd,
     Gaussians,
     Image,
@@ -323,3 +325,38 @@ def test_a_camera_with_a_distortion_model_of_opencv_is_taken() -> None:
     for count in (4, 5, 8):
         camera = CameraModel(width=3, height=2, fx=1, fy=1, cx=0, cy=0, distortion=(0.1,) * count)
         assert len(camera.distortion) == count
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"label": ""}, "0 characters"),
+        ({"label": "x" * 101}, "101 characters"),
+        ({"score": 1.01}, "within 0..1"),
+        ({"score": NAN}, "NaN"),
+        ({"box_px": (0.0, 0.0, INF, 1.0)}, "infinity"),
+        ({"box_px": (1.0, 0.0, 1.0, 1.0)}, "empty"),
+        ({"box_px": (0.0, 1.0, 1.0, 0.5)}, "empty"),
+    ],
+)
+def test_a_detection_is_a_named_box_with_a_score(fields: dict, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        Detection(**{"label": "cup", "score": 0.5, "box_px": (0.0, 0.0, 1.0, 1.0), **fields})
+
+
+@pytest.mark.parametrize(
+    "box_px", [(-0.6, 0, 1, 1), (0, -0.6, 1, 1), (0, 0, 2.6, 1), (0, 0, 1, 1.6)]
+)
+def test_a_box_lies_in_the_image(box_px: tuple[float, ...]) -> None:
+    whole = (-0.5, -0.5, 2.5, 1.5)
+    changed("detection_boxes", detections=(Detection(label="cup", score=1, box_px=whole),))
+    outside = Detection(label="cup", score=1, box_px=box_px)
+    with pytest.raises(ValueError, match="leaves the image of 3x2"):
+        changed("detection_boxes", detections=(outside,))
+
+
+def test_boxes_come_from_a_network() -> None:
+    with pytest.raises(ValueError, match="no network that made them"):
+        changed("detection_boxes", network="")
+    nobody = changed("detection_boxes", network="", detections=())
+    assert isinstance(nobody, DetectionBoxes)

@@ -1,0 +1,30 @@
+"""A network's boxes, recorded and lived again bit for bit."""
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from ldo_service.config import load_config
+from ldo_service.datasets import Sequence
+from ldo_service.errors import ReplayDiverged
+from ldo_service.recordings.replay import open_recording
+from ldo_service.testing import replay_recording
+from tests.runs.jobs import ROUGH
+from tests.semantics.networks import changed
+
+from .conftest import live
+
+FRAMES = 8
+
+
+def test_boxes_replay_and_another_network_is_noticed(room: Sequence, tmp_path: Path) -> None:
+    model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
+    settings = (ROUGH, f"detector.model={model}", "detector.network.score_min=0")
+    asyncio.run(live(tmp_path / "recording", room, load_config(settings=settings), FRAMES))
+    replayed = replay_recording(tmp_path / "recording", "detector")
+    assert replayed["detector"].made["detection/boxes"] >= 1
+    changed("yolov5", width=320, height=256, metadata="['a', 'b', 'c']").write(model)
+    (actor,) = open_recording(tmp_path / "recording", ("detector",))
+    with pytest.raises(ReplayDiverged, match="detection/boxes"):
+        actor.verify()

@@ -1,0 +1,37 @@
+"""The detector in a process of its own, with a network and with garbage."""
+
+from pathlib import Path
+
+import pytest
+
+from ldo_service.schemas import DetectionBoxes
+from tests.semantics.networks import changed
+from tests.service.conftest import live_service, wait_until
+
+APART = ("--set", "service.spawned=[detector]", "--set", "mapper.iterations=2")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("is_garbage", [False, True], ids=["network", "garbage"])
+def test_every_keyframe_is_answered_whatever_the_network_is(
+    tmp_path: Path, is_garbage: bool
+) -> None:
+    model = changed("yolox", width=320, height=256).write(tmp_path / "squares.onnx")
+    if is_garbage:
+        model.write_bytes(b"garbage")
+    use = ("--set", f"detector.model={model}", "--set", "detector.network.score_min=0")
+    boxes: list[DetectionBoxes] = []
+    with live_service(tmp_path, *APART, *use) as service:
+        with service.client.listen("detection/boxes", DetectionBoxes, keep=64) as inbox:
+            service.wait_for_actors()
+            publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "40")
+            service.wait_for_poses(20)
+            wait_until(lambda: boxes.extend(inbox()) or len(boxes) >= 2, 10, "boxes")
+            assert publisher.wait(60) == 0
+            facts = service.update_health()["detector"].facts
+        assert facts["networks_missing"] == is_garbage
+        assert {bool(message.detections) for message in boxes} == {not is_garbage}
+        assert service.stop() == 0
+        assert ("no network in ONNX" in service.log) == is_garbage
+        assert "Traceback" not in service.log
