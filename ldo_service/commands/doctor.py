@@ -15,7 +15,8 @@ from ldo_service import __version__, kernels
 from ldo_service.actors.graph import RUNNING
 from ldo_service.client import connect
 from ldo_service.diagnosis import Seen, remarks, troubles
-from ldo_service.errors import ConfigError, LdoError
+from ldo_service.errors import ConfigError, LdoError, ModelError
+from ldo_service.models import Models
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
@@ -58,7 +59,7 @@ def doctor(robot: Robot = "robot", endpoint: Endpoint = DEFAULT_ENDPOINT) -> Non
     """
     console = Console(highlight=False, soft_wrap=True)
     bad = 0
-    for finding in (*machine(), *libraries(), *extras(), *service(robot, endpoint)):
+    for finding in (*machine(), *libraries(), *extras(), *networks(), *service(robot, endpoint)):
         console.print(MARKS[finding.mark] + finding.text)
         bad += finding.mark == "bad"
     if bad:
@@ -95,6 +96,24 @@ def extras() -> Iterator[Finding]:
             yield Finding("absent", f"extra {extra} ({', '.join(missing)}): {advice}")
         else:
             yield Finding("ok", f"extra {extra}")
+
+
+def networks() -> Iterator[Finding]:
+    models = Models()
+    if not models.names:
+        yield Finding(
+            "absent",
+            "networks: nothing is detected without one; `ldo models add NAME FILE` registers a "
+            "YOLOv5, YOLOX or YOLOv8 in ONNX",
+        )
+    for name in models.names:
+        try:
+            model = models.get(name)
+            model.verify()
+            layout, classes = model.about.layout, len(model.about.classes)
+            yield Finding("ok", f"network {name}: {layout}, {classes} classes")
+        except ModelError as error:
+            yield Finding("bad", f"network {name}: {error}")
 
 
 def service(robot: str, endpoint: str) -> Iterator[Finding]:

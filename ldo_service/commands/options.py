@@ -6,6 +6,7 @@ from typing import Annotated
 
 import tyro
 
+from ldo_service.actors.detector import require_detector
 from ldo_service.actors.localiser import places_of
 from ldo_service.config import Config
 
@@ -77,3 +78,10 @@ def localising(config: Config, folder: Path | None) -> Config:
     places_of(folder)
     tracker = replace(config.tracker, localise=str(folder))
     return replace(config, tracker=tracker)
+
+
+def with_usable_networks(config: Config) -> Config:
+    """The same. Raises ConfigError when a network that it names cannot be used, which a service
+    only warns about."""
+    require_detector(config.detector)
+    return config

@@ -28,6 +28,7 @@ from .options import (
     Source,
     Stride,
     localising,
+    with_usable_networks,
 )
 from .progress import progress
 
@@ -85,6 +86,7 @@ def run(
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
     settings = localising(settings, localise)
+    with_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.data.options())

@@ -13,7 +13,15 @@ from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.simulation import Made, simulate_graph
 from ldo_service.runs.source import Selection
 
-from .options import ConfigFile, Json, MaxFrames, Settings, Source, Stride
+from .options import (
+    ConfigFile,
+    Json,
+    MaxFrames,
+    Settings,
+    Source,
+    Stride,
+    with_usable_networks,
+)
 from .progress import progress
 from .run import with_options
 
@@ -38,6 +46,7 @@ def simulate(
     """
     console = Console(stderr=True, highlight=False)
     settings = with_options(load_config(config, set), hold_out=None, threads=threads)
+    with_usable_networks(settings)
     sequence = open_source(source, settings.data.options())
     selection = Selection(stride, max_frames)
     with progress("simulate", len(selection.indices(sequence)), console) as advance:

@@ -1,0 +1,129 @@
+"""ldo models"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service.errors import ConfigError, LdoError, ModelError
+from ldo_service.models import Models
+from ldo_service.semantics.detectors import NetworkConfig
+
+Name = Annotated[
+    str,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="NAME", help="what `detector.model` calls it"),
+]
+
+
+@dataclass(frozen=True)
+class Add:
+    """Check a network in ONNX, copy and register it.
+
+    ldo models add nano yolox_nano.onnx --licence Apache-2.0
+    """
+
+    name: Name
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE", help="in ONNX")]
+    layout: Annotated[
+        Literal["yolov5", "yolox", "yolov8"] | None,
+        tyro.conf.arg(help="of its output; otherwise recognised"),
+    ] = None
+    names: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar="FILE",
+            help="its classes, one a line; otherwise those it carries, or the 80 of COCO",
+        ),
+    ] = ""
+    licence: Annotated[
+        str, tyro.conf.arg(metavar="FILE|TEXT", help="what you may do with it, kept beside it")
+    ] = ""
+
+
+@dataclass(frozen=True)
+class List:
+    """Show the registered networks."""
+
+
+@dataclass(frozen=True)
+class Remove:
+    """Forget a registered network and delete its copy."""
+
+    name: Name
+
+
+Verb = (
+    Annotated[Add, tyro.conf.subcommand("add")]
+    | Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Remove, tyro.conf.subcommand("remove")]
+)
+
+
+def models(verb: Verb) -> None:
+    """Register, list and remove the networks that find objects.
+
+    None comes with the package. `detector.model` in the configuration takes a registered name:
+
+      ldo models add nano yolox_nano.onnx
+      ldo run SOURCE --out DIR --set detector.model=nano
+    """
+    match verb:
+        case Add():
+            add(verb)
+        case List():
+            show(Console(highlight=False, markup=False, soft_wrap=True))
+        case Remove():
+            Models().remove(verb.name)
+            print(f"{verb.name} is removed.")
+
+
+def add(verb: Add) -> None:
+    config = NetworkConfig(layout=verb.layout or "", names=verb.names)
+    model = Models().add(verb.name, verb.file.expanduser(), config, _licence(verb.licence))
+    about = model.about
+    print(
+        f"{model.name} is registered: {about.layout}, {len(about.classes)} classes "
+        f"({', '.join(about.classes[:3])}, ...), in {model.folder}."
+    )
+
+
+def show(console: Console) -> None:
+    """Raises LdoError when one of them is damaged."""
+    registered, damaged = Models(), 0
+    table = Table("name", "layout", "classes", "licence", "sha256", "")
+    for name in registered.names:
+        try:
+            model = registered.get(name)
+            model.verify()
+            about = model.about
+            licence = (about.licence.strip().splitlines() or ["not stated"])[0]
+            table.add_row(
+                *(name, about.layout, str(len(about.classes)), licence[:40]),
+                *(about.sha256[:12], "ok"),
+            )
+        except ModelError:
+            table.add_row(name, "", "", "", "", "damaged")
+            damaged += 1
+    if registered.names:
+        console.print(table)
+    else:
+        console.print(f"none in {registered.folder}: `ldo models add NAME FILE` registers one.")
+    if damaged:
+        raise LdoError(f"{damaged} of the above must be removed and added again.")
+
+
+def _licence(text: str) -> str:
+    """The text of a file, or the text itself."""
+    path = Path(text)
+    try:
+        is_file = path.is_file()
+    except OSError:  # too long for the name of a file
+        return text
+    try:
+        return path.read_text("utf-8") if is_file else text
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"--licence {text} cannot be read: {error}.") from error

@@ -1,0 +1,84 @@
+"""ldo models, and what the other verbs say of networks."""
+
+from pathlib import Path
+
+import pytest
+
+from ldo_service.commands import doctor
+from ldo_service.models import Models
+from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.semantics.networks import SQUARES
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("LDO_MODELS", str(tmp_path / "models"))
+    return tmp_path / "models"
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return SQUARES["yolov5"].write(tmp_path / "squares.onnx")
+
+
+def test_add_list_remove(capsys, file: Path, tmp_path: Path) -> None:
+    (tmp_path / "LICENSE").write_text("Licence of squares\n\nAll rights reversed.\n")
+    licence = ("--licence", tmp_path / "LICENSE")
+    code, out, _ = ldo(capsys, "models", "add", "mine", file, *licence)
+    assert code == 0
+    assert "mine is registered: yolov5, 3 classes (red, green, blue" in out
+    assert Models().get("mine").about.licence.endswith("All rights reversed.\n")
+    code, out, _ = ldo(capsys, "models", "list")
+    assert code == 0
+    for word in ("mine", "yolov5", "Licence of squares", Models().get("mine").about.sha256[:12]):
+        assert word in out
+    assert ldo(capsys, "models", "remove", "mine")[0] == 0
+    code, out, _ = ldo(capsys, "models", "list")
+    assert code == 0
+    assert "ldo models add NAME FILE" in out
+
+
+def test_a_licence_may_be_a_text(capsys, file: Path) -> None:
+    ldo(capsys, "models", "add", "mine", file, "--licence", "Apache-2.0, of the authors" * 20)
+    assert Models().get("mine").about.licence == "Apache-2.0, of the authors" * 20
+
+
+def test_garbage_is_refused_in_one_paragraph(capsys, tmp_path: Path, folder: Path) -> None:
+    (tmp_path / "net.onnx").write_text("garbage")
+    code, _, err = ldo(capsys, "models", "add", "mine", tmp_path / "net.onnx")
+    assert code == 2
+    assert_one_paragraph(err)
+    assert not list(folder.iterdir())
+
+
+def test_a_wrong_layout_is_refused(capsys, file: Path) -> None:
+    code, _, err = ldo(capsys, "models", "add", "mine", file, "--layout", "yolov8")
+    assert code == 2
+    assert_one_paragraph(err)
+
+
+@pytest.mark.parametrize("verb", ["run", "simulate"])
+def test_a_run_over_a_file_with_an_unknown_model_does_not_begin(
+    capsys, tmp_path: Path, verb: str
+) -> None:
+    out = ("--out", tmp_path / "out") if verb == "run" else ()
+    code, _, err = ldo(capsys, verb, "synthetic:room", *out, "--set", "detector.model=nothing")
+    assert code == 2
+    assert_one_paragraph(err)
+    assert "ldo models add" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_doctor_says_what_is_missing_and_what_is_damaged(capsys, file: Path) -> None:
+    (finding,) = doctor.networks()
+    assert finding.mark == "absent"
+    assert "ldo models add" in finding.text
+    ldo(capsys, "models", "add", "mine", file)
+    (finding,) = doctor.networks()
+    assert (finding.mark, finding.text) == ("ok", "network mine: yolov5, 3 classes")
+    Models().get("mine").file.write_bytes(b"garbage")
+    (finding,) = doctor.networks()
+    assert finding.mark == "bad"
+    code, out, _ = ldo(capsys, "models", "list")
+    assert code == 1
+    assert "damaged" in out
