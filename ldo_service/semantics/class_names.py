@@ -22,6 +22,16 @@ COCO = (
 LONGEST = 100  # characters of a name
 
 
+def normalised(name: str) -> str:
+    """In lower case, with single spaces for spaces, hyphens and underscores: "TV-screen" is
+    "tv screen"."""
+    return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
+
+
+def is_name(text: object) -> bool:
+    return isinstance(text, str) and 0 < len(normalised(text)) <= LONGEST
+
+
 def class_names(
     count: int, given: Sequence[str] = (), metadata: str | None = None
 ) -> tuple[str, ...]:
@@ -51,7 +61,7 @@ def read_names(path: Path) -> tuple[str, ...]:
         raise ConfigError(f"the names in {path} cannot be read: {error}.") from error
     names = tuple(line.strip() for line in lines)
     for number, name in enumerate(names, 1):
-        if not 0 < len(name) <= LONGEST:
+        if not is_name(name):
             raise ConfigError(
                 f"line {number} of {path} is no name: write one of 1 to {LONGEST} characters a "
                 "line, in the order of the network's classes."
@@ -77,6 +87,6 @@ def _of_metadata(text: str) -> tuple[str, ...]:
         entry = [entry[number] for number in range(len(entry))]
     if not isinstance(entry, list | tuple):
         raise ModelError(f"its metadata names no classes: {text[:60]!r}.")
-    if not all(isinstance(name, str) and 0 < len(name) <= LONGEST for name in entry):
+    if not all(map(is_name, entry)):
         raise ModelError(f"its metadata has names that are none: {text[:60]!r}.")
     return tuple(entry)

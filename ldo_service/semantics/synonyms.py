@@ -6,15 +6,9 @@ from importlib import resources
 
 import yaml
 
-from .class_names import COCO
+from .class_names import COCO, normalised
 
 TABLE = "synonyms.yaml"
-
-
-def normalised(name: str) -> str:
-    """In lower case, with single spaces for spaces, hyphens and underscores: "TV-screen" is
-    "tv screen"."""
-    return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
 def canonical(name: str) -> str:

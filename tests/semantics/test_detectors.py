@@ -2,6 +2,7 @@
 
 import json
 import os
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.semantics.class_names import COCO
 from ldo_service.semantics.detectors import Detections, NetworkConfig, OnnxDetector
-from ldo_service.semantics.layouts import find_grid
+from ldo_service.semantics.layouts import STRIDES_PX, find_grid
 from ldo_service.semantics.synonyms import coco_class
 
 from .networks import COLORS, SQUARES, changed, squares_image
@@ -113,6 +114,7 @@ def test_the_names_of_the_user_come_before_those_it_carries(tmp_path, layout) ->
         ("{0: 'a', 1: 'b', 3: 'c'}", "metadata names no classes"),
         ("['a', 'b', 3]", "names that are none"),
         ("['a', 'b', '']", "names that are none"),
+        ("['a', 'b', '_ -']", "names that are none"),
         ("__import__('os').getcwd()", "metadata names no classes"),
     ],
 )
@@ -203,11 +205,17 @@ def test_settings_that_cannot_be_are_refused(fields) -> None:
         NetworkConfig(**fields)
 
 
-def test_no_two_grids_of_an_input_have_as_many_boxes() -> None:
-    for input_px in ((640, 640), (640, 480), (416, 416), (128, 96)):
-        for count in range(1, 3000):
-            grid = find_grid(count, input_px)
-            assert grid is None or len(grid.corners_px) == len(grid.strides_px) == count
+@pytest.mark.parametrize("input_px", [(640, 640), (640, 448), (448, 256), (128, 64)])
+def test_no_two_grids_of_an_input_have_as_many_boxes(input_px: tuple[int, int]) -> None:
+    strides = [STRIDES_PX[first:end] for first, end in combinations(range(len(STRIDES_PX) + 1), 2)]
+    cells = [sum(input_px[0] * input_px[1] // side**2 for side in some) for some in strides]
+    assert len({*cells, *(3 * count for count in cells)}) == 2 * len(strides) == 30
+    for some, count in zip(strides, cells, strict=True):
+        for boxes_per_cell in (1, 3):
+            grid = find_grid(boxes_per_cell * count, input_px)
+            assert grid is not None
+            assert grid.boxes_per_cell == boxes_per_cell
+            assert set(grid.strides_px.ravel()) == set(some)
 
 
 # --- execution providers --------------------------------------------------------------------------

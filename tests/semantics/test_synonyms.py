@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from ldo_service.semantics import synonyms
-from ldo_service.semantics.class_names import COCO, read_names
-from ldo_service.semantics.synonyms import answers_to, canonical, coco_class, normalised
+from ldo_service.semantics.class_names import COCO, normalised, read_names
+from ldo_service.semantics.synonyms import answers_to, canonical, coco_class
 
 TABLE = yaml.safe_load((Path(synonyms.__file__).parent / synonyms.TABLE).read_text())
 WORDS = [word for row in TABLE.values() for words in row.values() for word in words]
