@@ -5,7 +5,7 @@ from importlib.metadata import version
 
 from ldo_service import __version__
 
-LIBRARIES = ("numpy", "gtsam", "opencv-python-headless", "msgspec")
+LIBRARIES = ("numpy", "gtsam", "onnxruntime", "opencv-python-headless", "msgspec")
 
 
 def versions() -> dict[str, str]:
