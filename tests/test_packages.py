@@ -36,7 +36,7 @@ def test_wheel_holds_every_module(packages: Path) -> None:
     (wheel,) = packages.glob("*.whl")
     packed = set(zipfile.ZipFile(wheel).namelist())
     for name in tracked():
-        if not name.endswith((".py", ".pyi")):
+        if not name.endswith((".py", ".pyi", ".yaml")):
             continue
         if name.startswith("ldo_service/"):
             assert name in packed

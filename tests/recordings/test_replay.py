@@ -171,7 +171,7 @@ def pytest_on(example: Path, recording: Path) -> subprocess.CompletedProcess[str
 def test_the_example_makes_a_case_of_each_actor(spoilt: Path) -> None:
     rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7)
     done = pytest_on(EXAMPLE, spoilt)
-    assert "1 failed, 3 passed" in done.stdout
+    assert "1 failed, 4 passed" in done.stdout
     assert "ReplayDiverged: frame_source diverged at step 7" in done.stdout
 
 
