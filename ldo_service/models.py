@@ -45,7 +45,11 @@ class Model:
 
     def verify(self) -> None:
         """Raises ModelError when the file is not the one that was registered."""
-        if not self.file.is_file() or sha256(self.file) != self.about.sha256:
+        try:
+            is_whole = sha256(self.file) == self.about.sha256
+        except OSError:
+            is_whole = False
+        if not is_whole:
             raise ModelError(
                 f"{self.file} is not what was registered as {self.name}: it is damaged or was "
                 f"replaced. `ldo models remove {self.name}` and add it again."
@@ -125,8 +129,8 @@ def default_folder() -> Path:
     """As the XDG base directory specification has it, unless LDO_MODELS is set."""
     if folder := os.environ.get("LDO_MODELS"):
         return Path(folder).expanduser()
-    data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
-    return Path(data).expanduser() / "ldo" / "models"
+    data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")
+    return Path(data) / "ldo" / "models"
 
 
 def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:

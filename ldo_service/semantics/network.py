@@ -31,7 +31,6 @@ class Network:
     """
 
     def __init__(self, path: Path, providers: Sequence[str] = ("cpu",), threads: int = 1) -> None:
-        self.path = path
         wanted = available(providers)
         if not path.is_file():
             raise ModelError("there is no such file.")
@@ -51,10 +50,6 @@ class Network:
     def inputs(self) -> list[tuple[str, str, list[int | str | None]]]:
         """Name, type and shape of each; a side without a fixed length is a name or None."""
         return [(node.name, node.type, list(node.shape)) for node in self._session.get_inputs()]
-
-    @property
-    def outputs(self) -> list[str]:
-        return [node.name for node in self._session.get_outputs()]
 
     @property
     def metadata(self) -> dict[str, str]:
