@@ -143,7 +143,7 @@ def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
         pids = [health.pid for health in service.health.values()]
-        assert len(set(pids)) == 4
+        assert len(set(pids)) == len(EVERY_ACTOR)
         service.process.kill()
         service.process.wait()
         wait_until(lambda: not any(map(is_running, pids)), 10, "the children leave")
