@@ -39,7 +39,7 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path) -> None:
         # save: the map is on the disk, whole, though no checkpoint was due
         saved = ldo_control(service, "save")
         assert (saved.returncode, str(tmp_path / "s") in saved.stdout) == (0, True)
-        for actor in ("frame_source", "tracker", "detector", "mapper", "optimizer"):
+        for actor in ("frame_source", "tracker", "mapper", "optimizer"):
             assert (tmp_path / "s" / "state" / actor / "contents.msgpack").exists()
         # reset: all begin anew, in their processes
         before = {name: (h.epoch, h.pid) for name, h in service.update_health().items()}
