@@ -1,4 +1,4 @@
-"""What things are called: networks that find objects, and the names they use.
+"""What things are: networks that find and name objects, and the labels of the Gaussians.
 
 vocabulary                class names with stable indices
 synonyms                  other words for them, and kinds of them
@@ -8,4 +8,11 @@ layouts                   how the YOLO family writes boxes
 letterbox                 an image within the input of a network, and boxes back in the image
 non_maximum_suppression   one box for one object
 detectors                 all of these in their order: an image in, boxes out
+foreground                the object that fills a box
+assignment                which Gaussians a region shows
+fusion                    what detector and labeller say together
+labels                    what each Gaussian is, over time
+consistency               neighbours that ought to agree
+labelling                 all of these in their order: one keyframe
+label_images              labels as a camera sees them
 """
