@@ -1,0 +1,182 @@
+// Which region of an image each Gaussian belongs to.
+#pragma once
+#include <cmath>
+
+#include "labels.hpp"
+#include "projection.hpp"
+
+namespace ldo::LDO_ISA {
+
+// Boxes of two standard deviations around sixteen splats, cut to the image.
+struct SplatBoxes {
+  float x0[kLanes], y0[kLanes], x1[kLanes], y1[kLanes], z[kLanes];
+  float u[kLanes], v[kLanes];  // the pixel of the centre
+  uint32_t expected;  // bit i: lane i is in the image, on the surface that was measured there
+};
+
+class SplatBoxer {
+ public:
+  SplatBoxer(const View& view, const float* depth_m, float max_gap_m)
+      : view_(view), project_(view_), depth_m_(depth_m), max_gap_m_(max_gap_m) {}
+
+  // Of the rows that `indices` [count] name.
+  void operator()(const float* rows, const uint32_t* indices, int count, SplatBoxes& out) const {
+    alignas(64) float columns[kRowFloats][kLanes];
+    gather(rows, indices, count, columns);
+    const auto column = [&](int j) { return Floats::load(columns[j]); };
+    const Vector3 p = project_.to_camera({column(kMean), column(kMean + 1), column(kMean + 2)});
+    const Floats inverse_z = Floats(1.0f) / max(p.z, kNearPlane);
+    const Floats x = p.x * inverse_z, y = p.y * inverse_z;
+    Vector3 du, dv;
+    project_.jacobian(x, y, inverse_z, du, dv);
+    Floats uu = kLowPass, vv = kLowPass;
+    for (const Vector3& axis : principal_axes(columns).axis) {
+      const Floats su = dot(du, axis), sv = dot(dv, axis);
+      uu = uu + su * su;
+      vv = vv + sv * sv;
+    }
+    const Floats u = x * view_.fx + view_.cx, v = y * view_.fy + view_.cy;
+    const Floats half_x = sqrt(uu) * 2.0f, half_y = sqrt(vv) * 2.0f;
+    const float right = view_.width - 0.5f, bottom = view_.height - 0.5f;
+    clamp(u - half_x, -0.5f, right).store(out.x0);
+    clamp(u + half_x, -0.5f, right).store(out.x1);
+    clamp(v - half_y, -0.5f, bottom).store(out.y0);
+    clamp(v + half_y, -0.5f, bottom).store(out.y1);
+    p.z.store(out.z);
+    const Mask inside = (u >= -0.5f) & (u < right) & (v >= -0.5f) & (v < bottom);
+    out.expected = bits(inside & (p.z >= kNearPlane) & is_finite(columns)) & ((1u << count) - 1);
+    keep_on_surface(u, v, out);
+  }
+
+ private:
+  static void gather(const float* rows, const uint32_t* indices, int count,
+                     float (&columns)[kRowFloats][kLanes]) {
+    Floats matrix[kLanes];
+    for (int i = 0; i < kLanes; ++i)
+      matrix[i] = i < count ? Floats::load(rows + static_cast<int64_t>(indices[i]) * kRowFloats)
+                            : Floats(0.0f);
+    transpose(matrix);
+    for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
+  }
+
+  void keep_on_surface(Floats u, Floats v, SplatBoxes& out) const {
+    u.store(out.u);
+    v.store(out.v);
+    for (uint32_t rest = out.expected; rest != 0; rest &= rest - 1) {
+      const int i = __builtin_ctz(rest);
+      const int64_t row = static_cast<int64_t>(out.v[i] + 0.5f);
+      const float measured_m = depth_m_[row * view_.width + static_cast<int64_t>(out.u[i] + 0.5f)];
+      const bool is_near = measured_m > 0.0f && std::fabs(out.z[i] - measured_m) < max_gap_m_;
+      out.expected &= ~(static_cast<uint32_t>(!is_near) << i);
+    }
+  }
+
+  const View view_;
+  const Projection project_;
+  const float* const depth_m_;
+  const float max_gap_m_;
+};
+
+// Pixels of a region left of x and above y, fractions of pixels included: between the entries of
+// the table, which is bilinear where the mask is constant.
+inline double sum_before(const int32_t* sums, int width, int height, double x, double y) {
+  x = std::min(std::max(x, 0.0), static_cast<double>(width));
+  y = std::min(std::max(y, 0.0), static_cast<double>(height));
+  const int column = std::min(static_cast<int>(x), width - 1);
+  const int row = std::min(static_cast<int>(y), height - 1);
+  const double fx = x - column, fy = y - row;
+  const int32_t* above = sums + static_cast<int64_t>(row) * (width + 1) + column;
+  const int32_t* below = above + width + 1;
+  return (above[0] * (1 - fx) + above[1] * fx) * (1 - fy) +
+         (below[0] * (1 - fx) + below[1] * fx) * fy;
+}
+
+class Region {
+ public:
+  Region(const Regions& regions, int64_t j)
+      : score(regions.scores[j]), rect_(regions.rects + 4 * j), sums_(nullptr) {
+    for (int k = 0; k < 4; ++k) bound[k] = regions.boxes[4 * j + k];
+    area_ = static_cast<double>(bound[2] - bound[0]) * (bound[3] - bound[1]);
+    if (rect_[2] > 0) {
+      sums_ = regions.sums + regions.offsets[j];
+      area_ = sums_[static_cast<int64_t>(rect_[2] + 1) * (rect_[3] + 1) - 1];
+      for (int k = 0; k < 2; ++k) bound[k] = static_cast<float>(rect_[k]) - 0.5f;
+      for (int k = 0; k < 2; ++k) bound[2 + k] = bound[k] + static_cast<float>(rect_[2 + k]);
+    }
+  }
+
+  // Square pixels that the splat of a lane and the region share, over those of the splat, or over
+  // those of either.
+  float overlap(const SplatBoxes& s, int i, bool by_iou) const {
+    const double splat = static_cast<double>(s.x1[i] - s.x0[i]) * (s.y1[i] - s.y0[i]);
+    const double shared = sums_ == nullptr ? within_box(s, i) : within_mask(s, i);
+    return static_cast<float>(shared / (by_iou ? area_ + splat - shared : splat));
+  }
+
+  // Whether the centre of the splat lies in it.
+  bool holds(const SplatBoxes& s, int i) const {
+    const float u = s.u[i], v = s.v[i];
+    if (!(u >= bound[0] && u < bound[2] && v >= bound[1] && v < bound[3])) return false;
+    if (sums_ == nullptr) return true;
+    const int64_t stride = rect_[2] + 1;
+    const int32_t* corner =
+        sums_ + static_cast<int64_t>(v - bound[1]) * stride + static_cast<int64_t>(u - bound[0]);
+    return corner[stride + 1] - corner[stride] - corner[1] + corner[0] > 0;
+  }
+
+  const float score;
+  float bound[4];
+
+ private:
+  double within_box(const SplatBoxes& s, int i) const {
+    const double width = std::min(s.x1[i], bound[2]) - std::max(s.x0[i], bound[0]);
+    const double height = std::min(s.y1[i], bound[3]) - std::max(s.y0[i], bound[1]);
+    return std::max(width, 0.0) * std::max(height, 0.0);
+  }
+  double within_mask(const SplatBoxes& s, int i) const {
+    const auto before = [&](float x, float y) {
+      return sum_before(sums_, rect_[2], rect_[3], static_cast<double>(x) - bound[0],
+                        static_cast<double>(y) - bound[1]);
+    };
+    return before(s.x1[i], s.y1[i]) - before(s.x0[i], s.y1[i]) - before(s.x1[i], s.y0[i]) +
+           before(s.x0[i], s.y0[i]);
+  }
+
+  const int32_t* const rect_;
+  const int32_t* sums_;
+  double area_;
+};
+
+// Of sixteen splats the region whose reliability, overlap times score, is largest: the first of
+// equals.
+class Contest {
+ public:
+  explicit Contest(uint32_t expected) {
+    for (int i = 0; i < kLanes; ++i) region[i] = expected >> i & 1 ? kUnmatched : kUnexpected;
+  }
+
+  void enter(int32_t j, const Region& candidate, const SplatBoxes& s, const AssignmentRule& rule) {
+    const Mask meet = (Floats::load(s.x0) < candidate.bound[2]) &
+                      (Floats(candidate.bound[0]) < Floats::load(s.x1)) &
+                      (Floats::load(s.y0) < candidate.bound[3]) &
+                      (Floats(candidate.bound[1]) < Floats::load(s.y1));
+    for (uint32_t rest = bits(meet) & s.expected; rest != 0; rest &= rest - 1) {
+      const int i = __builtin_ctz(rest);
+      if (!rule.by_iou && !candidate.holds(s, i)) continue;
+      const float shared = candidate.overlap(s, i, rule.by_iou);
+      const float reliability = shared * candidate.score;
+      if (!(shared > rule.min_overlap && reliability > best_[i])) continue;
+      best_[i] = reliability;
+      region[i] = j;
+      overlap[i] = shared;
+    }
+  }
+
+  int32_t region[kLanes];
+  float overlap[kLanes] = {};
+
+ private:
+  float best_[kLanes] = {};
+};
+
+}  // namespace ldo::LDO_ISA

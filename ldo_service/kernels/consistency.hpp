@@ -1,0 +1,109 @@
+// Neighbours that disagree about what they are, and a step towards each other.
+#pragma once
+#include "label_update.hpp"
+#include "neighbourhood.hpp"
+#include "projection.hpp"
+
+namespace ldo::LDO_ISA {
+
+inline float background(const LabelRow& row) {
+  float rest = 1.0f;
+  for (float weight : row.weights) rest -= weight;
+  return std::max(rest, 0.0f);
+}
+
+inline uint8_t top_label(const LabelRow& row) {
+  return row.weights[0] > background(row) ? row.ids[0] : static_cast<uint8_t>(kBackground);
+}
+
+// Sixteen Gaussians or fewer, as columns.
+class Neighbours16 {
+ public:
+  Neighbours16(const float* rows, const uint32_t* indices, const LabelRow* labels,
+               const uint32_t* places, int count)
+      : count_(count) {
+    std::copy_n(places, count, place_);
+    label_[0] = kBackground;
+    std::fill_n(share_[0], kLanes, 0.0f);
+    for (int j = 0; j < count; ++j) {
+      const float* mean = rows + static_cast<int64_t>(indices[places[j]]) * kRowFloats;
+      for (int k = 0; k < 3; ++k) mean_[k][j] = mean[k];
+      add(labels[places[j]], j);
+    }
+  }
+
+  int labels() const { return n_labels_; }
+  uint8_t label(int l) const { return label_[l]; }
+  float share(int l, Floats weights) const { return sum(weights * Floats::load(share_[l])); }
+  float differing(uint8_t top, Floats weights) const {
+    const Floats tops = Floats::load(top_), own = static_cast<float>(top);
+    return sum(select((tops >= own) & (own >= tops), 0.0f, weights));
+  }
+
+  // exp(-d^2 / sigma^2) / |N| of each within the radius of `mean`, but for Gaussian `self`.
+  Floats weights(const float* mean, uint32_t self, const ConsistencyRule& rule) const {
+    const Floats x = Floats::load(mean_[0]) - mean[0], y = Floats::load(mean_[1]) - mean[1],
+                 z = Floats::load(mean_[2]) - mean[2];
+    const Floats square = x * x + y * y + z * z;
+    alignas(64) float counts[kLanes] = {};
+    for (int j = 0; j < count_; ++j) counts[j] = place_[j] == self ? 0.0f : 1.0f;
+    const Mask near =
+        (square < rule.radius_m * rule.radius_m) & (Floats(0.5f) < Floats::load(counts));
+    const int n = __builtin_popcount(bits(near));
+    if (n == 0) return 0.0f;
+    const Floats kernel = exp(square * (-1.0f / (rule.sigma_m * rule.sigma_m)));
+    return select(near, kernel, 0.0f) * (1.0f / static_cast<float>(n));
+  }
+
+ private:
+  void add(const LabelRow& row, int j) {
+    share_[0][j] = background(row);
+    top_[j] = static_cast<float>(top_label(row));
+    for (int k = 0; k < kSlots && row.weights[k] > 0.0f; ++k)
+      share_[column_of(row.ids[k])][j] = row.weights[k];
+  }
+  int column_of(uint8_t id) {
+    for (int l = 1; l < n_labels_; ++l)
+      if (label_[l] == id) return l;
+    std::fill_n(share_[n_labels_], kLanes, 0.0f);
+    label_[n_labels_] = id;
+    return n_labels_++;
+  }
+
+  static constexpr int kMost = 1 + kLanes * kSlots;
+  const int count_;
+  uint32_t place_[kLanes];
+  alignas(64) float mean_[3][kLanes] = {};
+  alignas(64) float top_[kLanes] = {};
+  int n_labels_ = 1;
+  uint8_t label_[kMost];
+  alignas(64) float share_[kMost][kLanes];
+};
+
+class ConsistencyStep {
+ public:
+  explicit ConsistencyStep(const ConsistencyRule& rule) : rule_(rule) {}
+
+  // Writes `row`, which was `before`.
+  void operator()(const Neighbours16& around, Floats weights, const LabelRow& before, LabelRow& row,
+                  Disagreement& sums) const {
+    const float mass = sum(weights);
+    if (!(mass > 0.0f)) return;
+    sums.literal += around.differing(top_label(before), weights);
+    float agreed = background(before) * around.share(0, weights);
+    Slots slots(row);
+    slots.fade(1.0f - rule_.rate * mass);
+    for (int l = 1; l < around.labels(); ++l) {
+      const float share = around.share(l, weights);
+      for (int k = 0; k < kSlots; ++k)
+        if (before.ids[k] == around.label(l)) agreed += before.weights[k] * share;
+      slots.add(around.label(l), rule_.rate * share);
+    }
+    sums.expected += mass - agreed;
+  }
+
+ private:
+  const ConsistencyRule rule_;
+};
+
+}  // namespace ldo::LDO_ISA

@@ -1,0 +1,79 @@
+// Compiled once per instruction set, LDO_ISA.
+#include <vector>
+
+#include "assignment.hpp"
+#include "consistency.hpp"
+#include "parallel.hpp"
+
+namespace ldo::LDO_ISA {
+
+constexpr int64_t kJob = 4096;  // Gaussians
+
+template <class F>
+void each_job(int64_t v, int threads, const F& f) {
+  Team(threads).each((v + kJob - 1) / kJob,
+                     [&](int64_t job) { f(job * kJob, std::min(v, (job + 1) * kJob)); });
+}
+
+void assign(const float* rows, const uint32_t* indices, int64_t v, const View& view,
+            const float* depth_m, const Regions& regions, const AssignmentRule& rule,
+            const Assignments& out, int threads) {
+  std::vector<Region> candidates;
+  for (int64_t j = 0; j < regions.m; ++j) candidates.emplace_back(regions, j);
+  const SplatBoxer boxes_of(view, depth_m, rule.max_depth_gap_m);
+  each_job(v, threads, [&](int64_t begin, int64_t end) {
+    for (int64_t first = begin; first < end; first += kLanes) {
+      const int count = static_cast<int>(std::min<int64_t>(kLanes, end - first));
+      SplatBoxes splats;
+      boxes_of(rows, indices + first, count, splats);
+      Contest contest(splats.expected);
+      for (int64_t j = 0; j < regions.m; ++j)
+        contest.enter(static_cast<int32_t>(j), candidates[j], splats, rule);
+      std::copy_n(contest.region, count, out.region + first);
+      std::copy_n(contest.overlap, count, out.overlap + first);
+      std::copy_n(splats.z, count, out.z + first);
+    }
+  });
+}
+
+void update(LabelRow* rows, const uint32_t* indices, int64_t v, const Observations& seen,
+            const UpdateRule& rule, int threads) {
+  const LabelUpdate look(rule);
+  each_job(v, threads, [&](int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i)
+      look(rows[indices[i]], seen.label[i], seen.confidence[i], seen.extent_m[i]);
+  });
+}
+
+Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices, int64_t v,
+                   const ConsistencyRule& rule, int threads) {
+  constexpr int64_t kJobVoxels = 256;
+  const Voxels voxels(rows, indices, v, 2.0f * rule.sigma_m);
+  std::vector<LabelRow> before(v);
+  for (int64_t i = 0; i < v; ++i) before[i] = labels[indices[i]];
+  // Elsewhere all is background, and agrees.
+  const auto active = voxels.about([&](uint32_t place) { return before[place].weights[0] > 0.0f; });
+  const ConsistencyStep step(rule);
+  const int64_t n = static_cast<int64_t>(active.size());
+  std::vector<Disagreement> sums((n + kJobVoxels - 1) / kJobVoxels);
+  Team(threads).each(static_cast<int64_t>(sums.size()), [&](int64_t job) {
+    for (int64_t a = job * kJobVoxels; a < std::min(n, (job + 1) * kJobVoxels); ++a) {
+      uint32_t places[kLanes];
+      const int count = voxels.around(active[a], places);
+      const Neighbours16 around(rows, indices, before.data(), places, count);
+      for (int64_t k = 0; k < voxels.count(active[a]); ++k) {
+        const uint32_t i = voxels.begin(active[a])[k];
+        const float* mean = rows + static_cast<int64_t>(indices[i]) * kRowFloats;
+        step(around, around.weights(mean, i, rule), before[i], labels[indices[i]], sums[job]);
+      }
+    }
+  });
+  Disagreement out;
+  for (const Disagreement& part : sums) {
+    out.literal += part.literal;
+    out.expected += part.expected;
+  }
+  return out;
+}
+
+}  // namespace ldo::LDO_ISA

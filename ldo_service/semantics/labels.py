@@ -1,0 +1,167 @@
+"""What each Gaussian has been seen as: a sparse distribution over labels, in 32 bytes.
+
+The kernel is `kernels/label_update.hpp`; its plain twin is `labels_reference.py`.
+
+A row keeps the five heaviest labels (L = 5, paper, III.B), float32, heaviest first; background has
+what is left of one, so zeros mean: nothing but background, and never seen. It is exact while at
+most five labels besides background were observed. A sixth puts the lightest weight on `other`:
+then no label is off by more than what `other` has. Rows are plain bytes [N, 32], one per row of the
+map, and may be moved, kept and compressed like its rows.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.kernels import _labels
+
+BACKGROUND, OTHER = 0, 1  # what every vocabulary begins with
+MOST_LABELS = 256  # C_max (III.B)
+SLOTS = 5  # L (III.B)
+NOT_SEEN, MISS = -2, -1  # in place of a label that was observed
+ROW = np.dtype(
+    [
+        ("weights", "<f4", SLOTS),
+        ("evidence", "<f4"),  # sum of the weights of all observations, those of long ago faded
+        ("extent_mm", "<u2"),  # of the object that the Gaussian was last seen as a part of
+        ("misses", "u1"),  # keyframes since then that expected it to be one
+        ("ids", "u1", SLOTS),
+    ]
+)
+ROW_BYTES = 32
+
+
+@dataclass(frozen=True, slots=True)
+class LabelConfig:
+    """Constants of `corrected` were given by a study with voxels on one floor of a Replica
+    apartment; usual_extent_m and hold_back were chosen on the same frames, with two detectors."""
+
+    ema: Literal["paper", "corrected"] = "corrected"
+    keep: float = 0.9  # lambda (III.A)
+    miss_limit: int = 5  # keyframes, N_miss (III.A), of `paper`
+    # Of `corrected`: a miss is evidence for background, where the detector should have seen it.
+    miss_weight: float = 0.3  # of a detection: its confidence
+    least_px: float = 40.0  # side of an object's box that the detector should see
+    usual_extent_m: float = 0.5  # of an object nobody has seen yet
+    hold_back: float = 1.0  # 0..1, of uncertain observations of settled Gaussians
+
+    def __post_init__(self) -> None:
+        if self.ema not in ("paper", "corrected"):
+            raise ConfigError(f"ema={self.ema!r} must be 'paper' or 'corrected'.")
+        if not (0 <= self.keep < 1 and 0 <= self.miss_weight <= 1 and 0 <= self.hold_back <= 1):
+            raise ConfigError(f"{self}: keep in [0, 1), miss_weight and hold_back in 0..1.")
+        if not (1 <= self.miss_limit <= 255 and self.least_px >= 0 and self.usual_extent_m >= 0):
+            raise ConfigError(f"{self}: miss_limit in 1..255, lengths not negative.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Observations:
+    """What a keyframe says of V Gaussians.
+
+    indices     [V] uint32, ascending: their rows
+    labels      [V] int16, or MISS: seen, and in no region; or NOT_SEEN
+    confidences [V] float32, 0..1, of labels
+    extents_m   [V] float32: of a label how large its object is, of a miss how large an object must
+                be to be missed
+    """
+
+    indices: np.ndarray
+    labels: np.ndarray
+    confidences: np.ndarray
+    extents_m: np.ndarray
+
+
+def new_labels(n: int) -> np.ndarray:
+    """Rows [n, 32] uint8 of Gaussians that nobody has seen."""
+    return np.zeros((n, ROW_BYTES), np.uint8)
+
+
+def fields(labels: np.ndarray) -> np.ndarray:
+    """Rows [N, 32] as records [N] of `ROW`, without a copy."""
+    return labels.view(ROW)[:, 0]
+
+
+def observe(
+    labels: np.ndarray, seen: Observations, config: LabelConfig, *, threads: int = 1
+) -> None:
+    """Fold a keyframe into rows [N, 32], in place.
+
+    A label s makes p <- (1 - a) p + a onehot(s). With `paper` a = 1 - keep, so that 0.9 needs seven
+    sightings to flip a label; misses are counted, and miss_limit in a row make background of it.
+    With `corrected` the mean of all observations is weighted as the average fades: with
+    w = confidence, W <- keep W + w, and a = w / W: the first sighting counts whole. A miss is an
+    observation of background with w = miss_weight, if the object it was seen as, or one of
+    usual_extent_m, would appear at least least_px large.
+
+    Uncertain observations of settled Gaussians are held back: the step of `paper`, and w, have the
+    factor 1 - hold_back exp(-2 H) (1 - confidence), with the entropy H of p, once p has a label.
+
+    >>> labels, config = new_labels(1), LabelConfig(hold_back=0)
+    >>> def see(label, confidence, config):
+    ...     one = [np.array([x], t) for x, t in ((0, "u4"), (label, "i2"), (confidence, "f4"))]
+    ...     observe(labels, Observations(*one, np.ones(1, np.float32)), config)
+    ...     return distribution(labels, 4)[0].astype(float).round(3).tolist()
+    >>> see(2, 0.6, config)  # W = 0.6, a = 1
+    [0.0, 0.0, 1.0, 0.0]
+    >>> see(3, 0.46, config)  # W = 0.54 + 0.46, a = 0.46
+    [0.0, 0.0, 0.54, 0.46]
+    >>> see(MISS, 0, config)  # W = 0.9 + 0.3, a = 0.25
+    [0.25, 0.0, 0.405, 0.345]
+    >>> see(2, 0.6, LabelConfig(ema="paper", hold_back=0))  # 0.9 p + 0.1
+    [0.225, 0.0, 0.464, 0.31]
+
+    Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads.
+    Paper, III.A; ALGORITHMS, Semantics on Gaussians.
+    """
+    _labels.update(
+        labels,
+        seen.indices,
+        seen.labels,
+        seen.confidences,
+        seen.extents_m,
+        config.ema == "corrected",
+        config.keep,
+        config.miss_weight,
+        config.miss_limit,
+        config.usual_extent_m,
+        config.hold_back,
+        threads,
+    )
+
+
+def background(labels: np.ndarray) -> np.ndarray:
+    """[N] float32, the share of background."""
+    return np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)
+
+
+def top_labels(labels: np.ndarray) -> np.ndarray:
+    """[N] uint8, the likeliest label; background where no other has more."""
+    rows = fields(labels)
+    return np.where(rows["weights"][:, 0] > background(labels), rows["ids"][:, 0], BACKGROUND)
+
+
+def distribution(labels: np.ndarray, classes: int = MOST_LABELS) -> np.ndarray:
+    """[N, classes] float32, dense: rows sum to one. Raises ValueError where a label is beyond."""
+    rows = fields(labels)
+    used = rows["weights"] > 0
+    if np.any(rows["ids"][used] >= classes):
+        raise ValueError(f"labels go up to {rows['ids'][used].max()}, beyond {classes} classes.")
+    out = np.zeros((len(labels), classes), np.float32)
+    out[:, BACKGROUND] = background(labels)
+    which = np.nonzero(used)
+    out[which[0], rows["ids"][which]] = rows["weights"][which]
+    return out
+
+
+def entropy(labels: np.ndarray) -> np.ndarray:
+    """[N] float32, H = -sum p log p (III.A), in nats.
+
+    >>> labels = new_labels(1)
+    >>> fields(labels)["weights"][0, 0] = 0.5
+    >>> round(float(entropy(labels)[0]), 4)  # log 2
+    0.6931
+    """
+    p = np.concatenate([fields(labels)["weights"], background(labels)[:, None]], axis=1)
+    return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=1)
