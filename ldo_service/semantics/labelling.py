@@ -1,0 +1,139 @@
+"""What a keyframe's regions make of the labels of the map: one step a line."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, se3
+
+from .assignment import UNMATCHED, Assigned, AssignmentConfig, Regions, assign
+from .consistency import ConsistencyConfig, Disagreement, agree
+from .foreground import ForegroundConfig, foreground, surfaces
+from .fusion import FusionConfig, fused
+from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe
+
+
+@dataclass(frozen=True, slots=True)
+class LabellingConfig:
+    region: Literal["foreground", "box"] = "foreground"
+    foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    labels: LabelConfig = field(default_factory=LabelConfig)
+    consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
+
+    def __post_init__(self) -> None:
+        if self.region not in ("foreground", "box"):
+            raise ConfigError(f"region={self.region!r} must be 'foreground' or 'box'.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Claims:
+    """What is said to be in M boxes of a keyframe.
+
+    boxes                  [M, 4], x0 y0 x1 y1, px, pixel centres at integers
+    labels, confidences    [M] of the detector; confidence 0: it says nothing
+    open_labels, open_confidences [M] of the open-vocabulary labeller; 0: it was not invoked
+    """
+
+    boxes: np.ndarray
+    labels: np.ndarray
+    confidences: np.ndarray
+    open_labels: np.ndarray
+    open_confidences: np.ndarray
+
+    @classmethod
+    def of_detector(
+        cls, boxes: np.ndarray, labels: np.ndarray, confidences: np.ndarray
+    ) -> "Claims":
+        return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
+
+    def scores(self) -> np.ndarray:
+        """[M], by which regions compete where they overlap."""
+        return np.maximum(self.confidences, self.open_confidences)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Labelled:
+    assigned: Assigned
+    seen: Observations
+    disagreement: Disagreement
+
+
+def label_keyframe(
+    rows: np.ndarray,
+    labels: np.ndarray,
+    indices: np.ndarray,
+    camera: Camera,
+    T_map_camera: np.ndarray,
+    depth_m: np.ndarray,
+    claims: Claims,
+    config: LabellingConfig,
+    *,
+    is_late: bool = False,
+    threads: int = 1,
+) -> Labelled:
+    """Fold what is claimed of a keyframe into the labels [N, 32] of the map, in place.
+
+    rows [N, 16]; indices [V] uint32, the Gaussians that made its image; depth_m [H, W] as it was
+    measured. `is_late`: the claims are some of a keyframe that was folded in before, so that what
+    they leave out is no miss. Raises ValueError for arrays that do not fit.
+    """
+    # which Gaussians are where
+    regions = regions_of(claims, depth_m, camera, config)
+    T_camera_map = se3.inverse(T_map_camera)
+    where = assign(
+        rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
+    )
+    # what they were seen as
+    seen = observations(where, indices, camera, claims, config, is_late=is_late)
+    observe(labels, seen, config.labels, threads=threads)
+    # what their neighbours say
+    touched = indices[seen.labels != NOT_SEEN]
+    return Labelled(where, seen, agree(rows, labels, touched, config.consistency, threads=threads))
+
+
+def regions_of(
+    claims: Claims, depth_m: np.ndarray, camera: Camera, config: LabellingConfig
+) -> Regions:
+    """The boxes, or the objects in them."""
+    if config.region == "box" or len(claims.boxes) == 0:
+        return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
+    found = surfaces(depth_m, camera, config.foreground)
+    parts = [foreground(box, depth_m, found, camera, config.foreground) for box in claims.boxes]
+    return Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
+
+
+def observations(
+    where: Assigned,
+    indices: np.ndarray,
+    camera: Camera,
+    claims: Claims,
+    config: LabellingConfig,
+    *,
+    is_late: bool = False,
+) -> Observations:
+    """Labels and confidences of the Gaussians that a region got; misses of the others in view. The
+    side of an object is that of a square like its box, at the depth of the Gaussian."""
+    hit = where.regions >= 0
+    labels = np.full(len(indices), NOT_SEEN, np.int16)
+    if not is_late:
+        labels[where.regions == UNMATCHED] = MISS
+    confidences = np.zeros(len(indices), np.float32)
+    sides_px = np.full(len(indices), config.labels.least_px, np.float32)
+    of = where.regions[hit]
+    both = fused(
+        claims.labels[of],
+        claims.confidences[of],
+        where.overlaps[hit],
+        claims.open_labels[of],
+        claims.open_confidences[of],
+        config.fusion,
+    )
+    labels[hit], confidences[hit] = both.labels, both.confidences
+    corners = np.reshape(claims.boxes, (-1, 2, 2))
+    sides_px[hit] = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))[of]
+    m_per_px = np.maximum(where.depths_m, 0) / np.float32(np.sqrt(camera.fx * camera.fy))
+    return Observations(indices, labels, confidences, sides_px * m_per_px)

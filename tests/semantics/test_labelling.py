@@ -1,0 +1,125 @@
+"""A wall with a thing before it, as Gaussians of one pixel each."""
+
+import numpy as np
+import pytest
+
+from ldo_service.gaussians import render
+from ldo_service.gaussians.model import aligned_rows
+from ldo_service.geometry import Camera
+from ldo_service.semantics.assignment import AssignmentConfig
+from ldo_service.semantics.fusion import FusionConfig
+from ldo_service.semantics.label_images import label_image, top_image
+from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
+from ldo_service.semantics.labels import fields, new_labels, top_labels
+
+CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
+THING = slice(20, 44), slice(36, 60)
+BOX = np.array([[30.0, 14.0, 66.0, 50.0]])  # six pixels larger on each side
+CHAIR, LAMP = 58, 90
+
+
+def depth_image() -> np.ndarray:
+    depth_m = np.full((64, 96), 2.0, np.float32)
+    depth_m[THING] = 1.2
+    return depth_m
+
+
+def surfels() -> np.ndarray:
+    """One per pixel, sharp and opaque."""
+    depth_m = depth_image()
+    rows = aligned_rows(depth_m.size)
+    rows[:] = 0
+    rows[:, :3] = CAMERA.backproject(depth_m).reshape(-1, 3)
+    rows[:, 3:6] = np.log(0.5 * depth_m.reshape(-1, 1) / CAMERA.fx)
+    rows[:, 6], rows[:, 10] = 1, 3
+    return rows
+
+
+def thing() -> np.ndarray:
+    out = np.zeros((64, 96), bool)
+    out[THING] = True
+    return out
+
+
+def claims(detector: float = 0.8, labeller: float = 0.0) -> Claims:
+    labels = np.array([CHAIR]), np.array([detector], np.float32)
+    return Claims(BOX, *labels, np.array([LAMP]), np.array([labeller], np.float32))
+
+
+def labelled(
+    config: LabellingConfig, *what: Claims, late: Claims | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    rows = surfels()
+    labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
+    view = CAMERA, np.eye(4), depth_image()
+    for claim in what:
+        label_keyframe(rows, labels, indices, *view, claim, config)
+    if late is not None:
+        label_keyframe(rows, labels, indices, *view, late, config, is_late=True)
+    return rows, labels
+
+
+def test_the_thing_gets_the_label_and_the_wall_in_its_box_does_not() -> None:
+    _, labels = labelled(LabellingConfig(), claims())
+    got = (top_labels(labels) == CHAIR).reshape(64, 96)
+    assert np.mean(got[thing()]) > 0.95
+    assert np.count_nonzero(got & ~thing()) < 0.02 * np.count_nonzero(thing())
+
+
+def test_by_box_the_wall_becomes_chair_too() -> None:
+    _, labels = labelled(LabellingConfig(region="box"), claims())
+    got = (top_labels(labels) == CHAIR).reshape(64, 96)
+    assert np.count_nonzero(got) > 2 * np.count_nonzero(thing())
+
+
+def test_the_literal_rule_labels_nothing_here() -> None:
+    config = LabellingConfig(assignment=AssignmentConfig("iou"))
+    _, labels = labelled(config, claims())
+    assert not top_labels(labels).any()
+
+
+@pytest.mark.parametrize(("rule", "wins"), [("adaptive", LAMP), ("detector", CHAIR)])
+def test_a_surer_labeller_overrules_the_detector_where_it_is_heard(rule, wins) -> None:
+    config = LabellingConfig(fusion=FusionConfig(rule=rule))
+    _, labels = labelled(config, claims(detector=0.3, labeller=0.9))
+    assert np.median(top_labels(labels).reshape(64, 96)[THING]) == wins
+
+
+def test_a_late_answer_lands_on_the_thing_and_misses_nothing_else() -> None:
+    _, once = labelled(LabellingConfig(), claims(detector=0.3))
+    _, labels = labelled(
+        LabellingConfig(), claims(detector=0.3), late=claims(detector=0.0, labeller=0.9)
+    )
+    assert np.median(top_labels(labels).reshape(64, 96)[THING]) == LAMP
+    outside = ~thing().ravel()
+    np.testing.assert_array_equal(
+        fields(labels)["misses"][outside], fields(once)["misses"][outside]
+    )
+
+
+def test_a_keyframe_without_claims_counts_misses_of_what_is_in_view() -> None:
+    none = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    _, labels = labelled(LabellingConfig(), none)
+    assert np.all(fields(labels)["misses"] == 1)
+
+
+def test_images_of_labels_show_the_thing() -> None:
+    rows, labels = labelled(LabellingConfig(), claims())
+    shown = render(rows, CAMERA, np.eye(4), contributions=True)
+    for image in (top_image(labels, shown), label_image(rows, labels, shown, CAMERA, np.eye(4))):
+        agreement = np.count_nonzero((image == CHAIR) & thing())
+        # splats reach a pixel over the edge
+        assert agreement > 0.8 * np.count_nonzero((image == CHAIR) | thing())
+
+
+def test_an_image_of_labels_is_of_the_largest_sum_not_of_the_nearest_gaussian() -> None:
+    """Three in a row, each of a fourth to a third of the pixel; the two behind agree."""
+    rows, labels = aligned_rows(3), new_labels(3)
+    rows[:] = 0
+    rows[:, 2], rows[:, 3:6], rows[:, 6] = [1, 1.1, 1.2], -1, 1
+    alphas = np.array([0.3, 0.35, 0.5])  # weights 0.3, 0.245, 0.2275
+    rows[:, 10] = np.log(alphas / (1 - alphas))
+    fields(labels)["weights"][:, 0], fields(labels)["ids"][:, 0] = 1, [CHAIR, LAMP, LAMP]
+    shown = render(rows, CAMERA, np.eye(4), contributions=True)
+    assert top_image(labels, shown)[31, 47] == CHAIR
+    assert label_image(rows, labels, shown, CAMERA, np.eye(4))[31, 47] == LAMP
