@@ -62,15 +62,15 @@ class Foreground:
 
 def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> Surfaces:
     """Pieces of depth [H, W] without steps and creases, connected by their sides. Once per
-    keyframe, for all boxes: 15 ms for 512x512."""
-    inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-6), 0).astype(np.float32)
+    keyframe, for all boxes: 7 ms for 640x480."""
+    inverse = _inverse(depth_m)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
     smooth = (low > 0) & (high < (1 + config.max_step) * low)
     normals = _normals(inverse, camera)
-    across = np.sum(normals[:, 4:] * normals[:, :-4], axis=2) > config.min_cosine
-    down = np.sum(normals[4:] * normals[:-4], axis=2) > config.min_cosine
-    smooth[:, 2:-2] &= across
-    smooth[2:-2] &= down
+    across = sum(n[:, 4:] * n[:, :-4] for n in normals)
+    down = sum(n[4:] * n[:-4] for n in normals)
+    smooth[:, 2:-2] &= across > config.min_cosine
+    smooth[2:-2] &= down > config.min_cosine
     _, labels = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
     return Surfaces(labels, np.bincount(labels.ravel()))
 
@@ -126,16 +126,22 @@ def mode_of(depth_m: np.ndarray, bin_share: float) -> float:
     return exp((int(np.argmax(counts)) + int(bins.min()) + 0.5) * bin_share)
 
 
-def _normals(inverse: np.ndarray, camera: Camera) -> np.ndarray:
-    """[H, W, 3], of the plane n . p = d through 5x5 pixels: 1 / z = n . ray / d."""
-    n_x, n_y = (
-        focal * cv2.Sobel(inverse, cv2.CV_32F, *order, ksize=5, scale=1 / 128)
-        for focal, order in ((camera.fx, (1, 0)), (camera.fy, (0, 1)))
-    )
-    u, v = np.arange(camera.width, dtype=np.float32), np.arange(camera.height, dtype=np.float32)
-    x, y = (u - camera.cx) / camera.fx, ((v - camera.cy) / camera.fy)[:, None]
-    normals = np.stack([n_x, n_y, inverse - n_x * x - n_y * y], axis=-1).astype(np.float32)
-    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-9)
+def _inverse(depth_m: np.ndarray) -> np.ndarray:
+    """1 / depth, float32, 0 where it is missing."""
+    one = np.float32(1)
+    return np.where(depth_m > 0, one / np.maximum(depth_m, np.float32(1e-6)), np.float32(0))
+
+
+def _normals(inverse: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
+    """Images [H, W] float32 of x, y, z: plane n . p = d through 5x5 pixels, 1 / z = n . ray / d."""
+    n_x = cv2.Sobel(inverse, cv2.CV_32F, 1, 0, ksize=5, scale=camera.fx / 128)
+    n_y = cv2.Sobel(inverse, cv2.CV_32F, 0, 1, ksize=5, scale=camera.fy / 128)
+    u, v = np.arange(camera.width), np.arange(camera.height)[:, None]
+    x, y = ((u - camera.cx) / camera.fx), ((v - camera.cy) / camera.fy)
+    n_z = inverse - n_x * x.astype(np.float32) - n_y * y.astype(np.float32)
+    length = np.sqrt(n_x * n_x + n_y * n_y + n_z * n_z)
+    inverse_length = np.float32(1) / np.maximum(length, np.float32(1e-9))
+    return n_x * inverse_length, n_y * inverse_length, n_z * inverse_length
 
 
 def _inside(labels: np.ndarray, sizes: np.ndarray, share: float) -> np.ndarray:
@@ -154,7 +160,7 @@ def _grown_from_middle(
     belongs: np.ndarray, depth: np.ndarray, mode_m: float, config: ForegroundConfig
 ) -> np.ndarray | None:
     """Of what belongs: what hangs together with a tenth or more of the pixels about the mode."""
-    inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0).astype(np.float32)
+    inverse = _inverse(depth)
     joined = cv2.dilate(inverse, _3X3) <= (1 + config.max_gap) * cv2.erode(inverse, _3X3)
     core = belongs & joined
     count, parts = cv2.connectedComponents(core.astype(np.uint8), connectivity=4)
