@@ -9,6 +9,9 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 
+# Before normals are taken: 0.58 of a Kinect's pixels then lie in pieces below 200 px, 0.78 without.
+# With 2, 1.3 points of mIoU are lost in the apartment.
+BLUR_PX = 1.5
 _3X3 = np.ones((3, 3), np.uint8)
 
 
@@ -66,7 +69,7 @@ def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> S
     inverse = _inverse(depth_m)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
     smooth = (low > 0) & (high < (1 + config.max_step) * low)
-    normals = _normals(inverse, camera)
+    normals = _normals(cv2.GaussianBlur(inverse, (5, 5), BLUR_PX), camera)
     across = sum(n[:, 4:] * n[:, :-4] for n in normals)
     down = sum(n[4:] * n[:-4] for n in normals)
     smooth[:, 2:-2] &= across > config.min_cosine

@@ -1,6 +1,6 @@
 """How well the map's labels agree with the truth, by rule, beside painting each frame alone.
 
-    LDO_WEIGHTS=... python tests/bench/bench_labels.py SOURCE [--pictures DIR] [--max-frames N]
+    LDO_WEIGHTS=... python tests/bench/bench_labels.py SOURCE [--only TEXT] [--pictures DIR]
 
 SOURCE: a Replica folder with `semantic_class/`, `instance/`, `labels.json` and true poses. Every
 second frame is a keyframe, where it really was; labels are fused as the map grows and judged at the
@@ -229,6 +229,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("source", type=Path)
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--only", default="", help="rules whose name holds this")
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--iterations", type=int, default=6)
     arguments = parser.parse_args()
@@ -250,7 +251,7 @@ def main() -> None:
         (name, what): Follower(config)
         for name in claims
         for what, config in variants().items()
-        if name != "true boxes" or "coverage corrected" in what
+        if arguments.only in what and (name != "true boxes" or "coverage corrected" in what)
     }
     builder = MapBuilder()
     for k in range(0, len(frames), 2):

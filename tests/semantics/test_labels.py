@@ -83,7 +83,7 @@ def test_five_labels_are_kept_exactly(config: LabelConfig) -> None:
 def test_of_many_labels_none_is_off_by_more_than_other_has() -> None:
     config = LabelConfig(hold_back=0)  # which looks at the entropy, and that is another
     ours, rest = new_labels(200), new_labels(200)
-    dense = np.eye(40)[np.zeros(200, int)]
+    dense, p = np.eye(40)[np.zeros(200, int)], np.zeros((200, 40))
     for seen in looks(200, 40, 40, seed=3):
         observe(ours, seen, config)
         observe_dense(dense, rest, seen, config)
