@@ -17,9 +17,9 @@ constexpr float kNearest = 1e-3f;  // metres: closer points do not project
 float smaller(float a, float b) { return a < b ? a : b; }
 float larger(float a, float b) { return a > b ? a : b; }
 
-void halve(const float* values, int width, int height, float tolerance, float* out) {
+void halve(const float* values, int width, int height, float tolerance, int least, float* out) {
   const int w = width / 2, h = height / 2;
-  const float missing = 1e30f, reach = 1.0f + tolerance;
+  const float missing = 1e30f, reach = 1.0f + tolerance, fewest = static_cast<float>(least);
   for (int y = 0; y < h; ++y) {
     const float* upper = values + static_cast<std::int64_t>(2 * y) * width;
     const float* lower = upper + width;
@@ -33,7 +33,8 @@ void halve(const float* values, int width, int height, float tolerance, float* o
       const float wb = (b > 0) & (b <= limit) ? 1.0f : 0.0f;
       const float wc = (c > 0) & (c <= limit) ? 1.0f : 0.0f;
       const float wd = (d > 0) & (d <= limit) ? 1.0f : 0.0f;
-      row[x] = (wa * a + wb * b + wc * c + wd * d) / larger(wa + wb + wc + wd, 1.0f);
+      const float count = wa + wb + wc + wd, sum = wa * a + wb * b + wc * c + wd * d;
+      row[x] = count >= fewest ? sum / larger(count, 1.0f) : 0.0f;
     }
   }
 }

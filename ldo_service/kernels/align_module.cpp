@@ -88,14 +88,16 @@ nb::ndarray<nb::numpy, T> owned(std::unique_ptr<T[]> data,
 
 std::unique_ptr<float[]> floats(std::size_t n) { return std::unique_ptr<float[]>(new float[n]); }
 
-Output halve(Input<2> values, double tolerance) {
+Output halve(Input<2> values, double tolerance, int least) {
   const std::size_t h = values.shape(0), w = values.shape(1);
   require_image(h, w);
   const float relative = positive(tolerance, "tolerance");
+  if (least < 1 || least > 4) throw nb::value_error("least must be within 1..4");
   auto out = floats((h / 2) * (w / 2));
   {
     nb::gil_scoped_release release;
-    chosen->halve(values.data(), static_cast<int>(w), static_cast<int>(h), relative, out.get());
+    chosen->halve(values.data(), static_cast<int>(w), static_cast<int>(h), relative, least,
+                  out.get());
   }
   return owned(std::move(out), {h / 2, w / 2});
 }
@@ -216,7 +218,7 @@ NB_MODULE(_align, m) {
   const ldo::Isa isa = ldo::chosen_isa();
   chosen = &kernels(isa);
   m.attr("isa") = ldo::name(isa);
-  m.def("halve", &halve, "values"_a.noconvert(), "tolerance"_a);
+  m.def("halve", &halve, "values"_a.noconvert(), "tolerance"_a, "least"_a = 1);
   m.def("pack", &pack, "image"_a.noconvert(), "depth_m"_a.noconvert(), "max_depth_m"_a);
   m.def("normals", &normals, "depth_m"_a.noconvert(), "intrinsics"_a, "radius"_a);
   m.def("points", &points, "texels"_a.noconvert(), "normals"_a.noconvert(), "intrinsics"_a);

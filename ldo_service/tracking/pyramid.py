@@ -79,9 +79,12 @@ def told(gray: np.ndarray) -> np.ndarray:
     return np.where(gray < CLIPPED, gray, 0).astype(np.float32)
 
 
-def halved_image(image: np.ndarray) -> np.ndarray:
-    """Means [H//2, W//2] float32 of what 2x2 blocks of an image [H, W] float32 tell."""
-    return _align.halve(image, ANY_DIFFERENCE)
+def halved_image(image: np.ndarray, least: int = 1) -> np.ndarray:
+    """Means [H//2, W//2] float32 of what 2x2 blocks of an image [H, W] float32 tell.
+
+    A block in which fewer than `least` pixels tell says nothing.
+    """
+    return _align.halve(image, ANY_DIFFERENCE, least)
 
 
 def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
@@ -101,8 +104,10 @@ def build_pyramid(
         smallest = min(scaled.width, scaled.height) // 2
         if len(levels) == config.levels or smallest < config.smallest_side_px:
             break
-        image, depth = halved_image(image), halved_depth(depth, config.depth_tolerance)
-        scaled = scaled.halved()
+        # At an edge of what is clipped, the rest of a block is darker than the whole: it has no part
+        # in the finest level. Coarser ones lead there, and would be left with too little.
+        image = halved_image(image, least=1 if levels else 4)
+        depth, scaled = halved_depth(depth, config.depth_tolerance), scaled.halved()
     if not levels:  # a strip: wide, and too low to be halved
         levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
     return Pyramid(gray, depth_m, camera, tuple(levels))

@@ -42,6 +42,8 @@ def test_halving_averages_what_lies_near_the_nearest() -> None:
     near = (blocks > 0) & (blocks <= 1.03 * nearest)
     expected = np.where(near, blocks, 0).sum(axis=-1) / np.maximum(near.sum(axis=-1), 1)
     np.testing.assert_allclose(_align.halve(depth_m, 0.03), expected, rtol=1e-6)
+    enough = np.where(near.sum(axis=-1) >= 3, expected, 0)
+    np.testing.assert_allclose(_align.halve(depth_m, 0.03, 3), enough, rtol=1e-6)
 
 
 def test_texels_hold_intensity_central_differences_and_depth() -> None:
@@ -140,6 +142,7 @@ IMAGE = np.ones((8, 8), np.float32)
     [
         (lambda: _align.halve(np.ones((1, 8), np.float32), 0.03), "2x2"),
         (lambda: _align.halve(IMAGE, float("nan")), "tolerance"),
+        (lambda: _align.halve(IMAGE, 0.03, 5), "least"),
         (lambda: _align.pack(IMAGE, np.ones((8, 9), np.float32), 1.0), "differ in size"),
         (lambda: _align.pack(IMAGE, IMAGE, 0.0), "max_depth_m"),
         (lambda: _align.normals(IMAGE, INTRINSICS, 0), "radius"),
