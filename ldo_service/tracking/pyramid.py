@@ -104,8 +104,8 @@ def build_pyramid(
         smallest = min(scaled.width, scaled.height) // 2
         if len(levels) == config.levels or smallest < config.smallest_side_px:
             break
-        # At an edge of what is clipped, the rest of a block is darker than the whole: it has no part
-        # in the finest level. Coarser ones lead there, and would be left with too little.
+        # At an edge of what is clipped, the rest of a block is darker than the whole: it has no
+        # part in the finest level. Coarser ones lead there, and would be left with too little.
         image = halved_image(image, least=1 if levels else 4)
         depth, scaled = halved_depth(depth, config.depth_tolerance), scaled.halved()
     if not levels:  # a strip: wide, and too low to be halved
