@@ -4,6 +4,7 @@ in   frame/rgbd         FrameRgbd     Latest(1)   a late frame is worth less tha
 in   graph/correction   Correction    Latest(1)   a versioned absolute state: the newest says it all
 in   odometry/prior     OdometryPrior Latest(64)  0.3 s at 200 Hz, while a frame is tracked; older
                                                   poses are worth less, and no robot waits for us
+in   detection/boxes    DetectionBoxes Latest(1)  who may walk away is not tracked against
 out  pose/tracked       TrackedPose
 out  keyframe/new       Keyframe      made only when every consumer has room: never waited for
 """
@@ -25,6 +26,8 @@ from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import (
     Array,
     Correction,
+    Detection,
+    DetectionBoxes,
     FrameRgbd,
     Keyframe,
     OdometryPrior,
@@ -32,6 +35,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.message import decode, encode
 from ldo_service.schemas.topics import (
+    DETECTION_BOXES,
     FRAME_RGBD,
     GRAPH_CORRECTION,
     KEYFRAME_NEW,
@@ -39,6 +43,7 @@ from ldo_service.schemas.topics import (
     POSE_TRACKED,
 )
 from ldo_service.tracking.judgement import Status
+from ldo_service.tracking.movable import Box
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.prior import Prior, Reading, Verdict
 from ldo_service.tracking.tracked import Tracked
@@ -106,6 +111,7 @@ class Tracker(Actor):
         In(FRAME_RGBD, Latest(1)),
         In(GRAPH_CORRECTION, Latest(1)),
         In(ODOMETRY_PRIOR, Latest(64)),
+        In(DETECTION_BOXES, Latest(1)),
     )
     outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, never_wait=True))
 
@@ -125,7 +131,7 @@ class Tracker(Actor):
         self._parts: dict[str, Any] | None = None  # of the state; what a prior does not change
 
     def handle(
-        self, message: FrameRgbd | Correction | OdometryPrior
+        self, message: FrameRgbd | Correction | OdometryPrior | DetectionBoxes
     ) -> Iterator[TrackedPose | Keyframe]:
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
@@ -133,6 +139,8 @@ class Tracker(Actor):
         self._parts = None
         if isinstance(message, Correction):
             self._correct(message)
+        elif isinstance(message, DetectionBoxes):
+            self._odometry.leave_out(message.keyframe, [_box(d) for d in message.detections])
         else:
             yield from self._track(rgbd_of(message))
 
@@ -338,3 +346,9 @@ class Tracker(Actor):
             "prior_refused": refused,
             "prior_restarts": restarts,
         }
+
+
+def _box(detection: Detection) -> Box:
+    """From pixel centres at integers to edges of pixels."""
+    x0, y0, x1, y1 = (edge + 0.5 for edge in detection.box_px)
+    return Box(detection.label, x0, y0, x1, y1)

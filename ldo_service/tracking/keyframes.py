@@ -52,12 +52,15 @@ class Keyframe:
     id: int  # ascending, given by the odometry: a camera's frame numbers may start again
     segment: int = 0  # whose odometry frame T_odom_keyframe leads to
     has_moved: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
-    left_out: np.ndarray | None = None  # [H, W] bool: what of it is not tracked against
+    left_out: np.ndarray | None = None  # [H, W] bool: what of it was seen to move
+    movable: np.ndarray | None = None  # [H, W] bool: what of it a detector knows to move by itself
     kept_features: Features | None = None  # of a place; its image is smaller than what they saw
 
     @cached_property
     def reference(self) -> Reference:
-        return build_reference(self.view, self.left_out)
+        """Without what moves."""
+        masks = [mask for mask in (self.left_out, self.movable) if mask is not None]
+        return build_reference(self.view, np.logical_or.reduce(masks) if masks else None)
 
     def features(self, config: FeatureConfig) -> Features:
         """Detected when first asked for: most keyframes never are."""
@@ -80,6 +83,7 @@ class Keyframe:
             "segment": self.segment,
             "has_moved": self.has_moved,
             "left_out": self.left_out,
+            "movable": self.movable,
             "features": None if features is None else asdict(features),
         }
 
@@ -95,6 +99,7 @@ class Keyframe:
             kept["segment"],
             kept["has_moved"],
             kept["left_out"],
+            kept["movable"],
             features,
         )
 

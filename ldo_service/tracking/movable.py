@@ -1,7 +1,4 @@
-"""What a detector knows to move by itself, as pixels. Conventions: `ldo_service.geometry`.
-
-For the masks of `moving`, once a detector's boxes come with the frames; nothing calls it before.
-"""
+"""What a detector knows to move by itself, as pixels. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,6 +33,11 @@ class Box:
     top: float
     right: float
     bottom: float
+
+    def in_smaller(self, times: float) -> "Box":
+        """In an image that is so many times smaller."""
+        edges = (self.left, self.top, self.right, self.bottom)
+        return Box(self.label, *(edge / times for edge in edges))
 
 
 def movable_pixels(boxes: Sequence[Box], depth_m: np.ndarray, config: MovableConfig) -> np.ndarray:

@@ -15,7 +15,7 @@ last. Conventions: `ldo_service.geometry`.
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,6 +33,7 @@ from .guesses import Guesses
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion
+from .movable import Box, MovableConfig, movable_pixels
 from .moving import MovingConfig, spread, watch
 from .places import Places, PlacesConfig, place_of, thumbnail_of
 from .prior import Anchor, PriorConfig, Reading
@@ -61,6 +62,7 @@ class OdometryConfig:
     segments: SegmentConfig = field(default_factory=SegmentConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
     moving: MovingConfig = field(default_factory=MovingConfig)
+    movable: MovableConfig = field(default_factory=MovableConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
 
@@ -195,6 +197,19 @@ class Odometry:
             if place.id not in self._rebuilt:
                 self._rebuilt[place.id] = place.keyframe(self.config.pyramid)
             yield self._rebuilt[place.id]
+
+    def leave_out(self, keyframe: int, boxes: Sequence[Box]) -> None:
+        """What a detector found in a keyframe: things that move by themselves are not tracked
+        against, as long as it is the one that frames are aligned to. Boxes in its own pixels."""
+        current = self._state.keyframe
+        if current is None or current.id != keyframe:
+            return
+        finest = current.view.levels[0]
+        times = current.view.camera.width / finest.camera.width
+        smaller = [box.in_smaller(times) for box in boxes]
+        mask = movable_pixels(smaller, finest.depth_m, self.config.movable)
+        if mask.any():
+            self._state = replace(self._state, keyframe=replace(current, movable=mask))
 
     def make_supporting(self, tracked: Tracked) -> int:
         """Go on against the same keyframe; the id of this frame as one that is only mapped."""

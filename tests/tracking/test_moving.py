@@ -11,6 +11,7 @@ from ldo_service.datasets.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
+from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
 from ldo_service.tracking.movable import Box, MovableConfig, movable_pixels
 from ldo_service.tracking.moving import MovingConfig, Watched, gap_m, spread, watch
@@ -143,9 +144,7 @@ def test_spread_takes_what_is_beside_and_as_far_away_but_no_wall_behind(walked: 
 
 def test_boxes_of_a_detector_become_the_pixels_of_the_thing(walked: Walked) -> None:
     person, view = walked.person(LATE), walked.view(LATE)
-    rows, columns = (np.flatnonzero(person.any(axis=axis)) for axis in (1, 0))
-    edges = (columns[0] - 2, rows[0] - 2, columns[-1] + 3, rows[-1] + 3)
-    box, other = Box("person", *edges), Box("couch", 0, 0, 160, 120)
+    box, other = box_around(person), Box("couch", 0, 0, 160, 120)
     mask = movable_pixels([box, other], view.levels[0].depth_m, MovableConfig())
     recall, precision = recall_and_precision(mask, person)
     assert recall > 0.95
@@ -189,6 +188,30 @@ def test_keyframes_of_the_odometry_do_not_track_against_who_walks(walked: Walked
             kept.append(k)
     assert tracked.is_moving is not None
     assert recall_and_precision(tracked.is_moving, walked.person(k))[0] > 0.5
+
+
+def test_whom_a_detector_found_in_a_keyframe_is_not_tracked_against(walked: Walked) -> None:
+    """Before anything was seen to move, and after a restart."""
+    frame, person = walked.frame(LATE), walked.person(LATE)
+    odometry = Odometry()
+    keyframe = odometry.make_keyframe(frame, odometry.track(frame))
+    odometry.leave_out(keyframe, [Box("couch", 0, 0, 160, 120)])
+    odometry.leave_out(keyframe + 1, [box_around(person)])
+    assert odometry.state()["keyframe"]["movable"] is None
+    odometry.leave_out(keyframe, [box_around(person)])
+    kept = odometry.state()
+    assert recall_and_precision(kept["keyframe"]["movable"], person)[0] > 0.95
+    restored = Odometry()
+    restored.restore(decode_state(encode_state(kept)))
+    for one in (odometry, restored):
+        tracked = one.track(walked.frame(LATE + 6))
+        error = se3.inverse(walked.T(LATE, LATE + 6)) @ tracked.T_odom_camera
+        assert np.linalg.norm(error[:3, 3]) < 0.01
+
+
+def box_around(mask: np.ndarray) -> Box:
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return Box("person", columns[0] - 2, rows[0] - 2, columns[-1] + 3, rows[-1] + 3)
 
 
 @pytest.mark.slow
