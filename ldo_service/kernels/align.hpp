@@ -48,8 +48,8 @@ struct Equations {
 
 // The entry points, compiled once per instruction set.
 struct Kernels {
-  // Mean of those of each 2x2 block that are within `tolerance` (relative) of the lowest, 0 of fewer
-  // than `least`; zeros are not measured.
+  // Mean of those of each 2x2 block that are within `tolerance` (relative) of the lowest, 0 of
+  // fewer than `least`; zeros are not measured.
   void (*halve)(const float* values, int width, int height, float tolerance, int least, float* out);
   // Texels of an image and its depth, which is dropped beyond `max_depth`; gradients are central
   // differences, 0 on the border and beside clipped pixels.
