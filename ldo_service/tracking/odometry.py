@@ -111,7 +111,7 @@ class Odometry:
             status = Status.LOST
         if status is Status.LOST:
             found = self._found(view, self._state.places, is_lost=True)
-            if found is None or not self._is_within_reach(*found, frame.stamp_ns):
+            if found is None:
                 return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
             # noise is another elsewhere, and what has gone is of another keyframe
@@ -313,15 +313,6 @@ class Odometry:
         state = self._state
         self._state = replace(state, searches=state.searches + 1)
         return self._relocaliser.find(view, places, state.searches, state.history, is_lost=is_lost)
-
-    def _is_within_reach(self, found: Keyframe, candidate: Candidate, stamp_ns: int) -> bool:
-        """Whether the camera can have come there; nothing is known of that between segments."""
-        lost, motion = self._state.keyframe, self._state.motion
-        if lost is None or lost.segment != found.segment:
-            return True
-        T_odom_camera = found.T_odom_keyframe @ candidate.alignment.T_reference_camera
-        T_then_now = se3.inverse(motion.T_odom_camera) @ T_odom_camera
-        return self._relocaliser.is_within_reach(T_then_now, 1e-9 * (stamp_ns - motion.stamp_ns))
 
     def _joining(self, tracked: Tracked, keyframe: Keyframe, view: Pyramid) -> Tracked:
         """Now and then, whether the view is seen from another segment too."""

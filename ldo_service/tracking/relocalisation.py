@@ -51,13 +51,6 @@ class RelocalisationConfig:
     variety_rad: float = 0.25  # likely places nearer to each other than this are one
     rival_inliers: float = 0.3  # of the best place's: a place with more that says
     rival_rad: float = 1.0  # the camera is this far elsewhere (57 degrees, or a median depth)
-    # How far a lost camera may have come: a brisk walk, and a quarter turn in two seconds. What is
-    # found farther away may only look alike, as a corridor does from its other end; a camera that
-    # was really carried there begins a segment, which is joined by more than one look.
-    max_speed_m_s: float = 1.5
-    max_turn_rad_s: float = 0.8
-    reach_m: float = 0.5  # at once, and
-    reach_rad: float = 0.5
     familiar: float = 0.4  # correlation with the last trusted thumbnail; below, a WEAK frame shows
     # another place. Kitchen, frame to frame: above 0.93; against another place: 97 % below
 
@@ -68,8 +61,6 @@ class RelocalisationConfig:
             raise ConfigError("attempts must be at least 1, across_scales at least 0.")
         if not min(self.agreement_rad, self.variety_rad, self.rival_rad) > 0:
             raise ConfigError("agreement_rad, variety_rad and rival_rad must be positive.")
-        if not min(self.max_speed_m_s, self.max_turn_rad_s, self.reach_m, self.reach_rad) > 0:
-            raise ConfigError("max_speed_m_s, max_turn_rad_s, reach_m, reach_rad must be positive.")
         if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.rival_inliers <= 1):
             raise ConfigError("min_geometric_inliers and rival_inliers must be within 0..1.")
         if not 0 <= self.familiar <= 1:
@@ -163,20 +154,6 @@ class Relocaliser:
             verdict is Status.OK
             and alignment.geometric_inliers >= self.config.min_geometric_inliers
             and extent(difference, candidate.median_depth_m) < self.config.agreement_rad
-        )
-
-    def is_within_reach(self, T_then_now: np.ndarray, elapsed_s: float) -> bool:
-        """Whether a camera can have moved by T_then_now [4, 4] in that time.
-
-        Anything may be where the stamps do not ascend: a clock began anew.
-        """
-        if elapsed_s <= 0:
-            return True
-        config = self.config
-        distance_m, angle_rad = np.linalg.norm(T_then_now[:3, 3]), se3.rotation_angle(T_then_now)
-        return bool(
-            distance_m <= config.reach_m + config.max_speed_m_s * elapsed_s
-            and angle_rad <= config.reach_rad + config.max_turn_rad_s * elapsed_s
         )
 
     def _has_rival(self, place: Place, pose: FeaturePose, poses: Iterable[PosedPlace]) -> bool:
