@@ -10,7 +10,7 @@ out  keyframe/refinement   KeyframeRefinement   where the renderer wants the key
 """
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,16 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.changes import Changes
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
-from ldo_service.gaussians.model import ROW
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.map_messages import (
+    NO_GAUSSIANS,
+    NO_IDS,
+    gaussians_message,
+    parts_of,
+    regrouped,
+)
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.process import give_back_free_memory
 from ldo_service.schemas import (
@@ -61,13 +66,6 @@ Output = ModelView | MapDelta | MapSnapshot | KeyframeRefinement
 # A successor starts from a checkpoint and must not use a version again that followers may hold:
 # more than a mapper could use up between two checkpoints.
 VERSIONS_IN_A_CHECKPOINT = 1 << 20
-
-NO_IDS = np.zeros(0, np.int64)
-NO_GAUSSIANS = Gaussians(
-    ids=Array.of(np.zeros(0, np.int64)),
-    params=Array.of(np.zeros((0, ROW), np.float32)),
-    anchors=Array.of(np.zeros(0, np.int32)),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,8 +329,7 @@ class Mapper(Actor):
             )
 
     def _gaussians(self, chosen: np.ndarray) -> Gaussians:
-        awake = self._map.gaussians
-        return gaussians_message(awake.ids[chosen], awake.rows[chosen], awake.anchors[chosen])
+        return gaussians_message(self._map.gaussians.all().at(chosen))
 
     def finish(self) -> Iterator[MapDelta | MapSnapshot]:
         """The whole map, so that whoever listens ends with it."""
@@ -389,41 +386,6 @@ class Mapper(Actor):
         }
 
 
-def gaussians_message(ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> Gaussians:
-    return Gaussians(ids=Array.of(ids), params=Array.of(rows), anchors=Array.of(anchors))
-
-
-def regrouped(
-    pieces: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], parts: int, size: int
-) -> Iterator[Gaussians]:
-    """Pieces of ids, rows and anchors as `parts` messages of `size` Gaussians, the last ones of
-    what is left."""
-    waiting: list[np.ndarray] = [np.zeros(0, np.int64), np.zeros((0, ROW), np.float32)]
-    waiting.append(np.zeros(0, np.int32))
-    made = 0
-    for piece in pieces:
-        waiting = [np.concatenate(pair) for pair in zip(waiting, piece, strict=True)]
-        while len(waiting[0]) >= size and made < parts - 1:
-            yield gaussians_message(*(array[:size] for array in waiting))
-            waiting = [array[size:] for array in waiting]
-            made += 1
-    for _ in range(made, parts):
-        yield gaussians_message(*(array[:size] for array in waiting))
-        waiting = [array[size:] for array in waiting]
-
-
 def to_bytes(image: np.ndarray) -> np.ndarray:
     """0..1 float to 0..255 uint8."""
     return (np.clip(image, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
-
-
-def parts_of(changes: Changes, size: int) -> Iterator[Changes]:
-    """The same in pieces of at most `size` Gaussians: first what goes, then what changed, then
-    what came. Nothing for no change."""
-    nothing = np.zeros(0, np.int64)
-    if len(changes.removed):
-        yield Changes(changes.removed, nothing, nothing)
-    for start in range(0, len(changes.changed), size):
-        yield Changes(nothing, changes.changed[start : start + size], nothing)
-    for start in range(0, len(changes.added), size):
-        yield Changes(nothing, nothing, changes.added[start : start + size])

@@ -3,14 +3,16 @@
 import numpy as np
 
 from ldo_service.gaussians.model import GaussianMap
-from ldo_service.schemas import Gaussians, MapDelta, MapSnapshot
+from ldo_service.map_messages import piece_of
+from ldo_service.schemas import MapDelta, MapSnapshot
 from ldo_service.wire import transform
 
 NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)
 
 
 class MapFollower:
-    """Feed it every map/delta and map/snapshot; `map` is equal to the mapper's at `version`.
+    """Feed it every map/delta and map/snapshot; `map` is equal to the mapper's at `version`, and
+    `label_names` says what its labels are, by index.
 
     A missed delta is noticed (`is_behind`), and the next complete snapshot puts it right.
     """
@@ -23,6 +25,7 @@ class MapFollower:
         self.map = GaussianMap()
         self.version = 0
         self.is_behind = False
+        self.label_names: tuple[str, ...] = ()
         self._exposures: dict[int, np.ndarray] = {}
         self._parts.clear()
 
@@ -51,14 +54,13 @@ class MapFollower:
         if delta.removed.shape[0]:
             self.map.remove(np.isin(self.map.ids, delta.removed.numpy()))
         if delta.changed.ids.shape[0]:
-            where = np.searchsorted(self.map.ids, delta.changed.ids.numpy())
-            self.map.rows[where] = delta.changed.params.numpy()
+            changed = piece_of(delta.changed)
+            where = np.searchsorted(self.map.ids, changed.ids)
+            self.map.rows[where], self.map.labels[where] = changed.rows, changed.labels
             self.map.touch(where.astype(np.uint32))
-        self._append(delta.added)
+        self.map.append(*piece_of(delta.added))
+        self.label_names = delta.label_names or self.label_names
         self.version = delta.version
-
-    def _append(self, gaussians: Gaussians) -> None:
-        self.map.append(gaussians.ids.numpy(), gaussians.params.numpy(), gaussians.anchors.numpy())
 
     def _take_part(self, part: MapSnapshot) -> bool:
         if part.part == 0 and part.version >= self.version:
@@ -73,7 +75,8 @@ class MapFollower:
             return False
         self.map = GaussianMap()
         for number in range(part.parts):
-            self._append(self._parts[number].gaussians)
+            self.map.append(*piece_of(self._parts[number].gaussians))
+        self.label_names = self._parts[0].label_names
         self.version, self.is_behind = part.version, False
         self._parts.clear()
         return True

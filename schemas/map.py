@@ -10,9 +10,12 @@ import msgspec
 import numpy as np
 
 from ldo_service.schemas.array import Array
+from ldo_service.schemas.detections import LONGEST_LABEL
 from ldo_service.schemas.frames import CameraModel
 from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Pose
+
+NO_LABELS = Array.of(np.zeros((0, 32), np.uint8))
 
 
 class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
@@ -20,11 +23,18 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
 
     mean xyz (map, metres), log of the scales (metres), quaternion wxyz, logit of the opacity,
     RGB 0..1, two unused numbers.
+
+    A row of `labels` is what the Gaussian has been seen as, little-endian: bytes 0..19 five weights
+    (f4), heaviest first; 20..23 how much was seen (f4); 24..25 side of the object in mm (u2); 26
+    misses; 27..31 the labels that the weights belong to, indices into `label_names`. What the
+    weights lack of one is background, label 0: the likeliest label is byte 27 where the first
+    weight is more than that, else 0.
     """
 
     ids: Array  # i8 [N], unique, ascending
     params: Array  # f4 [N, 16]
     anchors: Array  # i4 [N], the keyframe that moves it
+    labels: Array = NO_LABELS  # u1 [N, 32]; [0, 32]: nobody has seen any of them, all zero
 
     def __post_init__(self) -> None:
         self.ids.require("ids", "i8", (None,))
@@ -33,6 +43,8 @@ class Gaussians(msgspec.Struct, frozen=True, kw_only=True):
         self.params.require("params", "f4", (count, 16))
         self.params.require_finite("params")
         self.anchors.require("anchors", "i4", (count,))
+        self.labels.require("labels", "u1", (count if self.labels.shape[0] else 0, 32))
+        require_weights(self.labels)
 
 
 class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
@@ -55,9 +67,11 @@ class MapDelta(Message, frozen=True, kw_only=True):
     removed: Array  # i8 [R], ids, ascending
     changed: Gaussians
     added: Gaussians
+    label_names: tuple[str, ...] = ()  # by index, when there are new ones; indices never change
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
+        require_names(self.label_names)
         self.removed.require("removed", "i8", (None,))
         self.removed.require_ascending("removed")
         if not 0 <= self.since < self.version:
@@ -72,7 +86,7 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
     """map/snapshot: one part of the whole map at `version`; parts 0 .. parts-1 make it complete.
 
     Part 0 names the exposure of each keyframe: its camera saw gain * color + bias, per channel, of
-    the map's colours in 0..1.
+    the map's colours in 0..1. It also has the names of the labels.
     """
 
     version: int
@@ -82,9 +96,11 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
     gaussians: Gaussians
     keyframes: Array = NO_KEYFRAMES  # i8 [K], ids, ascending
     exposures: Array = NO_EXPOSURES  # f4 [K, 2, 3], gains, then biases
+    label_names: tuple[str, ...] = ()  # by index; none where nobody looked for objects
 
     def check(self) -> None:
         require_version(self.version, self.graph_version)
+        require_names(self.label_names)
         self.keyframes.require("keyframes", "i8", (None,))
         self.keyframes.require_ascending("keyframes")
         self.exposures.require("exposures", "f4", (self.keyframes.shape[0], 2, 3))
@@ -132,6 +148,24 @@ class MapRefine(Message, frozen=True, kw_only=True):
         require_finite("rates", (self.first_rate, self.last_rate))
         if not (0 < self.first_rate <= 1 and 0 < self.last_rate <= 1):
             raise ValueError(f"rates {self.first_rate} and {self.last_rate} must be in (0, 1]")
+
+
+MOST_NAMES = 256  # what one byte can number
+
+
+def require_names(names: tuple[str, ...]) -> None:
+    if len(names) > MOST_NAMES:
+        raise ValueError(f"{len(names)} label_names are over {MOST_NAMES}")
+    longest = max(map(len, names), default=0)
+    if longest > LONGEST_LABEL:
+        raise ValueError(f"a name of {longest} characters in label_names is over {LONGEST_LABEL}")
+
+
+def require_weights(labels: Array) -> None:
+    """Raise ValueError unless the six numbers of each row [32] are finite and not negative."""
+    numbers = np.ascontiguousarray(labels.numpy()[:, :24]).view("<f4")
+    if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
+        raise ValueError("labels hold weights that are negative, NaN or infinite")
 
 
 def require_version(version: int, graph_version: int) -> None:

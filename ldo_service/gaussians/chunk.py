@@ -9,7 +9,7 @@ import zstandard
 
 from ldo_service.errors import DataError
 
-from .model import ROW, moved_rows
+from .model import LABEL_BYTES, ROW, Piece, moved_rows
 
 _HEADER = struct.Struct("<qq")  # anchor, Gaussians
 _LEVEL = 1  # of zstd
@@ -17,16 +17,20 @@ _LEVEL = 1  # of zstd
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Chunk:
-    """ids [M] int64 ascending, rows [M, 16] float32 in the map."""
+    """ids [M] int64 ascending, rows [M, 16] float32 in the map, labels [M, 32] uint8."""
 
     anchor: int
     ids: np.ndarray
     rows: np.ndarray
+    labels: np.ndarray
 
     @property
     def anchors(self) -> np.ndarray:
         """[M] int32, as GaussianMap keeps them."""
         return np.full(len(self.ids), self.anchor, np.int32)
+
+    def piece(self) -> Piece:
+        return Piece(self.ids, self.rows, self.anchors, self.labels)
 
     def moved(self, motions: Iterable[np.ndarray]) -> "Chunk":
         """By one motion T_new_old [4, 4] of the anchor after the other, to the bits that
@@ -38,10 +42,12 @@ class Chunk:
 
 
 def packed(chunk: Chunk) -> bytes:
-    """Ids as differences and rows byte by byte, as the same byte of neighbours is often equal."""
+    """Ids as differences, rows and labels byte by byte, as the same byte of neighbours is often
+    equal."""
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
     planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T
-    body = _HEADER.pack(chunk.anchor, len(steps)) + steps.tobytes() + planes.tobytes()
+    arrays = steps, planes, np.ascontiguousarray(chunk.labels.T)
+    body = _HEADER.pack(chunk.anchor, len(steps)) + b"".join(a.tobytes() for a in arrays)
     return zstandard.ZstdCompressor(level=_LEVEL).compress(body)
 
 
@@ -52,7 +58,11 @@ def unpacked(data: bytes | memoryview) -> Chunk:
         anchor, count = _HEADER.unpack_from(body)
         steps = np.frombuffer(body, "<i8", count, _HEADER.size)
         planes = np.frombuffer(body, np.uint8, offset=_HEADER.size + steps.nbytes)
-        rows = np.ascontiguousarray(planes.reshape(4 * ROW, count).T).view("<f4")
+        if planes.size == 4 * ROW * count > 0:
+            raise DataError(f"{count} Gaussians without labels, as earlier versions wrote them")
+        planes = planes.reshape(4 * ROW + LABEL_BYTES, count).T
+        rows = np.ascontiguousarray(planes[:, : 4 * ROW]).view("<f4")
+        labels = np.ascontiguousarray(planes[:, 4 * ROW :])
     except (zstandard.ZstdError, struct.error, ValueError) as error:
         raise DataError(f"{len(data)} bytes hold no Gaussians: {error}") from error
-    return Chunk(anchor, np.cumsum(steps), rows)
+    return Chunk(anchor, np.cumsum(steps), rows, labels)

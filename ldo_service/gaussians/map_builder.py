@@ -18,7 +18,7 @@ from .horizon import Horizon
 from .insertion import InsertionConfig, insert
 from .keyframe_store import KeyframeStore, KeyframeStoreConfig
 from .keyframe_views import KeyframeViews
-from .model import GaussianMap
+from .model import GaussianMap, Piece
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
 from .render import Contributions, Rendering, RenderMemory, render
@@ -300,8 +300,8 @@ class MapBuilder:
         """Gaussians, awake and asleep."""
         return len(self.gaussians) + len(self.sleeping)
 
-    def pieces(self) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """The whole map, in pieces of ids, rows and anchors; ids ascend throughout."""
+    def pieces(self) -> Iterator[Piece]:
+        """The whole map, in pieces; ids ascend throughout."""
         yield from whole_map(self.gaussians, self.sleeping)
 
     # --- telling others ---------------------------------------------------------------------------

@@ -1,29 +1,58 @@
-"""The map: Gaussians in rows of one cache line, with stable ids and the keyframes they hang on."""
+"""The map: Gaussians in rows of one cache line, with stable ids, the keyframes they hang on, and
+what they have been seen as."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from ldo_service.errors import DataError
 from ldo_service.geometry import se3
 from ldo_service.kernels._rasterise import Bounds
 
 ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused
+LABEL_BYTES = 32  # per Gaussian; what they mean: `semantics.labels`. Zeros: nobody has seen it
 _CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache
+
+
+class Piece(NamedTuple):
+    """Some Gaussians of a map, in order.
+
+    ids     [M] int64
+    rows    [M, 16] float32
+    anchors [M] int32
+    labels  [M, 32] uint8
+    """
+
+    ids: np.ndarray
+    rows: np.ndarray
+    anchors: np.ndarray
+    labels: np.ndarray
+
+    def at(self, where: np.ndarray | slice) -> "Piece":
+        return Piece(*(array[where] for array in self))
+
+
+def new_labels(n: int) -> np.ndarray:
+    """Labels [n, 32] of Gaussians that nobody has seen."""
+    return np.zeros((n, LABEL_BYTES), np.uint8)
 
 
 class GaussianMap:
     """Gaussians in the map frame, in order of insertion.
 
-    `rows`, its columns (`means`, ...), `ids` and `anchors` are views without a copy, valid until
-    Gaussians come or go. Who writes through them calls `touch` before the next rendering. `version`
-    grows with every change, `membership` when Gaussians may have come or gone. `bounds` says to
-    `render` where the rows lie, so that it reads those in view only.
+    `rows`, its columns (`means`, ...), `ids`, `anchors` and `labels` are views without a copy,
+    valid until Gaussians come or go. Who writes through `rows` calls `touch` before the next
+    rendering. `version` grows with every change but those of labels, which no rendering shows;
+    `membership` when Gaussians may have come or gone. `bounds` says to `render` where the rows lie,
+    so that it reads those in view only. A Gaussian takes 108 bytes, 32 of them its labels.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
         self._rows = aligned_rows(capacity)
         self._ids = np.zeros(capacity, np.int64)
         self._anchors = np.zeros(capacity, np.int32)
+        self._labels = new_labels(capacity)
         self._size = 0
         self._next_id = 0
         self.version = 0
@@ -73,6 +102,16 @@ class GaussianMap:
         """[N] int32, id of the keyframe that each Gaussian moves with."""
         return self._anchors[: self._size]
 
+    @property
+    def labels(self) -> np.ndarray:
+        """[N, 32] uint8, what each has been seen as: see `semantics.labels`."""
+        return self._labels[: self._size]
+
+    @property
+    def _arrays(self) -> Piece:
+        """With the room behind the last Gaussian."""
+        return Piece(self._ids, self._rows, self._anchors, self._labels)
+
     def touch(self, rows: np.ndarray | slice | None = None) -> None:
         """Say what was written through a view: the rows with these numbers (uint32, or a slice
         without a step). Without an argument anything may have changed, which is always safe."""
@@ -95,16 +134,25 @@ class GaussianMap:
         self.append(ids, rows, np.full(len(rows), anchor, np.int32))
         return ids
 
-    def append(self, ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
+    def append(
+        self,
+        ids: np.ndarray,
+        rows: np.ndarray,
+        anchors: np.ndarray,
+        labels: np.ndarray | None = None,
+    ) -> None:
         """Append Gaussians that another map gave their ids [M], above all in this one, to follow
-        it. Raises ValueError for other shapes, ids that do not ascend, NaN and infinity."""
-        _require_rows(ids, rows, anchors)
+        it. Without labels [M, 32] nobody has seen them.
+
+        Raises ValueError for other shapes, ids that do not ascend, NaN and infinity.
+        """
+        new = _piece(ids, rows, anchors, labels)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
             raise ValueError(f"ids must ascend from {self._next_id}.")
         start, stop = self._size, self._size + len(rows)
         self._reserve(stop)
-        self._rows[start:stop], self._ids[start:stop] = rows, ids
-        self._anchors[start:stop] = anchors
+        for array, values in zip(self._arrays, new, strict=True):
+            array[start:stop] = values
         self._size = stop
         self._next_id = int(ids[-1]) + 1 if len(ids) else self._next_id
         self.membership += 1
@@ -121,36 +169,44 @@ class GaussianMap:
         first = int(np.argmax(mask))  # what comes before stays in place
         keep = ~mask[first:]
         size = first + int(np.count_nonzero(keep))
-        for array in (self._rows, self._ids, self._anchors):
+        for array in self._arrays:
             array[first:size] = array[first : self._size][keep]
         self.touch(slice(first, None))
         removed, self._size = self._size - size, size
         self.membership += 1
         return removed
 
-    def take_out(self, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def all(self) -> Piece:
+        """All of them, without a copy."""
+        return Piece(self.ids, self.rows, self.anchors, self.labels)
+
+    def take_out(self, mask: np.ndarray) -> Piece:
         """Remove the Gaussians where mask [N] is true, to keep them elsewhere for a while.
 
-        Returns copies of their ids [M], rows [M, 16] and anchors [M], in order. Raises ValueError
-        as `remove`.
+        Returns copies. Raises ValueError as `remove`.
         """
         self._require_mask(mask)
-        taken = self.ids[mask], self.rows[mask], self.anchors[mask]
+        taken = self.all().at(mask)
         self.remove(mask)
         return taken
 
-    def bring_back(self, ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
+    def bring_back(
+        self,
+        ids: np.ndarray,
+        rows: np.ndarray,
+        anchors: np.ndarray,
+        labels: np.ndarray | None = None,
+    ) -> None:
         """Put Gaussians that this map gave their ids [M], and that are absent now, where they
-        were among the others: `ids` ascend again. They may come in any order.
+        were among the others: `ids` ascend again. They may come in any order; without labels
+        [M, 32] nobody has seen them.
 
         Raises ValueError for other shapes, NaN and infinity, an id that is present, given twice
         or never was this map's. Linear in N.
         """
-        _require_rows(ids, rows, anchors)
-        order = np.argsort(ids, kind="stable")
-        ids, rows, anchors = ids[order], rows[order], anchors[order]
-        before = np.searchsorted(self.ids, ids)  # how many of those here come before each
-        self._require_absent(ids, before)
+        returned = _piece(ids, rows, anchors, labels).at(np.argsort(ids, kind="stable"))
+        before = np.searchsorted(self.ids, returned.ids)  # how many of those here come before each
+        self._require_absent(returned.ids, before)
         if len(ids) == 0:
             return
         places, old_size = before + np.arange(len(ids)), self._size
@@ -159,10 +215,9 @@ class GaussianMap:
         first = int(places[0])
         stay = np.ones(self._size - first, bool)
         stay[places - first] = False
-        arrays = self._rows, self._ids, self._anchors
-        for array, returned in zip(arrays, (rows, ids, anchors), strict=True):
+        for array, values in zip(self._arrays, returned, strict=True):
             array[first : self._size][stay] = array[first:old_size].copy()
-            array[places] = returned
+            array[places] = values
         self.touch()
         self.membership += 1
 
@@ -190,17 +245,24 @@ class GaussianMap:
             "rows": self.rows.copy(),
             "ids": self.ids.copy(),
             "anchors": self.anchors.copy(),
+            "labels": self.labels.copy(),
             "next_id": np.array(self._next_id, np.int64),
             "version": np.array(self.version, np.int64),
         }
 
     @classmethod
     def restore(cls, state: Mapping[str, np.ndarray]) -> "GaussianMap":
-        """The map of which `state` is the snapshot, exactly."""
+        """The map of which `state` is the snapshot, exactly. Raises DataError for one without
+        labels."""
+        if "labels" not in state:
+            raise DataError(
+                "the state has no labels of Gaussians: an earlier version saved it. Start with "
+                "another folder for states."
+            )
         size = len(state["rows"])
         out = cls(max(size, 1))
-        out._rows[:size], out._ids[:size] = state["rows"], state["ids"]
-        out._anchors[:size] = state["anchors"]
+        for name, array in out._arrays._asdict().items():
+            array[:size] = state[name]
         out._size, out._next_id = size, int(state["next_id"])
         out.version = int(state["version"])
         return out
@@ -223,10 +285,10 @@ class GaussianMap:
         if size <= len(self._rows):
             return
         capacity = max(size, 2 * len(self._rows))
-        grown = aligned_rows(capacity), np.zeros(capacity, np.int64), np.zeros(capacity, np.int32)
-        for new, old in zip(grown, (self._rows, self._ids, self._anchors), strict=True):
+        grown = GaussianMap(capacity)._arrays
+        for new, old in zip(grown, self._arrays, strict=True):
             new[: self._size] = old[: self._size]
-        self._rows, self._ids, self._anchors = grown
+        self._ids, self._rows, self._anchors, self._labels = grown
 
 
 def aligned_rows(capacity: int) -> np.ndarray:
@@ -245,11 +307,17 @@ def moved_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
     return out
 
 
-def _require_rows(ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray) -> None:
+def _piece(
+    ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray, labels: np.ndarray | None
+) -> Piece:
     if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
         raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids.")
     if not np.all(np.isfinite(rows)):
         raise ValueError("rows hold NaN or infinity.")
+    labels = new_labels(len(ids)) if labels is None else labels
+    if labels.shape != (len(ids), LABEL_BYTES) or labels.dtype != np.uint8:
+        raise ValueError(f"labels are {labels.dtype}{labels.shape}, must be uint8[M, 32].")
+    return Piece(ids, rows, anchors, labels)
 
 
 def _move(rows: np.ndarray, anchors: np.ndarray, keyframes: np.ndarray, T: np.ndarray) -> None:

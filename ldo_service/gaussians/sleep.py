@@ -13,7 +13,7 @@ from ldo_service.geometry import se3
 
 from .anchor_spheres import AnchorSpheres, PlacedCamera
 from .chunk import Chunk, packed, unpacked
-from .model import ROW, GaussianMap
+from .model import ROW, GaussianMap, Piece, new_labels
 from .sealed_folder import SealedFolder
 
 log = logging.getLogger(__name__)
@@ -118,15 +118,16 @@ class SleepingGaussians:
         awake. Linear in the size of the map.
         """
         mask = np.isin(clumps, np.array(sorted(chosen), np.int64))
-        labels = clumps[mask]
-        ids, rows, anchors = gaussians.take_out(mask)
-        numbers, refused = [], np.zeros(len(ids), bool)
-        for own in _members(labels):
-            number = self.put(Chunk(int(anchors[own[0]]), ids[own], rows[own]))
-            refused[own] = number is None
+        of_clump = clumps[mask]
+        taken = gaussians.take_out(mask)
+        numbers, refused = [], np.zeros(len(of_clump), bool)
+        for members in _members(of_clump):
+            ids, rows, anchors, labels = taken.at(members)
+            number = self.put(Chunk(int(anchors[0]), ids, rows, labels))
+            refused[members] = number is None
             numbers += [] if number is None else [number]
         if np.any(refused):
-            gaussians.bring_back(ids[refused], rows[refused], anchors[refused])
+            gaussians.bring_back(*taken.at(refused))
         return numbers
 
     def return_to(self, gaussians: GaussianMap, numbers: Iterable[int]) -> np.ndarray:
@@ -135,10 +136,9 @@ class SleepingGaussians:
         chunks = [self.wake(number) for number in sorted(numbers)]
         if not chunks:
             return np.zeros(0, np.int64)
-        ids = np.concatenate([chunk.ids for chunk in chunks])
-        rows = np.concatenate([chunk.rows for chunk in chunks])
-        gaussians.bring_back(ids, rows, np.concatenate([chunk.anchors for chunk in chunks]))
-        return np.sort(ids)
+        woken = _joined([chunk.piece() for chunk in chunks])
+        gaussians.bring_back(*woken)
+        return np.sort(woken.ids)
 
     # --- without waking ---------------------------------------------------------------------------
     def seen_from(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
@@ -167,12 +167,10 @@ class SleepingGaussians:
         for number in sorted(self._entries, key=lambda n: self._entries[n].first_id):
             by_anchor.setdefault(self._entries[number].anchor, []).append(number)
         for anchor, numbers in by_anchor.items():
-            parts = [self._read(number) for number in numbers]
-            ids = np.concatenate([part.ids for part in parts])
-            order = np.argsort(ids, kind="stable")
-            if len(ids):
-                rows = np.concatenate([part.rows for part in parts])
-                yield Chunk(anchor, ids[order], rows[order])
+            parts = _joined([self._read(number).piece() for number in numbers])
+            if len(parts.ids):
+                ids, rows, _, labels = _in_order(parts)
+                yield Chunk(anchor, ids, rows, labels)
 
     def _all_spheres(self) -> AnchorSpheres:
         entries = self._entries.values()
@@ -271,7 +269,8 @@ class SleepingGaussians:
                 raise DataError(f"the file holds {len(chunk.ids)} of anchor {chunk.anchor}")
         except DataError as error:
             self._lose(number, str(error))
-            return Chunk(entry.anchor, np.zeros(0, np.int64), np.zeros((0, ROW), np.float32))
+            rows = np.zeros((0, ROW), np.float32)
+            return Chunk(entry.anchor, np.zeros(0, np.int64), rows, new_labels(0))
         return chunk.moved(entry.motions)
 
     def _settle(self, number: int) -> None:
@@ -309,21 +308,21 @@ def _members(labels: np.ndarray) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 
 
-def whole_map(
-    gaussians: GaussianMap, sleeping: SleepingGaussians
-) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """All Gaussians, awake or asleep, in pieces of ids, rows and anchors; ids ascend throughout,
-    as those of one anchor follow each other. Of those asleep, one anchor's are in memory at a
-    time."""
-    awake, start = (gaussians.ids, gaussians.rows, gaussians.anchors), 0
+def _joined(pieces: list[Piece]) -> Piece:
+    return Piece(*map(np.concatenate, zip(*pieces, strict=True)))
+
+
+def _in_order(piece: Piece) -> Piece:
+    return piece.at(np.argsort(piece.ids, kind="stable"))
+
+
+def whole_map(gaussians: GaussianMap, sleeping: SleepingGaussians) -> Iterator[Piece]:
+    """All Gaussians, awake or asleep, in pieces; ids ascend throughout, as those of one anchor
+    follow each other. Of those asleep, one anchor's are in memory at a time."""
+    awake, start = gaussians.all(), 0
     for chunk in sleeping.chunks():
-        first, last = np.searchsorted(gaussians.ids, chunk.ids[[0, -1]])
-        yield awake[0][start:first], awake[1][start:first], awake[2][start:first]
-        mixed = [
-            np.concatenate([mine[first:last], other])
-            for mine, other in zip(awake, (chunk.ids, chunk.rows, chunk.anchors), strict=True)
-        ]
-        order = np.argsort(mixed[0], kind="stable")
-        yield mixed[0][order], mixed[1][order], mixed[2][order]
-        start = int(last)
-    yield awake[0][start:], awake[1][start:], awake[2][start:]
+        first, last = map(int, np.searchsorted(awake.ids, chunk.ids[[0, -1]]))
+        yield awake.at(slice(start, first))
+        yield _in_order(_joined([awake.at(slice(first, last)), chunk.piece()]))
+        start = last
+    yield awake.at(slice(start, None))

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from ldo_service.errors import ConfigError
+from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
 BACKGROUND, OTHER = 0, 1  # what every vocabulary begins with
@@ -30,7 +31,6 @@ ROW = np.dtype(
         ("ids", "u1", SLOTS),
     ]
 )
-ROW_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +71,6 @@ class Observations:
     labels: np.ndarray
     confidences: np.ndarray
     extents_m: np.ndarray
-
-
-def new_labels(n: int) -> np.ndarray:
-    """Rows [n, 32] uint8 of Gaussians that nobody has seen."""
-    return np.zeros((n, ROW_BYTES), np.uint8)
 
 
 def fields(labels: np.ndarray) -> np.ndarray:

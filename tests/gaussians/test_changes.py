@@ -75,13 +75,13 @@ def test_a_follower_ends_with_the_same_rows_whatever_happens(steps: list[tuple[s
                 asleep.append(gaussians.take_out(mask))
                 log.all_told(gaussians)
             case "wake" if asleep:
-                ids, woken, anchors = asleep.pop()
-                gaussians.bring_back(ids, woken, anchors)
-                log.woken(gaussians, ids)
+                woken = asleep.pop()
+                gaussians.bring_back(*woken)
+                log.woken(gaussians, woken.ids)
     while asleep:
-        ids, woken, anchors = asleep.pop()
-        gaussians.bring_back(ids, woken, anchors)
-        log.woken(gaussians, ids)
+        woken = asleep.pop()
+        gaussians.bring_back(*woken)
+        log.woken(gaussians, woken.ids)
     follower.take(log.take(gaussians, with_changed=True), gaussians)
     assert follower.rows == truth(gaussians)
 

@@ -162,7 +162,7 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     asleep = builder.statistics()["gaussians_asleep"]
     assert asleep > 1000
     assert builder.size() == len(builder.gaussians) + asleep
-    whole = np.concatenate([ids for ids, _, _ in builder.pieces()])
+    whole = np.concatenate([piece.ids for piece in builder.pieces()])
     assert np.all(np.diff(whole) > 0)
     assert len(whole) == builder.size()
     iterations = builder.statistics()["iterations"]
@@ -177,10 +177,10 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
 
 def test_followers_are_told_what_was_lost_on_disk(posed: dict, tmp_path: Path) -> None:
     builder = with_sleepers(posed, folder=tmp_path)
-    before = np.concatenate([ids for ids, _, _ in builder.pieces()])
+    before = np.concatenate([piece.ids for piece in builder.pieces()])
     for file in sorted((tmp_path / "gaussians").iterdir())[:2]:
         file.write_bytes(file.read_bytes()[:-20])
-    after = np.concatenate([ids for ids, _, _ in builder.pieces()])
+    after = np.concatenate([piece.ids for piece in builder.pieces()])
     assert len(after) < len(before)
     removed = builder.changes(with_changed=False).removed
     assert np.setdiff1d(before, removed).tolist() == after.tolist()

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ldo_service.errors import DataError
 from ldo_service.gaussians import GaussianMap, render
 from ldo_service.geometry import Camera, se3
 
@@ -22,11 +23,16 @@ def rows_of(n: int, seed: int = 0) -> np.ndarray:
 
 
 def map_of(*counts: int) -> GaussianMap:
-    """A map with that many Gaussians on keyframes 0, 1, ..."""
+    """A map with that many labelled Gaussians on keyframes 0, 1, ..."""
     out = GaussianMap(capacity=2)
     for keyframe, n in enumerate(counts):
         out.add(rows_of(n, keyframe), keyframe)
+        out.labels[len(out) - n :] = labels_of(n, keyframe)
     return out
+
+
+def labels_of(n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (n, 32), np.uint8)
 
 
 def test_added_rows_come_back_bit_for_bit_after_growing() -> None:
@@ -47,26 +53,30 @@ def test_removal_keeps_order_and_never_gives_an_id_twice() -> None:
     np.testing.assert_array_equal(gaussians.ids, [1, 2, 4, 5, 6])
     np.testing.assert_array_equal(gaussians.rows, before[~drop])
     np.testing.assert_array_equal(gaussians.anchors, [0, 0, 1, 1, 1])
+    labels = np.concatenate([labels_of(4, 0), labels_of(4, 1)])[~drop]
+    np.testing.assert_array_equal(gaussians.labels, labels)
     np.testing.assert_array_equal(gaussians.add(rows_of(2), 7), [8, 9])
+    assert not gaussians.labels[5:].any(), "nobody has seen what is new"
 
 
 def test_what_was_taken_out_comes_back_bit_for_bit() -> None:
     gaussians, untouched = map_of(4, 5, 6), map_of(4, 5, 6)
-    ids, rows, anchors = gaussians.take_out(gaussians.anchors == 1)
-    np.testing.assert_array_equal(ids, np.arange(4, 9))
-    np.testing.assert_array_equal(anchors, 1)
-    assert rows.tobytes() == rows_of(5, 1).tobytes()
+    taken = gaussians.take_out(gaussians.anchors == 1)
+    np.testing.assert_array_equal(taken.ids, np.arange(4, 9))
+    np.testing.assert_array_equal(taken.anchors, 1)
+    assert taken.rows.tobytes() == rows_of(5, 1).tobytes()
+    assert taken.labels.tobytes() == labels_of(5, 1).tobytes()
     np.testing.assert_array_equal(gaussians.ids, [*range(4), *range(9, 15)])
-    gaussians.bring_back(ids, rows, anchors)
-    for name in ("rows", "ids", "anchors"):
+    gaussians.bring_back(*taken)
+    for name in ("rows", "ids", "anchors", "labels"):
         assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
 
 
 def test_those_taken_out_are_copies() -> None:
     gaussians = map_of(3, 3)
-    _, rows, _ = gaussians.take_out(np.ones(6, bool))
+    taken = gaussians.take_out(np.ones(6, bool))
     gaussians.add(rows_of(6, 9), 2)
-    assert rows.tobytes() == np.concatenate([rows_of(3, 0), rows_of(3, 1)]).tobytes()
+    assert taken.rows.tobytes() == np.concatenate([rows_of(3, 0), rows_of(3, 1)]).tobytes()
 
 
 @given(masks=st.lists(st.integers(1, 2**12 - 1), min_size=1, max_size=4), data=st.data())
@@ -83,13 +93,13 @@ def test_any_order_of_leaving_and_returning_ends_with_the_same_map(masks, data) 
     for k in data.draw(st.permutations(range(len(away)))):
         shuffled = data.draw(st.permutations(range(len(away[k][0]))))
         gaussians.bring_back(*(part[list(shuffled)] for part in away[k]))
-    for name in ("rows", "ids", "anchors"):
+    for name in ("rows", "ids", "anchors", "labels"):
         assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
 
 
 def test_only_absent_gaussians_of_this_map_come_back() -> None:
     gaussians = map_of(6)
-    ids, rows, anchors = gaussians.take_out(np.array([0, 1, 1, 0, 0, 0], bool))
+    ids, rows, anchors, labels = gaussians.take_out(np.array([0, 1, 1, 0, 0, 0], bool))
     before = gaussians.snapshot()
     for wrong, reason in (([1, 3], "id 3 is in"), ([1, 6], "gave 0 to 5"), ([2, 2], "twice")):
         with pytest.raises(ValueError, match=reason):
@@ -98,6 +108,8 @@ def test_only_absent_gaussians_of_this_map_come_back() -> None:
         gaussians.bring_back(ids, np.full_like(rows, np.nan), anchors)
     with pytest.raises(ValueError, match="shape"):
         gaussians.bring_back(ids, rows[:1], anchors)
+    with pytest.raises(ValueError, match="labels"):
+        gaussians.bring_back(ids, rows, anchors, labels[:, :5])
     after = gaussians.snapshot()
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
@@ -191,7 +203,16 @@ def test_snapshot_does_not_follow_the_map() -> None:
     gaussians = map_of(5)
     state = gaussians.snapshot()
     gaussians.means[...] = 0
+    gaussians.labels[...] = 0
     assert np.abs(state["rows"][:, :3]).min() > 0
+    assert state["labels"].tobytes() == labels_of(5).tobytes()
+
+
+def test_a_state_without_labels_says_who_made_it() -> None:
+    state = map_of(5).snapshot()
+    del state["labels"]
+    with pytest.raises(DataError, match="an earlier version saved it"):
+        GaussianMap.restore(state)
 
 
 def test_bad_arguments_are_refused_and_change_nothing() -> None:

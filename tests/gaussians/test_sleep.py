@@ -29,15 +29,20 @@ def rows_of(n: int, seed: int = 0) -> np.ndarray:
     return rows
 
 
+def labels_of(n: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (n, 32), np.uint8)
+
+
 def map_of(*counts: int) -> GaussianMap:
     out = GaussianMap()
     for keyframe, n in enumerate(counts):
         out.add(rows_of(n, keyframe), keyframe)
+    out.labels[:] = labels_of(len(out))
     return out
 
 
 def chunk_of(anchor: int, first_id: int, n: int) -> Chunk:
-    return Chunk(anchor, np.arange(first_id, first_id + n), rows_of(n))
+    return Chunk(anchor, np.arange(first_id, first_id + n), rows_of(n), labels_of(n))
 
 
 def put_to_sleep(
@@ -48,29 +53,35 @@ def put_to_sleep(
 
 
 def pieces_of(gaussians: GaussianMap, sleeping: SleepingGaussians) -> list[np.ndarray]:
-    """Ids, rows and anchors of all, awake or asleep."""
+    """Ids, rows, anchors and labels of all, awake or asleep."""
     pieces = list(whole_map(gaussians, sleeping))
-    return [np.concatenate([piece[k] for piece in pieces]) for k in range(3)]
+    return [np.concatenate(arrays) for arrays in zip(*pieces, strict=True)]
 
 
 def assert_whole(gaussians: GaussianMap, sleeping: SleepingGaussians, plain: GaussianMap) -> None:
-    for mine, wanted in zip(
-        pieces_of(gaussians, sleeping), (plain.ids, plain.rows, plain.anchors), strict=True
-    ):
+    for mine, wanted in zip(pieces_of(gaussians, sleeping), plain.all(), strict=True):
         assert mine.tobytes() == wanted.tobytes()
 
 
 # --- one chunk --------------------------------------------------------------------------------
 def test_a_chunk_comes_back_bit_for_bit() -> None:
     ids = np.array([3, 4, 9, 2**40])
-    chunk = unpacked(packed(Chunk(7, ids, rows_of(4))))
+    chunk = unpacked(packed(Chunk(7, ids, rows_of(4), labels_of(4))))
     assert (chunk.anchor, chunk.ids.tolist()) == (7, ids.tolist())
     assert chunk.rows.dtype == np.float32
     assert chunk.rows.tobytes() == rows_of(4).tobytes()
+    assert chunk.labels.tobytes() == labels_of(4).tobytes()
     np.testing.assert_array_equal(chunk.anchors, np.full(4, 7, np.int32))
 
 
-@pytest.mark.parametrize("body", [b"", b"no zstd", packed(Chunk(0, np.arange(3), rows_of(2)))])
+def test_a_chunk_of_an_earlier_version_is_refused_with_the_reason() -> None:
+    with pytest.raises(DataError, match="4 Gaussians without labels, as earlier versions"):
+        unpacked(packed(Chunk(7, np.arange(4), rows_of(4), labels_of(0))))
+
+
+@pytest.mark.parametrize(
+    "body", [b"", b"no zstd", packed(Chunk(0, np.arange(3), rows_of(1), labels_of(1)))]
+)
 def test_other_bytes_are_no_chunk(body: bytes) -> None:
     with pytest.raises(DataError, match="no Gaussians"):
         unpacked(body)
@@ -79,7 +90,7 @@ def test_other_bytes_are_no_chunk(body: bytes) -> None:
 def test_gaussians_of_a_still_anchor_wake_bit_for_bit(tmp_path: Path) -> None:
     sleeping, rows_before = SleepingGaussians(tmp_path), rows_of(5)
     rows_before[:, [0, 7, 14]] = -0.0  # which no motion leaves negative
-    number = sleeping.put(Chunk(2, np.arange(10, 15), rows_before))
+    number = sleeping.put(Chunk(2, np.arange(10, 15), rows_before, labels_of(5)))
     assert number is not None
     assert sleeping.numbers() == [number]
     assert len(sleeping) == 5
@@ -87,6 +98,7 @@ def test_gaussians_of_a_still_anchor_wake_bit_for_bit(tmp_path: Path) -> None:
     chunk = sleeping.wake(number)
     assert (chunk.anchor, chunk.ids.tolist()) == (2, [10, 11, 12, 13, 14])
     assert chunk.rows.tobytes() == rows_before.tobytes()
+    assert chunk.labels.tobytes() == labels_of(5).tobytes()
     assert sleeping.numbers() == []
     with pytest.raises(KeyError):
         sleeping.wake(number)
@@ -115,7 +127,7 @@ def test_a_chunk_has_ids_in_order(tmp_path: Path) -> None:
     sleeping = SleepingGaussians(tmp_path)
     for ids, count in (([], 0), ([1, 1, 2], 3), ([2, 1, 3], 3), ([1, 2], 3)):
         with pytest.raises(ValueError, match="ids"):
-            sleeping.put(Chunk(2, np.array(ids, int), rows_of(count)))
+            sleeping.put(Chunk(2, np.array(ids, int), rows_of(count), labels_of(count)))
     assert sleeping.numbers() == []
 
 

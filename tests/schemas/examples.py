@@ -10,6 +10,7 @@ an earlier version has sent, and every later one must still read it.
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from ldo_service.schemas import (
@@ -61,6 +62,17 @@ def gaussians(ids: list[int]) -> Gaussians:
         params=Array.of(params),
         anchors=Array.of(np.arange(len(ids), dtype=np.int32)),
     )
+
+
+def labelled(ids: list[int]) -> Gaussians:
+    """Three quarters chair, of 0.5 m."""
+    row = np.zeros(32, np.uint8)
+    row[:24] = np.array([0.75, 0, 0, 0, 0, 1.5], "<f4").view(np.uint8)
+    row[24:26], row[27] = np.array([500], "<u2").view(np.uint8), 58
+    return msgspec.structs.replace(gaussians(ids), labels=Array.of(np.tile(row, (len(ids), 1))))
+
+
+LABEL_NAMES = ("background", "other", "person")
 
 
 EXAMPLES: dict[str, Message] = {
@@ -221,6 +233,26 @@ EXAMPLES: dict[str, Message] = {
         removed=Array.of(np.array([2, 3], np.int64)),
         changed=gaussians([1]),
         added=gaussians([8, 9]),
+    ),
+    "map_delta_with_labels": MapDelta(
+        stamp_ns=7,
+        since=4,
+        version=5,
+        graph_version=3,
+        motions=(),
+        removed=Array.of(np.zeros(0, np.int64)),
+        changed=labelled([1, 5]),
+        added=gaussians([8]),
+        label_names=LABEL_NAMES,
+    ),
+    "map_snapshot_with_labels": MapSnapshot(
+        stamp_ns=8,
+        version=5,
+        graph_version=3,
+        part=0,
+        parts=2,
+        gaussians=labelled([1, 8]),
+        label_names=LABEL_NAMES,
     ),
     "map_snapshot": MapSnapshot(
         stamp_ns=8, version=5, graph_version=3, part=1, parts=2, gaussians=gaussians([1, 8])

@@ -287,6 +287,36 @@ def test_gaussians_whose_arrays_do_not_fit_are_refused(
         )
 
 
+def label_rows(count: int, width: int = 32, weight: float = 0.5) -> Array:
+    rows = np.zeros((count, width), np.uint8)
+    rows[:, :4] = np.array([weight], "<f4").view(np.uint8)
+    return Array.of(rows)
+
+
+@pytest.mark.parametrize(
+    ("labels", "complaint"),
+    [
+        (label_rows(1), "labels is"),
+        (label_rows(2, width=31), "labels is"),
+        (label_rows(2, weight=NAN), "NaN"),
+        (label_rows(2, weight=-0.5), "negative"),
+    ],
+)
+def test_labels_that_are_none_are_refused(labels: Array, complaint: str) -> None:
+    two = {"ids": array([1, 2], np.int64), "params": array(np.zeros((2, 16)), np.float32)}
+    with pytest.raises(ValueError, match=complaint):
+        Gaussians(**two, anchors=array([0, 0], np.int32), labels=labels)
+
+
+@pytest.mark.parametrize(
+    ("names", "complaint"), [(("a",) * 257, "257 label_names"), (("a" * 101,), "101 characters")]
+)
+def test_label_names_are_few_and_short(names: tuple[str, ...], complaint: str) -> None:
+    for example in ("map_delta", "map_snapshot"):
+        with pytest.raises(ValueError, match=complaint):
+            changed(example, label_names=names)
+
+
 @pytest.mark.parametrize("since", [5, 6, -1])
 def test_a_delta_leads_to_a_newer_version(since: int) -> None:
     with pytest.raises(ValueError, match="goes back"):

@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians import GaussianMap
+from ldo_service.gaussians.model import LABEL_BYTES
 from ldo_service.semantics import labels as labels_module
 from ldo_service.semantics.labels import (
     MISS,
     NOT_SEEN,
     OTHER,
     ROW,
-    ROW_BYTES,
     SLOTS,
     LabelConfig,
     Observations,
@@ -54,7 +54,7 @@ def test_examples_in_the_docstrings_hold() -> None:
 
 
 def test_a_row_is_half_a_cache_line() -> None:
-    assert ROW.itemsize == ROW_BYTES
+    assert ROW.itemsize == LABEL_BYTES
 
 
 @pytest.mark.parametrize("config", CONFIGS)
@@ -187,7 +187,7 @@ def test_labels_travel_as_the_rows_of_a_map_do() -> None:
     away = np.arange(20) % 3 == 0
     kept, asleep = labels[~away], labels[away].tobytes()
     back = np.empty_like(labels)
-    back[~away], back[away] = kept, np.frombuffer(asleep, np.uint8).reshape(-1, ROW_BYTES)
+    back[~away], back[away] = kept, np.frombuffer(asleep, np.uint8).reshape(-1, LABEL_BYTES)
     for rows in (back, still):
         observe(rows, second, LabelConfig())
     assert back.tobytes() == still.tobytes()
