@@ -74,7 +74,6 @@ GRAPH: tuple[Box, ...] = (
         "keeps the map of Gaussians",
         lambda config: Mapper(config.mapper),
         later=(
-            In(t.DETECTION_BOXES, Lossless(8)),
             In(t.LABEL_OPEN, Latest(1, per_key=True)),
             Out(t.LABEL_REQUEST),
             Out(t.MAP_OBJECTS),

@@ -1,6 +1,7 @@
 """The map of Gaussians.                                                        actors/mapper.py
 
 in   keyframe/new          Keyframe             Lossless(8)   a missing one is a hole in the map
+in   detection/boxes       DetectionBoxes       Lossless(8)   a keyframe without it has no labels
 in   graph/correction      Correction           Latest(1)     a versioned absolute state
 in   map/refine            MapRefine            Latest(1)     what was asked last
 out  map/view              ModelView            the map as rendered at the newest keyframe
@@ -34,6 +35,7 @@ from ldo_service.schemas import (
     AnchorMotion,
     Array,
     Correction,
+    DetectionBoxes,
     Gaussians,
     Keyframe,
     KeyframeRefinement,
@@ -45,6 +47,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.pose import Matrix6
 from ldo_service.schemas.topics import (
+    DETECTION_BOXES,
     GRAPH_CORRECTION,
     KEYFRAME_NEW,
     KEYFRAME_REFINEMENT,
@@ -53,7 +56,9 @@ from ldo_service.schemas.topics import (
     MAP_SNAPSHOT,
     MAP_VIEW,
 )
+from ldo_service.semantics.semantic_map import SemanticMap, SemanticMapConfig
 from ldo_service.wire import (
+    claims_of,
     keyframe_poses_of,
     mask_of,
     pose_message,
@@ -71,6 +76,7 @@ VERSIONS_IN_A_CHECKPOINT = 1 << 20
 @dataclass(frozen=True, slots=True)
 class MapperConfig:
     builder: MapBuilderConfig = field(default_factory=MapBuilderConfig)
+    semantics: SemanticMapConfig = field(default_factory=SemanticMapConfig)
     iterations: int = 12  # of the optimiser per keyframe, fewer where the map is dense: 12 FPS on
     # two cores at 640x480
     least_iterations: int = 3  # however many keyframes wait: none is left as it was inserted
@@ -111,6 +117,7 @@ class Mapper(Actor):
     name = "mapper"
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
+        In(DETECTION_BOXES, Lossless(8)),
         In(GRAPH_CORRECTION, Latest(1)),
         In(MAP_REFINE, Latest(1)),
     )
@@ -122,6 +129,8 @@ class Mapper(Actor):
         folder = Path(self.config.folder) if self.config.folder else None
         threads = self.config.thread_count()
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
+        self._semantics = SemanticMap(self.config.semantics, threads=threads)
+        self._names_told = 0  # of labels, to followers
         self._poses = KeyframePoses()
         self._links: dict[tuple[int, int], Matrix6] = {}  # information by keyframe and reference
         self._refinements = 0  # sent
@@ -134,8 +143,12 @@ class Mapper(Actor):
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
-    def handle(self, message: Keyframe | Correction | MapRefine) -> Iterator[Output]:
+    def handle(
+        self, message: Keyframe | DetectionBoxes | Correction | MapRefine
+    ) -> Iterator[Output]:
         match message:
+            case DetectionBoxes():
+                self._take_boxes(message)
             case Correction():
                 yield from self._correct(message)
             case MapRefine():
@@ -164,6 +177,7 @@ class Mapper(Actor):
         frame = rgbd_of(message)
         moving = mask_of(message.is_moving)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
+        self._semantics.mapped(self._map, message.keyframe)
         # tell
         yield from self._refinement()
         yield from self._deltas(self._is_time_for_changed())
@@ -213,6 +227,19 @@ class Mapper(Actor):
             T_reference_keyframe=pose_message(T_reference_keyframe),
             information=information,
         )
+
+    # --- labels -----------------------------------------------------------------------------------
+    def _take_boxes(self, message: DetectionBoxes) -> None:
+        """Followers are told with what changes next. Where nobody looked, nothing was missed."""
+        if message.network:
+            claims = claims_of(message, self._semantics.vocabulary)
+            self._semantics.claim(self._map, message.keyframe, claims)
+
+    def _new_names(self) -> tuple[str, ...]:
+        """All, if there are some that followers do not know."""
+        names = self._semantics.names
+        is_news, self._names_told = len(names) > self._names_told, len(names)
+        return names if is_news else ()
 
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> Iterator[MapDelta]:
@@ -281,6 +308,7 @@ class Mapper(Actor):
             removed=Array.of(removed),
             changed=changed,
             added=added,
+            label_names=self._new_names(),
         )
 
     def _view(self, keyframe: Keyframe) -> ModelView:
@@ -326,6 +354,7 @@ class Mapper(Actor):
                 gaussians=gaussians,
                 keyframes=Array.of(np.array(named, np.int64)),
                 exposures=Array.of(np.array(matrices, np.float32).reshape(-1, 2, 3)),
+                label_names=self._semantics.names if part == 0 else (),
             )
 
     def _gaussians(self, chosen: np.ndarray) -> Gaussians:
@@ -359,6 +388,7 @@ class Mapper(Actor):
             "newest": self._newest,
             "version": self._version,
             "map": self._map.snapshot(),
+            "semantics": self._semantics.snapshot(),
             "poses": self._poses.snapshot(),
             "refinements": self._refinements,
             "unacknowledged": list(self._unacknowledged.items()),
@@ -372,6 +402,7 @@ class Mapper(Actor):
         self._newest = (int(stamp_ns), int(keyframe))
         self._version = int(saved["version"]) + VERSIONS_IN_A_CHECKPOINT
         self._map.restore(saved["map"])
+        self._semantics.restore(saved["semantics"])
         self._poses.restore(saved["poses"])
         self._refinements = saved["refinements"]
         self._unacknowledged = dict(saved["unacknowledged"])
@@ -383,6 +414,7 @@ class Mapper(Actor):
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
             **self._map.statistics(),
+            **self._semantics.statistics(self._map),
         }
 
 

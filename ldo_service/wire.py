@@ -23,6 +23,8 @@ from ldo_service.schemas import (
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
 from ldo_service.semantics.detectors import Detections
+from ldo_service.semantics.labelling import Claims
+from ldo_service.semantics.vocabulary import Vocabulary
 
 
 def pose_message(T: np.ndarray) -> Pose:
@@ -140,6 +142,16 @@ def boxes_message(
             for box_px, score, class_id in rows
         ),
         network="" if found is None else network,
+    )
+
+
+def claims_of(message: DetectionBoxes, vocabulary: Vocabulary) -> Claims:
+    """What the detector says; new names get an index."""
+    found = message.detections
+    return Claims.of_detector(
+        np.array([one.box_px for one in found], np.float32).reshape(-1, 4),
+        np.array([vocabulary.index(one.label) for one in found], np.int64),
+        np.array([one.score for one in found], np.float32),
     )
 
 

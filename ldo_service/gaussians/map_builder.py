@@ -271,6 +271,19 @@ class MapBuilder:
         self._log.removing(self.gaussians, mask)
         self._pruned += self.gaussians.remove(mask)
 
+    # --- labels -----------------------------------------------------------------------------------
+    def made_by(self, keyframe: int) -> np.ndarray:
+        """Indices [V] uint32, ascending, of the Gaussians that make its image, woken if they
+        slept."""
+        self._wake(self.views.placed(keyframe))
+        return self._contributions(keyframe).indices
+
+    def relabelled(self, indices: np.ndarray) -> None:
+        """These rows have other labels than followers know."""
+        mask = np.zeros(len(self.gaussians), bool)
+        mask[indices] = True
+        self._log.changed(mask)
+
     # --- sleep ------------------------------------------------------------------------------------
     @property
     def _reach_m(self) -> float:

@@ -17,9 +17,10 @@ from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
 from ldo_service.gaussians.ply import read_ply
 from ldo_service.geometry import Camera, Trajectory
+from ldo_service.semantics.saved import SavedSemantics, read_semantics
 from ldo_service.volumes import Viewpoint
 
-from .folder import CAMERA, REFINED
+from .folder import CAMERA, REFINED, SEMANTICS
 
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
@@ -74,6 +75,11 @@ class MapFolder:
     def gaussians(self) -> np.ndarray:
         """Rows [N, 16], see `gaussians.model`."""
         return read_ply(self.folder / "map.ply")
+
+    def semantics(self) -> SavedSemantics | None:
+        """What the Gaussians are, row by row; None where no detector looked."""
+        path = self.folder / SEMANTICS
+        return read_semantics(path, len(self.gaussians())) if path.is_file() else None
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every frame that has a pose, after the last correction."""

@@ -7,6 +7,7 @@ frames.csv              every frame: status, residuals, milliseconds, segment
 keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians that hang on keyframes in the map's frame
                         (those of segments that are not joined to the first are nowhere: left out)
+semantics.npz           what those Gaussians are, if a detector looked: see `semantics.saved`
 places.msgpack          what `--localise` finds the camera by, at the newest poses
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
@@ -34,17 +35,21 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.map_follower import MapFollower
 from ldo_service.schemas import (
     Correction,
+    DetectionBoxes,
     Keyframe,
     MapDelta,
     MapSnapshot,
     Message,
     TrackedPose,
 )
+from ldo_service.semantics.labels import top_labels
+from ldo_service.semantics.saved import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
 from .places import PlaceRecord
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
+SEMANTICS = "semantics.npz"
 REFINED = "refined"  # folder in that of the run, with such files of its own
 EXPORTED = {  # by `ldo export`, per format
     "ply": ("gaussians.ply",),
@@ -58,7 +63,7 @@ EXPORTED = {  # by `ldo export`, per format
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
-        PLACES,
+        *(PLACES, SEMANTICS, f"{REFINED}/{SEMANTICS}"),
         *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
@@ -124,6 +129,7 @@ class RunFolder:
         self.follower = MapFollower()
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.corrections = 0
+        self.boxes = 0  # that a detector found
         self.newest_stamp_ns = 0
         self.summary: dict[str, Any] = {}
 
@@ -142,6 +148,8 @@ class RunFolder:
                 self.corrections += 1
                 self._poses.correct(message.graph_version, keyframe_poses_of(message))
                 self._joined = dict(message.joined)
+            case DetectionBoxes():
+                self.boxes += len(message.detections)
             case MapDelta() | MapSnapshot():
                 self.follower.take(message)
 
@@ -201,6 +209,10 @@ class RunFolder:
         placed = [k for k, facts in self._keyframes.items() if self._root(facts["segment"]) == 0]
         return np.isin(self.follower.map.anchors, placed)
 
+    def labelled(self) -> int:
+        """Gaussians in the map that are likelier something than background."""
+        return int(np.count_nonzero(top_labels(self.follower.map.labels[self.in_map()])))
+
     def write_refined(self, iterations: int) -> None:
         """The map as it is now, and where its keyframes are."""
         folder = self.folder / REFINED
@@ -214,7 +226,11 @@ class RunFolder:
         if not self._makes_map:
             return
         write_json(folder / "keyframes.json", self._placed_keyframes())
-        write_ply(folder / "map.ply", self.follower.map.rows[self.in_map()])
+        in_map, gaussians = self.in_map(), self.follower.map
+        write_ply(folder / "map.ply", gaussians.rows[in_map])
+        if self.follower.label_names:
+            names = self.follower.label_names
+            write_semantics(folder / SEMANTICS, gaussians.labels[in_map], names)
         self._places.save(self.folder / PLACES, self._poses, self._joined)
 
     def online(self) -> Trajectory:

@@ -51,6 +51,8 @@ def summarise(
         "keyframes": record.keyframes,
         "gaussians": int(in_map.sum()),
         "gaussians_apart": int((~in_map).sum()),  # of segments never joined: in no file
+        "gaussians_labelled": record.labelled(),  # as something else than background
+        "boxes": record.boxes,
         "fps": round((frames - rejected) / used.wall_s, 3),
         "wall_s": round(used.wall_s, 3),
         "cpu_s": round(used.cpu_s, 3),

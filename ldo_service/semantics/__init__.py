@@ -14,5 +14,7 @@ fusion                    what detector and labeller say together
 labels                    what each Gaussian is, over time
 consistency               neighbours that ought to agree
 labelling                 all of these in their order: one keyframe
+semantic_map              the labels of a map while it grows
+saved                     labels in a file
 label_images              labels as a camera sees them
 """

@@ -115,7 +115,7 @@ class SemanticMap:
         `_literal` as the paper prints it, `_expected` as it is made smaller."""
         labelled = 0
         if self._boxes:
-            labelled = np.count_nonzero(top_labels(map_.gaussians.labels) != BACKGROUND)
+            labelled = int(np.count_nonzero(top_labels(map_.gaussians.labels) != BACKGROUND))
         return {
             "gaussians_labelled": labelled,  # of those awake
             "keyframes_labelled": len(self._done),

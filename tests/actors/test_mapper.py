@@ -17,8 +17,19 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.map_follower import MapFollower
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.state_store import decode_state, encode_state
-from ldo_service.schemas import KeyframeRefinement, MapDelta, MapRefine, MapSnapshot, ModelView
+from ldo_service.schemas import (
+    Detection,
+    DetectionBoxes,
+    KeyframeRefinement,
+    MapDelta,
+    MapRefine,
+    MapSnapshot,
+    ModelView,
+)
 from ldo_service.schemas.topics import KEYFRAME_NEW
+from ldo_service.semantics.labelling import LabellingConfig
+from ldo_service.semantics.labels import top_labels
+from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.wire import (
     correction_message,
     keyframe_poses_of,
@@ -353,6 +364,8 @@ def assert_equal_maps(follower: MapFollower, mapper: Mapper) -> None:
     np.testing.assert_array_equal(follower.map.ids, snapshot.map.ids)
     np.testing.assert_array_equal(follower.map.anchors, snapshot.map.anchors)
     np.testing.assert_array_equal(follower.map.rows, snapshot.map.rows)
+    np.testing.assert_array_equal(follower.map.labels, snapshot.map.labels)
+    assert follower.label_names == snapshot.label_names
 
 
 def test_what_a_keyframe_says_is_moving_does_not_count_in_the_map(keyframes) -> None:
@@ -371,3 +384,80 @@ def test_nothing_that_moves_travels_as_an_empty_mask(keyframes) -> None:
     camera = rgbd_of(keyframes[0]).camera
     for nothing in (None, np.zeros((8, 8), bool)):
         assert mask_of(mask_message(nothing, camera)) is None
+
+
+# --- labels -----------------------------------------------------------------------------------
+def boxes_of(keyframe, label: str = "chair", network: str = "test") -> DetectionBoxes:
+    """One, in the middle of the image."""
+    camera = keyframe.camera
+    x, y = camera.width / 4, camera.height / 4
+    box = Detection(label=label, score=0.8, box_px=(x, y, 3 * x, 3 * y))
+    return DetectionBoxes(
+        stamp_ns=keyframe.stamp_ns,
+        keyframe=keyframe.keyframe,
+        width=camera.width,
+        height=camera.height,
+        detections=(box,) if network else (),
+        network=network,
+    )
+
+
+LABELLING = replace(CONFIG, semantics=SemanticMapConfig(LabellingConfig(region="box")))
+
+
+def test_followers_hold_labels_to_the_bit_and_know_their_names(keyframes) -> None:
+    mapper, follower = Mapper(LABELLING), MapFollower()
+    for keyframe in keyframes[:6]:
+        boxes = boxes_of(keyframe, "lava lamp" if keyframe.keyframe > 2 else "chair")
+        followed(deltas_of(handled(mapper, [keyframe, boxes])), follower)
+    followed(deltas_of(mapper.finish()), follower)
+    assert_equal_maps(follower, mapper)
+    assert follower.label_names[-1] == "lava lamp"
+    known = {follower.label_names[k] for k in np.unique(top_labels(follower.map.labels))}
+    assert known == {"background", "chair", "lava lamp"}
+
+
+def test_names_travel_when_there_are_new_ones(keyframes) -> None:
+    mapper, told = Mapper(replace(LABELLING, snapshot_keyframes=100)), []
+    for keyframe in keyframes[:4]:
+        made = handled(mapper, [keyframe, boxes_of(keyframe)])
+        told.append(sum(bool(delta.label_names) for delta in deltas_of(made)))
+    assert told == [0, 1, 0, 0]
+
+
+def test_where_nobody_looked_nothing_is_labelled_or_missed(keyframes) -> None:
+    mapper = Mapper(LABELLING)
+    messages = handled(mapper, [keyframes[0], boxes_of(keyframes[0], network="")])
+    follower = followed([*changes(messages), *mapper.finish()])
+    assert not follower.map.labels.any()
+    assert follower.label_names == ()
+
+
+def test_labels_change_nothing_else_of_the_map(keyframes) -> None:
+    mapper, plain = Mapper(LABELLING), Mapper(LABELLING)
+    for keyframe in keyframes[:5]:
+        handled(mapper, [keyframe, boxes_of(keyframe)])
+        handled(plain, [keyframe])
+    labelled, without = followed(mapper.finish()).map, followed(plain.finish()).map
+    assert top_labels(labelled.labels).any()
+    assert labelled.rows.tobytes() == without.rows.tobytes()
+
+
+def test_a_successor_has_the_labels_and_answers_nothing_twice(keyframes, tmp_path) -> None:
+    config = replace(LABELLING, folder=str(tmp_path / "keyframes"))
+    first = Mapper(config)
+    for keyframe in keyframes[:4]:
+        handled(first, [keyframe, boxes_of(keyframe)])
+    state = decode_state(encode_state(first.checkpoint()))
+    shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
+    second = Mapper(replace(config, folder=str(tmp_path / "copy")))
+    second.restore(state)
+    handled(second, [boxes_of(keyframes[3])])
+    assert second.facts()["boxes_repeated"] == 1
+    ends = []
+    for mapper in (first, second):
+        handled(mapper, [boxes_of(keyframes[4]), keyframes[4]])
+        ends.append(followed(mapper.finish()))
+    assert ends[0].map.labels.tobytes() == ends[1].map.labels.tobytes()
+    assert ends[0].label_names == ends[1].label_names
+    assert top_labels(ends[0].map.labels).any()
