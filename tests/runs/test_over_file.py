@@ -12,11 +12,16 @@ from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import Judged, evaluate_rendering
+from ldo_service.gaussians.model import new_labels
 from ldo_service.geometry import Camera, RawFrame, Trajectory
-from ldo_service.runs.finished import read_run
+from ldo_service.runs.finished import MapFolder, read_run
 from ldo_service.runs.folder import RunFolder
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Warn
+from ldo_service.semantics.labels import top_labels
+from ldo_service.semantics.saved import write_semantics
+from ldo_service.semantics.vocabulary import FIRST_NAMES
+from tests.semantics.networks import changed
 
 from .jobs import job
 
@@ -75,7 +80,7 @@ def test_the_summary_has_what_tools_rely_on(finished: Path) -> None:
     expected = {
         *("frames", "frames_rejected", "keyframes", "gaussians", "fps", "wall_s", "cpu_s"),
         *("peak_rss_mb", "stage_ms", "drops", "loops_accepted", "loops_rejected", "vlm_calls"),
-        *("optimizations", "isa", "threads", "versions"),
+        *("optimizations", "isa", "threads", "versions", "gaussians_labelled", "boxes"),
     }
     assert expected <= set(summary)
     assert summary["frames"] == FRAMES
@@ -154,3 +159,31 @@ def test_forty_real_frames_stay_within_three_centimetres(data: Path, tmp_path: P
     assert truth is not None
     assert record.statuses["OK"] == FRAMES
     assert evaluate_trajectory(record.online(), truth).ate_m.rmse < 0.03
+
+
+def test_a_run_with_a_detector_says_what_each_gaussian_of_the_map_is(
+    room: Sequence, finished: Path, tmp_path: Path
+) -> None:
+    model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
+    settings = (f"detector.model={model}", "detector.network.score_min=0.02")
+    record = run(room, tmp_path / "out", *settings)
+    saved, gaussians = MapFolder(tmp_path / "out").semantics(), record.follower.map
+    assert saved is not None
+    assert (tmp_path / "out" / "map.ply").read_bytes() == (finished / "map.ply").read_bytes()
+    assert saved.labels.tobytes() == gaussians.labels[record.in_map()].tobytes()
+    labelled = np.count_nonzero(top_labels(saved.labels))
+    assert record.summary["gaussians_labelled"] == labelled > 0
+    assert record.summary["boxes"] > 0
+    assert {"red", "green", "blue"} & set(saved.names)
+
+
+def test_a_run_without_a_detector_says_nothing_of_labels(finished: Path) -> None:
+    assert MapFolder(finished).semantics() is None
+    assert not (finished / "semantics.npz").exists()
+
+
+def test_labels_of_another_map_are_refused(finished: Path, tmp_path: Path) -> None:
+    (tmp_path / "map.ply").write_bytes((finished / "map.ply").read_bytes())
+    write_semantics(tmp_path / "semantics.npz", new_labels(7), FIRST_NAMES)
+    with pytest.raises(DataError, match="labels 7 Gaussians"):
+        MapFolder(tmp_path).semantics()

@@ -18,6 +18,7 @@ from ldo_service.runs.source import Selection
 from ldo_service.schemas import Keyframe
 from tests.actors.conftest import frames, keyframes, tracked  # noqa: F401
 from tests.commands.test_cli import ldo
+from tests.semantics.networks import changed
 
 from .jobs import ROUGH
 
@@ -124,3 +125,22 @@ def test_real_frames_give_the_same_digests_for_one_thread_and_two(data: Path) ->
 
     kitchen = open_sequence(str(data / "tum" / "kitchen"))
     assert simulated(kitchen, "mapper.threads=1") == simulated(kitchen, "mapper.threads=2")
+
+
+@pytest.fixture(scope="module")
+def squares(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """Settings of a detector that finds what is red, green or blue, however pale."""
+    path = tmp_path_factory.mktemp("model") / "squares.onnx"
+    model = changed("yolov5", width=320, height=256).write(path)
+    return f"detector.model={model}", "detector.network.score_min=0.02"
+
+
+def test_a_labelled_map_does_not_depend_on_threads(
+    room: Sequence, squares: tuple[str, ...], made: dict[str, Made]
+) -> None:
+    one, two = (simulated(room, *squares, f"mapper.threads={threads}") for threads in (1, 2))
+    assert one == two
+    assert one["detector"].digest != made["detector"].digest
+    assert one["mapper"].digest != made["mapper"].digest
+    for same in ("tracker", "optimizer"):
+        assert one[same] == made[same], "labels reach nobody else"
