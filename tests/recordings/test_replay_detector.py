@@ -1,4 +1,4 @@
-"""A network's boxes, recorded and lived again bit for bit."""
+"""A network's boxes, and the labels made of them, recorded and lived again bit for bit."""
 
 import asyncio
 from pathlib import Path
@@ -22,8 +22,9 @@ def test_boxes_replay_and_another_network_is_noticed(room: Sequence, tmp_path: P
     model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
     settings = (ROUGH, f"detector.model={model}", "detector.network.score_min=0")
     asyncio.run(live(tmp_path / "recording", room, load_config(settings=settings), FRAMES))
-    replayed = replay_recording(tmp_path / "recording", "detector")
+    replayed = replay_recording(tmp_path / "recording", "detector", "mapper")
     assert replayed["detector"].made["detection/boxes"] >= 1
+    assert replayed["mapper"].made["map/delta"] >= 1
     changed("yolov5", width=320, height=256, metadata="['a', 'b', 'c']").write(model)
     (actor,) = open_recording(tmp_path / "recording", ("detector",))
     with pytest.raises(ReplayDiverged, match="detection/boxes"):
