@@ -87,7 +87,8 @@ class MapperConfig:
     # seldom, so that snapshots never cost more than a few times the deltas
     snapshot_keyframes_max: int = 200  # but after so many in any case: who joined late, or missed a
     # delta, waits no longer
-    part_gaussians: int = 16_384  # in one message: 1.2 MB, so that none blocks the others long
+    part_gaussians: int = 16_384  # in one message: 1.2 MB, 1.8 MB with labels, so that none blocks
+    # the others long
     changed_keyframes: int = 5  # between telling how old Gaussians changed: the optimiser touches
     # all that is in view at every keyframe
     checkpoint_keyframes: int = 5  # between saved states; a crash costs at most so many of the map
