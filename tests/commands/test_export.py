@@ -179,7 +179,7 @@ def test_a_broken_run_is_bad_data(run: Path, name: str, content: str, format: st
 
 def test_something_else_than_a_run_is_said(tmp_path: Path) -> None:
     code, said = ldo_export(tmp_path, "--format", "tum")
-    assert (code, "is it what `ldo run` wrote?" in said) == (3, True)
+    assert (code, "name the folder of a finished `ldo run`" in said) == (3, True)
 
 
 def test_a_folder_that_is_not_there_is_said(run: Path) -> None:
