@@ -17,4 +17,8 @@ labelling                 all of these in their order: one keyframe
 semantic_map              the labels of a map while it grows
 saved                     labels in a file
 label_images              labels as a camera sees them
+distributions             over labels: means, divergences, entropies
+landmarks                 objects: samples of Gaussians, and what follows of these
+association               which object is which region of a keyframe
+objects                   all of these in their order: how objects come and go
 """

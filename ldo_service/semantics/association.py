@@ -1,0 +1,238 @@
+"""Which landmark of the map is which region of a keyframe (paper, III.C).
+
+The box of a landmark is that of its members in the image, where measured depth does not hide them:
+what a detector would draw about what it can see of it. A landmark and a region may be the same if
+
+    IoU of their boxes >= 0.4,  they share a class,  and their depths meet;
+
+of all ways to pair them the one with the largest sum of IoU is taken.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera
+
+from .distributions import pooled, shared
+from .landmarks import MEMBERS, NO_MEMBER, believed, rows_of, shuffled, trimmed
+
+
+@dataclass(frozen=True, slots=True)
+class AssociationConfig:
+    min_iou: float = 0.4  # of the boxes (III.C)
+    min_shared: float = 0.3  # of the classes: a cup on a table is in its box, and no table
+    max_depth_gap_m: float = 0.1  # between their depths, and of members hidden (delta_z, III.A)
+    min_gaussians: int = 8  # of a region: with fewer nothing is known of where it is
+    max_regions: int = 64  # per keyframe, those with the most Gaussians: COCO images have 7
+
+    def __post_init__(self) -> None:
+        if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
+            raise ConfigError(f"{self}: min_iou must be in (0, 1], min_shared in 0..1.")
+        if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
+            raise ConfigError(f"{self}: max_depth_gap_m positive, counts at least 1.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class MapView:
+    """The map, and what a keyframe shows of it.
+
+    rows [N, 16], labels [N, 32], ids [N] int64 ascending, anchors [N] int32: of the map
+    indices      [V] uint32, ascending: rows of those that made the image
+    regions      [V] int32, region of each, see `Assigned`; negative: none
+    boxes        [M, 4] of the regions: x0 y0 x1 y1, px
+    depth_m      [H, W] float32, as it was measured
+    """
+
+    keyframe: int
+    camera: Camera
+    T_map_camera: np.ndarray
+    rows: np.ndarray
+    labels: np.ndarray
+    ids: np.ndarray
+    anchors: np.ndarray
+    indices: np.ndarray
+    regions: np.ndarray
+    boxes: np.ndarray
+    depth_m: np.ndarray
+
+    def __post_init__(self) -> None:
+        n, v, size = len(self.rows), len(self.indices), (self.camera.height, self.camera.width)
+        if not len(self.labels) == len(self.ids) == len(self.anchors) == n:
+            raise ValueError(f"labels, ids and anchors must be those of the {n} rows.")
+        if len(self.regions) != v or (v and not self.indices[-1] < n):
+            raise ValueError(f"{len(self.regions)} regions of {v} Gaussians among {n} rows.")
+        if v and self.regions.max() >= len(self.boxes):
+            raise ValueError(f"region {self.regions.max()} has none of {len(self.boxes)} boxes.")
+        if self.depth_m.shape != size:
+            raise ValueError(f"depth has shape {self.depth_m.shape}, its camera {size}.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Found:
+    """R regions of a keyframe with enough Gaussians.
+
+    numbers       [R] among those of the keyframe, ascending
+    boxes         [R, 4] px
+    members       [R, 256] ids of a sample of their Gaussians, as `landmarks` keeps them
+    p_map         [R, 256, 3] where they are
+    distributions [R, C] means of theirs, by opacity
+    near_m, far_m [R] depths they lie between
+    """
+
+    numbers: np.ndarray
+    boxes: np.ndarray
+    members: np.ndarray
+    p_map: np.ndarray
+    distributions: np.ndarray
+    near_m: np.ndarray
+    far_m: np.ndarray
+
+
+def found(view: MapView, T_camera_map: np.ndarray, config: AssociationConfig) -> Found:
+    """What the regions of a keyframe are made of."""
+    hit = np.flatnonzero(view.regions >= 0)
+    counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
+    numbers = np.sort(np.argsort(-counts, kind="stable")[: config.max_regions])
+    numbers = numbers[counts[numbers] >= config.min_gaussians]
+    at = _sampled(view, hit, counts, numbers)
+    rows = view.rows[np.maximum(at, 0)]
+    weights = np.where(at >= 0, 1 / (1 + np.exp(-rows[..., 10].astype(float))), 0)
+    p_map = rows[..., :3].astype(float)
+    z = p_map @ T_camera_map[2, :3] + T_camera_map[2, 3]
+    near_m, far_m = trimmed(z[..., None], (at >= 0)[..., None])
+    return Found(
+        numbers,
+        np.asarray(view.boxes, float).reshape(-1, 4)[numbers],
+        np.where(at >= 0, view.ids[np.maximum(at, 0)] if len(view.ids) else NO_MEMBER, NO_MEMBER),
+        p_map,
+        pooled(view.labels[np.maximum(at, 0)], weights),
+        near_m[:, 0],
+        far_m[:, 0],
+    )
+
+
+def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Rows [R, 256] of the Gaussians of each region that come first when shuffled; -1 beyond.
+
+    Of regions with more than 512 only that share is sorted that has some 512 of them.
+    """
+    ordinal = np.full(len(counts), -1)
+    ordinal[numbers] = np.arange(len(numbers))
+    which, rows = ordinal[view.regions[hit]], view.indices[hit]
+    places = shuffled(view.ids[rows])
+    last = np.minimum(2 * MEMBERS / np.maximum(counts, 1), 0.999) * 2.0**64
+    keep = (which >= 0) & (
+        (places <= last.astype(np.uint64)[view.regions[hit]])
+        | (counts <= 2 * MEMBERS)[view.regions[hit]]
+    )
+    which, rows, places = which[keep], rows[keep], places[keep]
+    order = np.lexsort((places, which))
+    which, rows = which[order], rows[order]
+    rank = np.arange(len(which)) - np.searchsorted(which, np.arange(len(numbers)))[which]
+    out = np.full((len(numbers), MEMBERS), -1)
+    first = rank < MEMBERS
+    out[which[first], rank[first]] = rows[first]
+    return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Looks:
+    """K landmarks as a keyframe should show them.
+
+    boxes         [K, 4] px, of what nothing hides; empty ones (x0 > x1) where all is hidden
+    shown         [K] share of the believed members that are in the image where depth was measured
+    through       [K] share of them that depth was measured far behind of: they are not there
+    near_m, far_m [K] depths they lie between
+    rows          [K, 256] of the members, -1 of those that are not awake
+    """
+
+    boxes: np.ndarray
+    shown: np.ndarray
+    through: np.ndarray
+    near_m: np.ndarray
+    far_m: np.ndarray
+    rows: np.ndarray
+
+
+def look(
+    table: np.ndarray, view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
+) -> Looks:
+    """How landmarks [K] appear; of one none of whose members is awake, how its centroid does."""
+    where = rows_of(table["members"], view.ids)
+    there = (where >= 0) & believed(table)
+    p_map = view.rows[np.maximum(where, 0), :3].astype(float)
+    gone = ~there.any(axis=1)
+    p_map[gone, 0] = table["centroid"][gone]
+    there[gone, 0] = True
+    p = p_map @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
+    near_m, far_m = (ends[:, 0] for ends in trimmed(p[..., 2:], there[..., None]))
+    px, measured_m = _measured(p, view)
+    gap_m = config.max_depth_gap_m
+    seen = there & (measured_m > 0) & (measured_m >= near_m[:, None] - gap_m)
+    through = seen & (measured_m > far_m[:, None] + gap_m)
+    shown = seen & ~through
+    low, high = trimmed(px, shown[..., None])
+    count = np.count_nonzero(there, axis=1)
+    return Looks(
+        np.concatenate([low, high], axis=1),
+        np.count_nonzero(shown, axis=1) / count,
+        np.count_nonzero(through, axis=1) / count,
+        near_m,
+        far_m,
+        where,
+    )
+
+
+def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels [..., 2] of points [..., 3], and the depth [...] there; 0 outside the image."""
+    z = np.maximum(p_camera[..., 2:], 1e-6)
+    px = view.camera.project(np.concatenate([p_camera[..., :2], z], axis=-1))
+    size = view.camera.width, view.camera.height
+    inside = (p_camera[..., 2] > 0) & np.all((px > -0.5) & (px < np.array(size) - 0.5), axis=-1)
+    u, v = np.where(inside[..., None], np.rint(px), 0).astype(int).transpose(2, 0, 1)
+    return px, np.where(inside, view.depth_m[v, u], 0)
+
+
+def overlaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """IoU [K, R] of boxes [K, 4] and [R, 4]; 0 of empty ones.
+
+    >>> overlaps(np.array([[0, 0, 2, 2]]), np.array([[1, 0, 3, 2], [5, 5, 6, 6]])).round(3)
+    array([[0.333, 0.   ]])
+    """
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    common = np.prod(np.clip(high - low, 0, None), axis=2)
+    area, other = (
+        np.prod(np.clip(these[:, 2:] - these[:, :2], 0, None), axis=1) for these in (boxes, others)
+    )
+    union = area[:, None] + other[None] - common
+    return np.where(common > 0, common / np.where(union > 0, union, 1), 0)
+
+
+def agreeing(
+    distributions: np.ndarray, looks: Looks, regions: Found, config: AssociationConfig
+) -> np.ndarray:
+    """[K, R] bool: pairs of landmarks with distributions [K, C] and regions that share a class and
+    whose depths meet."""
+    gap_m = np.maximum(looks.near_m[:, None], regions.near_m) - np.minimum(
+        looks.far_m[:, None], regions.far_m
+    )
+    pairs = np.argwhere(gap_m <= config.max_depth_gap_m)
+    out = np.zeros(gap_m.shape, bool)
+    in_common = shared(distributions[pairs[:, 0]], regions.distributions[pairs[:, 1]])
+    out[pairs[:, 0], pairs[:, 1]] = in_common >= config.min_shared
+    return out
+
+
+def associate(
+    iou: np.ndarray, allowed: np.ndarray, min_iou: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of rows and columns of iou [K, R], rows ascending: of those that are allowed and at
+    least min_iou the ones with the largest sum. The same arrays give the same pairs."""
+    gain = np.where(allowed & (iou >= min_iou), iou, 0)
+    k, r = linear_sum_assignment(gain, maximize=True)
+    paired = gain[k, r] > 0
+    return k[paired], r[paired]

@@ -1,0 +1,444 @@
+"""The objects of the map: how they come, are recognised, become one, and go (paper, III.C)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+
+from .assignment import HIDDEN
+from .association import (
+    AssociationConfig,
+    Found,
+    Looks,
+    MapView,
+    agreeing,
+    associate,
+    found,
+    look,
+    overlaps,
+)
+from .distributions import divergence, entropy, names
+from .labels import BACKGROUND
+from .landmarks import (
+    LANDMARK,
+    MOST_VOTES,
+    NO_MEMBER,
+    VIEWS,
+    believed,
+    derive,
+    distributions,
+    entropies,
+    joined,
+    moved,
+    new_landmarks,
+    rows_of,
+    within,
+)
+
+CANDIDATE = -1  # in place of an id
+_AT_A_TIME = 128  # landmarks that are derived together, to stay in cache
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectsConfig:
+    association: AssociationConfig = field(default_factory=AssociationConfig)
+    min_keyframes: int = 3  # that see it, until it is an object (III.C)
+    max_divergence: float = 0.2  # nats, of what they see from what was known (III.C)
+    miss_limit: int = 10  # keyframes in a row, while it is visible (III.C)
+    uncertain_miss_limit: int = 5  # of objects with more than
+    uncertain_entropy: float = 0.5  # nats: these go earlier (III.C)
+    candidate_miss_limit: int = 3  # nothing is lost with a candidate: it may come again
+    min_visible: float = 0.5  # share of its members in view and not hidden, to be missed
+    min_side_px: float = 20.0  # of its box; smaller ones are nobody's fault
+    merge_overlap: float = 0.5  # share of the members of one in the box of the other
+    max_objects: int = 2000  # 6 MB, and some ms per keyframe where all are in view
+    max_candidates: int = 256  # those seen last
+
+    def __post_init__(self) -> None:
+        counts = (
+            *(self.min_keyframes, self.miss_limit, self.uncertain_miss_limit),
+            *(self.candidate_miss_limit, self.max_objects, self.max_candidates),
+        )
+        if min(counts) < 1 or min(self.max_divergence, self.uncertain_entropy) < 0:
+            raise ConfigError(f"{self}: counts must be at least 1, nats not negative.")
+        if not (0 < self.min_visible <= 1 and 0 < self.merge_overlap <= 1):
+            raise ConfigError(f"{self}: min_visible and merge_overlap must be in (0, 1].")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Observation:
+    """An object in a keyframe: the box that shows it, or where one was missed.
+
+    box [4] px, x0 y0 x1 y1; distribution [C] and entropy (nats) of the Gaussians in its region, of
+    the object itself where it was missed
+    """
+
+    object: int
+    box: np.ndarray
+    distribution: np.ndarray
+    entropy: float
+    is_miss: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What a keyframe made of the objects: ids that came, that went, and that became another."""
+
+    observations: tuple[Observation, ...] = ()
+    born: tuple[int, ...] = ()
+    merged: tuple[tuple[int, int], ...] = ()  # this one is that one now
+    retired: tuple[int, ...] = ()
+
+
+class Objects:
+    """All landmarks. Not for two threads at once; the same calls give the same bits, also after
+    `unpacked`. An id is given once, and is its object's until that is merged or retired."""
+
+    def __init__(self, config: ObjectsConfig | None = None) -> None:
+        self.config = config or ObjectsConfig()
+        self._table = np.zeros(0, LANDMARK)
+        self._next_id = self._merged = self._retired = self._refused = 0
+
+    def __len__(self) -> int:
+        return int(np.count_nonzero(self._table["id"] != CANDIDATE))
+
+    @property
+    def landmarks(self) -> np.ndarray:
+        """A copy of the objects, records [K] of `LANDMARK`, by id."""
+        table = self._table[self._table["id"] != CANDIDATE]
+        return table[np.argsort(table["id"])]
+
+    def observe(self, view: MapView) -> Observed:
+        """Take in what a keyframe shows.
+
+        A region that no landmark is associated with begins a candidate. It becomes an object when
+        it was seen in min_keyframes, and each time KL(p || p_t) < max_divergence: p is what its
+        Gaussians were said to be before, p_t what those in the region are said to be now, both
+        means weighted by opacity. A keyframe that disagrees begins the count anew. Objects are
+        associated first, candidates with the regions that are left.
+
+        Raises ValueError for arrays that do not fit.
+        """
+        T_camera_map = se3.inverse(view.T_map_camera)
+        limits = self.config.association
+        # what is there, and what should be
+        regions = found(view, T_camera_map, limits)
+        near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
+        looks = look(self._table[near], view, T_camera_map, limits)
+        # which is which
+        k, r = self._match(near, looks, regions)
+        excused, left = self._pieces(near, k, looks, regions, r)
+        # what is learnt of those seen, and of those not
+        observations = self._update(view, near[k], r, looks.rows[k], looks.shown[k], regions)
+        missed = self._missed(looks, excused)
+        observations += self._miss(near[missed], looks.boxes[missed])
+        # who comes, who is another, who goes
+        born = self._promote(near[k])
+        merged, gone = self._merge(view, near, near[k])
+        retired = self._retire(gone)
+        self._begin(view, regions, left)
+        return Observed(tuple(observations), born, merged, retired)
+
+    # --- association ------------------------------------------------------------------------------
+    def _match(
+        self, near: np.ndarray, looks: Looks, regions: Found
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Pairs of a landmark, as number in `near`, and a region."""
+        limits, is_object = self.config.association, self._table["id"][near] != CANDIDATE
+        allowed = agreeing(distributions(self._table[near]), looks, regions, limits)
+        iou = overlaps(looks.boxes, regions.boxes)
+        k, r = associate(iou, allowed & is_object[:, None], limits.min_iou)
+        allowed[:, r] = False
+        others, left = associate(iou, allowed & ~is_object[:, None], limits.min_iou)
+        return np.concatenate([k, others]), np.concatenate([r, left])
+
+    def _pieces(
+        self, near: np.ndarray, k: np.ndarray, looks: Looks, regions: Found, r: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which landmarks near are not missed, [K] bool, since they were matched or a region shows
+        a piece of them, and the regions that are neither matched nor such pieces."""
+        excused = np.zeros(len(near), bool)
+        excused[k] = True
+        left = np.setdiff1d(np.arange(len(regions.numbers)), r)
+        known = self._table[near]
+        allowed = agreeing(distributions(known), looks, regions, self.config.association)
+        is_piece = np.zeros(len(left), bool)
+        for row, region in np.argwhere(allowed[:, left] & ~excused[:, None]):
+            valid = regions.members[left[region]] != NO_MEMBER
+            share = inside(known[row], regions.p_map[left[region]][valid])
+            if share >= self.config.merge_overlap:
+                excused[row], is_piece[region] = True, True
+        return excused, left[~is_piece]
+
+    # --- those seen -------------------------------------------------------------------------------
+    def _update(
+        self,
+        view: MapView,
+        which: np.ndarray,
+        r: np.ndarray,
+        rows: np.ndarray,
+        shown: np.ndarray,
+        regions: Found,
+    ) -> list[Observation]:
+        seen, p_seen = self._table[which], regions.distributions[r]
+        differs = divergence(distributions(seen), p_seen) >= self.config.max_divergence
+        begins = differs & (seen["id"] == CANDIDATE)
+        seen["votes"] = _voted(seen["votes"], rows, view, regions.numbers[r])
+        seen["members"], seen["votes"] = joined(
+            seen["members"], seen["votes"], regions.members[r], _one_each(regions.members[r])
+        )
+        seen["seen"] = np.where(begins, 1, seen["seen"] + 1)
+        seen["first"] = np.where(begins, view.keyframe, seen["first"])
+        seen["misses"], seen["last"] = 0, view.keyframe
+        _remember(seen, view.keyframe, shown, regions.boxes[r])
+        self._derive(seen, view.rows, view.labels, view.ids, view.anchors)
+        self._table[which] = seen
+        entropies_seen = entropy(p_seen)
+        return [
+            Observation(
+                int(seen["id"][i]), regions.boxes[r[i]], p_seen[i], entropies_seen[i], False
+            )
+            for i in np.flatnonzero(seen["id"] != CANDIDATE)
+        ]
+
+    def _derive(self, table: np.ndarray, *gaussians: np.ndarray) -> None:
+        """As far as enough of their Gaussians are awake; `gaussians`: see `landmarks.derive`."""
+        for start in range(0, len(table), _AT_A_TIME):
+            derive(
+                table[start : start + _AT_A_TIME],
+                *gaussians,
+                least=self.config.association.min_gaussians,
+            )
+
+    def _promote(self, which: np.ndarray) -> tuple[int, ...]:
+        """Ids of candidates that became objects."""
+        p = distributions(self._table[which])
+        heaviest = p[np.arange(len(p)), names(p)]
+        ready = (self._table["seen"][which] >= self.config.min_keyframes) & (
+            heaviest >= p[:, BACKGROUND]
+        )
+        ready = which[ready & (self._table["id"][which] == CANDIDATE)]
+        room = max(0, self.config.max_objects - len(self))
+        self._refused += len(ready[room:])
+        ids = self._next_id + np.arange(len(ready[:room]))
+        self._table["id"][ready[:room]] = ids
+        self._next_id += len(ids)
+        return tuple(ids.tolist())
+
+    # --- those not seen ---------------------------------------------------------------------------
+    def _missed(self, looks: Looks, excused: np.ndarray) -> np.ndarray:
+        """Numbers of those near that a detector should have seen, or whose place is empty."""
+        sides = np.clip(looks.boxes[:, 2:] - looks.boxes[:, :2], 0, None)
+        is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
+        is_visible = (looks.shown >= self.config.min_visible) & is_large
+        return np.flatnonzero((is_visible | (looks.through >= self.config.min_visible)) & ~excused)
+
+    def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[Observation]:
+        for name in ("missed", "misses"):
+            self._table[name][which] += 1
+        missed = self._table[which]
+        p = distributions(missed)
+        return [
+            Observation(int(missed["id"][i]), boxes[i], p[i], float(entropy(p[i])), True)
+            for i in np.flatnonzero(missed["id"] != CANDIDATE)
+        ]
+
+    def _retire(self, gone: np.ndarray) -> tuple[int, ...]:
+        """Ids of those missed too often. Drops them, and those that are `gone` [K] bool."""
+        table, config = self._table, self.config
+        missed = np.flatnonzero((table["misses"] > 0) & ~gone)
+        is_unsure = entropies(table[missed]) > config.uncertain_entropy
+        limit = np.where(is_unsure, config.uncertain_miss_limit, config.miss_limit)
+        is_candidate = table["id"][missed] == CANDIDATE
+        limit = np.where(is_candidate, config.candidate_miss_limit, limit)
+        over = missed[table["misses"][missed] >= limit]
+        retired = np.sort(table["id"][over][table["id"][over] != CANDIDATE])
+        self._retired += len(retired)
+        gone[over] = True
+        if np.any(gone):
+            self._table = table[~gone]
+        return tuple(retired.tolist())
+
+    # --- those that are one -----------------------------------------------------------------------
+    def _merge(
+        self, view: MapView, near: np.ndarray, matched: np.ndarray
+    ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
+        """Objects that became another, and which landmarks [K] bool did.
+
+        Two are one if they have the same name and most of one lies in the box of the other, but for
+        those that one keyframe shows in two regions.
+        """
+        merged: list[tuple[int, int]] = []
+        gone = np.zeros(len(self._table), bool)
+        for a, b in self._neighbours(near, matched):
+            if gone[a] or gone[b] or not self._coincide(a, b, view):
+                continue
+            keep, other = self._older(a, b)
+            self._join(keep, other, view)
+            gone[other] = True
+            if self._table["id"][other] != CANDIDATE:
+                merged.append((int(self._table["id"][other]), int(self._table["id"][keep])))
+        self._merged += len(merged)
+        return tuple(merged), gone
+
+    def _neighbours(self, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
+        """Pairs of one that was matched and one near that was not, of the same name, whose boxes
+        are close enough to meet."""
+        others = np.setdiff1d(near, matched)
+        name_of = names(distributions(self._table[near]))
+        name = dict(zip(near.tolist(), name_of.tolist(), strict=True))
+        place, reach = (
+            self._table["T_map_object"][:, :3, 3],
+            np.linalg.norm(self._table["size"], axis=1) / 2,
+        )
+        apart_m = np.linalg.norm(place[matched][:, None] - place[others][None], axis=2)
+        close = np.argwhere(apart_m < reach[matched][:, None] + reach[others][None])
+        pairs = [(int(matched[i]), int(others[j])) for i, j in close]
+        return sorted(pair for pair in pairs if name[pair[0]] == name[pair[1]])
+
+    def _coincide(self, a: int, b: int, view: MapView) -> bool:
+        one, other = self._table[a], self._table[b]
+        p_one, p_other = (_awake(self._table[[k]], view) for k in (a, b))
+        share = max(inside(other, p_one), inside(one, p_other))
+        return share >= self.config.merge_overlap
+
+    def _older(self, a: int, b: int) -> tuple[int, int]:
+        """Objects before candidates, then the first."""
+
+        def age(k: int) -> tuple[bool, int, int]:
+            return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
+
+        return (a, b) if age(a) < age(b) else (b, a)
+
+    def _join(self, keep: int, other: int, view: MapView) -> None:
+        one, gone = self._table[[keep]], self._table[[other]]
+        one["members"], one["votes"] = joined(
+            one["members"], one["votes"], gone["members"], gone["votes"]
+        )
+        for name in ("seen", "last"):
+            one[name] = np.maximum(one[name], gone[name])
+        for name in ("missed", "misses", "first"):
+            one[name] = np.minimum(one[name], gone[name])
+        for i in range(VIEWS):
+            seen = gone["view_keyframes"][:, i]
+            _add_view(one, seen, gone["view_scores"][:, i], gone["view_boxes"][:, i])
+        self._derive(one, view.rows, view.labels, view.ids, view.anchors)
+        self._table[[keep]] = one
+
+    # --- those that come --------------------------------------------------------------------------
+    def _begin(self, view: MapView, regions: Found, left: np.ndarray) -> None:
+        """A candidate of each region that is left; of too many those seen longest ago go."""
+        new = new_landmarks(len(left), view.keyframe)
+        new["members"], new["seen"] = regions.members[left], 1
+        new["votes"] = _one_each(new["members"])
+        _remember(new, view.keyframe, np.ones(len(left)), regions.boxes[left])
+        self._derive(new, view.rows, view.labels, view.ids, view.anchors)
+        if len(new):
+            self._table = np.concatenate([self._table, new])
+        candidates = np.flatnonzero(self._table["id"] == CANDIDATE)
+        excess = len(candidates) - self.config.max_candidates
+        if excess > 0:
+            oldest = np.argsort(self._table["last"][candidates], kind="stable")[:excess]
+            self._table = np.delete(self._table, candidates[oldest])
+
+    # --- corrections ------------------------------------------------------------------------------
+    def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+        """Keyframes were corrected: each landmark goes with the one that most of its members hang
+        on, so that those asleep are where their Gaussians will wake. `refresh` has the others."""
+        corrected = np.array(sorted(T_new_old), np.int64)
+        which = np.flatnonzero(np.isin(self._table["anchor"], corrected))
+        if len(which):
+            table = self._table[which]
+            moved(table, np.stack([T_new_old[int(k)] for k in table["anchor"]]))
+            self._table[which] = table
+
+    def refresh(
+        self, rows: np.ndarray, labels: np.ndarray, ids: np.ndarray, anchors: np.ndarray
+    ) -> None:
+        """Derive all landmarks anew from the map: after corrections, late labels and refinement."""
+        self._derive(self._table, rows, labels, ids, anchors)
+
+    # --- state ------------------------------------------------------------------------------------
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Arrays and plain numbers, for a file or a state."""
+        table = self._table.copy().view(np.uint8).reshape(len(self._table), LANDMARK.itemsize)
+        counts = [self._next_id, self._merged, self._retired, self._refused]
+        return {"landmarks": table, "counts": np.array(counts, np.int64)}
+
+    @staticmethod
+    def unpacked(packed: Mapping[str, Any], config: ObjectsConfig | None = None) -> "Objects":
+        """As it was. Raises ValueError when this is not what `packed` gave."""
+        table = np.ascontiguousarray(packed["landmarks"])
+        if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
+            raise ValueError(f"landmarks {table.dtype}{table.shape} are not of this version.")
+        out = Objects(config)
+        out._table = table.copy().view(LANDMARK)[:, 0]
+        out._next_id, out._merged, out._retired, out._refused = map(int, packed["counts"])
+        return out
+
+    def statistics(self) -> dict[str, float]:
+        return {
+            "objects": len(self),
+            "object_candidates": len(self._table) - len(self),
+            "objects_merged": self._merged,
+            "objects_retired": self._retired,
+            "objects_refused": self._refused,  # there are max_objects
+        }
+
+
+def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
+    """Share of points [M, 3] within the box of a landmark; 0 of none."""
+    T = landmark["T_map_object"]
+    local = (p_map - T[:3, 3]) @ T[:3, :3]
+    return (
+        float(np.mean(np.all(np.abs(local) <= landmark["size"] / 2, axis=1))) if len(local) else 0
+    )
+
+
+def _awake(landmark: np.ndarray, view: MapView) -> np.ndarray:
+    """Where the Gaussians [M, 3] of one, in a table [1], are."""
+    where = rows_of(landmark["members"][believed(landmark)], view.ids)
+    return view.rows[where[where >= 0], :3].astype(float)
+
+
+def _one_each(members: np.ndarray) -> np.ndarray:
+    return (members != NO_MEMBER).astype(np.int8)
+
+
+def _voted(votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray) -> np.ndarray:
+    """Votes [K, 256] one higher for members, in `rows` of the map, that lie in the region `numbers`
+    [K] of their landmark, and one lower for those that were seen beside it or are no more."""
+    at = np.minimum(np.searchsorted(view.indices, rows), len(view.indices) - 1)
+    is_shown = view.indices[at] == rows
+    region = np.where(is_shown, view.regions[at], HIDDEN)
+    is_in = region == numbers[:, None]
+    is_out = (rows < 0) | ((region != HIDDEN) & ~is_in)
+    change = is_in.astype(np.int8) - is_out.astype(np.int8)
+    return np.where(votes > 0, np.clip(votes + change, 0, MOST_VOTES), 0).astype(np.int8)
+
+
+def _remember(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
+    """Large boxes with much of the object in them are good views."""
+    scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
+    _add_view(table, np.full(len(table), keyframe), scores, boxes)
+
+
+def _add_view(
+    table: np.ndarray, keyframes: np.ndarray, scores: np.ndarray, boxes: np.ndarray
+) -> None:
+    """The best of the views that landmarks [K] have and one more of each, in place."""
+    all_scores = np.concatenate([table["view_scores"], scores[:, None]], axis=1).astype(np.float32)
+    order = np.argsort(-all_scores, axis=1, kind="stable")[:, :VIEWS]
+    for name, new in (
+        ("view_keyframes", keyframes),
+        ("view_scores", scores),
+        ("view_boxes", boxes),
+    ):
+        values = np.concatenate([table[name], np.asarray(new)[:, None]], axis=1)
+        at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
+        table[name] = np.take_along_axis(values, at, axis=1)

@@ -1,0 +1,99 @@
+"""Boxes and pairs against brute force."""
+
+import doctest
+from itertools import permutations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from ldo_service.semantics import association
+from ldo_service.semantics.association import AssociationConfig, associate, found, overlaps
+from ldo_service.semantics.labels import distribution
+from ldo_service.semantics.landmarks import MEMBERS, shuffled
+
+from .staged import THINGS, Stage, poses, shoot
+
+tenths = st.integers(0, 10).map(lambda i: i / 10)
+
+
+def test_the_examples_hold() -> None:
+    assert doctest.testmod(association).failed == 0
+
+
+def best_sum(gain: np.ndarray) -> float:
+    """Of all ways to pair rows with columns."""
+    if gain.shape[0] > gain.shape[1]:
+        gain = gain.T
+    rows = np.arange(len(gain))
+    return max(gain[rows, list(way)].sum() for way in permutations(range(gain.shape[1]), len(gain)))
+
+
+@given(
+    st.tuples(st.integers(1, 4), st.integers(1, 4)).flatmap(
+        lambda shape: st.tuples(
+            arrays(float, shape, elements=tenths), arrays(bool, shape, elements=st.booleans())
+        )
+    )
+)
+def test_pairs_are_allowed_and_have_the_largest_sum(case: tuple[np.ndarray, np.ndarray]) -> None:
+    iou, allowed = case
+    k, r = associate(iou, allowed, 0.4)
+    assert np.all(allowed[k, r] & (iou[k, r] >= 0.4))
+    assert len(set(k.tolist())) == len(set(r.tolist())) == len(k)
+    assert abs(iou[k, r].sum() - best_sum(np.where(allowed & (iou >= 0.4), iou, 0))) < 1e-12
+
+
+def test_ties_go_to_the_first() -> None:
+    k, r = associate(np.full((3, 2), 0.8), np.ones((3, 2), bool), 0.4)
+    assert list(zip(k, r, strict=True)) == [(0, 0), (1, 1)]
+
+
+def test_of_nothing_nothing_is_paired() -> None:
+    for shape in ((0, 3), (3, 0), (0, 0)):
+        k, r = associate(np.zeros(shape), np.zeros(shape, bool), 0.4)
+        assert len(k) == len(r) == 0
+
+
+boxes = arrays(np.int64, (3, 4), elements=st.integers(0, 12)).map(
+    lambda a: np.concatenate([np.minimum(a[:, :2], a[:, 2:]), np.maximum(a[:, :2], a[:, 2:])], 1)
+)
+
+
+@given(boxes, boxes)
+def test_overlaps_are_those_of_counted_pixels(one: np.ndarray, other: np.ndarray) -> None:
+    def mask(box: np.ndarray) -> np.ndarray:
+        out = np.zeros((12, 12), bool)
+        out[box[1] : box[3], box[0] : box[2]] = True
+        return out
+
+    got = overlaps(one, other)
+    for i, j in np.ndindex(3, 3):
+        a, b = mask(one[i]), mask(other[j])
+        union = np.count_nonzero(a | b)
+        assert abs(got[i, j] - (np.count_nonzero(a & b) / union if union else 0)) < 1e-12
+
+
+def test_regions_are_samples_of_their_gaussians() -> None:
+    """Against a plain loop over the regions, with one so large that a share of it is sorted."""
+    stage = Stage()
+    shot = shoot(THINGS, poses(1)[0])
+    view, _ = stage.show(shot, shot.claims(THINGS))
+    rng = np.random.default_rng(1)
+    regions = rng.choice([-1, 0, 1, 2], len(view.regions), p=[0.2, 0.7, 0.094, 0.006])
+    view = type(view)(
+        *(view.keyframe, view.camera, view.T_map_camera, view.rows, view.labels, view.ids),
+        *(view.anchors, view.indices, regions.astype(np.int32), np.zeros((3, 4)), view.depth_m),
+    )
+    assert np.count_nonzero(regions == 0) > 3 * MEMBERS
+    got = found(view, np.linalg.inv(view.T_map_camera), AssociationConfig(min_gaussians=30))
+    counts = np.bincount(regions[regions >= 0], minlength=3)
+    assert got.numbers.tolist() == np.flatnonzero(counts >= 30).tolist()
+    for number, members, p in zip(got.numbers, got.members, got.distributions, strict=True):
+        rows = view.indices[regions == number]
+        rows = rows[np.argsort(shuffled(view.ids[rows]))][:MEMBERS]
+        np.testing.assert_array_equal(members[members >= 0], view.ids[rows])
+        weights = 1 / (1 + np.exp(-view.rows[rows, 10].astype(float)))
+        expected = np.average(distribution(view.labels[rows]), axis=0, weights=weights)
+        np.testing.assert_allclose(p, expected, atol=1e-5)
