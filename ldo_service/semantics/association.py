@@ -102,7 +102,7 @@ def found(view: MapView, T_camera_map: np.ndarray, config: AssociationConfig) ->
     weights = np.where(at >= 0, 1 / (1 + np.exp(-rows[..., 10].astype(float))), 0)
     p_map = rows[..., :3].astype(float)
     z = p_map @ T_camera_map[2, :3] + T_camera_map[2, 3]
-    near_m, far_m = trimmed(z[..., None], (at >= 0)[..., None])
+    near_m, far_m = trimmed(z[..., None], at >= 0)
     return Found(
         numbers,
         np.asarray(view.boxes, float).reshape(-1, 4)[numbers],
@@ -142,7 +142,8 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 class Looks:
     """K landmarks as a keyframe should show them.
 
-    boxes         [K, 4] px, of what nothing hides; empty ones (x0 > x1) where all is hidden
+    boxes         [K, 4] px, of what nothing hides, or of where that should be; empty ones
+                  (x0 > x1) where all is hidden
     shown         [K] share of the believed members that are in the image where depth was measured
     through       [K] share of them that depth was measured far behind of: they are not there
     near_m, far_m [K] depths they lie between
@@ -168,13 +169,13 @@ def look(
     p_map[gone, 0] = table["centroid"][gone]
     there[gone, 0] = True
     p = p_map @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
-    near_m, far_m = (ends[:, 0] for ends in trimmed(p[..., 2:], there[..., None]))
+    near_m, far_m = (ends[:, 0] for ends in trimmed(p[..., 2:], there))
     px, measured_m = _measured(p, view)
     gap_m = config.max_depth_gap_m
     seen = there & (measured_m > 0) & (measured_m >= near_m[:, None] - gap_m)
     through = seen & (measured_m > far_m[:, None] + gap_m)
     shown = seen & ~through
-    low, high = trimmed(px, shown[..., None])
+    low, high = trimmed(px, np.where(shown.any(axis=1, keepdims=True), shown, seen))
     count = np.count_nonzero(there, axis=1)
     return Looks(
         np.concatenate([low, high], axis=1),
@@ -212,19 +213,27 @@ def overlaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.where(common > 0, common / np.where(union > 0, union, 1), 0)
 
 
-def agreeing(
+@dataclass(frozen=True, eq=False, slots=True)
+class Pairs:
+    """K landmarks and R regions: iou [K, R], and which may be the same, [K, R] bool: their boxes
+    overlap, their depths meet, and they share a class."""
+
+    iou: np.ndarray
+    allowed: np.ndarray
+
+
+def paired(
     distributions: np.ndarray, looks: Looks, regions: Found, config: AssociationConfig
-) -> np.ndarray:
-    """[K, R] bool: pairs of landmarks with distributions [K, C] and regions that share a class and
-    whose depths meet."""
+) -> Pairs:
+    """Of landmarks with distributions [K, C]."""
+    iou = overlaps(looks.boxes, regions.boxes)
     gap_m = np.maximum(looks.near_m[:, None], regions.near_m) - np.minimum(
         looks.far_m[:, None], regions.far_m
     )
-    pairs = np.argwhere(gap_m <= config.max_depth_gap_m)
-    out = np.zeros(gap_m.shape, bool)
-    in_common = shared(distributions[pairs[:, 0]], regions.distributions[pairs[:, 1]])
-    out[pairs[:, 0], pairs[:, 1]] = in_common >= config.min_shared
-    return out
+    allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
+    k, r = np.nonzero(allowed)
+    allowed[k, r] = shared(distributions[k], regions.distributions[r]) >= config.min_shared
+    return Pairs(iou, allowed)
 
 
 def associate(

@@ -15,13 +15,13 @@ from .association import (
     Found,
     Looks,
     MapView,
-    agreeing,
+    Pairs,
     associate,
     found,
     look,
-    overlaps,
+    paired,
 )
-from .distributions import divergence, entropy, names
+from .distributions import divergence, entropy
 from .labels import BACKGROUND
 from .landmarks import (
     LANDMARK,
@@ -33,6 +33,7 @@ from .landmarks import (
     distributions,
     entropies,
     joined,
+    labels_of,
     moved,
     new_landmarks,
     rows_of,
@@ -130,8 +131,9 @@ class Objects:
         near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
         looks = look(self._table[near], view, T_camera_map, limits)
         # which is which
-        k, r = self._match(near, looks, regions)
-        excused, left = self._pieces(near, k, looks, regions, r)
+        pairs = paired(distributions(self._table[near]), looks, regions, limits)
+        k, r = self._match(near, pairs)
+        excused, left = self._pieces(near, k, pairs, regions, r)
         # what is learnt of those seen, and of those not
         observations = self._update(view, near[k], r, looks.rows[k], looks.shown[k], regions)
         missed = self._missed(looks, excused)
@@ -144,35 +146,28 @@ class Objects:
         return Observed(tuple(observations), born, merged, retired)
 
     # --- association ------------------------------------------------------------------------------
-    def _match(
-        self, near: np.ndarray, looks: Looks, regions: Found
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of a landmark, as number in `near`, and a region."""
-        limits, is_object = self.config.association, self._table["id"][near] != CANDIDATE
-        allowed = agreeing(distributions(self._table[near]), looks, regions, limits)
-        iou = overlaps(looks.boxes, regions.boxes)
-        k, r = associate(iou, allowed & is_object[:, None], limits.min_iou)
+    def _match(self, near: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+        """Landmarks, as numbers in `near`, and the regions that show them."""
+        is_object = (self._table["id"][near] != CANDIDATE)[:, None]
+        allowed, least = pairs.allowed.copy(), self.config.association.min_iou
+        k, r = associate(pairs.iou, allowed & is_object, least)
         allowed[:, r] = False
-        others, left = associate(iou, allowed & ~is_object[:, None], limits.min_iou)
+        others, left = associate(pairs.iou, allowed & ~is_object, least)
         return np.concatenate([k, others]), np.concatenate([r, left])
 
     def _pieces(
-        self, near: np.ndarray, k: np.ndarray, looks: Looks, regions: Found, r: np.ndarray
+        self, near: np.ndarray, k: np.ndarray, pairs: Pairs, regions: Found, r: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Which landmarks near are not missed, [K] bool, since they were matched or a region shows
         a piece of them, and the regions that are neither matched nor such pieces."""
-        excused = np.zeros(len(near), bool)
-        excused[k] = True
-        left = np.setdiff1d(np.arange(len(regions.numbers)), r)
-        known = self._table[near]
-        allowed = agreeing(distributions(known), looks, regions, self.config.association)
-        is_piece = np.zeros(len(left), bool)
-        for row, region in np.argwhere(allowed[:, left] & ~excused[:, None]):
-            valid = regions.members[left[region]] != NO_MEMBER
-            share = inside(known[row], regions.p_map[left[region]][valid])
+        excused, is_left = np.zeros(len(near), bool), np.ones(len(regions.numbers), bool)
+        excused[k], is_left[r] = True, False
+        for row, region in np.argwhere(pairs.allowed & ~excused[:, None] & is_left):
+            valid = regions.members[region] != NO_MEMBER
+            share = inside(self._table[near[row]], regions.p_map[region][valid])
             if share >= self.config.merge_overlap:
-                excused[row], is_piece[region] = True, True
-        return excused, left[~is_piece]
+                excused[row], is_left[region] = True, False
+        return excused, np.flatnonzero(is_left)
 
     # --- those seen -------------------------------------------------------------------------------
     def _update(
@@ -216,12 +211,9 @@ class Objects:
 
     def _promote(self, which: np.ndarray) -> tuple[int, ...]:
         """Ids of candidates that became objects."""
-        p = distributions(self._table[which])
-        heaviest = p[np.arange(len(p)), names(p)]
-        ready = (self._table["seen"][which] >= self.config.min_keyframes) & (
-            heaviest >= p[:, BACKGROUND]
-        )
-        ready = which[ready & (self._table["id"][which] == CANDIDATE)]
+        seen = self._table[which]
+        ready = (seen["id"] == CANDIDATE) & (seen["seen"] >= self.config.min_keyframes)
+        ready = which[ready & (seen["labels"][:, 0] != BACKGROUND)]
         room = max(0, self.config.max_objects - len(self))
         self._refused += len(ready[room:])
         ids = self._next_id + np.arange(len(ready[:room]))
@@ -288,17 +280,12 @@ class Objects:
     def _neighbours(self, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
         """Pairs of one that was matched and one near that was not, of the same name, whose boxes
         are close enough to meet."""
-        others = np.setdiff1d(near, matched)
-        name_of = names(distributions(self._table[near]))
-        name = dict(zip(near.tolist(), name_of.tolist(), strict=True))
-        place, reach = (
-            self._table["T_map_object"][:, :3, 3],
-            np.linalg.norm(self._table["size"], axis=1) / 2,
-        )
-        apart_m = np.linalg.norm(place[matched][:, None] - place[others][None], axis=2)
-        close = np.argwhere(apart_m < reach[matched][:, None] + reach[others][None])
-        pairs = [(int(matched[i]), int(others[j])) for i, j in close]
-        return sorted(pair for pair in pairs if name[pair[0]] == name[pair[1]])
+        here, is_matched = self._table[near], np.isin(near, matched)
+        name, place = labels_of(here), here["T_map_object"][:, :3, 3]
+        reach = np.linalg.norm(here["size"], axis=1) / 2
+        one, other = np.nonzero((name[:, None] == name) & is_matched[:, None] & ~is_matched)
+        close = np.linalg.norm(place[one] - place[other], axis=1) < reach[one] + reach[other]
+        return list(zip(near[one[close]].tolist(), near[other[close]].tolist(), strict=True))
 
     def _coincide(self, a: int, b: int, view: MapView) -> bool:
         one, other = self._table[a], self._table[b]
@@ -413,7 +400,8 @@ def _one_each(members: np.ndarray) -> np.ndarray:
 def _voted(votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray) -> np.ndarray:
     """Votes [K, 256] one higher for members, in `rows` of the map, that lie in the region `numbers`
     [K] of their landmark, and one lower for those that were seen beside it or are no more."""
-    at = np.minimum(np.searchsorted(view.indices, rows), len(view.indices) - 1)
+    wanted = np.maximum(rows, 0).astype(view.indices.dtype)  # or all of `indices` is converted
+    at = np.minimum(np.searchsorted(view.indices, wanted), len(view.indices) - 1)
     is_shown = view.indices[at] == rows
     region = np.where(is_shown, view.regions[at], HIDDEN)
     is_in = region == numbers[:, None]
