@@ -29,6 +29,7 @@ from ldo_service.schemas.map import (
     ModelView,
 )
 from ldo_service.schemas.message import Message, decode, encode
+from ldo_service.schemas.objects import MapObject, MapObjects, ObjectObservation, ObjectView
 from ldo_service.schemas.odometry import OdometryPrior
 from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 
@@ -52,11 +53,15 @@ __all__ = [
     "Keyframe",
     "KeyframeRefinement",
     "MapDelta",
+    "MapObject",
+    "MapObjects",
     "MapRefine",
     "MapSnapshot",
     "MeasuredPose",
     "Message",
     "ModelView",
+    "ObjectObservation",
+    "ObjectView",
     "OdometryPrior",
     "OutputCount",
     "Pose",

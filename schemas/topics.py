@@ -14,6 +14,7 @@ from ldo_service.schemas.health import Health
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
 from ldo_service.schemas.map import MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.message import Message
+from ldo_service.schemas.objects import MapObjects, ObjectObservation
 from ldo_service.schemas.odometry import OdometryPrior
 from ldo_service.schemas.pose import TrackedPose
 
@@ -61,8 +62,10 @@ CONTROL = Topic(
 
 LABEL_REQUEST = Topic("label/request", None, "image crops of a region to be named", key="region")
 LABEL_OPEN = Topic("label/open", None, "the name of a region, late by design", key="region")
-MAP_OBJECTS = Topic("map/objects", None, "the named objects", is_state=True)
-OBJECT_OBSERVATION = Topic("object/observation", None, "an object seen from a keyframe")
+MAP_OBJECTS = Topic("map/objects", MapObjects, "the named objects", is_state=True)
+OBJECT_OBSERVATION = Topic(
+    "object/observation", ObjectObservation, "an object seen from a keyframe"
+)
 LOOP_CLOSURE = Topic("loop/closure", None, "a verified pose between two distant keyframes")
 LOOP_CANDIDATE = Topic("loop/candidate", None, "every candidate, and why it was refused")
 

@@ -19,6 +19,7 @@ from ldo_service.schemas import (
     Image,
     Keyframe,
     MapDelta,
+    MapObjects,
     MapSnapshot,
     Message,
     Pose,
@@ -390,3 +391,54 @@ def test_boxes_come_from_a_network() -> None:
         changed("detection_boxes", network="")
     nobody = changed("detection_boxes", network="", detections=())
     assert isinstance(nobody, DetectionBoxes)
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"object": -1}, "object is -1"),
+        ({"keyframe": -1}, "keyframe is -1"),
+        ({"box_px": (2.0, 0.0, 1.0, 1.0)}, "inside out"),
+        ({"box_px": (NAN, 0.0, 1.0, 1.0)}, "NaN"),
+        ({"entropy": NAN}, "entropy"),
+        ({"entropy": -0.1}, "entropy"),
+        ({"distribution": ()}, "over 0 classes"),
+        ({"distribution": (("cup", 0.7), ("cup", 0.3))}, "twice"),
+        ({"distribution": (("cup", 0.7), ("vase", 0.5))}, "more than 1"),
+        ({"distribution": (("cup", -0.1),)}, "negative"),
+        ({"distribution": (("cup", INF),)}, "infinity"),
+        ({"distribution": (("", 0.5),)}, "characters"),
+    ],
+)
+def test_an_observation_of_an_object_is_a_box_and_a_distribution(
+    fields: dict, complaint: str
+) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        changed("object_observation", **fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "complaint"),
+    [
+        ({"id": -1}, "id is -1"),
+        ({"seen": -1}, "seen is -1"),
+        ({"name": ""}, "0 characters"),
+        ({"confidence": 1.5}, "within 0..1"),
+        ({"centroid": (0.0, NAN, 0.0)}, "NaN"),
+        ({"covariance": (1.0,) * 6}, "9 numbers"),
+        ({"covariance": (-1.0, *(0.0,) * 8)}, "9 numbers"),
+        ({"size": (1.0, -1.0, 1.0)}, "negative"),
+    ],
+)
+def test_an_object_that_cannot_be_is_refused(fields: dict, complaint: str) -> None:
+    message = EXAMPLES["map_objects"]
+    assert isinstance(message, MapObjects)
+    with pytest.raises(ValueError, match=complaint):
+        msgspec.structs.replace(message.objects[0], **fields)
+
+
+def test_objects_come_by_id_and_each_once() -> None:
+    message = EXAMPLES["map_objects"]
+    assert isinstance(message, MapObjects)
+    with pytest.raises(ValueError, match="ascending"):
+        changed("map_objects", objects=2 * message.objects)
