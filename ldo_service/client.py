@@ -30,6 +30,7 @@ from ldo_service.schemas import (
     ControlAnswer,
     ControlRequest,
     Image,
+    MapObjects,
     MapRefine,
     Message,
     OdometryPrior,
@@ -43,6 +44,7 @@ from ldo_service.schemas.topics import (
     FROM_ODOMETRY,
     FROM_OPERATORS,
     FROM_OUTSIDE,
+    MAP_OBJECTS,
     MAP_REFINE,
     POSE_TRACKED,
     Topic,
@@ -185,6 +187,13 @@ class Client:
             consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
         )
         return [_message(r.ok, _type_of(topic)) for r in replies if r.ok is not None]
+
+    def objects(self, timeout_s: float = 3.0) -> MapObjects:
+        """The objects of the map as of now. Raises ConfigError when nobody answers."""
+        for message in self.last(MAP_OBJECTS, timeout_s):
+            assert isinstance(message, MapObjects)
+            return message
+        raise self._nobody("answers", MAP_OBJECTS)
 
     def alive(self, timeout_s: float = 1.0) -> set[str]:
         """Names of the actors whose process is there."""

@@ -17,13 +17,21 @@ from ldo_service.schemas import (
     FrameRgbd,
     Image,
     Keyframe,
+    MapObject,
+    MapObjects,
     MeasuredPose,
+    ObjectObservation,
+    ObjectView,
     Pose,
 )
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
+from ldo_service.schemas.objects import Box, Distribution
 from ldo_service.semantics.detectors import Detections
+from ldo_service.semantics.distributions import entropy, sparse
 from ldo_service.semantics.labelling import Claims
+from ldo_service.semantics.landmarks import distributions, labels_of
+from ldo_service.semantics.objects import Objects, Observed
 from ldo_service.semantics.vocabulary import Vocabulary
 
 
@@ -219,3 +227,77 @@ def raw_frame_of(message: CameraRgbd, index: int) -> RawFrame:
         depth_scale=message.depth_scale,
         camera=camera_of(message.camera),
     )
+
+
+def objects_message(
+    objects: Objects, names: Sequence[str], version: int, graph_version: int, stamp_ns: int
+) -> MapObjects:
+    """All objects; `names` of the vocabulary."""
+    table = objects.landmarks
+    p = distributions(table)
+    columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
+    return MapObjects(
+        stamp_ns=stamp_ns,
+        version=version,
+        graph_version=graph_version,
+        objects=tuple(_object_message(*column, names) for column in columns),
+    )
+
+
+def _object_message(
+    landmark: np.void, label: int, p: np.ndarray, entropy: float, names: Sequence[str]
+) -> MapObject:
+    T, views = landmark["T_map_object"], landmark["view_keyframes"]
+    return MapObject(
+        id=int(landmark["id"]),
+        name=names[label],
+        confidence=min(float(p[label]), 1.0),
+        centroid=_vector3(landmark["centroid"]),
+        covariance=tuple(landmark["covariance"].ravel().tolist()),
+        T_map_object=pose_message(T),
+        size=_vector3(landmark["size"]),
+        distribution=_distribution_message(p, names),
+        entropy=max(entropy, 0.0),
+        seen=int(landmark["seen"]),
+        missed=int(landmark["missed"]),
+        first_keyframe=int(landmark["first"]),
+        last_keyframe=int(landmark["last"]),
+        views=tuple(
+            ObjectView(keyframe=int(views[i]), box_px=_box(landmark["view_boxes"][i]))
+            for i in np.flatnonzero(views >= 0)
+        ),
+    )
+
+
+def observation_messages(
+    observed: Observed, names: Sequence[str], keyframe: int, stamp_ns: int
+) -> list[ObjectObservation]:
+    """What a keyframe shows of objects, and what it misses."""
+    return [
+        ObjectObservation(
+            stamp_ns=stamp_ns,
+            keyframe=keyframe,
+            object=seen.object,
+            box_px=_box(seen.box),
+            distribution=_distribution_message(seen.distribution, names),
+            entropy=max(float(seen.entropy), 0.0),
+            is_miss=seen.is_miss,
+        )
+        for seen in observed.observations
+    ]
+
+
+def _distribution_message(p: np.ndarray, names: Sequence[str]) -> Distribution:
+    labels, weights = sparse(p)
+    pairs = zip(labels.tolist(), weights.tolist(), strict=True)
+    return tuple((names[label], weight) for label, weight in pairs if weight > 0)
+
+
+def _vector3(v: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = v.tolist()
+    return x, y, z
+
+
+def _box(box: np.ndarray) -> Box:
+    x0, y0, x1, y1 = box.tolist()
+    return x0, y0, x1, y1

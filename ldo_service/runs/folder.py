@@ -46,6 +46,7 @@ from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.saved import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
+from .objects_file import OBJECTS
 from .places import PlaceRecord
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
@@ -63,7 +64,7 @@ EXPORTED = {  # by `ldo export`, per format
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
-        *(PLACES, SEMANTICS, f"{REFINED}/{SEMANTICS}"),
+        *(PLACES, OBJECTS, SEMANTICS, f"{REFINED}/{SEMANTICS}"),
         *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),

@@ -20,5 +20,6 @@ label_images              labels as a camera sees them
 distributions             over labels: means, divergences, entropies
 landmarks                 objects: samples of Gaussians, and what follows of these
 association               which object is which region of a keyframe
+search                    which objects somebody means who names a thing
 objects                   all of these in their order: how objects come and go
 """

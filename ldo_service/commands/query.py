@@ -1,0 +1,127 @@
+"""ldo query"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ldo_service.client import connect
+from ldo_service.errors import DataError
+from ldo_service.geometry import Trajectory
+from ldo_service.runs.objects_file import read_objects
+from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
+from ldo_service.schemas import MapObjects, Pose, TrackedPose
+from ldo_service.schemas.topics import POSE_TRACKED
+from ldo_service.semantics.search import Encode, nearest_names, search
+from ldo_service.wire import transform
+
+from .options import Endpoint, Json, Robot
+
+LIVE = "live"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """An object, in the map frame; lengths in metres."""
+
+    id: int
+    name: str
+    score: float  # 0..1, see `semantics.search`
+    center: tuple[float, float, float]  # of its box
+    size: tuple[float, float, float]  # along the axes of the box
+    T_map_object: Pose  # these axes
+    distance: float | None  # from where the camera is, or was at the end of the run
+
+
+def query(
+    where: Annotated[
+        str,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="DIR|live", help="folder of a finished run, or the running service"),
+    ],
+    text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT", help="its name")],
+    robot: Robot = "robot",
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
+) -> None:
+    """Tell where things are: boxes in the map, the likeliest first.
+
+    Other words for the same are understood, and kinds of it: "sofa" finds couches.
+
+      ldo query DIR "potted plant"
+      ldo query live chair --json
+    """
+    found, eye = _live(robot, endpoint) if where == LIVE else _of_run(Path(where).expanduser())
+    answers = answer(text, found, eye)
+    if json_:
+        print(json.dumps([_plain(one) for one in answers]))
+    else:
+        Console(highlight=False, markup=False).print(_table(answers))
+
+
+def answer(
+    text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
+) -> list[Answer]:
+    """Objects that answer to `text`, the best and of equals the nearest to `eye` [3] first.
+
+    Raises DataError when there is none.
+    """
+    objects = found.objects
+    hits = search(text, [dict(one.distribution) for one in objects], encode)
+    if not hits:
+        raise DataError(_nothing(text, [one.name for one in objects]))
+    answers = []
+    for hit in hits:
+        one = objects[hit.index]
+        center = one.T_map_object.translation
+        distance = None if eye is None else float(np.linalg.norm(eye - center))
+        about = (one.id, one.name, hit.score, center, one.size, one.T_map_object)
+        answers.append(Answer(*about, distance))
+    return sorted(answers, key=lambda one: (-one.score, one.distance or 0, one.id))
+
+
+def _nothing(text: str, names: list[str]) -> str:
+    if not names:
+        return "the map has no objects yet: a detector has to find one in three keyframes."
+    near = ", ".join(nearest_names(text, names))
+    return f"none of {len(names)} objects answers to {text!r}. There is {near}."
+
+
+def _of_run(folder: Path) -> tuple[MapObjects, np.ndarray | None]:
+    """The objects, and where the camera was at the end."""
+    found, path = read_objects(folder), folder / "trajectory.txt"
+    T_map_camera = Trajectory.load(path).T_world_camera if path.is_file() else np.zeros((0, 4, 4))
+    return found, T_map_camera[-1, :3, 3] if len(T_map_camera) else None
+
+
+def _live(robot: str, endpoint: str) -> tuple[MapObjects, np.ndarray | None]:
+    """The objects, and where the camera is."""
+    with connect(robot, endpoint) as service:
+        found, poses = service.objects(), service.last(POSE_TRACKED)
+    eye = None
+    for pose in poses:
+        assert isinstance(pose, TrackedPose)
+        eye = (transform(pose.T_map_odom) @ transform(pose.T_odom_camera))[:3, 3]
+    return found, eye
+
+
+def _plain(one: Answer) -> dict[str, object]:
+    pose = one.T_map_object
+    return {
+        **{name: value for name, value in asdict(one).items() if name != "T_map_object"},
+        "quaternion_wxyz": pose.quaternion,
+    }
+
+
+def _table(answers: list[Answer]) -> Table:
+    table = Table("id", "name", "score", "centre m", "size m", "distance m")
+    for one in answers:
+        away = "" if one.distance is None else f"{one.distance:.2f}"
+        lengths = (" ".join(f"{v:.2f}" for v in vector) for vector in (one.center, one.size))
+        table.add_row(str(one.id), one.name, f"{one.score:.2f}", *lengths, away)
+    return table

@@ -1,0 +1,163 @@
+"""ldo query, of a run and of a running service."""
+
+import json
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+
+from ldo_service.client import connect
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Trajectory
+from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
+from ldo_service.schemas import MapObjects, Pose, encode
+from ldo_service.schemas.topics import MAP_OBJECTS
+from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.schemas.examples import EXAMPLES
+from tests.service.conftest import free_endpoint
+
+EXAMPLE = EXAMPLES["map_objects"]
+assert isinstance(EXAMPLE, MapObjects)
+PLANT = EXAMPLE.objects[0]
+
+
+def thing(number: int, name: str, probability: float, x_m: float) -> msgspec.Struct:
+    return msgspec.structs.replace(
+        PLANT,
+        id=number,
+        name=name,
+        confidence=probability,
+        distribution=((name, probability),),
+        T_map_object=Pose((x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        size=(0.5, 0.25, 1.0),
+    )
+
+
+THINGS = (
+    thing(1, "chair", 0.9, 3.0),
+    thing(4, "couch", 0.8, -1.0),
+    thing(5, "chair", 0.9, 1.5),
+    thing(9, "chair", 0.95, 7.0),
+)
+FOUND = msgspec.structs.replace(EXAMPLE, objects=THINGS)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """What a run leaves that this verb reads; its camera ended at x = 1 m."""
+    write_objects(tmp_path, FOUND)
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 1
+    Trajectory(np.array([0.0, 1.0]), T).save(tmp_path / "trajectory.txt")
+    return tmp_path
+
+
+def test_objects_survive_the_file(folder: Path) -> None:
+    assert read_objects(folder) == FOUND
+    before = (folder / OBJECTS).read_bytes()
+    write_objects(folder, read_objects(folder))
+    assert (folder / OBJECTS).read_bytes() == before
+    plain = json.loads(before)
+    assert plain["objects"][1]["T_map_object"]["translation"] == [-1.0, 0.0, 0.0]
+
+
+def test_the_best_and_of_equals_the_nearest_comes_first(capsys, folder: Path) -> None:
+    code, out, _ = ldo(capsys, "query", folder, "chair", "--json")
+    assert code == 0
+    answers = json.loads(out)
+    assert [one["id"] for one in answers] == [9, 5, 1]
+    assert answers[1] == {
+        "id": 5,
+        "name": "chair",
+        "score": 0.9,
+        "center": [1.5, 0.0, 0.0],
+        "size": [0.5, 0.25, 1.0],
+        "distance": 0.5,
+        "quaternion_wxyz": [1.0, 0.0, 0.0, 0.0],
+    }
+
+
+def test_another_word_finds_it_in_a_table(capsys, folder: Path) -> None:
+    code, out, _ = ldo(capsys, "query", folder, "Sofa")
+    assert code == 0
+    (row,) = [line for line in out.splitlines() if "couch" in line]
+    for cell in ("4", "0.80", "-1.00 0.00 0.00", "0.50 0.25 1.00", "2.00"):
+        assert cell in row
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"), [("chiar", "There is chair."), ("piano", "There is chair, couch.")]
+)
+def test_what_is_not_there_is_told_with_what_is(
+    capsys, folder: Path, text: str, complaint: str
+) -> None:
+    code, out, err = ldo(capsys, "query", folder, text)
+    assert (code, out) == (3, "")
+    assert_one_paragraph(err)
+    assert complaint in err
+
+
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (None, "kept no objects"),
+        (b"{", "is not what `ldo run` writes"),
+        (b"\xff\xfe", "is not what `ldo run` writes"),
+        (json.dumps({"type": "MapObjects"}).encode(), "is not what `ldo run` writes"),
+        (msgspec.json.encode(msgspec.structs.replace(FOUND, objects=())), "has no objects yet"),
+    ],
+)
+def test_a_run_without_objects_is_bad_data(capsys, tmp_path: Path, content, complaint) -> None:
+    if content is not None:
+        (tmp_path / OBJECTS).write_bytes(content)
+    code, _, err = ldo(capsys, "query", tmp_path, "chair")
+    assert code == 3
+    assert_one_paragraph(err)
+    assert complaint in err
+
+
+def test_a_folder_that_is_not_there_is_bad_data(capsys, tmp_path: Path) -> None:
+    code, _, err = ldo(capsys, "query", tmp_path / "absent", "chair")
+    assert code == 3
+    assert_one_paragraph(err)
+    assert "is not a folder" in err
+
+
+# --- live -----------------------------------------------------------------------------------------
+def test_nobody_to_ask_is_a_configuration_error(capsys) -> None:
+    code, _, err = ldo(capsys, "query", "live", "chair", "--endpoint", free_endpoint())
+    assert code == 2
+    assert_one_paragraph(err)
+
+
+def test_the_running_service_is_asked(capsys) -> None:
+    """A router that answers as the mapper's stage does."""
+    endpoint = free_endpoint()
+    config = zenoh.Config.from_json5(
+        json.dumps(
+            {
+                "mode": "router",
+                "listen": {"endpoints": [endpoint]},
+                "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+            }
+        )
+    )
+    key = MAP_OBJECTS.expression("robot")
+
+    def reply(query: zenoh.Query) -> None:
+        with query:
+            query.reply(key, encode(FOUND))
+
+    handler = zenoh.handlers.Callback(reply, indirect=False)
+    with zenoh.open(config) as router:
+        with connect("robot", endpoint) as service, pytest.raises(ConfigError, match="map/objects"):
+            service.objects(timeout_s=0.5)
+        with router.declare_queryable(key, handler):
+            with connect("robot", endpoint) as service:
+                assert service.objects() == FOUND
+            code, out, _ = ldo(capsys, "query", "live", "sofa", "--json", "--endpoint", endpoint)
+    assert code == 0
+    (one,) = json.loads(out)
+    assert (one["id"], one["distance"]) == (4, None)
