@@ -289,8 +289,8 @@ def observation_messages(
 
 def _distribution_message(p: np.ndarray, names: Sequence[str]) -> Distribution:
     labels, weights = sparse(p)
-    pairs = zip(labels.tolist(), weights.tolist(), strict=True)
-    return tuple((names[label], weight) for label, weight in pairs if weight > 0)
+    pairs = zip(labels, weights, strict=True)
+    return tuple((names[int(label)], float(weight)) for label, weight in pairs if weight > 0)
 
 
 def _vector3(v: np.ndarray) -> tuple[float, float, float]:

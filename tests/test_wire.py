@@ -5,7 +5,6 @@ import numpy as np
 from ldo_service.schemas import MapObjects, decode, encode
 from ldo_service.semantics.landmarks import distributions, entropies
 from ldo_service.wire import objects_message, observation_messages, transform
-
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
 
 

@@ -19,6 +19,8 @@ from ldo_service.geometry import Camera
 from .distributions import pooled, shared
 from .landmarks import MEMBERS, NO_MEMBER, believed, rows_of, shuffled, trimmed
 
+PROBES = 128  # members that are projected: the first when shuffled are a sample of the sample
+
 
 @dataclass(frozen=True, slots=True)
 class AssociationConfig:
@@ -163,8 +165,8 @@ def look(
 ) -> Looks:
     """How landmarks [K] appear; of one none of whose members is awake, how its centroid does."""
     where = rows_of(table["members"], view.ids)
-    there = (where >= 0) & believed(table)
-    p_map = view.rows[np.maximum(where, 0), :3].astype(float)
+    there = ((where >= 0) & believed(table))[:, :PROBES]
+    p_map = view.rows[np.maximum(where[:, :PROBES], 0), :3].astype(float)
     gone = ~there.any(axis=1)
     p_map[gone, 0] = table["centroid"][gone]
     there[gone, 0] = True
