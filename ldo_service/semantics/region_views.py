@@ -1,0 +1,122 @@
+"""How good a view of a region is, and the picture of it that a labeller gets to see."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, codecs
+
+from .foreground import Foreground, pixels_of
+
+
+@dataclass(frozen=True, slots=True)
+class ViewConfig:
+    context: float = 0.15  # of the box's sides, shown around it
+    side_px: int = 336  # a larger crop is shrunk to it
+    good_side_px: float = 128.0  # of a region that more pixels would not show better
+    sharp: float = 100.0  # variance of the Laplacian (grey levels squared) that is half good
+    least: float = 0.25  # factor of a view that is cut off, or seen edge on
+
+    def __post_init__(self) -> None:
+        if not (self.context >= 0 and min(self.good_side_px, self.sharp) > 0 and self.side_px > 0):
+            raise ConfigError(f"{self}: sizes must be positive.")
+        if not 0 <= self.least <= 1:
+            raise ConfigError(f"{self}: least must be within 0..1.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RegionView:
+    """quality 0..1; jpeg of the crop, width x height; keyframe and box_px where it was seen"""
+
+    keyframe: int
+    box_px: tuple[float, float, float, float]
+    quality: float
+    width: int
+    height: int
+    jpeg: bytes
+
+
+def region_view(
+    keyframe: int,
+    color: np.ndarray,
+    depth_m: np.ndarray,
+    camera: Camera,
+    box_px: np.ndarray,
+    part: Foreground,
+    config: ViewConfig,
+) -> RegionView:
+    """The crop of a region from a keyframe: color [H, W, 3] uint8 RGB, depth_m [H, W]."""
+    x0, y0, x1, y1 = (float(v) for v in box_px)
+    margin = config.context * np.array([x1 - x0, y1 - y0])
+    grown = np.array([*(box_px[:2] - margin), *(box_px[2:] + margin)])
+    crop = shrunk(color[pixels_of(grown, depth_m.shape)], config.side_px)
+    quality = (
+        size_factor(box_px, config)
+        * border_factor(box_px, depth_m.shape, config)
+        * sharpness_factor(crop, config)
+        * facing_factor(depth_m, camera, part, config)
+    )
+    height, width = crop.shape[:2]
+    jpeg = codecs.encode_jpeg(crop)
+    return RegionView(keyframe, (x0, y0, x1, y1), float(quality), width, height, jpeg)
+
+
+def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
+    """Side of a square like the box, up to `good_side_px`.
+
+    >>> size_factor(np.array([0, 0, 64, 64]), ViewConfig())
+    0.5
+    """
+    side = float(np.sqrt(np.prod(box_px[2:] - box_px[:2])))
+    return min(1.0, side / config.good_side_px)
+
+
+def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig) -> float:
+    """1 when the border of the image is a tenth of the box's longer side away, `least` at it."""
+    height, width = shape[:2]
+    gaps = *(box_px[:2] + 0.5), width - 0.5 - box_px[2], height - 0.5 - box_px[3]
+    wanted = 0.1 * float((box_px[2:] - box_px[:2]).max())
+    reached = min(1.0, max(0.0, float(min(gaps))) / wanted)
+    return config.least + (1 - config.least) * reached
+
+
+def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
+    """v / (v + sharp), v the variance of the Laplacian (Pech-Pacheco et al., ICPR 2000)."""
+    grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
+    variance = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    return variance / (variance + config.sharp)
+
+
+def facing_factor(
+    depth_m: np.ndarray, camera: Camera, part: Foreground, config: ViewConfig
+) -> float:
+    """Mean cosine between its surface and the rays to it; `least` when edge on or unknown."""
+    height, width = part.mask.shape
+    if min(height, width) < 3 or not part.mask.any():
+        return config.least
+    rows, columns = part.row + np.arange(height), part.column + np.arange(width)
+    z = depth_m[rows[:, None], columns].astype(np.float64)
+    rays = np.empty((height, width, 3))
+    rays[..., 0] = (columns - camera.cx) / camera.fx
+    rays[..., 1] = ((rows - camera.cy) / camera.fy)[:, None]
+    rays[..., 2] = 1
+    p_camera = rays * z[..., None]
+    normals = np.cross(np.gradient(p_camera, axis=1), np.gradient(p_camera, axis=0))
+    lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)
+    usable = part.mask & (z > 0) & (lengths > 0)
+    if not usable.any():
+        return config.least
+    cosines = np.abs((normals * rays).sum(-1)[usable]) / lengths[usable]
+    return config.least + (1 - config.least) * float(cosines.mean())
+
+
+def shrunk(crop: np.ndarray, side_px: int) -> np.ndarray:
+    """With its longer side at most `side_px`."""
+    height, width = crop.shape[:2]
+    scale = side_px / max(height, width)
+    if scale >= 1:
+        return np.ascontiguousarray(crop)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)

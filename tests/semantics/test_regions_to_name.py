@@ -1,0 +1,189 @@
+"""Regions followed over keyframes, and when they are asked about."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, codecs
+from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.semantics.foreground import Foreground
+from ldo_service.semantics.region_views import (
+    ViewConfig,
+    border_factor,
+    facing_factor,
+    region_view,
+    sharpness_factor,
+)
+from ldo_service.semantics.regions_to_name import RegionConfig, RegionsToName
+from ldo_service.semantics.trigger import Candidate
+
+CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+SHAPE = 120, 160
+CONFIG = RegionConfig(views_first=2, views=3, most_questions=2)
+RNG = np.random.default_rng(3)
+COLOR = RNG.integers(0, 256, (*SHAPE, 3), np.uint8)
+
+
+def thing(left: int = 60, top: int = 40, side: int = 30, **fields) -> Candidate:
+    part = Foreground(top, left, np.ones((side, side), bool))
+    box = np.array([left - 0.5, top - 0.5, left + side - 0.5, top + side - 0.5])
+    return Candidate(box, part, **fields)
+
+
+def moved(x_m: float = 0.0) -> np.ndarray:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return T
+
+
+class Walk:
+    """Keyframes one after the other, over a wall at 2 m."""
+
+    def __init__(self, config: RegionConfig = CONFIG) -> None:
+        self.regions = RegionsToName(config)
+        self.T_map_keyframe: dict[int, np.ndarray] = {}
+
+    def see(self, *found: Candidate, at_x_m: float = 0.0, color: np.ndarray = COLOR) -> list[int]:
+        keyframe = len(self.T_map_keyframe)
+        self.T_map_keyframe[keyframe] = moved(at_x_m)
+        depth_m = np.full(SHAPE, 2.0, np.float32)
+        args = keyframe, found, color, depth_m, CAMERA, self.T_map_keyframe
+        return [region.id for region in self.regions.see(*args)]
+
+
+def test_a_region_is_asked_about_when_it_was_seen_twice() -> None:
+    walk = Walk()
+    assert walk.see(thing()) == []
+    assert walk.see(thing()) == [0]
+    region = walk.regions.get(0)
+    assert region is not None
+    assert [view.keyframe for view in region.views] == [0, 1]
+    assert (region.keyframe, region.box_px) == (1, (59.5, 39.5, 89.5, 69.5))
+
+
+def test_it_is_the_same_where_the_camera_moved_and_another_one_elsewhere() -> None:
+    """30 px at 2 m and f = 120 px are 0.5 m; the camera goes 0.5 m to the right."""
+    walk = Walk()
+    walk.see(thing(left=60))
+    assert walk.see(thing(left=30), at_x_m=0.5) == [0]
+    assert walk.see(thing(left=60), at_x_m=0.5) == []
+    assert len(walk.regions) == 2
+
+
+def test_two_things_in_a_keyframe_are_never_one() -> None:
+    walk = Walk()
+    walk.see(thing(left=60), thing(left=64))
+    assert len(walk.regions) == 2
+    assert sorted(walk.see(thing(left=60), thing(left=64))) == [0, 1]
+
+
+def test_a_correction_moves_regions_with_their_keyframes() -> None:
+    walk = Walk()
+    walk.see(thing())
+    walk.T_map_keyframe[0] = moved(5.0)
+    assert walk.see(thing(), at_x_m=5.0) == [0]
+
+
+def test_it_is_asked_again_only_when_its_views_got_better_and_not_too_often() -> None:
+    walk = Walk()
+    grey = np.full_like(COLOR, 128)
+    grey[::7] = 140
+    assert [walk.see(thing(), color=grey) for _ in range(2)] == [[], [0]]
+    assert walk.see(thing()) == [0], "far sharper"
+    assert [walk.see(thing()) for _ in range(5)] == [[]] * 5, "asked twice already"
+
+
+def test_a_confident_answer_settles_it_and_another_does_not() -> None:
+    blurred = np.full_like(COLOR, 128)
+    blurred[::7] = 140
+    for confidence, more in ((0.59, [0]), (0.6, [])):
+        walk = Walk()
+        walk.see(thing(), color=blurred)
+        walk.see(thing(), color=blurred)
+        walk.regions.answered(0, confidence)
+        assert walk.see(thing()) == more
+    walk.regions.answered(99, 1.0)
+
+
+def test_the_surest_opinion_of_the_detector_is_kept() -> None:
+    walk = Walk()
+    walk.see(thing(label="vase", score=0.3))
+    walk.see(thing(label="cup", score=0.5))
+    walk.see(thing())
+    region = walk.regions.get(0)
+    assert region is not None
+    assert (region.label, region.score) == ("cup", 0.5)
+
+
+def test_the_region_not_seen_for_longest_is_forgotten() -> None:
+    walk = Walk(replace(CONFIG, most=2))
+    walk.see(thing(left=10), thing(left=60))
+    walk.see(thing(left=10), thing(left=110))
+    assert [walk.regions.get(region) is None for region in (0, 1, 2)] == [False, True, False]
+
+
+def test_what_has_no_depth_is_left_out() -> None:
+    regions = RegionsToName(CONFIG)
+    nothing = np.zeros(SHAPE, np.float32)
+    assert regions.see(0, [thing()], COLOR, nothing, CAMERA, {0: moved()}) == []
+    assert len(regions) == 0
+
+
+def test_a_state_is_plain_and_goes_on_where_it_was() -> None:
+    walk = Walk()
+    walk.see(thing(label="cup", score=0.5), thing(left=110))
+    packed = decode_state(encode_state(walk.regions.packed))
+    successor = Walk()
+    successor.regions = RegionsToName.unpacked(packed, CONFIG)
+    successor.T_map_keyframe = dict(walk.T_map_keyframe)
+    assert successor.see(thing()) == walk.see(thing()) == [0]
+    one, other = successor.regions.get(0), walk.regions.get(0)
+    assert one is not None
+    assert other is not None
+    assert (one.views[0].jpeg, one.views[0].box_px) == (other.views[0].jpeg, other.views[0].box_px)
+    assert successor.see(thing(top=80, left=20)) == []
+    assert successor.regions.get(2) is not None, "ids go on"
+
+
+# --- how good a view is ---------------------------------------------------------------------------
+def test_the_crop_shows_the_region_with_some_of_what_is_around_it() -> None:
+    color = np.zeros((*SHAPE, 3), np.uint8)
+    color[40:70, 60:90] = (250, 10, 10)
+    depth_m = np.full(SHAPE, 2.0, np.float32)
+    one = thing()
+    view = region_view(4, color, depth_m, CAMERA, one.box_px, one.part, ViewConfig())
+    assert (view.width, view.height, view.keyframe) == (40, 40, 4)
+    crop = codecs.decode_color("jpeg", view.width, view.height, memoryview(view.jpeg))
+    assert crop[19, 19, 0] > 200
+    assert crop[1, 1].max() < 60
+
+
+def test_views_cut_off_by_the_border_are_worse() -> None:
+    config = ViewConfig()
+    factors = [border_factor(thing(left=left).box_px, SHAPE, config) for left in (0, 1, 3, 60)]
+    assert factors == pytest.approx([0.25, 0.5, 1.0, 1.0])
+
+
+def test_blurred_views_are_worse() -> None:
+    config = ViewConfig()
+    flat = np.full((40, 40, 3), 128, np.uint8)
+    assert sharpness_factor(flat, config) == 0
+    assert sharpness_factor(COLOR[:40, :40], config) > 0.9
+
+
+def test_a_surface_faced_is_better_than_one_edge_on() -> None:
+    """A plane through (0, 0, 2) whose normal is turned by an angle about the vertical."""
+    config, part = ViewConfig(), Foreground(58, 78, np.ones((5, 5), bool))
+    u = (np.arange(160) - CAMERA.cx) / CAMERA.fx
+    for angle in (0.0, 0.6, 1.2):
+        depth_m = np.tile(2 / (1 + np.tan(angle) * u), (120, 1)).astype(np.float32)
+        expected = 0.25 + 0.75 * np.cos(angle)
+        assert facing_factor(depth_m, CAMERA, part, config) == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize("fields", [{"views": 0}, {"views_first": 9}, {"gain": 1.0}, {"near": 0.0}])
+def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
+    with pytest.raises(ConfigError):
+        RegionConfig(**fields)

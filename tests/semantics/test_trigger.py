@@ -1,0 +1,124 @@
+"""Which regions are to be named."""
+
+import doctest
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera
+from ldo_service.semantics import region_views, trigger
+from ldo_service.semantics.foreground import ForegroundConfig, surfaces
+from ldo_service.semantics.trigger import TriggerConfig, candidates, depth_objects
+
+CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+WALL_M, NEAR_M = 3.0, 2.0
+CONFIG = TriggerConfig(min_side_px=12, structure_shares=(0.1,))
+NOBODY = np.zeros((120, 160), bool)
+
+
+def wall_with(*boxes: tuple[int, int, int, int]) -> np.ndarray:
+    """A wall that fills the view, and things before it: first and last column and row."""
+    depth_m = np.full((120, 160), WALL_M, np.float32)
+    for left, top, right, bottom in boxes:
+        depth_m[top : bottom + 1, left : right + 1] = NEAR_M
+    return depth_m
+
+
+def asked(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config=CONFIG):
+    boxes = np.reshape(np.array(boxes, float), (-1, 4))
+    found = surfaces(depth_m, CAMERA, config.foreground)
+    scores = np.array(scores)
+    return candidates(boxes, labels, scores, depth_m, found, CAMERA, is_labelled, config)
+
+
+THING = (60, 40, 89, 79)
+
+
+@pytest.mark.parametrize("module", [trigger, region_views])
+def test_the_examples_hold(module) -> None:
+    names = {name: getattr(module, name) for name in dir(module)}
+    result = doctest.testmod(module, extraglobs=names)
+    assert (result.attempted > 0, result.failed) == (True, 0)
+
+
+def test_what_stands_before_a_wall_is_asked_about_and_the_wall_is_not() -> None:
+    (found,) = asked(wall_with(THING))
+    assert found.box_px == pytest.approx(np.array([59.5, 39.5, 89.5, 79.5]), abs=3)
+    assert (found.label, found.score) == ("", 0)
+    mask = found.part.image((120, 160))
+    truth = wall_with(THING) == NEAR_M
+    assert np.count_nonzero(mask & truth) > 0.8 * np.count_nonzero(truth)
+    assert not np.any(mask & ~truth)
+    assert asked(wall_with()) == []
+
+
+@pytest.mark.parametrize(("score", "count"), [(0.61, 0), (0.6, 0), (0.59, 1), (0.1, 1)])
+def test_a_box_is_asked_about_below_the_score_of_the_paper(score: float, count: int) -> None:
+    box = (59.5, 39.5, 89.5, 79.5)
+    found = asked(wall_with(THING), [box], ["vase"], [score])
+    assert len(found) == count, "the object in it is not asked about a second time"
+    for one in found:
+        assert (one.label, one.score) == ("vase", score)
+        assert one.box_px.tolist() == list(box)
+
+
+def test_a_hesitant_box_of_what_a_sure_one_has_is_not_asked_about() -> None:
+    boxes = [(59.5, 39.5, 89.5, 79.5), (58.5, 39.5, 89.5, 78.5)]
+    assert asked(wall_with(THING), boxes, ["chair", "bench"], [0.9, 0.5]) == []
+
+
+def test_what_the_map_has_a_name_for_is_not_asked_about() -> None:
+    depth_m = wall_with(THING, (110, 40, 139, 79))
+    assert len(asked(depth_m)) == 2
+    is_labelled = np.zeros((120, 160), bool)
+    is_labelled[:, :100] = True
+    (found,) = asked(depth_m, is_labelled=is_labelled)
+    assert found.box_px[0] > 100
+
+
+def test_things_too_small_or_as_large_as_rooms_are_left_out() -> None:
+    assert asked(wall_with((60, 40, 67, 79))) == []
+    large = asked(wall_with((20, 10, 139, 109)), config=TriggerConfig(structure_shares=(1.0,)))
+    assert large == []
+
+
+def test_missing_depth_is_no_object() -> None:
+    assert asked(np.zeros((120, 160), np.float32)) == []
+    depth_m = wall_with()
+    depth_m[40:80, 60:90] = 0
+    assert asked(depth_m) == []
+
+
+def test_the_largest_come_first_and_no_more_than_the_most() -> None:
+    depth_m = wall_with(THING, (10, 40, 29, 59), (110, 40, 149, 89))
+    sizes = [np.count_nonzero(found.part.mask) for found in asked(depth_m)]
+    assert sizes == sorted(sizes, reverse=True)
+    assert len(sizes) == 3
+    assert len(asked(depth_m, config=replace(CONFIG, most=2))) == 2
+
+
+def test_two_things_at_different_depths_that_overlap_are_two() -> None:
+    depth_m = wall_with((40, 40, 79, 79))
+    depth_m[30:90, 80:110] = 1.2
+    found = surfaces(depth_m, CAMERA, ForegroundConfig())
+    parts = depth_objects(depth_m, found, 0.2, TriggerConfig())
+    assert [part.mask.shape for part in parts] == [(58, 28), (38, 38)]
+
+
+def test_what_stands_on_a_table_is_asked_about_beside_the_table() -> None:
+    """A table top of a third of the image, seen from the front, and a thing 40 cm before it."""
+    depth_m = wall_with((20, 50, 139, 109))
+    depth_m[60:90, 60:90] = 1.6
+    both = replace(CONFIG, structure_shares=(0.5, 0.1), max_share=0.5)
+    widths = [found.part.mask.shape[1] for found in asked(depth_m, config=both)]
+    assert widths[-1] == pytest.approx(30, abs=3)
+    with_table = asked(depth_m, config=replace(both, structure_shares=(0.5,)))
+    assert max(found.part.mask.shape[1] for found in with_table) > 100
+
+
+@pytest.mark.parametrize("fields", [{"sure": 1.5}, {"min_side_px": 0}, {"most": 0}])
+def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
+    with pytest.raises(ConfigError):
+        TriggerConfig(**fields)
