@@ -3,7 +3,8 @@
     LdoError                      exit code 1
     ├── ConfigError               2   bad arguments or configuration
     │   ├── LosslessCycle             a graph of actors that could wait for itself
-    │   └── ModelError                a network that is not what it is taken for, or fails
+    │   ├── ModelError                a network that is not what it is taken for, or fails
+    │   └── EndpointError             a server that does not answer, or not what it was asked
     ├── DataError                 3   nothing readable, broken calibration, too many bad frames
     │   └── FrameError                one frame cannot be read: skipped, counted, warned about once
     ├── StageError                4   a part of the service gave up
@@ -31,6 +32,10 @@ class LosslessCycle(ConfigError):
             "Make one of these inputs Latest."
         )
         self.path = path
+
+
+class EndpointError(ConfigError):
+    pass
 
 
 class ModelError(ConfigError):

@@ -1,0 +1,160 @@
+"""Names by a vision-language model behind an OpenAI-compatible server: vLLM, llama.cpp, Ollama."""
+
+import base64
+import logging
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+import numpy as np
+
+from ldo_service.errors import ConfigError, EndpointError
+from ldo_service.geometry import codecs
+from ldo_service.semantics.class_names import LONGEST, is_name
+from ldo_service.semantics.region_views import shrunk
+from ldo_service.semantics.synonyms import canonical
+
+from . import Opinion, fused_over_views
+from .answers import NONE, Answer, Sureness, confidence, name_of, read_answer
+from .endpoint import Endpoint, EndpointConfig
+
+log = logging.getLogger(__name__)
+
+OPEN = (
+    "What is the object in the middle of this picture? Answer with its common name alone, in one "
+    f'to three words, in English, without a sentence. If you cannot tell, answer "{NONE}".'
+)
+CLOSED = (
+    "Which of these is the object in the middle of this picture? {names}. Answer with one of these "
+    f'names alone, as it is written here. If none of them fits, answer "{NONE}".'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class HttpConfig:
+    """How a vision-language model is asked."""
+
+    model: str = ""  # its name on the server; empty: the server's only one
+    views: int = 2  # of a region at most, each a question of its own
+    side_px: int = 336  # a larger crop is shrunk to it: what CLIP-L at 336 px, LLaVA's eye, sees
+    confidence: Sureness = "product"  # of an answer's tokens: the probability of all, or their mean
+    confidence_untold: float = 0.3  # where the server tells no log-probabilities
+    most_words: int = 4  # of an answer to the open question; more is a sentence
+    most_tokens: int = 16  # asked for
+    endpoint: EndpointConfig = field(default_factory=EndpointConfig)
+
+    def __post_init__(self) -> None:
+        if self.confidence not in ("product", "mean"):
+            raise ConfigError(f"http.confidence={self.confidence!r} must be 'product' or 'mean'.")
+        if min(self.views, self.side_px, self.most_words, self.most_tokens) < 1:
+            raise ConfigError(
+                "http: views, side_px, most_words and most_tokens must be at least 1."
+            )
+        if not 0 <= self.confidence_untold <= 1:
+            raise ConfigError("http.confidence_untold must be within 0..1.")
+
+
+class HttpLabeller:
+    """Asks for one view at a time; the answers are fused. Keeps to itself what it does not trust.
+
+    url    of the API, such as http://127.0.0.1:8000/v1
+    names  to choose from; empty: the question is open
+    clock, sleep  see `Endpoint`
+
+    Raises ConfigError for an address or a key that cannot be.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        config: HttpConfig | None = None,
+        names: Sequence[str] = (),
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self.config = config or HttpConfig()
+        self._endpoint = Endpoint(url, self.config.endpoint, clock, sleep)
+        self._names = list(dict.fromkeys(map(canonical, names)))
+        self._questions = self._refused = self._undecided = self._untold = 0
+        self.identity = f"{self.config.model or 'model'} at {url}"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._names)
+
+    def add(self, name: str) -> None:
+        """Raises ConfigError when it may say any name, or for what is none."""
+        if not is_name(name):
+            raise ConfigError(f"{name[:40]!r} is no name: write one of 1 to {LONGEST} characters.")
+        if not self._names:
+            raise ConfigError(
+                f"{self.identity} may answer any name, {name!r} too: a list that one could add to "
+                "is given with vlm_labeller.names."
+            )
+        if canonical(name) not in self._names:
+            self._names.append(canonical(name))
+
+    def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
+        """See `Labeller`. A view whose answer is refused has no opinion; when the server fails
+        after a view was answered, that view's answer stands alone."""
+        views: list[list[Opinion]] = []
+        for crop in crops[: self.config.views]:
+            try:
+                views.append(self._look(crop))
+            except EndpointError:
+                if not any(views):
+                    raise
+                break
+        return fused_over_views(views)
+
+    def facts(self) -> dict[str, float]:
+        """`answers_refused`: no name, or none of the list. `answers_undecided`: the model said that
+        it cannot tell. `answers_without_logprobs`: sure to a configured degree only."""
+        return {
+            "names": len(self._names),
+            "questions": self._questions,
+            "attempts": self._endpoint.attempts,
+            "answers_refused": self._refused,
+            "answers_undecided": self._undecided,
+            "answers_without_logprobs": self._untold,
+        }
+
+    def _look(self, crop: np.ndarray) -> list[Opinion]:
+        self._questions += 1
+        answer = read_answer(self._endpoint.post("/chat/completions", self._question(crop)))
+        name = name_of(answer.text, self.names, self.config.most_words)
+        if name is None:
+            self._undecided += canonical(answer.text.strip(" .\"'")) == NONE
+            self._refused += canonical(answer.text.strip(" .\"'")) != NONE
+            return []
+        return [(name, self._confidence(answer))]
+
+    def _confidence(self, answer: Answer) -> float:
+        if answer.logprobs:
+            return confidence(answer.logprobs, self.config.confidence)
+        if not self._untold:
+            log.warning(
+                "%s tells no log-probabilities: its answers count as %g sure",
+                self.identity,
+                self.config.confidence_untold,
+            )
+        self._untold += 1
+        return self.config.confidence_untold
+
+    def _question(self, crop: np.ndarray) -> bytes:
+        """As OpenAI's API has it: text, then the picture in the address of a data URL."""
+        picture = base64.b64encode(codecs.encode_jpeg(shrunk(crop, self.config.side_px))).decode()
+        text = CLOSED.format(names=", ".join(self._names)) if self._names else OPEN
+        content = [
+            {"type": "text", "text": text},
+            {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{picture}"}},
+        ]
+        question = {
+            "messages": [{"role": "user", "content": content}],
+            "temperature": 0,
+            "max_tokens": self.config.most_tokens,
+            "logprobs": True,
+            **({"model": self.config.model} if self.config.model else {}),
+        }
+        return msgspec.json.encode(question)
