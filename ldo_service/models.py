@@ -1,7 +1,12 @@
 """Networks that the user has registered: `ldo models`. None comes with the package.
 
-    <folder>/<name>/model.onnx    a copy of the file
+    <folder>/<name>/model.onnx    a copy of the file: a detector, or the image encoder of a pair
     <folder>/<name>/about.json    checksum, layout, classes, licence
+
+and of a pair that names regions (CLIP's layout) a text encoder with its byte pairs, or embeddings:
+
+    text.onnx, bpe.txt.gz
+    embeddings.npz or embeddings.safetensors
 
 The folder is LDO_MODELS, or ldo/models where XDG_DATA_HOME says that data of programs live.
 """
@@ -10,6 +15,7 @@ import os
 import re
 import shutil
 import tempfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,10 +23,15 @@ import msgspec
 
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.semantics.detectors import NetworkConfig, OnnxDetector
+from ldo_service.semantics.labellers.dual_encoder import DualEncoder, DualEncoderConfig, Pair
 from ldo_service.semantics.network import sha256
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 FILE, ABOUT = "model.onnx", "about.json"
+TEXT, VOCABULARY = "text.onnx", "bpe.txt.gz"
+EMBEDDINGS = ("embeddings.npz", "embeddings.safetensors", "text_embeddings.npz")
+IMAGES = (FILE, "image_encoder.onnx")  # as a folder that is not registered may name them
+CLIP = "clip"  # layout of a pair
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,6 +42,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     classes: tuple[str, ...]
     licence: str = ""  # its text; empty: not stated
     source: str = ""  # name of the file it was copied from
+    parts: dict[str, str] = {}  # checksums of the other files of a pair, by name
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,15 +57,16 @@ class Model:
 
     def verify(self) -> None:
         """Raises ModelError when the file is not the one that was registered."""
-        try:
-            is_whole = sha256(self.file) == self.about.sha256
-        except OSError:
-            is_whole = False
-        if not is_whole:
-            raise ModelError(
-                f"{self.file} is not what was registered as {self.name}: it is damaged or was "
-                f"replaced. `ldo models remove {self.name}` and add it again."
-            )
+        for part, registered in {FILE: self.about.sha256, **self.about.parts}.items():
+            try:
+                is_whole = sha256(self.folder / part) == registered
+            except OSError:
+                is_whole = False
+            if not is_whole:
+                raise ModelError(
+                    f"{self.folder / part} is not what was registered as {self.name}: it is "
+                    f"damaged or was replaced. `ldo models remove {self.name}` and add it again."
+                )
 
 
 class Models:
@@ -68,18 +81,36 @@ class Models:
         Raises ConfigError for a name that is taken or none, ModelError for a file that cannot be
         used.
         """
+        return self._add(name, [file], lambda folder: _fill(folder, file, config, licence))
+
+    def add_pair(
+        self,
+        name: str,
+        pair: Pair,
+        config: DualEncoderConfig,
+        names: Sequence[str] = (),
+        licence: str = "",
+    ) -> Model:
+        """The same for a pair of encoders, see `DualEncoder`; `names` are kept with it."""
+        files = [file for file in (pair.image, pair.text, pair.vocabulary, pair.embeddings) if file]
+        return self._add(
+            name, files, lambda folder: _fill_pair(folder, pair, config, names, licence)
+        )
+
+    def _add(self, name: str, files: Sequence[Path], fill: Callable[[Path], About]) -> Model:
         _require_name(name)
         if (self.folder / name).exists():
             raise ConfigError(
                 f"there is a model {name!r} already: `ldo models remove {name}`, or choose another "
                 "name."
             )
-        if not file.is_file():
-            raise ModelError(f"{file} is no file: name an ONNX file.")
+        for file in files:
+            if not file.is_file():
+                raise ModelError(f"{file} is no file: name an ONNX file.")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(prefix=".new-", dir=self.folder) as unfinished:
-                about = _fill(Path(unfinished) / name, file, config, licence)
+                about = fill(Path(unfinished) / name)
                 (Path(unfinished) / name).rename(self.folder / name)
         except OSError as error:
             raise ConfigError(
@@ -151,8 +182,66 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
         return OnnxDetector(path, config)
     found = models.get(model)
     found.verify()
+    if found.about.layout == CLIP:
+        raise ModelError(f"{model} is a pair that names regions: vlm_labeller.model takes it.")
     settings = replace(config, layout=config.layout or found.about.layout)
     return OnnxDetector(found.file, settings, found.about.classes, name=model)
+
+
+def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
+    """A pair by the name it is registered as, or by a folder with its files named as here.
+
+    names  to choose from; empty: those it was registered with
+    Raises ConfigError when there is neither, ModelError when it cannot be used.
+    """
+    models = Models()
+    if model not in models.names:
+        folder = Path(model).expanduser()
+        if not any((folder / file).is_file() for file in IMAGES):
+            raise ConfigError(
+                f"vlm_labeller.model={model} is neither a folder with {' or '.join(IMAGES)} nor "
+                f"registered in {models.folder}, where there are: "
+                f"{', '.join(models.names) or 'none'}. "
+                "`ldo models add NAME FILE --embeddings FILE` registers one."
+            )
+        return DualEncoder(_pair_in(folder), config, names, name=folder.name)
+    found = models.get(model)
+    found.verify()
+    if found.about.layout != CLIP:
+        raise ModelError(f"{model} is a detector, {found.about.layout}: detector.model takes it.")
+    return DualEncoder(_pair_in(found.folder), config, names or found.about.classes, name=model)
+
+
+def _pair_in(folder: Path) -> Pair:
+    def here(*parts: str) -> Path | None:
+        return next((folder / part for part in parts if (folder / part).is_file()), None)
+
+    return Pair(here(*IMAGES) or folder / FILE, here(TEXT), here(VOCABULARY), here(*EMBEDDINGS))
+
+
+def _fill_pair(
+    folder: Path, pair: Pair, config: DualEncoderConfig, names: Sequence[str], licence: str
+) -> About:
+    labeller = DualEncoder(pair, config, names)
+    suffix = pair.embeddings.suffix if pair.embeddings else ""
+    embeddings = next((part for part in EMBEDDINGS if part.endswith(suffix)), EMBEDDINGS[0])
+    copies = {FILE: pair.image, TEXT: pair.text, VOCABULARY: pair.vocabulary}
+    copies = {**copies, embeddings: pair.embeddings}
+    folder.mkdir()
+    for part, file in copies.items():
+        if file:
+            shutil.copyfile(file, folder / part)
+    checksums = {part: sha256(folder / part) for part, file in copies.items() if file}
+    about = About(
+        sha256=checksums.pop(FILE),
+        layout=CLIP,
+        classes=labeller.words,
+        licence=licence,
+        source=pair.image.name,
+        parts=checksums,
+    )
+    (folder / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=1))
+    return about
 
 
 def _fill(folder: Path, file: Path, config: NetworkConfig, licence: str) -> About:

@@ -7,11 +7,14 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError, ModelError
-from ldo_service.models import Models, default_folder, open_detector
+from ldo_service.models import Models, default_folder, open_detector, open_labeller
 from ldo_service.semantics.detectors import NetworkConfig
+from ldo_service.semantics.labellers.dual_encoder import DualEncoderConfig, Pair
+from tests.semantics.labellers.encoders import ColorPair, embeddings, plain, vocabulary
 from tests.semantics.networks import SQUARES, changed, squares_image
 
 CONFIG = NetworkConfig()
+ENCODERS = DualEncoderConfig()
 
 
 @pytest.fixture
@@ -126,3 +129,79 @@ def test_the_configuration_may_overrule_the_names(models: Models, file, tmp_path
     detector = open_detector("one", NetworkConfig(names=str(tmp_path / "names.txt")))
     assert detector.labels == ("a", "b", "c")
     assert np.isfinite(detector.find(squares_image([])).scores).all()
+
+
+# --- pairs that name regions ----------------------------------------------------------------------
+@pytest.fixture
+def pair(tmp_path: Path) -> Pair:
+    colors = ColorPair()
+    return Pair(
+        colors.image(tmp_path / "visual.onnx"),
+        colors.text(tmp_path / "textual.onnx"),
+        vocabulary(tmp_path / "merges.gz"),
+    )
+
+
+def test_a_pair_is_registered_with_all_its_files(models: Models, pair: Pair) -> None:
+    about = models.add_pair("colours", pair, ENCODERS, ("Red", "sofa", "green")).about
+    for file in (pair.image, pair.text, pair.vocabulary):
+        assert file is not None
+        file.unlink()
+    assert (about.layout, about.classes) == ("clip", ("Red", "sofa", "green"))
+    assert set(about.parts) == {"text.onnx", "bpe.txt.gz"}
+    labeller = open_labeller("colours", ENCODERS)
+    assert labeller.names == ("red", "couch", "green")
+    assert labeller.label([plain("green")])[0][0] == "green"
+    assert open_labeller("colours", ENCODERS, ("blue",)).names == ("blue",)
+    assert labeller.identity == f"colours {about.sha256[:12]}"
+
+
+def test_embeddings_are_registered_under_words_of_the_same_meaning(
+    models: Models, pair: Pair, tmp_path: Path
+) -> None:
+    path = embeddings(tmp_path / "e.npz", names=np.array(["sofa", "green", "blue"]))
+    models.add_pair("cached", Pair(pair.image, embeddings=path), ENCODERS)
+    for names in ((), ("couch", "green")):
+        labeller = open_labeller("cached", ENCODERS, names)
+        assert labeller.label([plain("red")])[0][0] == "couch"
+
+
+@pytest.mark.parametrize("part", ["model.onnx", "text.onnx", "bpe.txt.gz"])
+def test_a_pair_with_a_damaged_file_is_refused(models: Models, pair: Pair, part: str) -> None:
+    model = models.add_pair("colours", pair, ENCODERS)
+    (model.folder / part).write_bytes(b"garbage")
+    with pytest.raises(ModelError, match=f"{part} is not what was registered"):
+        open_labeller("colours", ENCODERS)
+
+
+def test_a_pair_that_does_not_fit_leaves_nothing_behind(
+    models: Models, pair: Pair, tmp_path: Path
+) -> None:
+    (tmp_path / "merges.gz").write_bytes(b"garbage")
+    with pytest.raises(ModelError, match=r"merges\.gz") as caught:
+        models.add_pair("colours", pair, ENCODERS)
+    assert ".new-" not in str(caught.value)
+    assert list(models.folder.iterdir()) == []
+
+
+def test_detectors_and_pairs_are_not_taken_for_each_other(
+    models: Models, file: Path, pair: Pair
+) -> None:
+    models.add("squares", file, CONFIG)
+    models.add_pair("colours", pair, ENCODERS)
+    with pytest.raises(ModelError, match=r"vlm_labeller\.model takes it"):
+        open_detector("colours", CONFIG)
+    with pytest.raises(ModelError, match=r"detector\.model takes it"):
+        open_labeller("squares", ENCODERS)
+    with pytest.raises(ConfigError, match="there are: colours, squares"):
+        open_labeller("other", ENCODERS)
+
+
+def test_a_folder_of_a_pair_may_be_used_without_registering_it(
+    models: Models, tmp_path: Path
+) -> None:
+    ColorPair().image(tmp_path / "image_encoder.onnx")
+    embeddings(tmp_path / "text_embeddings.npz")
+    labeller = open_labeller(str(tmp_path), ENCODERS)
+    assert labeller.label([plain("blue")])[0][0] == "blue"
+    assert models.names == []

@@ -9,13 +9,15 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.errors import ConfigError, LdoError, ModelError
-from ldo_service.models import Models
+from ldo_service.models import Model, Models
+from ldo_service.semantics.class_names import read_names
 from ldo_service.semantics.detectors import NetworkConfig
+from ldo_service.semantics.labellers.dual_encoder import DualEncoderConfig, Pair
 
 Name = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(metavar="NAME", help="what `detector.model` calls it"),
+    tyro.conf.arg(metavar="NAME", help="what `detector.model` or `vlm_labeller.model` calls it"),
 ]
 
 
@@ -24,6 +26,12 @@ class Add:
     """Check a network in ONNX, copy and register it.
 
     ldo models add nano yolox_nano.onnx --licence Apache-2.0
+
+    With a text encoder or embeddings FILE is the image encoder of a pair in CLIP's layout, which
+    names regions:
+
+    ldo models add clip visual.onnx --text text.onnx --vocabulary bpe_simple_vocab_16e6.txt.gz
+    ldo models add clip visual.onnx --embeddings names.npz
     """
 
     name: Name
@@ -42,6 +50,27 @@ class Add:
     licence: Annotated[
         str, tyro.conf.arg(metavar="FILE|TEXT", help="what you may do with it, kept beside it")
     ] = ""
+    text: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="text encoder in ONNX")] = None
+    vocabulary: Annotated[
+        Path | None, tyro.conf.arg(metavar="FILE", help="its byte pairs, as CLIP's .txt.gz")
+    ] = None
+    embeddings: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="FILE", help="names, embeddings and perhaps logit_scale, .npz or .safetensors"
+        ),
+    ] = None
+
+    @property
+    def is_pair(self) -> bool:
+        return any((self.text, self.vocabulary, self.embeddings))
+
+    def pair(self) -> Pair:
+        """Raises ConfigError for half a pair."""
+        files = self.file, self.text, self.vocabulary, self.embeddings
+        image, text, vocabulary, embeddings = (file and file.expanduser() for file in files)
+        assert image is not None
+        return Pair(image, text, vocabulary, embeddings)
 
 
 @dataclass(frozen=True)
@@ -64,9 +93,10 @@ Verb = (
 
 
 def models(verb: Verb) -> None:
-    """Register, list and remove the networks that find objects.
+    """Register, list and remove the networks that find objects, and those that name regions.
 
-    None comes with the package. `detector.model` in the configuration takes a registered name:
+    None comes with the package. `detector.model` in the configuration takes a registered name, and
+    `vlm_labeller.model` that of a pair:
 
       ldo models add nano yolox_nano.onnx
       ldo run SOURCE --out DIR --set detector.model=nano
@@ -82,13 +112,26 @@ def models(verb: Verb) -> None:
 
 
 def add(verb: Add) -> None:
-    config = NetworkConfig(layout=verb.layout or "", names=verb.names)
-    model = Models().add(verb.name, verb.file.expanduser(), config, _licence(verb.licence))
+    """Raises ConfigError for what cannot be used."""
+    model = _add_pair(verb) if verb.is_pair else _add_detector(verb)
     about = model.about
     print(
         f"{model.name} is registered: {about.layout}, {len(about.classes)} classes "
         f"({', '.join(about.classes[:3])}, ...), in {model.folder}."
     )
+
+
+def _add_detector(verb: Add) -> Model:
+    config = NetworkConfig(layout=verb.layout or "", names=verb.names)
+    return Models().add(verb.name, verb.file.expanduser(), config, _licence(verb.licence))
+
+
+def _add_pair(verb: Add) -> Model:
+    if verb.layout:
+        raise ConfigError(f"--layout {verb.layout} is of a detector, and a pair was named.")
+    names = read_names(Path(verb.names).expanduser()) if verb.names else ()
+    licence = _licence(verb.licence)
+    return Models().add_pair(verb.name, verb.pair(), DualEncoderConfig(), names, licence)
 
 
 def show(console: Console) -> None:

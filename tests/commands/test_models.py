@@ -7,6 +7,7 @@ import pytest
 from ldo_service.commands import doctor
 from ldo_service.models import Models
 from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.semantics.labellers.encoders import ColorPair, vocabulary
 from tests.semantics.networks import SQUARES
 
 
@@ -36,6 +37,23 @@ def test_add_list_remove(capsys, file: Path, tmp_path: Path) -> None:
     code, out, _ = ldo(capsys, "models", "list")
     assert code == 0
     assert "ldo models add NAME FILE" in out
+
+
+def test_a_pair_is_added_by_its_files(capsys, tmp_path: Path) -> None:
+    image, text = ColorPair().image(tmp_path / "i.onnx"), ColorPair().text(tmp_path / "t.onnx")
+    merges, names = vocabulary(tmp_path / "bpe.gz"), tmp_path / "names.txt"
+    names.write_text("red\nblue\n")
+    add = ("models", "add", "colours", image, "--text", text)
+    code, _, err = ldo(capsys, *add)
+    assert (code, "--vocabulary" in err) == (2, True)
+    assert_one_paragraph(err)
+    code, out, _ = ldo(capsys, *add, "--vocabulary", merges, "--names", names)
+    assert code == 0
+    assert "colours is registered: clip, 2 classes (red, blue" in out
+    (finding,) = doctor.networks()
+    assert finding.text == "network colours: clip, 2 classes"
+    code, _, err = ldo(capsys, *add, "--vocabulary", merges, "--layout", "yolox")
+    assert (code, "of a detector" in err) == (2, True)
 
 
 def test_a_licence_may_be_a_text(capsys, file: Path) -> None:
