@@ -12,6 +12,7 @@ from ldo_service.actors.localiser import LocalisingTracker
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
+from ldo_service.actors.vlm_labeller import VlmLabeller
 from ldo_service.config import Config
 from ldo_service.errors import ConfigError
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
@@ -63,11 +64,10 @@ GRAPH: tuple[Box, ...] = (
         "finds objects of known classes",
         lambda config: Detector(config.detector),
     ),
-    Box(
-        "vlm_labeller",
+    _built(
+        VlmLabeller,
         "names what the detector does not know",
-        inputs=(In(t.LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),),
-        outputs=(Out(t.LABEL_OPEN),),
+        lambda config: VlmLabeller(config.vlm_labeller),
     ),
     _built(
         Mapper,

@@ -30,6 +30,8 @@ from ldo_service.schemas import (
     ControlAnswer,
     ControlRequest,
     Image,
+    LabelAdd,
+    LabelNames,
     MapObjects,
     MapRefine,
     Message,
@@ -44,6 +46,8 @@ from ldo_service.schemas.topics import (
     FROM_ODOMETRY,
     FROM_OPERATORS,
     FROM_OUTSIDE,
+    LABEL_ADD,
+    LABEL_NAMES,
     MAP_OBJECTS,
     MAP_REFINE,
     POSE_TRACKED,
@@ -237,10 +241,34 @@ class Client:
             last_rate=last_rate,
         )
         message.check()
-        publisher, until_s = self._publisher(MapRefine), time.monotonic() + timeout_s
+        self._ask(MAP_REFINE, message, timeout_s)
+
+    def add_label(self, name: str, timeout_s: float = 60.0) -> tuple[str, ...]:
+        """Ask the labeller to choose from one more name when it names regions; returns all of them
+        when it has. It may be busy with a region for some seconds.
+
+        Raises ConfigError when it refuses, or nobody answers.
+        """
+        try:
+            message = LabelAdd(stamp_ns=time.time_ns(), name=name)
+        except ValueError as error:
+            raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from error
+        until_s = time.monotonic() + timeout_s
+        with self.listen(LABEL_NAMES.name, LabelNames) as inbox:
+            self._ask(LABEL_ADD, message, min(timeout_s, 3.0))
+            while time.monotonic() < until_s:
+                for answer in inbox():
+                    if answer.stamp_ns == message.stamp_ns:
+                        return _names_or_why(name, answer)
+                time.sleep(0.02)
+        raise self._nobody("answers", LABEL_ADD)
+
+    def _ask(self, topic: Topic, message: MapRefine | LabelAdd, timeout_s: float) -> None:
+        """Send, when somebody listens. Raises ConfigError when nobody does."""
+        publisher, until_s = self._publisher(type(message)), time.monotonic() + timeout_s
         while not publisher.matching_status.matching:
             if time.monotonic() > until_s:
-                raise self._nobody("listens", MAP_REFINE)
+                raise self._nobody("listens", topic)
             time.sleep(0.02)
         header = Header("operator", self._epoch, self._asked, message.stamp_ns)
         publisher.put(msgspec.msgpack.encode(message), attachment=encode(header))
@@ -255,6 +283,12 @@ class Client:
     def _subscriber(self, name: str, keep: int) -> Any:
         ring = zenoh.handlers.RingChannel(keep)
         return self._session.declare_subscriber(self._network.expression(name), ring)
+
+
+def _names_or_why(name: str, answer: LabelNames) -> tuple[str, ...]:
+    if answer.refused:
+        raise ConfigError(f"{name!r} is not added: {answer.refused}")
+    return answer.names
 
 
 def _stamp(stamp_ns: int | None) -> int:

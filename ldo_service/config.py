@@ -29,6 +29,7 @@ from ldo_service.actors.frame_source import FrameSourceConfig
 from ldo_service.actors.mapper import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.recording_file import RecordConfig
@@ -76,6 +77,7 @@ class RunConfig:
     mapper_latency_frames: int = 3  # a keyframe is in the map so many frames later, on any machine
     optimizer_latency_frames: int = 3
     detector_latency_frames: int = 3
+    vlm_labeller_latency_frames: int = 30  # a second: its answers are late by design
     max_rejected: float = 0.1  # share of unreadable frames over which the data is called bad
 
     def __post_init__(self) -> None:
@@ -90,6 +92,7 @@ class RunConfig:
             "detector": self.detector_latency_frames,
             "mapper": self.mapper_latency_frames,
             "optimizer": self.optimizer_latency_frames,
+            "vlm_labeller": self.vlm_labeller_latency_frames,
         }
 
 
@@ -98,6 +101,7 @@ class Config:
     frame_source: FrameSourceConfig = field(default_factory=FrameSourceConfig)
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     detector: DetectorConfig = field(default_factory=DetectorConfig)
+    vlm_labeller: VlmLabellerConfig = field(default_factory=VlmLabellerConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     data: DataConfig = field(default_factory=DataConfig)

@@ -53,6 +53,7 @@ def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
         yield from _of_steps(seen.health)
         yield from _of_failures(seen.health)
         yield from _of_networks(seen.health)
+        yield from _of_labeller(seen.health)
 
 
 def _silent(how_long: str) -> Trouble:
@@ -99,6 +100,20 @@ def _of_networks(health: Health) -> Iterator[Trouble]:
         )
 
 
+def _of_labeller(health: Health) -> Iterator[Trouble]:
+    if health.facts.get("labellers_missing"):
+        yield Trouble(
+            "goes on without the labeller that it was told to use",
+            "the log of `ldo serve` says why; `ldo models list` shows the pairs there are",
+        )
+    if health.facts.get("labeller_failing"):
+        failed = health.facts.get("labellings_failed", 0)
+        yield Trouble(
+            f"gets no answer from its labeller, {failed:.0f} regions so far stay unnamed",
+            "the log of `ldo serve` has the first failure; is the server at vlm_labeller.url up?",
+        )
+
+
 def remarks(seen: Seen) -> Iterator[str]:
     """What a person wants to know and nobody has to mend."""
     health = seen.health
@@ -117,3 +132,17 @@ def remarks(seen: Seen) -> Iterator[str]:
         yield f"had its last frame {health.step_age_s:.0f} s ago"
     if health.facts.get("networks") == 0 and not health.facts.get("networks_missing"):
         yield "has no model: nothing is detected until detector.model names one of `ldo models`"
+    yield from _of_answers(health)
+
+
+def _of_answers(health: Health) -> Iterator[str]:
+    if refused := health.facts.get("answers_refused"):
+        questions = health.facts.get("questions", 0)
+        yield f"refused {refused:.0f} of {questions:.0f} answers: no name, or not one asked for"
+    if untold := health.facts.get("answers_without_logprobs"):
+        yield (
+            f"had {untold:.0f} answers without log-probabilities, which count as "
+            "vlm_labeller.http.confidence_untold sure"
+        )
+    if refused := health.facts.get("names_refused"):
+        yield f"refused {refused:.0f} names that were to be added: the log says why"

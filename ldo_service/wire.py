@@ -17,6 +17,7 @@ from ldo_service.schemas import (
     FrameRgbd,
     Image,
     Keyframe,
+    LabelRequest,
     MapObject,
     MapObjects,
     MeasuredPose,
@@ -161,6 +162,18 @@ def claims_of(message: DetectionBoxes, vocabulary: Vocabulary) -> Claims:
         np.array([vocabulary.index(one.label) for one in found], np.int64),
         np.array([one.score for one in found], np.float32),
     )
+
+
+def crop_message(color: np.ndarray) -> Image:
+    """A crop [h, w, 3] uint8 RGB as JPEG."""
+    height, width = color.shape[:2]
+    data = memoryview(codecs.encode_jpeg(color))
+    return Image(encoding="jpeg", width=width, height=height, data=data)
+
+
+def crops_of(request: LabelRequest) -> list[np.ndarray]:
+    """Each [h, w, 3] uint8 RGB. Raises FrameError for bytes that are no such image."""
+    return [codecs.decode_color(c.encoding, c.width, c.height, c.data) for c in request.crops]
 
 
 def correction_message(

@@ -20,6 +20,7 @@ from ldo_service.schemas.frames import (
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement, MeasuredPose
+from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
 from ldo_service.schemas.map import (
     AnchorMotion,
     Gaussians,
@@ -52,6 +53,10 @@ __all__ = [
     "InputCount",
     "Keyframe",
     "KeyframeRefinement",
+    "LabelAdd",
+    "LabelNames",
+    "LabelOpen",
+    "LabelRequest",
     "MapDelta",
     "MapObject",
     "MapObjects",

@@ -12,6 +12,7 @@ from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, Fra
 from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
+from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
 from ldo_service.schemas.map import MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.message import Message
 from ldo_service.schemas.objects import MapObjects, ObjectObservation
@@ -50,6 +51,12 @@ KEYFRAME_REFINEMENT = Topic(
 DETECTION_BOXES = Topic(
     "detection/boxes", DetectionBoxes, "boxes with class and score, per keyframe"
 )
+LABEL_REQUEST = Topic(
+    "label/request", LabelRequest, "image crops of a region to be named", key="region"
+)
+LABEL_OPEN = Topic("label/open", LabelOpen, "the name of a region, late by design", key="region")
+LABEL_ADD = Topic("label/add", LabelAdd, "asked: choose from this name too")
+LABEL_NAMES = Topic("label/names", LabelNames, "what the labeller chooses from", is_state=True)
 MAP_VIEW = Topic("map/view", ModelView, "the map rendered at the newest keyframe")
 MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last version")
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
@@ -60,8 +67,6 @@ CONTROL = Topic(
     "control", ControlRequest, "asked: pause, resume, save or reset", answer=ControlAnswer
 )
 
-LABEL_REQUEST = Topic("label/request", None, "image crops of a region to be named", key="region")
-LABEL_OPEN = Topic("label/open", None, "the name of a region, late by design", key="region")
 MAP_OBJECTS = Topic("map/objects", MapObjects, "the named objects", is_state=True)
 OBJECT_OBSERVATION = Topic(
     "object/observation", ObjectObservation, "an object seen from a keyframe"
@@ -80,6 +85,8 @@ TOPICS: tuple[Topic, ...] = (
     DETECTION_BOXES,
     LABEL_REQUEST,
     LABEL_OPEN,
+    LABEL_ADD,
+    LABEL_NAMES,
     MAP_VIEW,
     MAP_DELTA,
     MAP_SNAPSHOT,
@@ -96,4 +103,4 @@ TOPICS: tuple[Topic, ...] = (
 
 FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs
 FROM_ODOMETRY = (ODOMETRY_PRIOR,)  # made by the robot's wheels, inertial unit or other camera
-FROM_OPERATORS = (MAP_REFINE,)
+FROM_OPERATORS = (MAP_REFINE, LABEL_ADD)

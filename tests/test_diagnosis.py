@@ -53,6 +53,11 @@ def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
         (seen(health(set_aside=1, failures=2, restarts=2)), "1 messages aside"),
         (seen(health(facts={"networks_missing": 1.0, "networks": 0.0})), "without the network"),
         (seen(health(facts={"inferences_failed": 3.0})), "3 inferences fail"),
+        (seen(health(facts={"labellers_missing": 1.0})), "without the labeller"),
+        (
+            seen(health(facts={"labeller_failing": 1.0, "labellings_failed": 2.0})),
+            "2 regions so far stay unnamed",
+        ),
     ],
 )
 def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
@@ -67,6 +72,9 @@ def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
         (health(held=True), "ldo control resume"),
         (health(inputs=inputs("camera/rgbd", delivered=0)), "no frame yet"),
         (health(inputs=inputs("camera/rgbd"), step_age_s=9.0), "last frame 9 s ago"),
+        (health(facts={"answers_refused": 2.0, "questions": 9.0}), "refused 2 of 9 answers"),
+        (health(facts={"answers_without_logprobs": 4.0}), "confidence_untold"),
+        (health(facts={"names_refused": 1.0}), "refused 1 names"),
     ],
 )
 def test_what_is_no_fault_is_a_remark(of: Health, says: str) -> None:

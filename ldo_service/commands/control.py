@@ -12,13 +12,17 @@ from ldo_service.schemas.map import MOST_ITERATIONS
 from .options import Endpoint, Robot
 
 Verb = Annotated[
-    Literal["pause", "resume", "save", "reset", "refine"],
+    Literal["pause", "resume", "save", "reset", "refine", "add-label"],
     tyro.conf.Positional,
     tyro.conf.arg(
         metavar="VERB",
         help="pause: leave frames out; resume: take them again; save: write every actor's state "
-        "now; reset: begin anew with an empty map; refine: fit the map further",
+        "now; reset: begin anew with an empty map; refine: fit the map further; add-label: "
+        "choose from NAME too when regions are named",
     ),
+]
+Name = Annotated[
+    str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help="of add-label, such as samovar")
 ]
 Iterations = Annotated[
     int, tyro.conf.arg(metavar="N", help=f"of refine, at most {MOST_ITERATIONS} at a time")
@@ -27,6 +31,7 @@ Iterations = Annotated[
 
 def control(
     verb: Verb,
+    name: Name = "",
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
     iterations: Iterations = 200,
@@ -38,10 +43,16 @@ def control(
 
       ldo control reset
       ldo control refine --iterations 500
+      ldo control add-label "fire extinguisher"
     """
+    if bool(name) != (verb == "add-label"):
+        raise ConfigError("`ldo control add-label NAME` takes a name, and no other verb does.")
     with connect(robot, endpoint) as service:
         if verb == "refine":
             ask_to_refine(service, iterations)
+        elif verb == "add-label":
+            names = service.add_label(name)
+            print(f"{name} is added: regions are named from {len(names)} names.")
         else:
             obey(service, verb)
 

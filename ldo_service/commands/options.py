@@ -8,6 +8,7 @@ import tyro
 
 from ldo_service.actors.detector import require_detector
 from ldo_service.actors.localiser import places_of
+from ldo_service.actors.vlm_labeller import require_labeller
 from ldo_service.config import Config
 
 ConfigFile = Annotated[
@@ -84,4 +85,5 @@ def with_usable_networks(config: Config) -> Config:
     """The same. Raises ConfigError when a network that it names cannot be used, which a service
     only warns about."""
     require_detector(config.detector)
+    require_labeller(config.vlm_labeller)
     return config

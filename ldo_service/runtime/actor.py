@@ -34,7 +34,10 @@ class Actor:
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
-    talks_outside: ClassVar[bool] = False  # asks what no journal records: a replay leaves it out
+    talks_outside = (
+        False  # asks what no journal records: a replay leaves it out, and who takes what
+    )
+    # it makes is fed from what it took then
 
     def __init__(self) -> None:
         self.situation = Situation()

@@ -127,7 +127,7 @@ def test_a_publisher_without_a_service_is_told_to_start_one(capsys) -> None:
 
 
 def test_a_declared_actor_cannot_be_served(capsys) -> None:
-    code, _, err = ldo(capsys, "serve", "--only", "vlm_labeller")
+    code, _, err = ldo(capsys, "serve", "--only", "loop_closer")
     assert code == 2
     assert "declared" in err
 

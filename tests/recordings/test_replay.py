@@ -28,7 +28,14 @@ EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "replay_test.py"
 
 def test_every_actor_replays(recording: Path) -> None:
     replayed = replay_recording(recording)
-    assert set(replayed) == {"frame_source", "tracker", "detector", "mapper", "optimizer"}
+    assert set(replayed) == {
+        "frame_source",
+        "tracker",
+        "detector",
+        "vlm_labeller",
+        "mapper",
+        "optimizer",
+    }
     assert replayed["frame_source"].steps == FRAMES + 1
     assert replayed["tracker"].made["pose/tracked"] >= FRAMES - 1
     keyframes = replayed["tracker"].made["keyframe/new"]
@@ -171,7 +178,7 @@ def pytest_on(example: Path, recording: Path) -> subprocess.CompletedProcess[str
 def test_the_example_makes_a_case_of_each_actor(spoilt: Path) -> None:
     rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7)
     done = pytest_on(EXAMPLE, spoilt)
-    assert "1 failed, 4 passed" in done.stdout
+    assert "1 failed, 5 passed" in done.stdout
     assert "ReplayDiverged: frame_source diverged at step 7" in done.stdout
 
 

@@ -36,9 +36,16 @@ def made(room: Sequence) -> dict[str, Made]:
 
 
 def test_every_actor_has_a_digest(made: dict[str, Made]) -> None:
-    assert list(made) == ["frame_source", "tracker", "detector", "mapper", "optimizer"]
+    assert list(made) == [
+        "frame_source",
+        "tracker",
+        "detector",
+        "vlm_labeller",
+        "mapper",
+        "optimizer",
+    ]
     assert made["frame_source"].messages == FRAMES
-    assert len({entry.digest for entry in made.values()}) == 5
+    assert len({entry.digest for entry in made.values()}) == 6
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])

@@ -32,6 +32,10 @@ from ldo_service.schemas import (
     InputCount,
     Keyframe,
     KeyframeRefinement,
+    LabelAdd,
+    LabelNames,
+    LabelOpen,
+    LabelRequest,
     MapDelta,
     MapObject,
     MapObjects,
@@ -80,6 +84,30 @@ LABEL_NAMES = ("background", "other", "person")
 
 
 EXAMPLES: dict[str, Message] = {
+    "label_request": LabelRequest(
+        stamp_ns=1_700_000_000_000_000_031,
+        region=12,
+        keyframe=40,
+        box_px=(-0.5, 3.25, 17.5, 20.0),
+        crops=(
+            Image(encoding="rgb8", width=2, height=1, data=memoryview(b"\1\2\3\4\5\6")),
+            Image(encoding="jpeg", width=9, height=7, data=memoryview(b"\xff\xd8\xff")),
+        ),
+        label="vase",
+        score=0.375,
+    ),
+    "label_open": LabelOpen(
+        stamp_ns=1_700_000_000_000_000_032,
+        region=12,
+        keyframe=40,
+        label="samovar",
+        confidence=0.8125,
+        labeller="clip 0123456789ab",
+    ),
+    "label_add": LabelAdd(stamp_ns=1_700_000_000_000_000_033, name="samovar"),
+    "label_names": LabelNames(
+        stamp_ns=1_700_000_000_000_000_033, names=("cup", "samovar"), refused="why not"
+    ),
     "camera_rgbd": CameraRgbd(
         stamp_ns=1_700_000_000_000_000_001,
         frame=7,

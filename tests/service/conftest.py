@@ -80,7 +80,7 @@ class LiveService:
         self.health.update({health.actor: health for health in self._health()})
         return self.health
 
-    def wait_for_actors(self, count: int = 5) -> None:
+    def wait_for_actors(self, count: int = 6) -> None:
         wait_until(lambda: len(self.update_health()) == count, 20, "all actors report")
 
     def poses(self) -> list[TrackedPose]:
