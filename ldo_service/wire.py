@@ -33,6 +33,7 @@ from ldo_service.semantics.distributions import entropy, sparse
 from ldo_service.semantics.labelling import Claims
 from ldo_service.semantics.landmarks import distributions, labels_of
 from ldo_service.semantics.objects import Objects, Observed
+from ldo_service.semantics.regions_to_name import Region
 from ldo_service.semantics.vocabulary import Vocabulary
 
 
@@ -169,6 +170,23 @@ def crop_message(color: np.ndarray) -> Image:
     height, width = color.shape[:2]
     data = memoryview(codecs.encode_jpeg(color))
     return Image(encoding="jpeg", width=width, height=height, data=data)
+
+
+def label_request_message(region: Region, stamp_ns: int) -> LabelRequest:
+    """What is asked about a region; `stamp_ns` is that of its newest keyframe."""
+    crops = (
+        Image(encoding="jpeg", width=v.width, height=v.height, data=memoryview(v.jpeg))
+        for v in region.views
+    )
+    return LabelRequest(
+        stamp_ns=stamp_ns,
+        region=region.id,
+        keyframe=region.keyframe,
+        box_px=region.box_px,
+        crops=tuple(crops),
+        label=region.label,
+        score=region.score,
+    )
 
 
 def crops_of(request: LabelRequest) -> list[np.ndarray]:

@@ -18,6 +18,7 @@ from ldo_service.semantics.region_views import (
 )
 from ldo_service.semantics.regions_to_name import RegionConfig, RegionsToName
 from ldo_service.semantics.trigger import Candidate
+from ldo_service.wire import crops_of, label_request_message
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
@@ -145,6 +146,20 @@ def test_a_state_is_plain_and_goes_on_where_it_was() -> None:
     assert (one.views[0].jpeg, one.views[0].box_px) == (other.views[0].jpeg, other.views[0].box_px)
     assert successor.see(thing(top=80, left=20)) == []
     assert successor.regions.get(2) is not None, "ids go on"
+
+
+def test_a_question_shows_its_views_the_best_first() -> None:
+    walk = Walk()
+    walk.see(thing(label="cup", score=0.5), color=np.full_like(COLOR, 128))
+    walk.see(thing())
+    region = walk.regions.get(0)
+    assert region is not None
+    question = label_request_message(region, 77)
+    assert (question.stamp_ns, question.region, question.keyframe) == (77, 0, 1)
+    assert (question.label, question.score, question.box_px) == ("cup", 0.5, region.box_px)
+    sharp, flat = crops_of(question)
+    assert sharp.shape == flat.shape == (40, 40, 3)
+    assert sharp.std() > 20 > flat.std()
 
 
 # --- how good a view is ---------------------------------------------------------------------------
