@@ -17,6 +17,7 @@ import re
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -216,7 +217,7 @@ def _explain(config: Any, depth: int) -> list[str]:
             lines += [f"{indent}{entry.name}:", *_explain(value, depth + 1)]
         else:
             plain = msgspec.to_builtins(value)
-            text = yaml.safe_dump(plain, default_flow_style=True).splitlines()[0]
+            text = yaml.safe_dump(plain, default_flow_style=True, width=inf).splitlines()[0]
             comment = f"  # {comments[entry.name]}" if entry.name in comments else ""
             lines.append(f"{indent}{entry.name}: {text}{comment}")
     return lines or ["  " * depth + "{}"]
