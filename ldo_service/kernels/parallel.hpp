@@ -125,7 +125,7 @@ class Helpers {
   // The next round is mostly a few microseconds away, and sleeping costs more.
   template <class Condition>
   static void yield_while(Condition condition) {
-    for (int i = 0; i < 64 && condition(); ++i) std::this_thread::yield();
+    for (int i = 0; i < 1024 && condition(); ++i) std::this_thread::yield();
   }
 
   const pid_t process_ = getpid();
