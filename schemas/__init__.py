@@ -21,6 +21,7 @@ from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement, MeasuredPose
 from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
+from ldo_service.schemas.loops import LoopCandidate, LoopClosure
 from ldo_service.schemas.map import (
     AnchorMotion,
     Gaussians,
@@ -57,6 +58,8 @@ __all__ = [
     "LabelNames",
     "LabelOpen",
     "LabelRequest",
+    "LoopCandidate",
+    "LoopClosure",
     "MapDelta",
     "MapObject",
     "MapObjects",

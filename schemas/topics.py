@@ -13,6 +13,7 @@ from ldo_service.schemas.graph import Correction
 from ldo_service.schemas.health import Health
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
 from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
+from ldo_service.schemas.loops import LoopCandidate, LoopClosure
 from ldo_service.schemas.map import MapDelta, MapRefine, MapSnapshot, ModelView
 from ldo_service.schemas.message import Message
 from ldo_service.schemas.objects import MapObjects, ObjectObservation
@@ -71,8 +72,8 @@ MAP_OBJECTS = Topic("map/objects", MapObjects, "the named objects", is_state=Tru
 OBJECT_OBSERVATION = Topic(
     "object/observation", ObjectObservation, "an object seen from a keyframe"
 )
-LOOP_CLOSURE = Topic("loop/closure", None, "a verified pose between two distant keyframes")
-LOOP_CANDIDATE = Topic("loop/candidate", None, "every candidate, and why it was refused")
+LOOP_CLOSURE = Topic("loop/closure", LoopClosure, "a verified pose between two distant keyframes")
+LOOP_CANDIDATE = Topic("loop/candidate", LoopCandidate, "every candidate, and why it was refused")
 
 TOPICS: tuple[Topic, ...] = (
     CAMERA_RGBD,

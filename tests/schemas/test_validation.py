@@ -18,6 +18,7 @@ from ldo_service.schemas import (
     Gaussians,
     Image,
     Keyframe,
+    LoopClosure,
     MapDelta,
     MapObjects,
     MapSnapshot,
@@ -435,6 +436,32 @@ def test_an_object_that_cannot_be_is_refused(fields: dict, complaint: str) -> No
     assert isinstance(message, MapObjects)
     with pytest.raises(ValueError, match=complaint):
         msgspec.structs.replace(message.objects[0], **fields)
+
+
+@pytest.mark.parametrize(
+    ("example", "fields", "message"),
+    [
+        ("loop_closure", {"overlap": 1.5}, "overlap is 1.5"),
+        ("loop_closure", {"overlap": NAN}, "overlap is nan"),
+        ("loop_closure", {"rmse_m": -1.0}, "rmse_m is -1"),
+        ("loop_closure", {"entropy": INF}, "entropy holds NaN or infinity"),
+        ("loop_candidate", {"similarity": -0.5}, "similarity is -0.5"),
+        ("loop_candidate", {"inliers": -1}, "inliers is -1"),
+        ("loop_candidate", {"refused": "x" * 101}, "a reason of 101 characters"),
+        ("loop_candidate", {"refused": "", "evidence": ""}, "without evidence"),
+    ],
+)
+def test_an_impossible_loop_is_refused(example: str, fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        changed(example, **fields)
+
+
+def test_a_loop_closes_with_an_older_keyframe() -> None:
+    message = EXAMPLES["loop_closure"]
+    assert isinstance(message, LoopClosure)
+    turned = msgspec.structs.replace(message.pose, reference=9, keyframe=1)
+    with pytest.raises(ValueError, match="newer 9"):
+        changed("loop_closure", pose=turned)
 
 
 def test_objects_come_by_id_and_each_once() -> None:
