@@ -31,10 +31,17 @@ NO_PAST = History()
 class PlacesConfig:
     count: int = 1000  # places kept, 0.13 MB each at 640x480 (kitchen); then the path is thinned
     features: int = 500  # of each: half of a frame's, which halves the time to match
+    same: float = (
+        0.1  # rad, as `motion.extent`: a place so near is replaced by the newer one, which
+    )
+    # shows it as it is now. Half a step between keyframes: on a round the memory stops growing
+    recent: int = 16  # last places, which are all kept: new keyframes are measured against them
 
     def __post_init__(self) -> None:
         if self.count < 3 or self.features < 1:
             raise ConfigError("places.count must be at least 3 and places.features at least 1.")
+        if self.same < 0 or self.recent < 0:
+            raise ConfigError("places.same and places.recent must not be negative.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +179,24 @@ class Places:
         return len(self.all)
 
     def added(self, place: Place, config: PlacesConfig) -> "Places":
-        """With one more; where there are too many, one that leaves the smallest gap is gone."""
-        kept = (*self.all, place)
+        """With one more, and without the one that it shows anew; where there are too many, one that
+        leaves the smallest gap is gone."""
+        kept = (*self._others(place, config), place)
         if len(kept) > config.count:
             spare = int(np.argmin(_gaps(kept))) + 1
             kept = (*kept[:spare], *kept[spare + 1 :])
         return Places(kept)
+
+    def _others(self, place: Place, config: PlacesConfig) -> tuple[Place, ...]:
+        """All but the nearest of those that are the same place, the last ones aside."""
+        older = self.all[: max(0, len(self.all) - config.recent)]
+        if not older:
+            return self.all
+        extents = _extents(older, place)
+        nearest = int(np.argmin(extents))
+        if extents[nearest] >= config.same:
+            return self.all
+        return (*self.all[:nearest], *self.all[nearest + 1 :])
 
     def alike(self, view: Pyramid) -> list[int]:
         """Indices of all places, the one whose thumbnail correlates best first."""
@@ -197,11 +216,26 @@ def _gaps(path: tuple[Place, ...]) -> np.ndarray:
 
     Infinite where they are of two segments.
     """
-    T = np.array([place.T_odom_keyframe for place in path])
-    R, t = T[:, :3, :3], T[:, :3, 3]
-    cosine = (np.einsum("nij,nij->n", R[:-2], R[2:]) - 1.0) / 2.0
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
-    shift = np.linalg.norm(t[2:] - t[:-2], axis=1) / median_depth_m
+    extents = _extent(_poses(path[:-2]), _poses(path[2:]), median_depth_m)
     segment = np.array([place.segment for place in path])
-    gaps = np.arccos(np.clip(cosine, -1.0, 1.0)) + shift
-    return np.where(segment[:-2] == segment[2:], gaps, np.inf)
+    return np.where(segment[:-2] == segment[2:], extents, np.inf)
+
+
+def _extents(places: tuple[Place, ...], other: Place) -> np.ndarray:
+    """[N] rad: how far each is from another one, as `motion.extent`; infinite in other segments."""
+    T = np.broadcast_to(other.T_odom_keyframe, (len(places), 4, 4))
+    extents = _extent(_poses(places), T, np.array(other.median_depth_m))
+    segment = np.array([place.segment for place in places])
+    return np.where(segment == other.segment, extents, np.inf)
+
+
+def _poses(places: tuple[Place, ...]) -> np.ndarray:
+    return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
+
+
+def _extent(T_a: np.ndarray, T_b: np.ndarray, median_depth_m: np.ndarray) -> np.ndarray:
+    """`motion.extent` between poses [N, 4, 4], two by two."""
+    cosine = (np.einsum("nij,nij->n", T_a[:, :3, :3], T_b[:, :3, :3]) - 1.0) / 2.0
+    shift_m = np.linalg.norm(T_b[:, :3, 3] - T_a[:, :3, 3], axis=1)
+    return np.arccos(np.clip(cosine, -1.0, 1.0)) + shift_m / median_depth_m

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -81,6 +83,25 @@ def test_a_full_memory_thins_the_path_where_it_is_densest(room) -> None:
     assert kept[0] == 0, "the first stays"
     assert kept[-1] == 5, "and the newest"
     assert not {2, 3} <= set(kept), "of two that are nearly one, one is enough"
+
+
+def test_on_a_round_the_newest_look_at_a_place_stays_and_no_more(room) -> None:
+    config, places = PlacesConfig(recent=2), Places()
+    angles, offsets = (0.0, 0.3, 0.6, 0.9, 1.2), (0.0, 0.02, -0.02)
+    around = [angle + offset for offset in offsets for angle in angles]
+    for number, angle in enumerate(around):
+        places = places.added(place_at(room, turned(angle), number), config)
+    assert [place.id for place in places.all] == [10, 11, 12, 13, 14]
+
+
+def test_what_is_half_a_step_away_or_in_another_segment_is_another_place(room) -> None:
+    config = PlacesConfig(recent=0)
+    first = place_at(room, np.eye(4), 0)
+    places = Places((first, replace(first, id=1, segment=1)))
+    places = places.added(place_at(room, turned(config.same + 0.01), 2), config)
+    assert [place.id for place in places.all] == [0, 1, 2]
+    places = places.added(place_at(room, turned(0.01), 3), config)
+    assert [place.id for place in places.all] == [1, 2, 3]
 
 
 def test_a_memory_of_two_places_is_refused() -> None:
