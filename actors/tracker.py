@@ -212,7 +212,7 @@ class Tracker(Actor):
             tracked.T_odom_camera,
             tracked.segment,
         )
-        self._poses.keep_only(self._needed(keyframe))
+        self._poses.keep_only(self._needed(keyframe, tracked.keyframe))
         self._made += 1
         return Keyframe(
             stamp_ns=frame.stamp_ns,
@@ -234,10 +234,11 @@ class Tracker(Actor):
             else (measured_message(tracked.join.measures(keyframe)),),
         )
 
-    def _needed(self, newest: int) -> Iterator[int]:
-        """The one tracked against, and those that the optimizer may not have placed yet."""
-        current = self._odometry.keyframe
-        return (k for k in self._poses if k > newest - RECENT_KEYFRAMES or k == current)
+    def _needed(self, newest: int, reference: int | None) -> Iterator[int]:
+        """Those tracked against, before and from now on, and those that the optimizer may not have
+        placed yet."""
+        tracked_against = (reference, self._odometry.keyframe)
+        return (k for k in self._poses if k > newest - RECENT_KEYFRAMES or k in tracked_against)
 
     # --- poses ------------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> None:

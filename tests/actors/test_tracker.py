@@ -15,6 +15,7 @@ from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, Odometry
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.tracking import OdometryConfig
+from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.segments import SegmentConfig
 from ldo_service.wire import correction_message, pose_message, rgbd_message, rgbd_of, transform
 
@@ -175,6 +176,20 @@ def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, key
     T_true = shift @ se3.inverse(truth.T_world_camera[0]) @ truth.T_world_camera[2]
     np.testing.assert_allclose(T_map_camera, T_true, atol=5e-3)
     assert back == msgspec.structs.replace(again, keyframe=back.keyframe), "one id was skipped"
+
+
+def test_a_lost_camera_may_make_a_keyframe_from_one_it_had_forgotten(
+    frames, keyframes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ldo_service.actors.tracker.RECENT_KEYFRAMES", 1)
+    often = KeyframeConfig(min_overlap=1.0, min_frames=1)  # every frame that is OK
+    tracker = Tracker(TrackerConfig(odometry=OdometryConfig(keyframes=often)))
+    handled(tracker, frames)
+    tracked, made = poses_of(outs := handled(tracker, frames[2:3]))[0], outs[0]
+    assert isinstance(made, Keyframe)
+    assert tracked.method == "relocalised"
+    assert made.reference == tracked.reference
+    assert made.reference < made.keyframe - 20, "long forgotten"
 
 
 def test_a_correction_before_any_frame_is_harmless() -> None:
