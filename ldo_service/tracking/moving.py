@@ -72,6 +72,11 @@ class Watched:
     has_moved: np.ndarray
     suspicion: Suspicion
 
+    def is_much_news(self, known: np.ndarray | None, config: MovingConfig) -> bool:
+        """Whether much has moved beside what is known, [H, W] bool; None: nothing is."""
+        news = self.has_moved if known is None else self.has_moved & ~known
+        return bool(np.mean(news) > config.renewed_share)
+
 
 @dataclass(frozen=True, slots=True)
 class _Pair:

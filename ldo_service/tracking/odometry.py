@@ -15,7 +15,7 @@ last. Conventions: `ldo_service.geometry`.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -33,7 +33,7 @@ from .guesses import Guesses
 from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
 from .motion import Motion
-from .movable import Box, MovableConfig, movable_pixels
+from .movable import Box, MovableConfig, movable_in
 from .moving import MovingConfig, spread, watch
 from .places import Places, PlacesConfig, place_of, thumbnail_of
 from .prior import Anchor, PriorConfig, Reading
@@ -43,7 +43,7 @@ from .segments import Join, Look, SegmentConfig
 from .shape import ShapeConfig
 from .state import State, packed, unpacked
 from .tracked import Tracked, report
-from .window import WindowConfig, measured_from
+from .window import EarlierKeyframes, WindowConfig, measured_from
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +93,7 @@ class Odometry:
         )
         self._viewed: tuple[RgbdFrame, Pyramid] | None = None  # the last frame, made ready
         self._prior: Reading | None = None  # of the last frame
-        self._rebuilt: dict[int, Keyframe] = {}  # from places, for the window
+        self._earlier = EarlierKeyframes(self.config.pyramid)
 
     def track(self, frame: RgbdFrame, prior: Reading | None = None) -> Tracked:
         """The pose of a frame. Never raises for what a frame shows: it may be blank.
@@ -177,26 +177,12 @@ class Odometry:
         keyframe = self._state.keyframe
         if keyframe is None or tracked.keyframe is None:
             return []
-        earlier = self._earlier(keyframe.segment, without={keyframe.id, tracked.keyframe})
+        places = self._state.places.of(keyframe.segment, without={keyframe.id, tracked.keyframe})
+        earlier = self._earlier.newest_first(places, self.config.window.reach)
         usual = Appearance(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
         return measured_from(earlier, keyframe, usual, self.config.align, self.config.window)
-
-    def _earlier(self, segment: int, without: set[int]) -> Iterator[Keyframe]:
-        """The last keyframes of a segment from their places, newest first, each rebuilt once."""
-        others = [
-            place
-            for place in self._state.places.all
-            if place.segment == segment and place.id not in without
-        ]
-        last = others[-self.config.window.reach :]
-        ids = {place.id for place in last}
-        self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
-        for place in reversed(last):
-            if place.id not in self._rebuilt:
-                self._rebuilt[place.id] = place.keyframe(self.config.pyramid)
-            yield self._rebuilt[place.id]
 
     def leave_out(self, keyframe: int, boxes: Sequence[Box]) -> None:
         """What a detector found in a keyframe: things that move by themselves are not tracked
@@ -204,10 +190,7 @@ class Odometry:
         current = self._state.keyframe
         if current is None or current.id != keyframe:
             return
-        finest = current.view.levels[0]
-        times = current.view.camera.width / finest.camera.width
-        smaller = [box.in_smaller(times) for box in boxes]
-        mask = movable_pixels(smaller, finest.depth_m, self.config.movable)
+        mask = movable_in(current.view, boxes, self.config.movable)
         if mask.any():
             self._state = replace(self._state, keyframe=replace(current, movable=mask))
 
@@ -237,7 +220,7 @@ class Odometry:
         """Continue where `state` was taken: the next frames give bitwise equal results."""
         self._state = unpacked(state, self.config.pyramid)
         self._viewed = None
-        self._rebuilt = {}
+        self._earlier = EarlierKeyframes(self.config.pyramid)
 
     def _view(self, frame: RgbdFrame) -> Pyramid:
         if self._viewed is None or self._viewed[0] is not frame:
@@ -302,8 +285,9 @@ class Odometry:
 
     def _apart_from(self, segment: int) -> Places:
         """The places of segments that are not joined to one."""
-        joined = self._state.segments.are_joined
-        return Places(tuple(p for p in self._state.places.all if not joined(p.segment, segment)))
+        state = self._state
+        joined = state.segments.are_joined
+        return Places(tuple(p for p in state.places.all if not joined(p.segment, segment)))
 
     def _found(
         self, view: Pyramid, places: Places, *, is_lost: bool
@@ -320,11 +304,14 @@ class Odometry:
         if tracked.status is not Status.OK or not before.is_time_to_look(config):
             return tracked
         found = self._found(view, self._apart_from(keyframe.segment), is_lost=False)
-        look = None if found is None else _look(tracked, found[0], found[1].alignment)
+        look = join = None
+        if found is not None:
+            there, alignment = found[0], found[1].alignment
+            look = Look.at(there, alignment, tracked.segment, tracked.T_odom_camera)
+            join = Join.of(there, alignment)
         self._state = replace(self._state, segments=before.looked(look, config))
-        if found is None or look is None or not before.is_confirmed_by(look, config):
+        if look is None or not before.is_confirmed_by(look, config):
             return tracked
-        join = _join(found[0], found[1].alignment)
         return replace(tracked, wants_keyframe=True, wants_mapping=True, join=join)
 
     def _lost(self, frame: RgbdFrame, keyframe: Keyframe, alignment: Alignment) -> Tracked:
@@ -398,9 +385,7 @@ class Odometry:
             self.config.align.residuals.noise,
         )
         self._state = replace(self._state, is_moving=seen.is_moving, suspicion=seen.suspicion)
-        known = keyframe.has_moved
-        news = seen.has_moved if known is None else seen.has_moved & ~known
-        if np.mean(news) > config.renewed_share:
+        if seen.is_much_news(keyframe.has_moved, config):
             left_out = spread(seen.has_moved, keyframe.view, config)
             renewed = replace(keyframe, has_moved=seen.has_moved, left_out=left_out)
             self._state = replace(self._state, keyframe=renewed)
@@ -426,15 +411,3 @@ class Odometry:
             frames_since_keyframe=before.frames_since_keyframe + 1,
             segments=before.segments.after(status is Status.LOST, frame.stamp_ns),
         )
-
-
-def _look(tracked: Tracked, other: Keyframe, alignment: Alignment) -> Look:
-    T_there_camera = other.T_odom_keyframe @ alignment.T_reference_camera
-    T_there_here = T_there_camera @ se3.inverse(tracked.T_odom_camera)
-    median_depth_m = other.reference.median_depth_m
-    T_here_camera = tracked.T_odom_camera
-    return Look(tracked.segment, other.segment, T_there_here, T_here_camera, median_depth_m)
-
-
-def _join(other: Keyframe, alignment: Alignment) -> Join:
-    return Join(other.id, other.segment, alignment.T_reference_camera, alignment.information)

@@ -4,6 +4,7 @@ A place is a keyframe's thumbnail, its strongest ORB features with their points,
 and depth at the working resolution, compressed: from these it can be tracked against again.
 """
 
+from collections.abc import Set
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from statistics import median
@@ -186,6 +187,10 @@ class Places:
             spare = int(np.argmin(_gaps(kept))) + 1
             kept = (*kept[:spare], *kept[spare + 1 :])
         return Places(kept)
+
+    def of(self, segment: int, without: Set[int] = frozenset()) -> tuple[Place, ...]:
+        """Those of a segment but for some, by id."""
+        return tuple(p for p in self.all if p.segment == segment and p.id not in without)
 
     def _others(self, place: Place, config: PlacesConfig) -> tuple[Place, ...]:
         """All but the nearest of those that are the same place, the last ones aside."""

@@ -15,6 +15,8 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
 
+from .align import Alignment
+from .keyframes import Keyframe
 from .motion import extent
 
 
@@ -51,6 +53,12 @@ class Join:
     T_keyframe_camera: np.ndarray  # [4, 4]
     information: np.ndarray  # [6, 6]
 
+    @staticmethod
+    def of(keyframe: Keyframe, alignment: Alignment) -> "Join":
+        """By the alignment of the camera's frame to that keyframe."""
+        T_keyframe_camera = alignment.T_reference_camera
+        return Join(keyframe.id, keyframe.segment, T_keyframe_camera, alignment.information)
+
     def measures(self, keyframe: int) -> RelativePose:
         """The pose of the keyframe that the camera's frame was made."""
         return RelativePose(self.keyframe, keyframe, self.T_keyframe_camera, self.information)
@@ -65,6 +73,16 @@ class Look:
     T_there_here: np.ndarray  # [4, 4]
     T_here_camera: np.ndarray  # [4, 4], of the view
     median_depth_m: float  # of what was recognised
+
+    @staticmethod
+    def at(
+        keyframe: Keyframe, alignment: Alignment, here: int, T_here_camera: np.ndarray
+    ) -> "Look":
+        """By the alignment of a frame at T_here_camera [4, 4] to a keyframe of another segment."""
+        T_there_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
+        T_there_here = T_there_camera @ se3.inverse(T_here_camera)
+        median_depth_m = keyframe.reference.median_depth_m
+        return Look(here, keyframe.segment, T_there_here, T_here_camera, median_depth_m)
 
     def agrees(self, other: "Look", config: SegmentConfig) -> bool:
         if (self.here, self.there) != (other.here, other.there):

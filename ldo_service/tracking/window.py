@@ -6,7 +6,7 @@ of measurements that the optimizer solves together. On `synthetic:flat-exact` th
 trajectory falls to under half.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from ldo_service.errors import ConfigError
@@ -16,6 +16,8 @@ from ldo_service.geometry.relative_pose import RelativePose
 from .align import AlignConfig, Alignment, align
 from .equations import Appearance
 from .keyframes import Keyframe
+from .places import Place
+from .pyramid import PyramidConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,24 @@ class WindowConfig:
             raise ConfigError(f"{self}: min_overlap must be within 0..1, worst_noise at least 1.")
         if not self.iterations or min(self.iterations) < 1:
             raise ConfigError(f"iterations={self.iterations}: at least 1 for each level.")
+
+
+class EarlierKeyframes:
+    """The last keyframes from their places, each rebuilt once and kept while it is among them."""
+
+    def __init__(self, config: PyramidConfig) -> None:
+        self._config = config
+        self._rebuilt: dict[int, Keyframe] = {}
+
+    def newest_first(self, places: Sequence[Place], reach: int) -> Iterator[Keyframe]:
+        """The last `reach` of places, which come oldest first."""
+        last = places[-reach:]
+        ids = {place.id for place in last}
+        self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
+        for place in reversed(last):
+            if place.id not in self._rebuilt:
+                self._rebuilt[place.id] = place.keyframe(self._config)
+            yield self._rebuilt[place.id]
 
 
 def measured_from(
