@@ -179,7 +179,7 @@ def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, key
 
 
 def test_a_lost_camera_may_make_a_keyframe_from_one_it_had_forgotten(
-    frames, keyframes, monkeypatch: pytest.MonkeyPatch
+    frames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ldo_service.actors.tracker.RECENT_KEYFRAMES", 1)
     often = KeyframeConfig(min_overlap=1.0, min_frames=1)  # every frame that is OK
