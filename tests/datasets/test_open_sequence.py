@@ -16,6 +16,19 @@ def test_unknown_synthetic_name_lists_the_known_ones() -> None:
         open_sequence("synthetic:castle")
 
 
+def test_a_seed_behind_the_name_is_part_of_the_name() -> None:
+    plain, other = (open_sequence(f"synthetic:room{seed}") for seed in ("@0", "@3"))
+    assert (plain.name, other.name) == ("synthetic:room", "synthetic:room@3")
+    assert plain[0].color.tobytes() != other[0].color.tobytes()
+    assert open_sequence("synthetic:flat-exact@2").name == "synthetic:flat-exact@2"
+
+
+@pytest.mark.parametrize("seed", ["@", "@x", "@-1", "@1.5"])
+def test_what_is_no_seed_is_refused(seed: str) -> None:
+    with pytest.raises(DataError, match="such as synthetic:room@3"):
+        open_sequence(f"synthetic:room{seed}")
+
+
 def test_folder_of_no_known_layout_says_what_was_looked_for(tmp_path: Path) -> None:
     (tmp_path / "rgb.txt").write_text("")
     with pytest.raises(

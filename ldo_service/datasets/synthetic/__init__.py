@@ -7,6 +7,8 @@ no sine, no logarithm, no matrix product.
     room, tour    one furnished room, rendered when read; -noisy: with a Kinect's depth
     person        the same room, and somebody walks through it; -noisy as above
     flat          two rooms and a corridor, hard on purpose and labelled; -exact: without noise
+
+A number behind @ is the seed of textures, of the hand's shaking and of the noise: `room@3`.
 """
 
 from ldo_service.errors import DataError
@@ -19,10 +21,17 @@ __all__ = ["FlatConfig", "FlatSequence", "SyntheticConfig", "SyntheticSequence",
 
 
 def open_synthetic(name: str) -> SyntheticSequence | FlatSequence:
-    """The sequence `synthetic:name`. Raises DataError listing the known names."""
-    if name in sequence.NAMED:
-        return SyntheticSequence.named(name)
-    if name in flat.NAMED:
-        return FlatSequence.named(name)
+    """The sequence `synthetic:name`, or `synthetic:name@seed`.
+
+    Raises DataError listing the known names, or when the seed is not a whole number.
+    """
+    plain, at, seed = name.partition("@")
+    if at and not (seed.isascii() and seed.isdigit()):
+        raise DataError(f"synthetic:{name}: behind @ stands a seed, such as synthetic:{plain}@3.")
+    changes = {"seed": int(seed)} if at else {}
+    if plain in sequence.NAMED:
+        return SyntheticSequence.named(plain, **changes)
+    if plain in flat.NAMED:
+        return FlatSequence.named(plain, **changes)
     known = ", ".join(f"synthetic:{known}" for known in (*sequence.NAMED, *flat.NAMED))
-    raise DataError(f"there is no synthetic:{name}. There is {known}.")
+    raise DataError(f"there is no synthetic:{plain}. There is {known}.")

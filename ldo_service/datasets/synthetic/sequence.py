@@ -72,7 +72,9 @@ class SyntheticSequence(Sequence):
         if name not in NAMED:
             known = ", ".join(f"synthetic:{known}" for known in NAMED)
             raise DataError(f"there is no synthetic:{name}. There is {known}.")
-        return SyntheticSequence(replace(NAMED[name], **changes), f"synthetic:{name}")
+        config = replace(NAMED[name], **changes)
+        seed = f"@{config.seed}" if config.seed else ""
+        return SyntheticSequence(config, f"synthetic:{name}{seed}")
 
     def read(self, index: int) -> RawFrame:
         exact = self._rendering(index)

@@ -69,7 +69,9 @@ class FlatSequence(Sequence):
         """The sequence `synthetic:name`, its config changed by keywords. Raises DataError."""
         if name not in NAMED:
             raise DataError(f"there is no synthetic:{name} among the flats {', '.join(NAMED)}.")
-        return FlatSequence(replace(NAMED[name], **changes), f"synthetic:{name}")
+        config = replace(NAMED[name], **changes)
+        seed = f"@{config.seed}" if config.seed else ""
+        return FlatSequence(config, f"synthetic:{name}{seed}")
 
     @property
     def cache_folder(self) -> Path:
