@@ -90,6 +90,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         serve,
         show_config,
         simulate,
+        suite,
         topics,
     )
 
@@ -97,6 +98,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         "demo": demo.demo,
         "run": run.run,
         "eval": evaluate.evaluate,
+        "suite": suite.suite,
         "query": query.query,
         "export": export.export,
         "serve": serve.serve,

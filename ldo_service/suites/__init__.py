@@ -1,0 +1,22 @@
+"""Lists of runs that make a table: sources x variants x seeds, each run and judged by itself.
+
+The files beside this one are the tables of the paper that LDO-SLAM implements, its sensitivity and
+its ablation; `published` in them are the figures that the paper prints, of its own and of others.
+"""
+
+from .figures import FIGURES, Judged
+from .suite import Entry, Suite, known_suites, load_suite
+from .tables import markdown
+from .work import Outcome, Work
+
+__all__ = [
+    "FIGURES",
+    "Entry",
+    "Judged",
+    "Outcome",
+    "Suite",
+    "Work",
+    "known_suites",
+    "load_suite",
+    "markdown",
+]

@@ -1,0 +1,100 @@
+"""What a suite file says."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import yaml
+from msgspec import field
+
+from ldo_service.errors import ConfigError
+
+from .figures import FIGURES
+
+HERE = Path(__file__).parent
+SYNTHETIC = "synthetic:"
+NAME = re.compile(r"[\w][\w .+-]{0,60}")  # becomes the name of a folder
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One run: `sequence` and `variant` by their names, with what `ldo run` is told."""
+
+    sequence: str
+    variant: str
+    source: str
+    settings: tuple[str, ...]
+    seed: int | None  # None: the source has none
+
+    @property
+    def folder(self) -> Path:
+        """Within that of the suite's results."""
+        seed = "" if self.seed is None else f"@{self.seed}"
+        return Path(self.sequence) / f"{self.variant}{seed}"
+
+
+class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A suite file. Raises ConfigError for names that cannot be folders and unknown figures."""
+
+    title: str
+    about: str = ""
+    sequences: dict[str, str]  # name: source, a folder within that of the data, or synthetic:...
+    variants: dict[str, tuple[str, ...]] = field(default_factory=lambda: {"LDO-SLAM": ()})
+    # name: settings, as of `ldo run --set`
+    figures: tuple[str, ...]
+    seeds: tuple[int, ...] = (0,)  # of synthetic sources: another run of a folder is the same run
+    hold_out: int = 0
+    refine: int = 0
+    stride: int = 1
+    max_frames: int | None = None
+    published: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
+    # method: sequence: figure
+
+    def __post_init__(self) -> None:
+        if not self.sequences or not self.variants or not self.figures or not self.seeds:
+            raise ConfigError("a suite needs sequences, variants, figures and seeds: one at least.")
+        for name in (*self.sequences, *self.variants):
+            if not NAME.fullmatch(name):
+                raise ConfigError(
+                    f"{name!r} cannot be the name of a folder: letters, digits, spaces and ._+- do."
+                )
+        unknown = sorted(set(self.figures) - FIGURES.keys())
+        if unknown:
+            raise ConfigError(f"no figure {', '.join(unknown)}. There is {', '.join(FIGURES)}.")
+
+    def entries(self, data: Path) -> Iterator[Entry]:
+        """All runs, sequence by sequence; sources lie in the folder `data`."""
+        for sequence, source in self.sequences.items():
+            for variant, settings in self.variants.items():
+                if not source.startswith(SYNTHETIC):
+                    yield Entry(sequence, variant, str(data / source), settings, None)
+                    continue
+                for seed in self.seeds:
+                    yield Entry(sequence, variant, f"{source}@{seed}", settings, seed)
+
+    def options(self) -> list[str]:
+        """Of `ldo run`, alike for all."""
+        words = ["--hold-out", self.hold_out, "--refine", self.refine, "--stride", self.stride]
+        if self.max_frames is not None:
+            words += ["--max-frames", self.max_frames]
+        return [str(word) for word in words]
+
+
+def known_suites() -> list[str]:
+    """Names of those that come with the package."""
+    return sorted(path.stem for path in HERE.glob("*.yaml"))
+
+
+def load_suite(name: str) -> Suite:
+    """A suite that comes with the package, or a file. Raises ConfigError."""
+    path = HERE / f"{name}.yaml" if name in known_suites() else Path(name).expanduser()
+    if not path.is_file():
+        raise ConfigError(
+            f"there is no suite {name}: neither a file nor one of {', '.join(known_suites())}."
+        )
+    try:
+        return msgspec.convert(yaml.safe_load(path.read_text()), Suite)
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, msgspec.ValidationError) as error:
+        raise ConfigError(f"{path} is not a suite: {error}") from error

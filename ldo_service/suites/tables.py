@@ -1,0 +1,81 @@
+"""The outcomes of a suite as tables in Markdown."""
+
+from collections.abc import Sequence
+from statistics import mean, stdev
+
+from .figures import FIGURES, Figure
+from .suite import Suite
+from .work import Outcome
+
+AVERAGE = "average"
+Cells = dict[str, str]  # by column
+
+
+def markdown(suite: Suite, outcomes: Sequence[Outcome]) -> str:
+    """A table with all figures of a single sequence, or one of all sequences for each figure.
+
+    Cells are means over seeds with their standard deviation; methods of other papers stand above.
+    """
+    parts = [f"# {suite.title}", suite.about.strip()]
+    if len(suite.sequences) == 1:
+        parts.append(_of_one_sequence(suite, outcomes))
+    else:
+        parts += [_of_one_figure(suite, name, outcomes) for name in suite.figures]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _of_one_sequence(suite: Suite, outcomes: Sequence[Outcome]) -> str:
+    (sequence,) = suite.sequences
+    rows: dict[str, Cells] = {}
+    for method, printed in suite.published.items():
+        known = printed.get(sequence, {})
+        rows[method] = {
+            name: f"{known[name]:{FIGURES[name].form}}" for name in suite.figures if name in known
+        }
+    for variant in suite.variants:
+        here = [o for o in outcomes if o.entry.variant == variant]
+        rows[variant] = {name: _cell(FIGURES[name], here) for name in suite.figures}
+    return _table(sequence, {name: FIGURES[name].title for name in suite.figures}, rows)
+
+
+def _of_one_figure(suite: Suite, name: str, outcomes: Sequence[Outcome]) -> str:
+    figure, rows = FIGURES[name], dict[str, Cells]()
+    for method, printed in suite.published.items():
+        known = {sequence: f[name] for sequence, f in printed.items() if name in f}
+        rows[method] = {sequence: f"{value:{figure.form}}" for sequence, value in known.items()}
+    for variant in suite.variants:
+        here = [o for o in outcomes if o.entry.variant == variant]
+        rows[variant] = {
+            sequence: _cell(figure, [o for o in here if o.entry.sequence == sequence])
+            for sequence in suite.sequences
+        } | {AVERAGE: _average(suite, figure, here)}
+    columns = {sequence: sequence for sequence in (*suite.sequences, AVERAGE)}
+    return _table(figure.title, columns, {method: cells for method, cells in rows.items() if cells})
+
+
+def _table(corner: str, columns: dict[str, str], rows: dict[str, Cells]) -> str:
+    lines = [[corner, *columns.values()], ["---"] * (1 + len(columns))]
+    lines += [[row, *(cells.get(column, "") for column in columns)] for row, cells in rows.items()]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _cell(figure: Figure, outcomes: Sequence[Outcome]) -> str:
+    values = _values(figure, outcomes)
+    if not values:
+        return next((o.missing for o in outcomes if o.missing), "-")
+    spread = f" ± {stdev(values):{figure.form}}" if len(values) > 1 else ""
+    return f"{mean(values):{figure.form}}{spread}"
+
+
+def _average(suite: Suite, figure: Figure, outcomes: Sequence[Outcome]) -> str:
+    """Over sequences; none where one is missing, since it would be the mean of other ones."""
+    means = [
+        _values(figure, [o for o in outcomes if o.entry.sequence == sequence])
+        for sequence in suite.sequences
+    ]
+    return f"{mean(map(mean, means)):{figure.form}}" if all(means) else "-"
+
+
+def _values(figure: Figure, outcomes: Sequence[Outcome]) -> list[float]:
+    found = [figure.of(o.judged) for o in outcomes if o.judged is not None]
+    return [value for value in found if value is not None]
