@@ -5,21 +5,22 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import drawing, topics_table
+from docs.generate import PAGES, generated
 from ldo_service.errors import LdoError
 
 ROOT = Path(__file__).parent.parent
-README = (ROOT / "README.md").read_text()
+MANUAL = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 
-def test_the_table_and_the_drawing_are_those_of_the_graph() -> None:
-    assert topics_table() in README, "paste `ldo topics --markdown`"
-    assert drawing() in README, "paste `ldo topics --mermaid`"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_is_taken_from_the_code_is_as_the_code_has_it(page: Path) -> None:
+    assert page.read_text() == generated(page.read_text()), "run `python docs/generate.py`"
 
 
-def test_every_link_to_a_file_leads_somewhere() -> None:
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
-        assert (ROOT / target).exists(), target
+@pytest.mark.parametrize("page", MANUAL, ids=lambda page: page.name)
+def test_every_link_to_a_file_leads_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text()):
+        assert (page.parent / target).exists(), target
 
 
 @pytest.mark.parametrize("error", LdoError.__subclasses__(), ids=lambda e: e.__name__)
