@@ -1,6 +1,6 @@
 """Write what the manual takes from the code: the text between `<!-- NAME -->` and `<!-- end -->`.
 
-    python docs/generate.py
+python docs/generate.py
 """
 
 import ast
