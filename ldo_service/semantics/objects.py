@@ -9,7 +9,6 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
-from .assignment import HIDDEN
 from .association import (
     AssociationConfig,
     Found,
@@ -25,20 +24,17 @@ from .distributions import divergence, entropy
 from .labels import BACKGROUND
 from .landmarks import (
     LANDMARK,
-    MOST_VOTES,
     NO_MEMBER,
-    VIEWS,
-    believed,
     derive,
     distributions,
     entropies,
     joined,
-    labels_of,
     moved,
     new_landmarks,
-    rows_of,
     within,
 )
+from .merging import absorb, coincide, inside, neighbours
+from .sightings import one_each, remember, voted
 
 CANDIDATE = -1  # in place of an id
 _AT_A_TIME = 128  # landmarks that are derived together, to stay in cache
@@ -182,14 +178,14 @@ class Objects:
         seen, p_seen = self._table[which], regions.distributions[r]
         differs = divergence(distributions(seen), p_seen) >= self.config.max_divergence
         begins = differs & (seen["id"] == CANDIDATE)
-        seen["votes"] = _voted(seen["votes"], rows, view, regions.numbers[r])
+        seen["votes"] = voted(seen["votes"], rows, view, regions.numbers[r])
         seen["members"], seen["votes"] = joined(
-            seen["members"], seen["votes"], regions.members[r], _one_each(regions.members[r])
+            seen["members"], seen["votes"], regions.members[r], one_each(regions.members[r])
         )
         seen["seen"] = np.where(begins, 1, seen["seen"] + 1)
         seen["first"] = np.where(begins, view.keyframe, seen["first"])
         seen["misses"], seen["last"] = 0, view.keyframe
-        _remember(seen, view.keyframe, shown, regions.boxes[r])
+        remember(seen, view.keyframe, shown, regions.boxes[r])
         self._derive(seen, view.rows, view.labels, view.ids, view.anchors)
         self._table[which] = seen
         entropies_seen = entropy(p_seen)
@@ -259,60 +255,28 @@ class Objects:
     def _merge(
         self, view: MapView, near: np.ndarray, matched: np.ndarray
     ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-        """Objects that became another, and which landmarks [K] bool did.
-
-        Two are one if they have the same name and most of one lies in the box of the other, but for
-        those that one keyframe shows in two regions.
-        """
+        """Objects that became another, and which landmarks [K] bool did: see `merging`."""
         merged: list[tuple[int, int]] = []
         gone = np.zeros(len(self._table), bool)
-        for a, b in self._neighbours(near, matched):
-            if gone[a] or gone[b] or not self._coincide(a, b, view):
+        for a, b in neighbours(self._table, near, matched):
+            one, other = self._table[[a]], self._table[[b]]
+            if gone[a] or gone[b] or not coincide(one, other, view, self.config.merge_overlap):
                 continue
-            keep, other = self._older(a, b)
-            self._join(keep, other, view)
-            gone[other] = True
-            if self._table["id"][other] != CANDIDATE:
-                merged.append((int(self._table["id"][other]), int(self._table["id"][keep])))
+            keep, goes = (a, b) if self._age(a) < self._age(b) else (b, a)
+            self._join(keep, goes, view)
+            gone[goes] = True
+            if self._table["id"][goes] != CANDIDATE:
+                merged.append((int(self._table["id"][goes]), int(self._table["id"][keep])))
         self._merged += len(merged)
         return tuple(merged), gone
 
-    def _neighbours(self, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
-        """Pairs of one that was matched and one near that was not, of the same name, whose boxes
-        are close enough to meet."""
-        here, is_matched = self._table[near], np.isin(near, matched)
-        name, place = labels_of(here), here["T_map_object"][:, :3, 3]
-        reach = np.linalg.norm(here["size"], axis=1) / 2
-        one, other = np.nonzero((name[:, None] == name) & is_matched[:, None] & ~is_matched)
-        close = np.linalg.norm(place[one] - place[other], axis=1) < reach[one] + reach[other]
-        return list(zip(near[one[close]].tolist(), near[other[close]].tolist(), strict=True))
+    def _age(self, k: int) -> tuple[bool, int, int]:
+        """By which objects come before candidates, then the first."""
+        return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
 
-    def _coincide(self, a: int, b: int, view: MapView) -> bool:
-        one, other = self._table[a], self._table[b]
-        p_one, p_other = (_awake(self._table[[k]], view) for k in (a, b))
-        share = max(inside(other, p_one), inside(one, p_other))
-        return share >= self.config.merge_overlap
-
-    def _older(self, a: int, b: int) -> tuple[int, int]:
-        """Objects before candidates, then the first."""
-
-        def age(k: int) -> tuple[bool, int, int]:
-            return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
-
-        return (a, b) if age(a) < age(b) else (b, a)
-
-    def _join(self, keep: int, other: int, view: MapView) -> None:
-        one, gone = self._table[[keep]], self._table[[other]]
-        one["members"], one["votes"] = joined(
-            one["members"], one["votes"], gone["members"], gone["votes"]
-        )
-        for name in ("seen", "last"):
-            one[name] = np.maximum(one[name], gone[name])
-        for name in ("missed", "misses", "first"):
-            one[name] = np.minimum(one[name], gone[name])
-        for i in range(VIEWS):
-            seen = gone["view_keyframes"][:, i]
-            _add_view(one, seen, gone["view_scores"][:, i], gone["view_boxes"][:, i])
+    def _join(self, keep: int, goes: int, view: MapView) -> None:
+        one = self._table[[keep]]
+        absorb(one, self._table[[goes]])
         self._derive(one, view.rows, view.labels, view.ids, view.anchors)
         self._table[[keep]] = one
 
@@ -321,8 +285,8 @@ class Objects:
         """A candidate of each region that is left; of too many those seen longest ago go."""
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
-        new["votes"] = _one_each(new["members"])
-        _remember(new, view.keyframe, np.ones(len(left)), regions.boxes[left])
+        new["votes"] = one_each(new["members"])
+        remember(new, view.keyframe, np.ones(len(left)), regions.boxes[left])
         self._derive(new, view.rows, view.labels, view.ids, view.anchors)
         if len(new):
             self._table = np.concatenate([self._table, new])
@@ -376,57 +340,3 @@ class Objects:
             "objects_retired": self._retired,
             "objects_refused": self._refused,  # there are max_objects
         }
-
-
-def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
-    """Share of points [M, 3] within the box of a landmark; 0 of none."""
-    T = landmark["T_map_object"]
-    local = (p_map - T[:3, 3]) @ T[:3, :3]
-    return (
-        float(np.mean(np.all(np.abs(local) <= landmark["size"] / 2, axis=1))) if len(local) else 0
-    )
-
-
-def _awake(landmark: np.ndarray, view: MapView) -> np.ndarray:
-    """Where the Gaussians [M, 3] of one, in a table [1], are."""
-    where = rows_of(landmark["members"][believed(landmark)], view.ids)
-    return view.rows[where[where >= 0], :3].astype(float)
-
-
-def _one_each(members: np.ndarray) -> np.ndarray:
-    return (members != NO_MEMBER).astype(np.int8)
-
-
-def _voted(votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray) -> np.ndarray:
-    """Votes [K, 256] one higher for members, in `rows` of the map, that lie in the region `numbers`
-    [K] of their landmark, and one lower for those that were seen beside it or are no more."""
-    wanted = np.maximum(rows, 0).astype(view.indices.dtype)  # or all of `indices` is converted
-    at = np.minimum(np.searchsorted(view.indices, wanted), len(view.indices) - 1)
-    is_shown = view.indices[at] == rows
-    region = np.where(is_shown, view.regions[at], HIDDEN)
-    is_in = region == numbers[:, None]
-    is_out = (rows < 0) | ((region != HIDDEN) & ~is_in)
-    change = is_in.astype(np.int8) - is_out.astype(np.int8)
-    return np.where(votes > 0, np.clip(votes + change, 0, MOST_VOTES), 0).astype(np.int8)
-
-
-def _remember(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
-    """Large boxes with much of the object in them are good views."""
-    scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
-    _add_view(table, np.full(len(table), keyframe), scores, boxes)
-
-
-def _add_view(
-    table: np.ndarray, keyframes: np.ndarray, scores: np.ndarray, boxes: np.ndarray
-) -> None:
-    """The best of the views that landmarks [K] have and one more of each, in place."""
-    all_scores = np.concatenate([table["view_scores"], scores[:, None]], axis=1).astype(np.float32)
-    order = np.argsort(-all_scores, axis=1, kind="stable")[:, :VIEWS]
-    for name, new in (
-        ("view_keyframes", keyframes),
-        ("view_scores", scores),
-        ("view_boxes", boxes),
-    ):
-        values = np.concatenate([table[name], np.asarray(new)[:, None]], axis=1)
-        at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
-        table[name] = np.take_along_axis(values, at, axis=1)
