@@ -12,7 +12,7 @@ out  keyframe/refinement   KeyframeRefinement   where the renderer wants the key
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,30 +22,21 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.map_messages import (
-    NO_GAUSSIANS,
-    NO_IDS,
-    gaussians_message,
-    parts_of,
-    regrouped,
-)
+from ldo_service.keyframe_links import KeyframeLinks
+from ldo_service.map_teller import MapTeller, Occasion, Pace
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
-from ldo_service.runtime.process import give_back_free_memory
 from ldo_service.schemas import (
     AnchorMotion,
     Array,
     Correction,
     DetectionBoxes,
-    Gaussians,
     Keyframe,
     KeyframeRefinement,
     MapDelta,
     MapRefine,
     MapSnapshot,
-    MeasuredPose,
     ModelView,
 )
-from ldo_service.schemas.pose import Matrix6
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
@@ -67,10 +58,6 @@ from ldo_service.wire import (
 )
 
 Output = ModelView | MapDelta | MapSnapshot | KeyframeRefinement
-
-# A successor starts from a checkpoint and must not use a version again that followers may hold:
-# more than a mapper could use up between two checkpoints.
-VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +98,10 @@ class MapperConfig:
     def thread_count(self) -> int:
         return self.threads or max(1, (os.cpu_count() or 1) - 1)
 
+    def pace(self) -> Pace:
+        """Of telling others."""
+        return Pace(**{f.name: getattr(self, f.name) for f in fields(Pace)})
+
 
 class Mapper(Actor):
     """Maps a keyframe at once; corrections move each Gaussian with the keyframe that made it."""
@@ -131,16 +122,10 @@ class Mapper(Actor):
         threads = self.config.thread_count()
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
         self._semantics = SemanticMap(self.config.semantics, threads=threads)
-        self._names_told = 0  # of labels, to followers
         self._poses = KeyframePoses()
-        self._links: dict[tuple[int, int], Matrix6] = {}  # information by keyframe and reference
-        self._refinements = 0  # sent
-        self._unacknowledged: dict[int, int] = {}  # the refinement that no correction knows yet
+        self._links = KeyframeLinks(self._poses)
+        self._teller = MapTeller(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
-        self._version = 0  # of the map, as followers know it
-        self._since_snapshot = self.config.snapshot_keyframes  # the first keyframe sends one
-        self._since_changed = 0
-        self._in_snapshot = 0  # Gaussians in the last one
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -169,10 +154,7 @@ class Mapper(Actor):
             transform(message.T_odom_keyframe),
             message.segment,
         )
-        if message.reference is not None:
-            self._links[message.keyframe, message.reference] = message.information
-        for pose in message.window:
-            self._links[pose.keyframe, pose.reference] = pose.information
+        self._links.add(message)
         self._newest = (message.stamp_ns, message.keyframe)
         # map it
         frame = rgbd_of(message)
@@ -181,9 +163,9 @@ class Mapper(Actor):
         self._semantics.mapped(self._map, message.keyframe)
         # tell
         yield from self._refinement()
-        yield from self._deltas(self._is_time_for_changed())
+        yield from self._teller.keyframe(self._now())
         yield self._view(message)
-        yield from self._snapshot_when_due()
+        yield from self._teller.snapshot_when_due(self._now())
 
     def _iterations(self) -> int:
         """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
@@ -197,37 +179,12 @@ class Mapper(Actor):
     def _refine(self, message: MapRefine) -> Iterator[Output]:
         self._map.refine(message.iterations, (message.first_rate, message.last_rate))
         yield from self._refinement()
-        yield from self._deltas(with_changed=True)
+        yield from self._teller.deltas(self._now(), with_changed=True)
 
     def _refinement(self) -> Iterator[KeyframeRefinement]:
-        """Keyframes that the optimiser moved, measured anew against all that they were measured
-        against; and those that were measured against them, against where they are now."""
-        moved = self._map.refined()
-        if not moved:
-            return
-        for keyframe, T_map_keyframe in moved.items():
-            self._poses.place(keyframe, T_map_keyframe)
-        poses = tuple(
-            self._measured(keyframe, reference, information)
-            for (keyframe, reference), information in self._links.items()
-            if reference in self._poses and (keyframe in moved or reference in moved)
-        )
-        if poses:
-            self._refinements += 1
-            self._unacknowledged.update(dict.fromkeys(moved, self._refinements))
-            yield KeyframeRefinement(
-                stamp_ns=self._newest[0], poses=poses, number=self._refinements
-            )
-
-    def _measured(self, keyframe: int, reference: int, information: Matrix6) -> MeasuredPose:
-        """The loss tells no information: the tracker's stands."""
-        T_reference_keyframe = se3.inverse(self._poses[reference]) @ self._poses[keyframe]
-        return MeasuredPose(
-            reference=reference,
-            keyframe=keyframe,
-            T_reference_keyframe=pose_message(T_reference_keyframe),
-            information=information,
-        )
+        refinement = self._links.refined(self._map.refined(), self._newest[0])
+        if refinement:
+            yield refinement
 
     # --- labels -----------------------------------------------------------------------------------
     def _take_boxes(self, message: DetectionBoxes) -> None:
@@ -236,24 +193,15 @@ class Mapper(Actor):
             claims = claims_of(message, self._semantics.vocabulary)
             self._semantics.claim(self._map, message.keyframe, claims)
 
-    def _new_names(self) -> tuple[str, ...]:
-        """All, if there are some that followers do not know."""
-        names = self._semantics.names
-        is_news, self._names_told = len(names) > self._names_told, len(names)
-        return names if is_news else ()
-
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> Iterator[MapDelta]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
-        self._unacknowledged = {
-            k: number for k, number in self._unacknowledged.items() if number > message.refinements
-        }
-        T_map = keyframe_poses_of(message)
-        self._poses.correct(message.graph_version, T_map, held=self._unacknowledged.keys())
+        held = self._links.acknowledged(message.refinements)
+        self._poses.correct(message.graph_version, keyframe_poses_of(message), held=held)
         motions = tuple(self._motion(keyframe) for keyframe in self._misplaced())
         if motions:
             self._map.move({m.keyframe: transform(m.T_new_old) for m in motions})
-            yield self._delta(motions=motions)
+            yield self._teller.delta(self._now(), motions=motions)
 
     def _misplaced(self) -> list[int]:
         """Keyframes that are not where their Gaussians are; too little to show adds up until it is
@@ -274,43 +222,8 @@ class Mapper(Actor):
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
 
     # --- messages ---------------------------------------------------------------------------------
-    def _is_time_for_changed(self) -> bool:
-        self._since_changed += 1
-        return self._since_changed >= self.config.changed_keyframes
-
-    def _deltas(self, with_changed: bool) -> Iterator[MapDelta]:
-        """What followers do not know, in messages of a bounded size."""
-        changes = self._map.changes(with_changed=with_changed)
-        for part in parts_of(changes, self.config.part_gaussians):
-            yield self._delta(
-                removed=part.removed,
-                changed=self._gaussians(part.changed),
-                added=self._gaussians(part.added),
-            )
-        if with_changed:
-            self._since_changed = 0
-            self._map.rest()
-            give_back_free_memory()  # copies as large as the map were made
-
-    def _delta(
-        self,
-        motions: tuple[AnchorMotion, ...] = (),
-        removed: np.ndarray = NO_IDS,
-        changed: Gaussians = NO_GAUSSIANS,
-        added: Gaussians = NO_GAUSSIANS,
-    ) -> MapDelta:
-        self._version += 1
-        return MapDelta(
-            stamp_ns=self._newest[0],
-            since=self._version - 1,
-            version=self._version,
-            graph_version=self._poses.version,
-            motions=motions,
-            removed=Array.of(removed),
-            changed=changed,
-            added=added,
-            label_names=self._new_names(),
-        )
+    def _now(self) -> Occasion:
+        return Occasion(self._newest[0], self._poses.version, self._semantics.names)
 
     def _view(self, keyframe: Keyframe) -> ModelView:
         views, k = self._map.views, keyframe.keyframe
@@ -318,7 +231,7 @@ class Mapper(Actor):
         return ModelView(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.keyframe,
-            version=self._version,
+            version=self._teller.version,
             graph_version=self._poses.version,
             camera=keyframe.camera,
             T_map_camera=pose_message(views.poses[k]),
@@ -327,44 +240,10 @@ class Mapper(Actor):
             opacity=Array.of(to_bytes(rendering.opacity)),
         )
 
-    def _snapshot_when_due(self) -> Iterator[MapDelta | MapSnapshot]:
-        self._since_snapshot += 1
-        grown = self._map.size() - self._in_snapshot
-        has_grown = grown >= self.config.snapshot_growth * self._in_snapshot
-        if self._since_snapshot >= (
-            self.config.snapshot_keyframes if has_grown else self.config.snapshot_keyframes_max
-        ):
-            yield from self._snapshot()
-
-    def _snapshot(self) -> Iterator[MapDelta | MapSnapshot]:
-        """First all that is new, so that followers and late joiners hold the same."""
-        yield from self._deltas(with_changed=True)
-        self._since_snapshot, self._in_snapshot = 0, self._map.size()
-        parts = max(1, -(-self._map.size() // self.config.part_gaussians))
-        pieces = regrouped(self._map.pieces(), parts, self.config.part_gaussians)
-        exposures = self._map.views.exposures
-        for part, gaussians in enumerate(pieces):
-            named = list(exposures) if part == 0 else []
-            matrices = [exposures[k].matrix for k in named]
-            yield MapSnapshot(
-                stamp_ns=self._newest[0],
-                version=self._version,
-                graph_version=self._poses.version,
-                part=part,
-                parts=parts,
-                gaussians=gaussians,
-                keyframes=Array.of(np.array(named, np.int64)),
-                exposures=Array.of(np.array(matrices, np.float32).reshape(-1, 2, 3)),
-                label_names=self._semantics.names if part == 0 else (),
-            )
-
-    def _gaussians(self, chosen: np.ndarray) -> Gaussians:
-        return gaussians_message(self._map.gaussians.all().at(chosen))
-
     def finish(self) -> Iterator[MapDelta | MapSnapshot]:
         """The whole map, so that whoever listens ends with it."""
         if self._map.size():
-            yield from self._snapshot()
+            yield from self._teller.snapshot(self._now())
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -387,28 +266,22 @@ class Mapper(Actor):
     def _put_away(self) -> None:
         self._checkpoint = {
             "newest": self._newest,
-            "version": self._version,
             "map": self._map.snapshot(),
             "semantics": self._semantics.snapshot(),
             "poses": self._poses.snapshot(),
-            "refinements": self._refinements,
-            "unacknowledged": list(self._unacknowledged.items()),
-            "since_changed": self._since_changed,
-            "links": [(*pair, information) for pair, information in self._links.items()],
+            "links": self._links.snapshot(),
+            "told": self._teller.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["map"]
         stamp_ns, keyframe = saved["newest"]
         self._newest = (int(stamp_ns), int(keyframe))
-        self._version = int(saved["version"]) + VERSIONS_IN_A_CHECKPOINT
         self._map.restore(saved["map"])
         self._semantics.restore(saved["semantics"])
         self._poses.restore(saved["poses"])
-        self._refinements = saved["refinements"]
-        self._unacknowledged = dict(saved["unacknowledged"])
-        self._since_changed = saved["since_changed"]
-        self._links = {(k, reference): tuple(info) for k, reference, info in saved["links"]}
+        self._links.restore(saved["links"])
+        self._teller.restore(saved["told"])
 
     def facts(self) -> dict[str, float]:
         return {
