@@ -72,13 +72,7 @@ GRAPH: tuple[Box, ...] = (
     _built(
         Mapper,
         "keeps the map of Gaussians",
-        lambda config: Mapper(config.mapper),
-        later=(
-            In(t.LABEL_OPEN, Latest(1, per_key=True)),
-            Out(t.LABEL_REQUEST),
-            Out(t.MAP_OBJECTS),
-            Out(t.OBJECT_OBSERVATION),
-        ),
+        lambda config: Mapper(config.mapper, has_labeller=config.vlm_labeller.is_chosen),
     ),
     Box(
         "loop_closer",

@@ -2,11 +2,15 @@
 
 in   keyframe/new          Keyframe             Lossless(8)   a missing one is a hole in the map
 in   detection/boxes       DetectionBoxes       Lossless(8)   a keyframe without it has no labels
+in   label/open            LabelOpen            Latest(1 per region)   late by design
 in   graph/correction      Correction           Latest(1)     a versioned absolute state
 in   map/refine            MapRefine            Latest(1)     what was asked last
 out  map/view              ModelView            the map as rendered at the newest keyframe
 out  map/delta             MapDelta             what changed
 out  map/snapshot          MapSnapshot          the whole of it, in parts, now and then
+out  label/request         LabelRequest         what a labeller is to name, if there is one
+out  map/objects           MapObjects           what stands in it
+out  object/observation    ObjectObservation    where a keyframe shows them, or ought to
 out  keyframe/refinement   KeyframeRefinement   where the renderer wants the keyframes
 """
 
@@ -32,32 +36,51 @@ from ldo_service.schemas import (
     DetectionBoxes,
     Keyframe,
     KeyframeRefinement,
+    LabelOpen,
+    LabelRequest,
     MapDelta,
+    MapObjects,
     MapRefine,
     MapSnapshot,
     ModelView,
+    ObjectObservation,
 )
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
     KEYFRAME_NEW,
     KEYFRAME_REFINEMENT,
+    LABEL_OPEN,
+    LABEL_REQUEST,
     MAP_DELTA,
+    MAP_OBJECTS,
     MAP_REFINE,
     MAP_SNAPSHOT,
     MAP_VIEW,
+    OBJECT_OBSERVATION,
 )
-from ldo_service.semantics.semantic_map import SemanticMap, SemanticMapConfig
+from ldo_service.semantics.semantic_map import Learnt, SemanticMap, SemanticMapConfig
 from ldo_service.wire import (
     claims_of,
     keyframe_poses_of,
+    label_request_message,
     mask_of,
+    objects_message,
+    observation_messages,
     pose_message,
     rgbd_of,
     transform,
 )
 
-Output = ModelView | MapDelta | MapSnapshot | KeyframeRefinement
+Output = (
+    ModelView
+    | MapDelta
+    | MapSnapshot
+    | LabelRequest
+    | MapObjects
+    | ObjectObservation
+    | KeyframeRefinement
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,18 +133,30 @@ class Mapper(Actor):
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
+        In(LABEL_OPEN, Latest(1, per_key=True)),
         In(GRAPH_CORRECTION, Latest(1)),
         In(MAP_REFINE, Latest(1)),
     )
-    outputs = (Out(MAP_VIEW), Out(MAP_DELTA), Out(MAP_SNAPSHOT), Out(KEYFRAME_REFINEMENT))
+    outputs = (
+        Out(MAP_VIEW),
+        Out(MAP_DELTA),
+        Out(MAP_SNAPSHOT),
+        Out(LABEL_REQUEST),
+        Out(MAP_OBJECTS),
+        Out(OBJECT_OBSERVATION),
+        Out(KEYFRAME_REFINEMENT),
+    )
 
-    def __init__(self, config: MapperConfig | None = None) -> None:
+    def __init__(self, config: MapperConfig | None = None, *, has_labeller: bool = False) -> None:
+        """`has_labeller`: there is an actor that answers label/request with names."""
         super().__init__()
         self.config = config or MapperConfig()
         folder = Path(self.config.folder) if self.config.folder else None
         threads = self.config.thread_count()
         self._map = MapBuilder(self.config.builder, folder=folder, threads=threads)
-        self._semantics = SemanticMap(self.config.semantics, threads=threads)
+        self._semantics = SemanticMap(
+            self._map, self.config.semantics, has_labeller=has_labeller, threads=threads
+        )
         self._poses = KeyframePoses()
         self._links = KeyframeLinks(self._poses)
         self._teller = MapTeller(self._map, self.config.pace())
@@ -130,11 +165,13 @@ class Mapper(Actor):
         self._repeated = 0
 
     def handle(
-        self, message: Keyframe | DetectionBoxes | Correction | MapRefine
+        self, message: Keyframe | DetectionBoxes | LabelOpen | Correction | MapRefine
     ) -> Iterator[Output]:
         match message:
             case DetectionBoxes():
-                self._take_boxes(message)
+                yield from self._take_boxes(message)
+            case LabelOpen():
+                yield from self._take_name(message)
             case Correction():
                 yield from self._correct(message)
             case MapRefine():
@@ -160,12 +197,13 @@ class Mapper(Actor):
         frame = rgbd_of(message)
         moving = mask_of(message.is_moving)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
-        self._semantics.mapped(self._map, message.keyframe)
+        learnt = self._semantics.mapped(message.keyframe)
         # tell
         yield from self._refinement()
         yield from self._teller.keyframe(self._now())
         yield self._view(message)
         yield from self._teller.snapshot_when_due(self._now())
+        yield from self._tell_learnt(learnt, message.stamp_ns)
 
     def _iterations(self) -> int:
         """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
@@ -178,30 +216,56 @@ class Mapper(Actor):
 
     def _refine(self, message: MapRefine) -> Iterator[Output]:
         self._map.refine(message.iterations, (message.first_rate, message.last_rate))
+        self._semantics.refresh()
         yield from self._refinement()
         yield from self._teller.deltas(self._now(), with_changed=True)
+        yield from self._objects()
 
     def _refinement(self) -> Iterator[KeyframeRefinement]:
         refinement = self._links.refined(self._map.refined(), self._newest[0])
         if refinement:
             yield refinement
 
-    # --- labels -----------------------------------------------------------------------------------
-    def _take_boxes(self, message: DetectionBoxes) -> None:
-        """Followers are told with what changes next. Where nobody looked, nothing was missed."""
-        if message.network:
-            claims = claims_of(message, self._semantics.vocabulary)
-            self._semantics.claim(self._map, message.keyframe, claims)
+    # --- labels and objects -----------------------------------------------------------------------
+    def _take_boxes(self, message: DetectionBoxes) -> Iterator[Output]:
+        """Followers are told of labels with what changes next. Where nobody looked, nothing was
+        missed."""
+        vocabulary = self._semantics.vocabulary
+        claims = claims_of(message, vocabulary) if message.network else None
+        learnt = self._semantics.claim(message.keyframe, claims)
+        yield from self._tell_learnt(learnt, message.stamp_ns)
+
+    def _take_name(self, message: LabelOpen) -> Iterator[Output]:
+        about = message.region, message.keyframe
+        if self._semantics.answer(*about, message.label, message.confidence):
+            yield from self._objects()
+
+    def _tell_learnt(self, learnt: Learnt | None, stamp_ns: int) -> Iterator[Output]:
+        if learnt is not None:
+            names = self._semantics.names
+            yield from observation_messages(learnt.observed, names, learnt.keyframe, stamp_ns)
+            yield from (label_request_message(region, stamp_ns) for region in learnt.asked)
+            yield from self._objects()
+
+    def _objects(self) -> Iterator[MapObjects]:
+        """All of them; nothing where nobody ever looked."""
+        semantics = self._semantics
+        if semantics.is_used:
+            versions = self._teller.version, self._poses.version
+            yield objects_message(semantics.objects, semantics.names, *versions, self._newest[0])
 
     # --- corrections ------------------------------------------------------------------------------
-    def _correct(self, message: Correction) -> Iterator[MapDelta]:
+    def _correct(self, message: Correction) -> Iterator[Output]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         held = self._links.acknowledged(message.refinements)
         self._poses.correct(message.graph_version, keyframe_poses_of(message), held=held)
         motions = tuple(self._motion(keyframe) for keyframe in self._misplaced())
         if motions:
-            self._map.move({m.keyframe: transform(m.T_new_old) for m in motions})
+            T_new_old = {m.keyframe: transform(m.T_new_old) for m in motions}
+            self._map.move(T_new_old)
+            self._semantics.moved(T_new_old)
             yield self._teller.delta(self._now(), motions=motions)
+            yield from self._objects()
 
     def _misplaced(self) -> list[int]:
         """Keyframes that are not where their Gaussians are; too little to show adds up until it is
@@ -227,7 +291,7 @@ class Mapper(Actor):
 
     def _view(self, keyframe: Keyframe) -> ModelView:
         views, k = self._map.views, keyframe.keyframe
-        rendering = self._map.seen_from(views.cameras[k], views.poses[k])
+        rendering = self._map.shown(k, contributions=self._semantics.is_used)
         return ModelView(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.keyframe,
@@ -240,10 +304,12 @@ class Mapper(Actor):
             opacity=Array.of(to_bytes(rendering.opacity)),
         )
 
-    def finish(self) -> Iterator[MapDelta | MapSnapshot]:
+    def finish(self) -> Iterator[Output]:
         """The whole map, so that whoever listens ends with it."""
         if self._map.size():
+            self._semantics.refresh()
             yield from self._teller.snapshot(self._now())
+            yield from self._objects()
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -288,7 +354,7 @@ class Mapper(Actor):
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
             **self._map.statistics(),
-            **self._semantics.statistics(self._map),
+            **self._semantics.statistics(),
         }
 
 

@@ -49,6 +49,11 @@ class VlmLabellerConfig:
                 f"vlm_labeller has model={self.model} and url={self.url}: choose one of them."
             )
 
+    @property
+    def is_chosen(self) -> bool:
+        """One is named: the mapper asks for names then."""
+        return bool(self.model or self.url)
+
 
 class VlmLabeller(Actor):
     """Remembers the names that were added, and nothing else."""
@@ -149,10 +154,9 @@ class VlmLabeller(Actor):
 
     def facts(self) -> dict[str, float]:
         """`labellers_missing`: named in the configuration, and cannot be used."""
-        is_wanted = bool(self.config.model or self.config.url)
         return {
             "labellers": float(self._labeller is not None),
-            "labellers_missing": float(is_wanted and self._labeller is None),
+            "labellers_missing": float(self.config.is_chosen and self._labeller is None),
             "labellings_failed": self._failures,
             "labeller_failing": float(self._is_failing),
             "regions_named": self._named,
@@ -165,7 +169,7 @@ class VlmLabeller(Actor):
 
 def opened(config: VlmLabellerConfig) -> Labeller | None:
     """The labeller that a configuration names; None where it names none. Raises ConfigError."""
-    if not (config.model or config.url):
+    if not config.is_chosen:
         return None
     names = read_names(Path(config.names).expanduser()) if config.names else ()
     if config.url:

@@ -91,6 +91,7 @@ class MapBuilder:
         self._log = ChangeLog()
         self._told: dict[int, np.ndarray] = {}  # T_map_keyframe that others know
         self._newest: int | None = None
+        self._shown: tuple[int, Rendering] | None = None  # of a keyframe, while the map stays
         self._iterations = self._unusable = self._pruned = self._excess = 0
 
     # --- keyframes --------------------------------------------------------------------------------
@@ -110,6 +111,7 @@ class MapBuilder:
         Its Gaussians hang on it.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera, Horizon.of(frame.depth_m)))
+        self._shown = None
         before = self.seen_from(frame.camera, T_map_camera)
         exposure = self._exposure(frame, before, is_moving)
         self._insert(frame, T_map_camera, keyframe, before, exposure, is_moving)
@@ -135,6 +137,15 @@ class MapBuilder:
             contributions=contributions,
             threads=self._threads,
         )
+
+    def shown(self, keyframe: int, *, contributions: bool = False) -> Rendering:
+        """What it shows where a keyframe stands; rendered once while the map does not change."""
+        if self._shown is None or self._shown[0] != keyframe:
+            self._shown = None
+        if self._shown is None or (contributions and self._shown[1].contributions is None):
+            camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
+            self._shown = keyframe, self.seen_from(camera, pose, contributions=contributions)
+        return self._shown[1]
 
     def _exposure(
         self, frame: RgbdFrame, before: Rendering, is_moving: np.ndarray | None
@@ -231,7 +242,7 @@ class MapBuilder:
 
     def refine(self, iterations: int, rates: tuple[float, float] = (1.0, 1.0)) -> None:
         """Fit to random keyframes, with steps that shrink or grow from one rate to the other."""
-        known = self.views.store.keyframes()
+        known, self._shown = self.views.store.keyframes(), None
         if known:
             chosen = self._rng(len(self._told), self._iterations).integers(
                 len(known), size=iterations
@@ -272,11 +283,12 @@ class MapBuilder:
         self._pruned += self.gaussians.remove(mask)
 
     # --- labels -----------------------------------------------------------------------------------
-    def made_by(self, keyframe: int) -> np.ndarray:
-        """Indices [V] uint32, ascending, of the Gaussians that make its image, woken if they
-        slept."""
+    def made_by(self, keyframe: int) -> Contributions:
+        """The Gaussians that make its image, woken if they slept."""
         self._wake(self.views.placed(keyframe))
-        return self._contributions(keyframe).indices
+        shown = self.shown(keyframe, contributions=True).contributions
+        assert shown is not None
+        return shown
 
     def relabelled(self, indices: np.ndarray) -> None:
         """These rows have other labels than followers know."""
@@ -292,6 +304,8 @@ class MapBuilder:
     def _wake(self, camera: PlacedCamera) -> None:
         seen = self.sleeping.seen_from(camera, self._reach_m)
         ids = self.sleeping.return_to(self.gaussians, seen)
+        if len(ids):
+            self._shown = None
         self._log.woken(self.gaussians, ids)
 
     def rest(self) -> None:
@@ -307,6 +321,7 @@ class MapBuilder:
         choice = choose_sleepers(awake, recent, self.config.sleep)
         self._excess = choice.excess
         self.sleeping.take_from(self.gaussians, clumps, choice.clumps)
+        self._shown = None
         self._log.all_told(self.gaussians)
 
     def size(self) -> int:
@@ -339,6 +354,7 @@ class MapBuilder:
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
         """Keyframes were corrected: what hangs on each goes with it, and its view."""
         T_map = {k: T @ self.views.poses[k] for k, T in T_new_old.items()}
+        self._shown = None
         self.gaussians.move_anchors(T_new_old)
         self.sleeping.move(T_new_old)
         self.views.poses.update(T_map)
@@ -368,7 +384,7 @@ class MapBuilder:
         self.views.restore(state["views"])
         self.sleeping.restore(state["sleeping"])
         self._told = dict(zip(self.views.poses, state["told"], strict=True))
-        self._newest, self._iterations = state["newest"], state["iterations"]
+        self._newest, self._iterations, self._shown = state["newest"], state["iterations"], None
         self._log.all_told(self.gaussians)
 
     def statistics(self) -> dict[str, float]:

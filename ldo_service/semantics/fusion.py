@@ -24,11 +24,13 @@ class FusionConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Fused:
-    """labels [V] int16; confidences [V] float32, SemConf; alpha [V] float32, the detector's part"""
+    """labels [V] int16; confidences [V] float32, SemConf; alpha [V] float32, the detector's part;
+    by_detector [V] float32, alpha Conf_YOLO"""
 
     labels: np.ndarray
     confidences: np.ndarray
     alpha: np.ndarray
+    by_detector: np.ndarray
 
 
 def fused(
@@ -66,7 +68,7 @@ def fused(
     alpha = alpha.astype(np.float32)
     by_detector, by_labeller = alpha * confidences, (1 - alpha) * open_confidences
     labels = np.where(by_detector >= by_labeller, detector_labels, open_labels)
-    return Fused(labels.astype(np.int16), by_detector + by_labeller, alpha)
+    return Fused(labels.astype(np.int16), by_detector + by_labeller, alpha, by_detector)
 
 
 def _alpha(r_detector: np.ndarray, r_open: np.ndarray, config: FusionConfig) -> np.ndarray:

@@ -17,6 +17,14 @@ def top_image(labels: np.ndarray, shown: Rendering) -> np.ndarray:
     return np.where(top >= 0, top_labels(labels)[top], BACKGROUND).astype(np.uint8)
 
 
+def reliable_image(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
+    """[H, W] bool, where the Gaussian that made most of a pixel, `top` [H, W], has a label but
+    background with that probability, or more."""
+    rows = labels[np.maximum(top, 0).ravel()]
+    is_named = (fields(rows)["weights"][:, 0] >= least) & (top_labels(rows) != BACKGROUND)
+    return is_named.reshape(top.shape) & (top >= 0)
+
+
 def label_image(
     rows: np.ndarray,
     labels: np.ndarray,

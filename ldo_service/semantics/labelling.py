@@ -10,9 +10,9 @@ from ldo_service.geometry import Camera, se3
 
 from .assignment import UNMATCHED, Assigned, AssignmentConfig, Regions, assign
 from .consistency import ConsistencyConfig, Disagreement, agree
-from .foreground import ForegroundConfig, foreground, surfaces
+from .foreground import Foreground, ForegroundConfig, foreground, surfaces
 from .fusion import FusionConfig, fused
-from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe
+from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe, top_labels
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,7 @@ class Claims:
     boxes                  [M, 4], x0 y0 x1 y1, px, pixel centres at integers
     labels, confidences    [M] of the detector; confidence 0: it says nothing
     open_labels, open_confidences [M] of the open-vocabulary labeller; 0: it was not invoked
+    parts                  what of each box it is; None, or none at all: what is found in it
     """
 
     boxes: np.ndarray
@@ -43,6 +44,7 @@ class Claims:
     confidences: np.ndarray
     open_labels: np.ndarray
     open_confidences: np.ndarray
+    parts: tuple[Foreground | None, ...] = ()
 
     @classmethod
     def of_detector(
@@ -73,13 +75,16 @@ def label_keyframe(
     config: LabellingConfig,
     *,
     is_late: bool = False,
+    spared: np.ndarray | None = None,
     threads: int = 1,
 ) -> Labelled:
     """Fold what is claimed of a keyframe into the labels [N, 32] of the map, in place.
 
     rows [N, 16]; indices [V] uint32, the Gaussians that made its image; depth_m [H, W] as it was
     measured. `is_late`: the claims are some of a keyframe that was folded in before, so that what
-    they leave out is no miss. Raises ValueError for arrays that do not fit.
+    they leave out is no miss, and where the detector's word is the heavier one it was counted.
+    `spared` [256] bool: labels that the detector does not know, and cannot miss. Raises ValueError
+    for arrays that do not fit.
     """
     # which Gaussians are where
     regions = regions_of(claims, depth_m, camera, config)
@@ -89,6 +94,9 @@ def label_keyframe(
     )
     # what they were seen as
     seen = observations(where, indices, camera, claims, config, is_late=is_late)
+    if spared is not None:
+        is_spared = spared[top_labels(labels[indices])] & (seen.labels == MISS)
+        seen.labels[is_spared] = NOT_SEEN
     observe(labels, seen, config.labels, threads=threads)
     # what their neighbours say
     touched = indices[seen.labels != NOT_SEEN]
@@ -101,8 +109,14 @@ def regions_of(
     """The boxes, or the objects in them."""
     if config.region == "box" or len(claims.boxes) == 0:
         return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
-    found = surfaces(depth_m, camera, config.foreground)
-    parts = [foreground(box, depth_m, found, camera, config.foreground) for box in claims.boxes]
+    known = claims.parts or (None,) * len(claims.boxes)
+    parts = [part for part in known if part is not None]
+    if len(parts) < len(known):
+        found = surfaces(depth_m, camera, config.foreground)
+        parts = [
+            part or foreground(box, depth_m, found, camera, config.foreground)
+            for box, part in zip(claims.boxes, known, strict=True)
+        ]
     return Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
 
 
@@ -133,6 +147,8 @@ def observations(
         config.fusion,
     )
     labels[hit], confidences[hit] = both.labels, both.confidences
+    if is_late:
+        labels[np.flatnonzero(hit)[2 * both.by_detector >= both.confidences]] = NOT_SEEN
     corners = np.reshape(claims.boxes, (-1, 2, 2))
     sides_px[hit] = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))[of]
     m_per_px = np.maximum(where.depths_m, 0) / np.float32(np.sqrt(camera.fx * camera.fy))

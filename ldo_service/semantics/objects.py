@@ -29,6 +29,7 @@ from .landmarks import (
     distributions,
     entropies,
     joined,
+    labels_of,
     moved,
     new_landmarks,
     within,
@@ -109,8 +110,9 @@ class Objects:
         table = self._table[self._table["id"] != CANDIDATE]
         return table[np.argsort(table["id"])]
 
-    def observe(self, view: MapView) -> Observed:
-        """Take in what a keyframe shows.
+    def observe(self, view: MapView, spared: np.ndarray | None = None) -> Observed:
+        """Take in what a keyframe shows. `spared` [256] bool: labels that the detector does not
+        know, and cannot miss unless their place is empty.
 
         A region that no landmark is associated with begins a candidate. It becomes an object when
         it was seen in min_keyframes, and each time KL(p || p_t) < max_divergence: p is what its
@@ -132,7 +134,7 @@ class Objects:
         excused, left = self._pieces(near, k, pairs, regions, r)
         # what is learnt of those seen, and of those not
         observations = self._update(view, near[k], r, looks.rows[k], looks.shown[k], regions)
-        missed = self._missed(looks, excused)
+        missed = self._missed(near, looks, excused, spared)
         observations += self._miss(near[missed], looks.boxes[missed])
         # who comes, who is another, who goes
         born = self._promote(near[k])
@@ -218,11 +220,15 @@ class Objects:
         return tuple(ids.tolist())
 
     # --- those not seen ---------------------------------------------------------------------------
-    def _missed(self, looks: Looks, excused: np.ndarray) -> np.ndarray:
+    def _missed(
+        self, near: np.ndarray, looks: Looks, excused: np.ndarray, spared: np.ndarray | None
+    ) -> np.ndarray:
         """Numbers of those near that a detector should have seen, or whose place is empty."""
         sides = np.clip(looks.boxes[:, 2:] - looks.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
         is_visible = (looks.shown >= self.config.min_visible) & is_large
+        if spared is not None:
+            is_visible &= ~spared[labels_of(self._table[near])]
         return np.flatnonzero((is_visible | (looks.through >= self.config.min_visible)) & ~excused)
 
     def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[Observation]:

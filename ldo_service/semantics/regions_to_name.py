@@ -1,7 +1,7 @@
 """Regions that nobody has a name for, followed over keyframes until a labeller can be asked.
 
 A region is where it is: two sightings are of the same one when their middles are nearer than half
-its size. Each keeps its best views. Conventions: `ldo_service.geometry`.
+its size. Each keeps its best views, and what the labeller said of it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,12 +25,15 @@ class RegionConfig:
     gain: float = 1.3  # of the views' summed quality, before it is asked again
     settled: float = 0.6  # of an answer that needs no second one
     near: float = 0.5  # of its size, between two sightings of a region
+    least_quality: float = 0.02  # of a view: worse ones show a labeller nothing
     most: int = 256  # regions; the one not seen for longest is forgotten
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
         if min(self.views, self.views_first, self.most_questions, self.most) < 1:
             raise ConfigError(f"{self}: counts must be at least 1.")
+        if not 0 <= self.least_quality <= 1:
+            raise ConfigError(f"{self}: least_quality must be within 0..1.")
         if self.views_first > self.views or not (self.gain > 1 and self.near > 0):
             raise ConfigError(f"{self}: views_first at most views, gain over 1, near positive.")
 
@@ -43,6 +46,7 @@ class Region:
     views           the best, the best first
     label, score    of the surest detector so far
     questions       asked so far; `quality` of the views, summed, when it was asked last
+    name, sure      the labeller's surest answer
     """
 
     id: int
@@ -55,7 +59,31 @@ class Region:
     score: float = 0.0
     questions: int = 0
     quality: float = 0.0
-    is_settled: bool = False
+    name: str = ""
+    sure: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Question:
+    """A region to be asked about now, and its newest sighting."""
+
+    region: Region
+    candidate: Candidate
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Opinion:
+    """What a labeller said before of a region that is seen again, 0..1 `sure`."""
+
+    of: Candidate
+    label: str
+    sure: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Sightings:
+    questions: list[Question]
+    opinions: list[Opinion]
 
 
 class RegionsToName:
@@ -81,13 +109,18 @@ class RegionsToName:
         depth_m: np.ndarray,
         camera: Camera,
         T_map_keyframe: Mapping[int, np.ndarray],
-    ) -> list[Region]:
-        """Take note of a keyframe's candidates; those regions that are to be asked about now.
+        named: Sequence[Candidate] = (),
+    ) -> Sightings:
+        """Take note of a keyframe's candidates: those regions that are to be asked about now, and
+        what was said before of those that have an answer.
 
         color [H, W, 3] uint8 RGB, depth_m [H, W]; T_map_keyframe [4, 4] by keyframe, this one and
-        those of earlier sightings, as they are now.
+        those of earlier sightings, as they are now; `named`: objects that the map has a name for,
+        of which nobody is asked.
         """
-        asked, taken = [], set[int]()
+        asked: list[Question] = []
+        opinions: list[Opinion] = []
+        taken = set[int]()
         for candidate in found:
             sighting = _sighting(keyframe, candidate, depth_m, camera)
             if sighting is None:
@@ -99,17 +132,28 @@ class RegionsToName:
             if self._is_due(region):
                 quality = sum(view.quality for view in region.views)
                 region = replace(region, questions=region.questions + 1, quality=quality)
-                asked.append(region)
-            self._regions.pop(region.id, None)
-            self._regions[region.id] = region
+                asked.append(Question(region, candidate))
+            opinions += self._keep(region, candidate)
+        for candidate in named:
+            sighting = _sighting(keyframe, candidate, depth_m, camera)
+            region = sighting and self._same(sighting, T_map_keyframe, taken)
+            if sighting and region and region.name:
+                taken.add(region.id)
+                opinions += self._keep(_moved(region, sighting), candidate)
         self._forget()
-        return asked
+        return Sightings(asked, opinions)
 
-    def answered(self, region: int, confidence: float) -> None:
+    def _keep(self, region: Region, candidate: Candidate) -> list[Opinion]:
+        """As the one seen last; what was said of it."""
+        self._regions.pop(region.id, None)
+        self._regions[region.id] = region
+        return [Opinion(candidate, region.name, region.sure)] if region.name else []
+
+    def answered(self, region: int, label: str, confidence: float) -> None:
         """The labeller has spoken of it; a confident answer needs no second one."""
         known = self._regions.get(region)
-        if known is not None and confidence >= self.config.settled:
-            self._regions[region] = replace(known, is_settled=True)
+        if known is not None and confidence > known.sure:
+            self._regions[region] = replace(known, name=label, sure=confidence)
 
     def _same(
         self, sighting: Region, T_map_keyframe: Mapping[int, np.ndarray], taken: set[int]
@@ -131,11 +175,13 @@ class RegionsToName:
         return replace(sighting, id=self._next_id - 1)
 
     def _with_view(self, region: Region, view: RegionView) -> Region:
+        if view.quality < self.config.least_quality:
+            return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
         return replace(region, views=tuple(views[: self.config.views]))
 
     def _is_due(self, region: Region) -> bool:
-        if region.is_settled or region.questions >= self.config.most_questions:
+        if region.sure >= self.config.settled or region.questions >= self.config.most_questions:
             return False
         if region.questions == 0:
             return len(region.views) >= self.config.views_first

@@ -1,4 +1,4 @@
-"""The labels of a map while it grows: what is claimed of each keyframe, folded in once."""
+"""What is known of a map beside its shape: the labels of its Gaussians, and its objects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -8,16 +8,24 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.views import View
 
+from .association import MapView
 from .consistency import Disagreement
-from .labelling import Claims, LabellingConfig, label_keyframe
+from .label_images import reliable_image
+from .labelling import Claims, Labelled, LabellingConfig, label_keyframe
 from .labels import BACKGROUND, MOST_LABELS, top_labels
+from .naming import Naming, NamingConfig
+from .objects import Objects, ObjectsConfig, Observed
+from .regions_to_name import Region
 from .vocabulary import Vocabulary
 
 
 @dataclass(frozen=True, slots=True)
 class SemanticMapConfig:
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
+    objects: ObjectsConfig = field(default_factory=ObjectsConfig)
+    naming: NamingConfig = field(default_factory=NamingConfig)
     most_names: int = MOST_LABELS  # of the vocabulary; a later name is `other`
     most_waiting: int = 8  # keyframes whose boxes came before they were mapped: as many as may be
     # on their way to the mapper
@@ -27,95 +35,212 @@ class SemanticMapConfig:
             raise ConfigError(f"{self}: most_waiting at least 0, most_names up to {MOST_LABELS}.")
 
 
+@dataclass(frozen=True, slots=True)
+class Learnt:
+    """What a keyframe told, and which of its regions a labeller is to be asked about."""
+
+    keyframe: int
+    observed: Observed
+    asked: tuple[Region, ...] = ()
+
+
+NOTHING = Claims.of_detector(np.zeros((0, 4), np.float32), *np.zeros((2, 0), np.float32))
+
+
 class SemanticMap:
     """Labels the Gaussians of a MapBuilder, which keeps what each keyframe measured and where it
-    is now.
+    is now, and finds objects among them. What is claimed of a keyframe is folded in once; what a
+    labeller says of a part of it, later, when it is said.
 
     Deterministic as the builder is. Where nothing is ever claimed, the map stays bit for bit as it
     is without this class.
     """
 
-    def __init__(self, config: SemanticMapConfig | None = None, *, threads: int = 1) -> None:
+    def __init__(
+        self,
+        map_: MapBuilder,
+        config: SemanticMapConfig | None = None,
+        *,
+        has_labeller: bool = False,
+        threads: int = 1,
+    ) -> None:
+        """`has_labeller`: there is somebody to be asked for names."""
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.most_names)
-        self._threads = threads
+        self.objects = Objects(self.config.objects)
+        self.naming = Naming(self.config.naming) if has_labeller else None
+        self._map, self._threads = map_, threads
+        self._by_detector, self._by_labeller = set[int](), set[int]()  # labels they gave
         self._done: set[int] = set()  # keyframes
-        self._waiting: dict[int, Claims] = {}  # by keyframe, the first to come first
+        self._waiting: dict[int, Claims | None] = {}  # by keyframe, the first to come first
         self._disagreement = Disagreement(0.0, 0.0)
         self._boxes = self._repeated = self._too_early = self._without_images = 0
+        self._answers_without_images = 0
+
+    @property
+    def is_used(self) -> bool:
+        """Something was claimed."""
+        return bool(self._done or self._waiting)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Of the labels; none before anything was claimed."""
-        return self.vocabulary.names if self._done or self._waiting else ()
+        return self.vocabulary.names if self.is_used else ()
 
-    def claim(self, map_: MapBuilder, keyframe: int, claims: Claims) -> None:
-        """What is in a keyframe. It waits until the keyframe is mapped; said again, it is left
-        out."""
+    # --- keyframes --------------------------------------------------------------------------------
+    def claim(self, keyframe: int, claims: Claims | None) -> Learnt | None:
+        """What a detector found in a keyframe; None: nobody looked. It waits until the keyframe is
+        mapped; said again, it is left out."""
+        if claims is None and self.naming is None:
+            return None
         if keyframe in self._done or keyframe in self._waiting:
             self._repeated += 1
-        elif keyframe in map_.views:
-            self._label(map_, keyframe, claims)
+        elif keyframe in self._map.views:
+            return self._learn(keyframe, claims)
         else:
             self._waiting[keyframe] = claims
             while len(self._waiting) > self.config.most_waiting:
                 del self._waiting[next(iter(self._waiting))]
                 self._too_early += 1
+        return None
 
-    def mapped(self, map_: MapBuilder, keyframe: int) -> None:
-        """A keyframe is in the map: label what waits for it."""
-        claims = self._waiting.pop(keyframe, None)
-        if claims is not None:
-            self._label(map_, keyframe, claims)
+    def mapped(self, keyframe: int) -> Learnt | None:
+        """A keyframe is in the map: learn what waits for it."""
+        if keyframe not in self._waiting:
+            return None
+        return self._learn(keyframe, self._waiting.pop(keyframe))
 
-    def _label(self, map_: MapBuilder, keyframe: int, claims: Claims) -> None:
+    def _learn(self, keyframe: int, found: Claims | None) -> Learnt | None:
         """Its images may be forgotten by now, then nobody can tell what is in the boxes."""
         self._done.add(keyframe)
-        if not map_.views.is_readable(keyframe):
+        if not self._map.views.is_readable(keyframe):
             self._without_images += 1
-            return
-        view = map_.views[keyframe]
-        indices = map_.made_by(keyframe)
-        before = map_.gaussians.labels[indices]
+            return None
+        view = self._map.views[keyframe]
+        # who makes its image
+        made_by = self._map.made_by(keyframe)
+        # what is said of it, and what is to be asked
+        claims, asked = self._with_names(view, made_by.top, found or NOTHING)
+        # what they are
+        labelled = self._label(view, made_by.indices, claims, is_late=found is None)
+        self._boxes += len(claims.boxes)
+        self._disagreement = labelled.disagreement
+        # which objects they are
+        seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims.boxes)
+        return Learnt(keyframe, self.objects.observe(seen, self._spared()), asked)
+
+    def _with_names(
+        self, view: View, top: np.ndarray, claims: Claims
+    ) -> tuple[Claims, tuple[Region, ...]]:
+        """With what a labeller said before of what is there; what it is asked now."""
+        self._by_detector.update(claims.labels.astype(int).tolist())
+        if self.naming is None:
+            return claims, ()
+        is_labelled = reliable_image(self._map.gaussians.labels, top, self.naming.config.reliable)
+        T_map_keyframe = self._map.views.poses
+        claims, questions = self.naming.see(
+            view, claims, self.vocabulary, is_labelled, T_map_keyframe
+        )
+        return claims, tuple(question.region for question in questions)
+
+    def _spared(self) -> np.ndarray | None:
+        """[256] bool, labels that only the labeller gave: a detector cannot miss them."""
+        if not self._by_labeller:
+            return None
+        labels = np.arange(MOST_LABELS)
+        return np.isin(labels, [*self._by_labeller]) & ~np.isin(labels, [*self._by_detector])
+
+    def _label(
+        self, view: View, indices: np.ndarray, claims: Claims, *, is_late: bool = False
+    ) -> Labelled:
+        gaussians = self._map.gaussians
+        before = gaussians.labels[indices]
         labelled = label_keyframe(
-            map_.gaussians.rows,
-            map_.gaussians.labels,
+            gaussians.rows,
+            gaussians.labels,
             indices,
             view.camera,
             view.T_map_camera,
             view.depth_m,
             claims,
             self.config.labelling,
+            is_late=is_late,
+            spared=self._spared(),
             threads=self._threads,
         )
-        is_new = np.any(map_.gaussians.labels[indices] != before, axis=1)
-        map_.relabelled(indices[is_new])
-        self._boxes += len(claims.boxes)
-        self._disagreement = labelled.disagreement
+        is_new = np.any(gaussians.labels[indices] != before, axis=1)
+        self._map.relabelled(indices[is_new])
+        return labelled
+
+    def _map_view(
+        self, view: View, indices: np.ndarray, regions: np.ndarray, boxes: np.ndarray
+    ) -> MapView:
+        gaussians = self._map.gaussians
+        at = view.keyframe, view.camera, view.T_map_camera
+        known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
+        return MapView(*at, *known, indices, regions, boxes, view.depth_m)
+
+    # --- answers ----------------------------------------------------------------------------------
+    def answer(self, region: int, keyframe: int, label: str, confidence: float) -> bool:
+        """What a labeller takes a region for, as that keyframe showed it; whether it was folded in.
+
+        Without the images of the keyframe nobody can tell which Gaussians are meant.
+        """
+        claims = self.naming and self.naming.answered(
+            region, keyframe, label, confidence, self.vocabulary
+        )
+        if claims is None:
+            return False
+        if not self._map.views.is_readable(keyframe):
+            self._answers_without_images += 1
+            return False
+        self._by_labeller.update(claims.open_labels.tolist())
+        indices = self._map.made_by(keyframe).indices
+        self._label(self._map.views[keyframe], indices, claims, is_late=True)
+        self.refresh()
+        return True
+
+    # --- the map changes --------------------------------------------------------------------------
+    def moved(self, T_new_old: Mapping[int, np.ndarray]) -> None:
+        """Keyframes were corrected, and the map with them: see `Objects.move`."""
+        self.objects.move(T_new_old)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Objects are what has become of their Gaussians."""
+        gaussians = self._map.gaussians
+        rows, labels = gaussians.rows, gaussians.labels
+        self.objects.refresh(rows, labels, gaussians.ids, gaussians.anchors)
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
         """All but the labels, which the map has."""
         return {
             "vocabulary": self.vocabulary.packed,
+            "objects": self.objects.packed,
             "done": np.array(sorted(self._done), np.int64),
-            "waiting": [
-                (keyframe, [getattr(claims, f.name) for f in fields(claims)])
-                for keyframe, claims in self._waiting.items()
-            ],
+            "waiting": [(keyframe, _packed(claims)) for keyframe, claims in self._waiting.items()],
+            "naming": self.naming and self.naming.packed,
+            "given": [sorted(self._by_detector), sorted(self._by_labeller)],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self.vocabulary = Vocabulary.unpacked(state["vocabulary"])
+        self.objects = Objects.unpacked(state["objects"], self.config.objects)
         self._done = set(state["done"].tolist())
-        self._waiting = {keyframe: Claims(*arrays) for keyframe, arrays in state["waiting"]}
+        self._waiting = {
+            keyframe: Claims(*arrays) if arrays else None for keyframe, arrays in state["waiting"]
+        }
+        self._by_detector, self._by_labeller = map(set, state["given"])
+        if self.naming and state["naming"]:
+            self.naming = Naming.unpacked(state["naming"], self.config.naming)
 
-    def statistics(self, map_: MapBuilder) -> dict[str, float]:
+    def statistics(self) -> dict[str, float]:
         """`label_disagreement` is that of the newest keyframe labelled, summed over its Gaussians:
         `_literal` as the paper prints it, `_expected` as it is made smaller."""
         labelled = 0
         if self._boxes:
-            labelled = int(np.count_nonzero(top_labels(map_.gaussians.labels) != BACKGROUND))
+            labelled = int(np.count_nonzero(top_labels(self._map.gaussians.labels) != BACKGROUND))
         return {
             "gaussians_labelled": labelled,  # of those awake
             "keyframes_labelled": len(self._done),
@@ -127,4 +252,13 @@ class SemanticMap:
             "label_disagreement_expected": self._disagreement.expected,
             "label_names": len(self.names),
             "label_names_refused": self.vocabulary.refused,
+            **self.objects.statistics(),
+            **(self.naming.statistics() if self.naming else {}),
+            "answers_without_images": self._answers_without_images,  # of keyframes forgotten
         }
+
+
+def _packed(claims: Claims | None) -> list[np.ndarray]:
+    """Arrays of a detector's claims; none where nobody looked."""
+    names = [f.name for f in fields(Claims) if f.name != "parts"]
+    return [getattr(claims, name) for name in names] if claims else []

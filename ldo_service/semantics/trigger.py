@@ -7,7 +7,7 @@ candidate is followed from keyframe to keyframe by where it is, see `regions_to_
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -49,13 +49,15 @@ class TriggerConfig:
 class Candidate:
     """A region that nobody has a reliable name for.
 
-    box_px [4], x0 y0 x1 y1; part, what of the box it is; label and score of the detector, if any
+    box_px [4], x0 y0 x1 y1; part, what of the box it is; number, label and score of the detector's
+    box, if it is one
     """
 
     box_px: np.ndarray
     part: Foreground
     label: str = ""
     score: float = 0.0
+    number: int | None = None
 
 
 def candidates(
@@ -66,6 +68,7 @@ def candidates(
     found: Surfaces,
     camera: Camera,
     is_labelled: np.ndarray,
+    apart: Sequence[Candidate],
     config: TriggerConfig,
 ) -> list[Candidate]:
     """Regions of a keyframe that a labeller should see, the largest first.
@@ -73,6 +76,7 @@ def candidates(
     boxes_px, labels, scores  [M, 4], M, [M] of the detector
     depth_m, found            [H, W], 0 where it is missing, and its surfaces
     is_labelled               [H, W] bool: the map has a reliable name for what this pixel shows
+    apart                     its objects, as `standing_apart` finds them
 
     The same arguments give the same candidates.
     """
@@ -84,23 +88,61 @@ def candidates(
             foreground(boxes_px[i], depth_m, found, camera, config.foreground),
             labels[i],
             float(scores[i]),
+            i,
         )
         for i in hesitant
     ]
     explained = is_labelled | _painted(boxes_px[is_sure], depth_m.shape)
     for candidate in asked:
         explained = explained | candidate.part.image(depth_m.shape)
-    for share in config.structure_shares:
-        apart = [Candidate(_box(p), p) for p in depth_objects(depth_m, found, share, config)]
-        asked += [
-            candidate
-            for candidate in apart
-            if _is_worth_a_look(candidate, depth_m.shape, config)
-            and _share(explained, candidate.part) < config.explained
-            and all(_iou(candidate.box_px, a.box_px) < config.same_iou for a in asked)
-        ]
+    unexplained = [one for one in apart if _share(explained, one.part) < config.explained]
+    asked += [one for one in unexplained if _is_new(one, [a.box_px for a in asked], config)]
     worth = [c for c in asked if _is_worth_a_look(c, depth_m.shape, config)]
     return sorted(worth, key=lambda c: -np.count_nonzero(c.part.mask))[: config.most]
+
+
+def named_objects(
+    boxes_px: np.ndarray,
+    is_labelled: np.ndarray,
+    apart: Sequence[Candidate],
+    config: TriggerConfig,
+) -> list[Candidate]:
+    """Those of the objects `apart` that the map has a reliable name for, is_labelled [H, W] bool,
+    and no box [M, 4] is drawn about."""
+    return [
+        one
+        for one in apart
+        if _share(is_labelled, one.part) >= config.explained
+        and _is_new(one, list(boxes_px), config)
+    ]
+
+
+def standing_apart(depth_m: np.ndarray, found: Surfaces, config: TriggerConfig) -> list[Candidate]:
+    """Objects that depth [H, W] sets apart from structure, each once. What stands on one is no part
+    of it."""
+    out: list[Candidate] = []
+    for share in config.structure_shares:
+        parts = depth_objects(depth_m, found, share, config)
+        known = [one.box_px for one in out]
+        finer = [
+            one
+            for one in (Candidate(_box(part), part) for part in parts)
+            if _is_worth_a_look(one, depth_m.shape, config) and _is_new(one, known, config)
+        ]
+        stands = np.any([one.part.image(depth_m.shape) for one in finer], axis=0) if finer else None
+        out = [one if stands is None else _without(one, stands) for one in out] + finer
+    return out
+
+
+def _without(one: Candidate, others: np.ndarray) -> Candidate:
+    """Its part but for the pixels of others [H, W] bool."""
+    part, (height, width) = one.part, one.part.mask.shape
+    here = others[part.row : part.row + height, part.column : part.column + width]
+    return replace(one, part=Foreground(part.row, part.column, part.mask & ~here))
+
+
+def _is_new(one: Candidate, boxes_px: Sequence[np.ndarray], config: TriggerConfig) -> bool:
+    return all(_iou(one.box_px, box_px) < config.same_iou for box_px in boxes_px)
 
 
 def hesitant_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConfig) -> list[int]:

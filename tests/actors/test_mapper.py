@@ -67,7 +67,7 @@ def deltas_of(messages) -> list[MapDelta]:
 
 def followed(messages, follower: MapFollower | None = None) -> MapFollower:
     follower = follower or MapFollower()
-    for message in messages:
+    for message in changes(messages):
         follower.take(message)
     return follower
 

@@ -13,7 +13,7 @@ from ldo_service.datasets.synthetic.cast import View
 from ldo_service.datasets.synthetic.path import look_at
 from ldo_service.datasets.synthetic.solids import Solid
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.geometry import Camera, RgbdFrame
+from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.semantics.association import MapView
 from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
 from ldo_service.semantics.labels import new_labels
@@ -89,6 +89,22 @@ def shoot(things: Sequence[Thing], T_world_camera: np.ndarray, index: int = 0) -
     frame = RgbdFrame(color.reshape(*size, 3), depth_m, CAMERA, index * 10**8, index)
     instances = np.maximum(hits.surface - 5, 0).reshape(size)
     return Shot(frame, T_world_camera, instances)
+
+
+def true_things(p_map: np.ndarray, things: Sequence[Thing], way: np.ndarray) -> np.ndarray:
+    """Number of the thing [N] on whose true surface each point [N, 3] lies, within 3 cm of the
+    depth that some pose sees of it; -1 of the room's."""
+    p_map = p_map.astype(float)
+    out = np.full(len(p_map), -1)
+    for T in way:
+        shot = shoot(things, T)
+        camera, p = shot.frame.camera, se3.transform(se3.inverse(T), p_map)
+        u, v = np.rint(camera.project(np.maximum(p, [-np.inf, -np.inf, 0.1]))).astype(int).T
+        inside = (p[:, 2] > 0.1) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        at = np.flatnonzero(inside)
+        on = np.abs(shot.frame.depth_m[v[at], u[at]] - p[at, 2]) < 0.03
+        out[at[on]] = np.maximum(out[at[on]], shot.instances[v[at[on]], u[at[on]]] - 1)
+    return out
 
 
 @dataclass

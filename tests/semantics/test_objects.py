@@ -12,7 +12,7 @@ from ldo_service.semantics.labels import fields
 from ldo_service.semantics.landmarks import believed, entropies, rows_of
 from ldo_service.semantics.objects import Objects, ObjectsConfig
 
-from .staged import NAMES, SHELL, THINGS, Claims, Shot, Stage, Thing, poses, shoot
+from .staged import NAMES, SHELL, THINGS, Claims, Shot, Stage, Thing, poses, shoot, true_things
 
 COUCH, VASE, BALL = THINGS[0], THINGS[2], THINGS[5]
 AHEAD = poses(1)[0]
@@ -22,19 +22,7 @@ WAY = poses(40)
 
 
 def true_gaussians(stage: Stage, things: tuple[Thing, ...], way: np.ndarray) -> np.ndarray:
-    """Number of the thing [N] on whose true surface each Gaussian lies, within 3 cm of the depth
-    that some pose sees of it; -1 of the room's."""
-    p_map = stage.builder.gaussians.means.astype(float)
-    out = np.full(len(p_map), -1)
-    for T in way:
-        shot = shoot(things, T)
-        camera, p = shot.frame.camera, se3.transform(se3.inverse(T), p_map)
-        u, v = np.rint(camera.project(np.maximum(p, [-np.inf, -np.inf, 0.1]))).astype(int).T
-        inside = (p[:, 2] > 0.1) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        at = np.flatnonzero(inside)
-        on = np.abs(shot.frame.depth_m[v[at], u[at]] - p[at, 2]) < 0.03
-        out[at[on]] = np.maximum(out[at[on]], shot.instances[v[at[on]], u[at[on]]] - 1)
-    return out
+    return true_things(stage.builder.gaussians.means, things, way)
 
 
 @pytest.fixture(scope="module")

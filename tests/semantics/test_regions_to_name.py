@@ -51,7 +51,7 @@ class Walk:
         self.T_map_keyframe[keyframe] = moved(at_x_m)
         depth_m = np.full(SHAPE, 2.0, np.float32)
         args = keyframe, found, color, depth_m, CAMERA, self.T_map_keyframe
-        return [region.id for region in self.regions.see(*args)]
+        return [question.region.id for question in self.regions.see(*args).questions]
 
 
 def test_a_region_is_asked_about_when_it_was_seen_twice() -> None:
@@ -103,9 +103,34 @@ def test_a_confident_answer_settles_it_and_another_does_not() -> None:
         walk = Walk()
         walk.see(thing(), color=blurred)
         walk.see(thing(), color=blurred)
-        walk.regions.answered(0, confidence)
+        walk.regions.answered(0, "cup", confidence)
         assert walk.see(thing()) == more
-    walk.regions.answered(99, 1.0)
+    walk.regions.answered(99, "cup", 1.0)
+
+
+def test_what_was_said_of_a_region_is_told_where_it_is_seen_again() -> None:
+    walk = Walk()
+    walk.see(thing())
+    walk.see(thing())
+    walk.regions.answered(0, "teapot", 0.5)
+    walk.regions.answered(0, "kettle", 0.4)
+    keyframe, depth_m = 2, np.full(SHAPE, 2.0, np.float32)
+    walk.T_map_keyframe[keyframe] = moved()
+    at = COLOR, depth_m, CAMERA, walk.T_map_keyframe
+    asked_about, known, other = thing(), thing(left=62), thing(left=120)
+    (opinion,) = walk.regions.see(keyframe, [asked_about], *at).opinions
+    assert (opinion.of, opinion.label, opinion.sure) == (asked_about, "teapot", 0.5)
+    seen = walk.regions.see(keyframe, [], *at, named=[known, other])
+    assert [(one.of, one.label) for one in seen.opinions] == [(known, "teapot")]
+    assert len(walk.regions) == 1, "what has a name already is no new region"
+
+
+def test_a_view_that_shows_nothing_is_not_shown() -> None:
+    walk = Walk()
+    flat = np.full_like(COLOR, 128)
+    assert [walk.see(thing(), color=flat) for _ in range(4)] == [[]] * 4
+    assert walk.see(thing()) == []
+    assert walk.see(thing()) == [0]
 
 
 def test_the_surest_opinion_of_the_detector_is_kept() -> None:
@@ -128,7 +153,8 @@ def test_the_region_not_seen_for_longest_is_forgotten() -> None:
 def test_what_has_no_depth_is_left_out() -> None:
     regions = RegionsToName(CONFIG)
     nothing = np.zeros(SHAPE, np.float32)
-    assert regions.see(0, [thing()], COLOR, nothing, CAMERA, {0: moved()}) == []
+    seen = regions.see(0, [thing()], COLOR, nothing, CAMERA, {0: moved()})
+    assert (seen.questions, seen.opinions) == ([], [])
     assert len(regions) == 0
 
 
@@ -150,16 +176,18 @@ def test_a_state_is_plain_and_goes_on_where_it_was() -> None:
 
 def test_a_question_shows_its_views_the_best_first() -> None:
     walk = Walk()
-    walk.see(thing(label="cup", score=0.5), color=np.full_like(COLOR, 128))
+    dull = np.full_like(COLOR, 128)
+    dull[::7] = 140
+    walk.see(thing(label="cup", score=0.5), color=dull)
     walk.see(thing())
     region = walk.regions.get(0)
     assert region is not None
     question = label_request_message(region, 77)
     assert (question.stamp_ns, question.region, question.keyframe) == (77, 0, 1)
     assert (question.label, question.score, question.box_px) == ("cup", 0.5, region.box_px)
-    sharp, flat = crops_of(question)
-    assert sharp.shape == flat.shape == (40, 40, 3)
-    assert sharp.std() > 20 > flat.std()
+    sharp, blurred = crops_of(question)
+    assert sharp.shape == blurred.shape == (40, 40, 3)
+    assert sharp.std() > 20 > blurred.std()
 
 
 # --- how good a view is ---------------------------------------------------------------------------

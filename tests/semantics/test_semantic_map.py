@@ -45,19 +45,21 @@ def claims(label: int = CHAIR) -> Claims:
 
 def labels_after(posed, order: Iterable[tuple[str, int]]) -> bytes:
     """Of the map, after keyframes were mapped ("map") and boxes came ("box") in that order."""
-    builder, semantics = MapBuilder(), SemanticMap(BY_BOX)
+    builder = MapBuilder()
+    semantics = SemanticMap(builder, BY_BOX)
     for what, keyframe in order:
         if what == "map":
             builder.add(*posed[keyframe], keyframe, 0)
-            semantics.mapped(builder, keyframe)
+            semantics.mapped(keyframe)
         else:
-            semantics.claim(builder, keyframe, claims())
+            semantics.claim(keyframe, claims())
     return builder.gaussians.labels.tobytes()
 
 
 def test_what_is_in_a_box_gets_its_label_and_the_rest_does_not(posed) -> None:
-    builder, semantics = built(posed[:1]), SemanticMap(BY_BOX)
-    semantics.claim(builder, 0, claims())
+    builder = built(posed[:1])
+    semantics = SemanticMap(builder, BY_BOX)
+    semantics.claim(0, claims())
     frame, T_map_camera = posed[0]
     p_camera = se3.transform(se3.inverse(T_map_camera), builder.gaussians.means)
     u, v = frame.camera.project(p_camera).T
@@ -66,8 +68,8 @@ def test_what_is_in_a_box_gets_its_label_and_the_rest_does_not(posed) -> None:
     top = top_labels(builder.gaussians.labels)
     assert np.mean(top[inside] == CHAIR) > 0.9
     assert np.mean(top[outside] == CHAIR) < 0.01
-    assert semantics.statistics(builder)["gaussians_labelled"] == np.count_nonzero(top)
-    assert semantics.statistics(builder)["label_disagreement_literal"] > 0
+    assert semantics.statistics()["gaussians_labelled"] == np.count_nonzero(top)
+    assert semantics.statistics()["label_disagreement_literal"] > 0
 
 
 def test_boxes_may_come_before_their_keyframe(posed) -> None:
@@ -83,18 +85,20 @@ def test_boxes_that_come_again_count_once(posed) -> None:
 
 
 def test_few_boxes_wait_for_keyframes_that_never_come(posed) -> None:
-    builder, semantics = built(posed[:1]), SemanticMap(replace(BY_BOX, most_waiting=2))
+    builder = built(posed[:1])
+    semantics = SemanticMap(builder, replace(BY_BOX, most_waiting=2))
     for keyframe in (7, 8, 9):
-        semantics.claim(builder, keyframe, claims())
-    assert semantics.statistics(builder)["boxes_too_early"] == 1
+        semantics.claim(keyframe, claims())
+    assert semantics.statistics()["boxes_too_early"] == 1
     assert [keyframe for keyframe, _ in semantics.snapshot()["waiting"]] == [8, 9]
 
 
 def test_boxes_of_a_forgotten_keyframe_are_counted_and_left_out(posed) -> None:
-    builder, semantics = built(posed[:2]), SemanticMap(BY_BOX)
+    builder = built(posed[:2])
+    semantics = SemanticMap(builder, BY_BOX)
     builder.views.store.keep_only([1])
-    semantics.claim(builder, 0, claims())
-    assert semantics.statistics(builder)["boxes_without_images"] == 1
+    semantics.claim(0, claims())
+    assert semantics.statistics()["boxes_without_images"] == 1
     assert not builder.gaussians.labels.any()
 
 
@@ -103,23 +107,24 @@ def test_late_boxes_find_gaussians_that_sleep(posed) -> None:
     far = se3.exp(np.array([0, 0, 0, 50.0, 0, 0])) @ T_map_camera
     sleep = SleepConfig(max_active=100, reach_m=8.0)
     builder = MapBuilder(MapBuilderConfig(sleep=sleep, recent_cameras=1))
-    awake, semantics = built([(frame, T_map_camera), (frame, far)]), SemanticMap(BY_BOX)
+    awake, semantics = built([(frame, T_map_camera), (frame, far)]), SemanticMap(builder, BY_BOX)
     for keyframe, T in enumerate((T_map_camera, far)):
         builder.add(frame, T, keyframe, 0)
     builder.changes(with_changed=True)
     builder.rest()
     assert builder.statistics()["gaussians_asleep"] > 100
-    semantics.claim(builder, 0, claims())
-    SemanticMap(BY_BOX).claim(awake, 0, claims())
+    semantics.claim(0, claims())
+    SemanticMap(awake, BY_BOX).claim(0, claims())
     assert builder.gaussians.labels.any()
     assert builder.gaussians.labels.tobytes() == awake.gaussians.labels.tobytes()
 
 
 def test_only_gaussians_with_other_labels_are_told_again(posed) -> None:
-    builder, semantics = built(posed[:1]), SemanticMap(BY_BOX)
+    builder = built(posed[:1])
+    semantics = SemanticMap(builder, BY_BOX)
     builder.changes(with_changed=True)
     before = builder.gaussians.labels.copy()
-    semantics.claim(builder, 0, claims())
+    semantics.claim(0, claims())
     is_new = np.any(builder.gaussians.labels != before, axis=1)
     assert np.count_nonzero(is_new) > 100
     changed = builder.changes(with_changed=True).changed
@@ -127,11 +132,12 @@ def test_only_gaussians_with_other_labels_are_told_again(posed) -> None:
 
 
 def test_labels_leave_what_the_map_looks_like(posed) -> None:
-    plain, labelled, semantics = MapBuilder(), MapBuilder(), SemanticMap(BY_BOX)
+    plain, labelled = MapBuilder(), MapBuilder()
+    semantics = SemanticMap(labelled, BY_BOX)
     for keyframe, (frame, T_map_camera) in enumerate(posed):
         for builder in (plain, labelled):
             builder.add(frame, T_map_camera, keyframe, 3)
-        semantics.claim(labelled, keyframe, claims())
+        semantics.claim(keyframe, claims())
     assert labelled.gaussians.labels.any()
     assert labelled.gaussians.rows.tobytes() == plain.gaussians.rows.tobytes()
 
@@ -140,26 +146,28 @@ def test_labels_leave_what_the_map_looks_like(posed) -> None:
 def test_any_number_of_threads_gives_the_same_bits(posed, threads: int) -> None:
     one, many = built(posed), built(posed, threads=threads)
     for builder, count in ((one, 1), (many, threads)):
-        semantics = SemanticMap(threads=count)
+        semantics = SemanticMap(builder, threads=count)
         for keyframe in range(len(posed)):
-            semantics.claim(builder, keyframe, claims())
+            semantics.claim(keyframe, claims())
     assert one.gaussians.labels.any()
     assert one.gaussians.labels.tobytes() == many.gaussians.labels.tobytes()
 
 
 def test_a_successor_goes_on_with_labels_names_and_what_waits(posed, tmp_path: Path) -> None:
-    builder, semantics = built(posed[:2], folder=tmp_path), SemanticMap(BY_BOX)
+    builder = built(posed[:2], folder=tmp_path)
+    semantics = SemanticMap(builder, BY_BOX)
     lamp = semantics.vocabulary.index("lava lamp")
-    semantics.claim(builder, 0, claims(lamp))
-    semantics.claim(builder, 2, claims(TABLE))
+    semantics.claim(0, claims(lamp))
+    semantics.claim(2, claims(TABLE))
     state = decode_state(encode_state([builder.snapshot(), semantics.snapshot()]))
-    successor, its_semantics = MapBuilder(folder=tmp_path), SemanticMap(BY_BOX)
+    successor = MapBuilder(folder=tmp_path)
+    its_semantics = SemanticMap(successor, BY_BOX)
     successor.restore(state[0])
     its_semantics.restore(state[1])
     for one, labels in ((builder, semantics), (successor, its_semantics)):
         one.add(*posed[2], 2, 0)
-        labels.mapped(one, 2)
-        labels.claim(one, 0, claims())
+        labels.mapped(2)
+        labels.claim(0, claims())
     assert its_semantics.vocabulary.find("lava lamp") == lamp
     assert set(top_labels(builder.gaussians.labels)) == {0, lamp, TABLE}
     assert builder.gaussians.labels.tobytes() == successor.gaussians.labels.tobytes()

@@ -10,7 +10,13 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.semantics import region_views, trigger
 from ldo_service.semantics.foreground import ForegroundConfig, surfaces
-from ldo_service.semantics.trigger import TriggerConfig, candidates, depth_objects
+from ldo_service.semantics.trigger import (
+    TriggerConfig,
+    candidates,
+    depth_objects,
+    named_objects,
+    standing_apart,
+)
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 WALL_M, NEAR_M = 3.0, 2.0
@@ -30,7 +36,8 @@ def asked(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config=CO
     boxes = np.reshape(np.array(boxes, float), (-1, 4))
     found = surfaces(depth_m, CAMERA, config.foreground)
     scores = np.array(scores)
-    return candidates(boxes, labels, scores, depth_m, found, CAMERA, is_labelled, config)
+    apart = standing_apart(depth_m, found, config)
+    return candidates(boxes, labels, scores, depth_m, found, CAMERA, is_labelled, apart, config)
 
 
 THING = (60, 40, 89, 79)
@@ -76,6 +83,18 @@ def test_what_the_map_has_a_name_for_is_not_asked_about() -> None:
     is_labelled[:, :100] = True
     (found,) = asked(depth_m, is_labelled=is_labelled)
     assert found.box_px[0] > 100
+
+
+def test_what_the_map_has_a_name_for_is_found_again_where_no_box_is() -> None:
+    depth_m = wall_with(THING, (110, 40, 139, 79))
+    is_labelled = np.zeros((120, 160), bool)
+    is_labelled[:, :100] = True
+    apart = standing_apart(depth_m, surfaces(depth_m, CAMERA, CONFIG.foreground), CONFIG)
+    assert len(apart) == 2
+    none, box = np.zeros((0, 4)), np.array([[59.5, 39.5, 89.5, 79.5]])
+    (found,) = named_objects(none, is_labelled, apart, CONFIG)
+    assert found.box_px[2] < 100
+    assert named_objects(box, is_labelled, apart, CONFIG) == []
 
 
 def test_things_too_small_or_as_large_as_rooms_are_left_out() -> None:

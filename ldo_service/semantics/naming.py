@@ -1,0 +1,185 @@
+"""What an open-vocabulary labeller is asked, and what its answers are about (paper, III.B).
+
+An answer comes late. It speaks of the pixels that a keyframe showed of a region, so these are kept
+until then; and it stays with the region: where a later keyframe shows that again, the labeller has
+the same opinion of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.gaussians.views import View
+
+from .foreground import Foreground, surfaces
+from .labelling import Claims
+from .regions_to_name import Opinion, Question, RegionConfig, RegionsToName
+from .trigger import TriggerConfig, candidates, named_objects, standing_apart
+from .vocabulary import BACKGROUND, Vocabulary
+
+
+@dataclass(frozen=True, slots=True)
+class NamingConfig:
+    trigger: TriggerConfig = field(default_factory=TriggerConfig)
+    regions: RegionConfig = field(default_factory=RegionConfig)
+    reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
+    most_open: int = 96  # questions without an answer, some 10 kB each: the labeller has 32 regions
+    # waiting, and may be asked three times about each
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.reliable <= 1 or self.most_open < 1:
+            raise ConfigError(f"{self}: reliable must be within 0..1, most_open at least 1.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Asked:
+    """What a question was about: a part of a box in a keyframe, and the detector's word on it."""
+
+    box_px: np.ndarray
+    part: Foreground
+    label: str
+    score: float
+
+
+class Naming:
+    """Chooses what to ask, and knows what was asked. Bounded; the same calls give the same bits,
+    also after `unpacked`."""
+
+    def __init__(self, config: NamingConfig | None = None) -> None:
+        self.config = config or NamingConfig()
+        self._regions = RegionsToName(self.config.regions)
+        self._open: dict[tuple[int, int], Asked] = {}  # by region and keyframe, the oldest first
+        self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
+
+    # --- questions --------------------------------------------------------------------------------
+    def see(
+        self,
+        view: View,
+        claims: Claims,
+        vocabulary: Vocabulary,
+        is_labelled: np.ndarray,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> tuple[Claims, list[Question]]:
+        """The detector's claims of a keyframe with what is known of its regions, and what is to be
+        asked about them now.
+
+        is_labelled [H, W] bool: the map has a reliable name for this pixel
+        T_map_keyframe: where all keyframes are now
+        """
+        config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
+        labels = [vocabulary.name(int(label)) for label in claims.labels]
+        found = surfaces(depth_m, camera, config.foreground)
+        apart = standing_apart(depth_m, found, config)
+        doubtful = candidates(
+            *(claims.boxes, labels, claims.confidences),
+            *(depth_m, found, camera, is_labelled, apart, config),
+        )
+        named = named_objects(claims.boxes, is_labelled, apart, config)
+        color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
+        sightings = self._regions.see(
+            view.keyframe, doubtful, color, depth_m, camera, T_map_keyframe, named
+        )
+        for question in sightings.questions:
+            self._remember(question)
+        return with_opinions(claims, sightings.opinions, vocabulary), sightings.questions
+
+    def _remember(self, question: Question) -> None:
+        region, of = question.region, question.candidate
+        self._questions += 1
+        self._open[region.id, region.keyframe] = Asked(of.box_px, of.part, of.label, of.score)
+        while len(self._open) > self.config.most_open:
+            del self._open[next(iter(self._open))]
+            self._overdue += 1
+
+    # --- answers ----------------------------------------------------------------------------------
+    def answered(
+        self, region: int, keyframe: int, label: str, confidence: float, vocabulary: Vocabulary
+    ) -> Claims | None:
+        """What the labeller claims of that keyframe, with what the detector said of the same part.
+        None where it names nothing, or nobody asked."""
+        asked = self._open.pop((region, keyframe), None)
+        if asked is None:
+            self._unknown += 1
+            return None
+        is_name = confidence > 0 and vocabulary.find(label) != BACKGROUND
+        self._named += is_name
+        self._unnamed += not is_name
+        if not is_name:
+            return None
+        self._regions.answered(region, label, confidence)
+        said = vocabulary.index(label)
+        return Claims(
+            np.reshape(asked.box_px, (1, 4)).astype(np.float32),
+            np.array([vocabulary.index(asked.label) if asked.label else said]),
+            np.array([asked.score], np.float32),
+            np.array([said]),
+            np.array([confidence], np.float32),
+            (asked.part,),
+        )
+
+    # --- state ------------------------------------------------------------------------------------
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Plain values and arrays, for a state."""
+        return {
+            "regions": self._regions.packed,
+            "open": [[*key, *_packed(asked)] for key, asked in self._open.items()],
+        }
+
+    @staticmethod
+    def unpacked(packed: Mapping[str, Any], config: NamingConfig | None = None) -> "Naming":
+        """As it was."""
+        out = Naming(config)
+        out._regions = RegionsToName.unpacked(packed["regions"], out.config.regions)
+        out._open = {
+            (region, keyframe): _unpacked(*row) for region, keyframe, *row in packed["open"]
+        }
+        return out
+
+    def statistics(self) -> dict[str, float]:
+        return {
+            "regions_to_name": len(self._regions),
+            "questions": self._questions,
+            "questions_open": len(self._open),
+            "questions_overdue": self._overdue,  # given up for newer ones
+            "answers_named": self._named,
+            "answers_unnamed": self._unnamed,  # no opinion, or nobody could look
+            "answers_unknown": self._unknown,  # to questions given up, or said again
+        }
+
+
+def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocabulary) -> Claims:
+    """Claims of a detector with what a labeller said before of the same regions: of a box of the
+    detector beside its label, of other regions alone."""
+    labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
+    for opinion in opinions:
+        if (number := opinion.of.number) is not None:
+            labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
+    alone = [opinion for opinion in opinions if opinion.of.number is None]
+    said = np.array([vocabulary.index(opinion.label) for opinion in alone], np.int64)
+    boxes = np.array([opinion.of.box_px for opinion in alone], np.float32).reshape(-1, 4)
+    return Claims(
+        np.concatenate([claims.boxes, boxes]),
+        np.concatenate([claims.labels, said]),
+        np.concatenate([claims.confidences, np.zeros(len(alone), np.float32)]),
+        np.concatenate([labels, said]),
+        np.concatenate([confidences, np.array([one.sure for one in alone], np.float32)]),
+        (*[None] * len(claims.boxes), *[opinion.of.part for opinion in alone]),
+    )
+
+
+def _packed(asked: Asked) -> list[Any]:
+    part = asked.part
+    place = part.row, part.column, *part.mask.shape
+    return [asked.box_px, place, np.packbits(part.mask), asked.label, asked.score]
+
+
+def _unpacked(
+    box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, label: str, score: float
+) -> Asked:
+    row, column, height, width = place
+    mask = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
+    return Asked(box_px, Foreground(row, column, mask), label, score)
