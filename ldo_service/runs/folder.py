@@ -8,6 +8,7 @@ keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians that hang on keyframes in the map's frame
                         (those of segments that are not joined to the first are nowhere: left out)
 semantics.npz           what those Gaussians are, if a detector looked: see `semantics.saved`
+objects.json            the objects among them, if a detector looked: see `objects_file`
 places.msgpack          what `--localise` finds the camera by, at the newest poses
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
@@ -24,6 +25,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from ldo_service.actors.localiser import PLACES
@@ -38,6 +40,7 @@ from ldo_service.schemas import (
     DetectionBoxes,
     Keyframe,
     MapDelta,
+    MapObjects,
     MapSnapshot,
     Message,
     TrackedPose,
@@ -46,7 +49,7 @@ from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.saved import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
-from .objects_file import OBJECTS
+from .objects_file import OBJECTS, write_objects
 from .places import PlaceRecord
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
@@ -64,7 +67,7 @@ EXPORTED = {  # by `ldo export`, per format
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
-        *(PLACES, OBJECTS, SEMANTICS, f"{REFINED}/{SEMANTICS}"),
+        *(PLACES, OBJECTS, SEMANTICS, f"{REFINED}/{SEMANTICS}", f"{REFINED}/{OBJECTS}"),
         *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
@@ -128,6 +131,7 @@ class RunFolder:
         self._joined: dict[int, int] = {}  # segments placed in an older one
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.follower = MapFollower()
+        self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.corrections = 0
         self.boxes = 0  # that a detector found
@@ -151,6 +155,8 @@ class RunFolder:
                 self._joined = dict(message.joined)
             case DetectionBoxes():
                 self.boxes += len(message.detections)
+            case MapObjects():
+                self._objects = message
             case MapDelta() | MapSnapshot():
                 self.follower.take(message)
 
@@ -232,6 +238,8 @@ class RunFolder:
         if self.follower.label_names:
             names = self.follower.label_names
             write_semantics(folder / SEMANTICS, gaussians.labels[in_map], names)
+        if self._objects is not None:
+            write_objects(folder, self._placed_objects(self._objects))
         self._places.save(self.folder / PLACES, self._poses, self._joined)
 
     def online(self) -> Trajectory:
@@ -266,6 +274,16 @@ class RunFolder:
             }
             for keyframe, facts in self._keyframes.items()
         ]
+
+    def _placed_objects(self, found: MapObjects) -> MapObjects:
+        """Those first seen from a keyframe in the map's frame."""
+        keyframes = self._keyframes
+        placed = tuple(
+            one
+            for one in found.objects
+            if self._root(keyframes[one.first_keyframe]["segment"]) == 0
+        )
+        return msgspec.structs.replace(found, objects=placed)
 
 
 def _trajectory(frames: Sequence[TrackedFrame], T_map_camera: list[np.ndarray]) -> Trajectory:

@@ -1,6 +1,7 @@
 """The whole service in one event loop, recorded over the synthetic room."""
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -50,8 +51,10 @@ async def live(
     config: Config = CONFIG,
     count: int = FRAMES,
     prior: Trajectory | None = None,
+    until: Callable[[dict[str, Stage]], bool] = lambda _: True,
 ) -> None:
-    """Frame by frame, each behind its prior, then a soft stop, producers first."""
+    """Frame by frame, each behind its prior, then, once `until` holds of the stages by name, a soft
+    stop, producers first."""
     transport = MemoryTransport()
     actors = stages(folder, transport, config)
     camera = Outlet(Out(CAMERA_RGBD), "camera", 1, transport)
@@ -65,6 +68,7 @@ async def live(
                 await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_odom_base=pose))
             await send(camera, camera_rgbd_message(sequence.read(index)))
             await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
+        await eventually(lambda: until({stage.name: stage for stage in actors}))
         for stage, task in zip(actors, tasks, strict=True):
             stage.drain()
             await task

@@ -1,0 +1,42 @@
+"""Names from a server outside, recorded and lived again bit for bit without it."""
+
+import asyncio
+from pathlib import Path
+
+from ldo_service.config import load_config
+from ldo_service.datasets import Sequence
+from ldo_service.recordings.replay import open_recording
+from ldo_service.runtime.journal import Step
+from ldo_service.runtime.stage import Stage
+from ldo_service.schemas import LabelOpen, decode
+from ldo_service.testing import replay_recording
+from tests.runs.jobs import ROUGH
+from tests.semantics.labellers.server import says, serving
+
+from .conftest import live
+
+FRAMES = 12
+
+
+def has_answers(stages: dict[str, Stage]) -> bool:
+    inputs = stages["mapper"].health().inputs
+    return any(port.delivered for port in inputs if port.topic == "label/open")
+
+
+def names_taken(folder: Path) -> list[str]:
+    """By the mapper."""
+    (mapper,) = open_recording(folder, ("mapper",))
+    steps = [(f, s) for f in mapper.files for s in f.entries() if isinstance(s, Step)]
+    answers = [f.taken(step) for f, step in steps if step.topic == "label/open"]
+    return [decode(body, LabelOpen).label for body in answers]
+
+
+def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_path: Path) -> None:
+    with serving(says("samovar", 0.9)) as server:
+        settings = (ROUGH, f"vlm_labeller.url={server.url}")
+        config = load_config(settings=settings)
+        asyncio.run(live(tmp_path / "recording", room, config, FRAMES, until=has_answers))
+    assert "samovar" in names_taken(tmp_path / "recording")
+    replayed = replay_recording(tmp_path / "recording", "mapper", "vlm_labeller")
+    assert replayed["mapper"].made["label/request"] >= 1
+    assert replayed["mapper"].made["map/objects"] >= 1

@@ -1,0 +1,75 @@
+"""A run whose labeller is slow: the camera's poses and the map never wait for it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.datasets import Sequence
+from ldo_service.runs.finished import MapFolder
+from ldo_service.runs.folder import RunFolder
+from ldo_service.runs.objects_file import read_objects
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.semantics.labels import fields
+from tests.semantics.labellers.server import Server, hangs, says, sends, serving
+
+from .jobs import job
+
+FRAMES = 16
+QUICK = ("endpoint.timeout_s=0.2", "endpoint.attempts=1", "endpoint.per_minute=1000000000.0")
+
+
+def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -> RunFolder:
+    """With a labeller that answers so many frames late."""
+    settings = [f"run.vlm_labeller_latency_frames={latency}", "mapper.threads=1"]
+    if server:
+        settings += [f"vlm_labeller.http.{setting}" for setting in QUICK]
+        settings += [f"vlm_labeller.url={server.url}"]
+    return run_over_file(job(sequence, folder, *settings, frames=FRAMES), lambda _: None)
+
+
+@pytest.fixture(scope="module")
+def alone(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("alone") / "run"
+    run(room, folder, None, 0)
+    return folder
+
+
+def labelled(folder: Path) -> set[str]:
+    """Names that Gaussians of the map have."""
+    semantics = MapFolder(folder).semantics()
+    assert semantics is not None
+    rows = fields(semantics.labels)
+    return {semantics.names[k] for k in np.unique(rows["ids"][rows["weights"] > 0])}
+
+
+@pytest.mark.parametrize("latency", [0, 10])
+def test_answers_however_late_leave_poses_and_map_to_the_bit(
+    room: Sequence, tmp_path: Path, alone: Path, latency: int
+) -> None:
+    with serving(says("samovar", 0.9)) as server:
+        run(room, tmp_path / "run", server, latency)
+        assert server.asked
+    for name in ("trajectory_online.txt", "trajectory.txt", "map.ply", "keyframes.json"):
+        assert (tmp_path / "run" / name).read_bytes() == (alone / name).read_bytes(), name
+    assert labelled(tmp_path / "run") == {"samovar"}
+    names = {one.name for one in read_objects(tmp_path / "run").objects}
+    assert names <= {"samovar"}
+    assert not (alone / "objects.json").exists()
+
+
+@pytest.mark.parametrize(
+    "behaves",
+    [sends(500), says("I think it is a kind of thing", 0.9), hangs],
+    ids=["500", "nonsense", "hangs"],
+)
+def test_a_server_that_fails_leaves_the_run_as_it_is_and_names_nothing(
+    room: Sequence, tmp_path: Path, alone: Path, behaves
+) -> None:
+    with serving(behaves) as server:
+        run(room, tmp_path / "run", server, 5)
+        assert server.asked
+    for name in ("trajectory.txt", "map.ply"):
+        assert (tmp_path / "run" / name).read_bytes() == (alone / name).read_bytes(), name
+    assert labelled(tmp_path / "run") == set()
+    assert read_objects(tmp_path / "run").objects == ()
