@@ -71,7 +71,7 @@ GRAPH: tuple[Box, ...] = (
     ),
     _built(
         Mapper,
-        "keeps the map of Gaussians",
+        "keeps the map of Gaussians, and what stands in it",
         lambda config: Mapper(config.mapper, has_labeller=config.vlm_labeller.is_chosen),
     ),
     Box(

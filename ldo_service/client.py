@@ -193,10 +193,16 @@ class Client:
         return [_message(r.ok, _type_of(topic)) for r in replies if r.ok is not None]
 
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
-        """The objects of the map as of now. Raises ConfigError when nobody answers."""
+        """The objects of the map as of now. Raises ConfigError when nobody answers: a map without
+        a detector has none."""
         for message in self.last(MAP_OBJECTS, timeout_s):
             assert isinstance(message, MapObjects)
             return message
+        if "mapper" in self.alive():
+            raise ConfigError(
+                "the map has no objects yet, which takes a keyframe, and a detector that looked at "
+                "it: `ldo serve --set detector.model=...`; `ldo models` tells how."
+            )
         raise self._nobody("answers", MAP_OBJECTS)
 
     def alive(self, timeout_s: float = 1.0) -> set[str]:

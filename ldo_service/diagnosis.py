@@ -52,8 +52,7 @@ def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
             )
         yield from _of_steps(seen.health)
         yield from _of_failures(seen.health)
-        yield from _of_networks(seen.health)
-        yield from _of_labeller(seen.health)
+        yield from _of_models(seen.health)
 
 
 def _silent(how_long: str) -> Trouble:
@@ -87,29 +86,24 @@ def _of_failures(health: Health) -> Iterator[Trouble]:
         )
 
 
-def _of_networks(health: Health) -> Iterator[Trouble]:
-    if health.facts.get("networks_missing"):
-        yield Trouble(
-            "goes on without the network that it was told to use",
-            "the log of `ldo serve` says why; `ldo models list` shows those there are",
-        )
-    if failed := health.facts.get("inferences_failed"):
+def _of_models(health: Health) -> Iterator[Trouble]:
+    """Networks and labellers that an actor was told to use."""
+    facts = health.facts
+    for what in ("network", "labeller"):
+        if facts.get(f"{what}s_missing"):
+            yield Trouble(
+                f"goes on without the {what} that it was told to use",
+                "the log of `ldo serve` says why; `ldo models list` shows those there are",
+            )
+    if failed := facts.get("inferences_failed"):
         yield Trouble(
             f"had {failed:.0f} inferences fail, and these keyframes have no labels",
             "the log of `ldo serve` has the first of them; try detector.network.providers=[cpu]",
         )
-
-
-def _of_labeller(health: Health) -> Iterator[Trouble]:
-    if health.facts.get("labellers_missing"):
+    if facts.get("labeller_failing"):
         yield Trouble(
-            "goes on without the labeller that it was told to use",
-            "the log of `ldo serve` says why; `ldo models list` shows the pairs there are",
-        )
-    if health.facts.get("labeller_failing"):
-        failed = health.facts.get("labellings_failed", 0)
-        yield Trouble(
-            f"gets no answer from its labeller, {failed:.0f} regions so far stay unnamed",
+            f"gets no answer from its labeller, {facts.get('labellings_failed', 0):.0f} regions so "
+            "far stay unnamed",
             "the log of `ldo serve` has the first failure; is the server at vlm_labeller.url up?",
         )
 

@@ -1,4 +1,4 @@
-"""A name added to a live service."""
+"""Names in a live service: added while it runs, and from a labeller that is slow."""
 
 import subprocess
 from pathlib import Path
@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.schemas import LabelNames
+from ldo_service.schemas import LabelNames, MapDelta
 from ldo_service.schemas.topics import LABEL_NAMES
 from tests.semantics.labellers.encoders import ColorPair, vocabulary
+from tests.semantics.labellers.server import hangs, says, serving
 from tests.service.conftest import LDO, live_service, wait_until
 
 
@@ -37,3 +38,65 @@ def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
         wait_until(is_counted, 5, "counted")
         assert service.stop() == 0
         assert "Traceback" not in service.log
+
+
+ROUGH = ("--set", "mapper.iterations=2")
+
+
+def asking(url: str, *settings: str) -> tuple[str, ...]:
+    use = (f"vlm_labeller.url={url}", *(f"vlm_labeller.http.endpoint.{s}" for s in settings))
+    return (*ROUGH, *(word for setting in use for word in ("--set", setting)))
+
+
+@pytest.mark.timeout(300)
+def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path) -> None:
+    """The model says nothing else, and without the name on the list nobody would believe it."""
+    (tmp_path / "names.txt").write_text("red\n")
+    names = ("--set", f"vlm_labeller.names={tmp_path / 'names.txt'}")
+    with (
+        serving(says("fire hydrant", 0.9)) as server,
+        live_service(tmp_path, *asking(server.url), *names) as service,
+        service.client.listen("map/delta", MapDelta) as deltas,
+    ):
+        service.wait_for_actors()
+        with pytest.raises(ConfigError, match="no objects yet, which takes a keyframe"):
+            service.client.objects(timeout_s=1)
+        assert "fire hydrant" in service.client.add_label("fire hydrant")
+        publisher = service.publisher("synthetic:room", "--rate", "10", "--max-frames", "60")
+        told: set[str] = set()
+
+        def is_used() -> bool:
+            told.update(name for delta in deltas() for name in delta.label_names)
+            return "fire hydrant" in told
+
+        wait_until(is_used, 30, "used")
+        assert {one.name for one in service.client.objects().objects} <= {"fire hydrant"}
+        publisher.kill()
+        publisher.wait()
+        assert service.stop() == 0
+        assert "Traceback" not in service.log
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path) -> None:
+    """Every frame has its pose while it is busy; what it never says labels nothing."""
+    slow = asking("", "timeout_s=5.0", "attempts=1")
+    with serving(hangs) as server:
+        use = [word.replace("url=", f"url={server.url}") for word in slow]
+        with live_service(tmp_path, *use) as service:
+            service.wait_for_actors()
+            publisher = service.publisher("synthetic:room", "--rate", "10", "--max-frames", "60")
+            poses = service.wait_for_poses(40, timeout_s=30)
+            wait_until(lambda: len(server.asked) > 0, 10, "asked")
+            assert publisher.wait(60) == 0
+            assert {pose.status for pose in poses} == {"OK"}
+
+            def is_said() -> bool:
+                return service.update_health()["vlm_labeller"].facts.get("labeller_failing") == 1
+
+            wait_until(is_said, 15, "said")
+            assert service.client.objects().objects == ()
+            server.over.set()
+            assert service.stop() == 0
+            assert "Traceback" not in service.log
