@@ -28,6 +28,7 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.keyframe_links import KeyframeLinks
 from ldo_service.map_teller import MapTeller, Occasion, Pace
+from ldo_service.objects_teller import ObjectsTeller
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     AnchorMotion,
@@ -65,7 +66,6 @@ from ldo_service.wire import (
     keyframe_poses_of,
     label_request_message,
     mask_of,
-    objects_message,
     observation_messages,
     pose_message,
     rgbd_of,
@@ -157,6 +157,7 @@ class Mapper(Actor):
         self._semantics = SemanticMap(
             self._map, self.config.semantics, has_labeller=has_labeller, threads=threads
         )
+        self._objects_teller = ObjectsTeller()
         self._poses = KeyframePoses()
         self._links = KeyframeLinks(self._poses)
         self._teller = MapTeller(self._map, self.config.pace())
@@ -251,8 +252,8 @@ class Mapper(Actor):
         """All of them; nothing where nobody ever looked."""
         semantics = self._semantics
         if semantics.is_used:
-            versions = self._teller.version, self._poses.version
-            yield objects_message(semantics.objects, semantics.names, *versions, self._newest[0])
+            now = self._teller.version, self._poses.version, self._newest[0]
+            yield self._objects_teller.message(semantics.objects, semantics.names, *now)
 
     # --- corrections ------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> Iterator[Output]:
@@ -263,7 +264,7 @@ class Mapper(Actor):
         if motions:
             T_new_old = {m.keyframe: transform(m.T_new_old) for m in motions}
             self._map.move(T_new_old)
-            self._semantics.moved(T_new_old)
+            self._semantics.objects.move(T_new_old)
             yield self._teller.delta(self._now(), motions=motions)
             yield from self._objects()
 

@@ -264,15 +264,19 @@ def objects_message(
     objects: Objects, names: Sequence[str], version: int, graph_version: int, stamp_ns: int
 ) -> MapObjects:
     """All objects; `names` of the vocabulary."""
-    table = objects.landmarks
-    p = distributions(table)
-    columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
     return MapObjects(
         stamp_ns=stamp_ns,
         version=version,
         graph_version=graph_version,
-        objects=tuple(_object_message(*column, names) for column in columns),
+        objects=map_objects(objects.landmarks, names),
     )
+
+
+def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...]:
+    """Of landmarks [K], in their order."""
+    p = distributions(table)
+    columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
+    return tuple(_object_message(*column, names) for column in columns)
 
 
 def _object_message(

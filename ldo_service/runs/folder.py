@@ -39,7 +39,9 @@ from ldo_service.schemas import (
     Correction,
     DetectionBoxes,
     Keyframe,
+    LabelOpen,
     MapDelta,
+    MapObject,
     MapObjects,
     MapSnapshot,
     Message,
@@ -135,6 +137,7 @@ class RunFolder:
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.corrections = 0
         self.boxes = 0  # that a detector found
+        self.labeller_calls = 0  # regions that a labeller looked at
         self.newest_stamp_ns = 0
         self.summary: dict[str, Any] = {}
 
@@ -155,6 +158,8 @@ class RunFolder:
                 self._joined = dict(message.joined)
             case DetectionBoxes():
                 self.boxes += len(message.detections)
+            case LabelOpen():
+                self.labeller_calls += bool(message.labeller)
             case MapObjects():
                 self._objects = message
             case MapDelta() | MapSnapshot():
@@ -215,6 +220,10 @@ class RunFolder:
         """Which Gaussians [N] bool hang on keyframes in the map's frame."""
         placed = [k for k, facts in self._keyframes.items() if self._root(facts["segment"]) == 0]
         return np.isin(self.follower.map.anchors, placed)
+
+    def objects(self) -> tuple[MapObject, ...]:
+        """Those in the map; none where nobody looked."""
+        return self._placed_objects(self._objects).objects if self._objects else ()
 
     def labelled(self) -> int:
         """Gaussians in the map that are likelier something than background."""

@@ -53,6 +53,7 @@ def summarise(
         "gaussians_apart": int((~in_map).sum()),  # of segments never joined: in no file
         "gaussians_labelled": record.labelled(),  # as something else than background
         "boxes": record.boxes,
+        "objects": len(record.objects()),
         "fps": round((frames - rejected) / used.wall_s, 3),
         "wall_s": round(used.wall_s, 3),
         "cpu_s": round(used.cpu_s, 3),
@@ -61,7 +62,7 @@ def summarise(
         "drops": drops,
         "loops_accepted": 0,
         "loops_rejected": 0,
-        "vlm_calls": 0,
+        "vlm_calls": record.labeller_calls,
         "optimizations": record.corrections,
         "isa": kernels.isa(),
         "threads": os.cpu_count(),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import se3
+from ldo_service.geometry import Camera, se3
 
 from .association import (
     AssociationConfig,
@@ -314,10 +314,22 @@ class Objects:
             self._table[which] = table
 
     def refresh(
-        self, rows: np.ndarray, labels: np.ndarray, ids: np.ndarray, anchors: np.ndarray
+        self,
+        rows: np.ndarray,
+        labels: np.ndarray,
+        ids: np.ndarray,
+        anchors: np.ndarray,
+        seen_from: tuple[Camera, np.ndarray] | None = None,
     ) -> None:
-        """Derive all landmarks anew from the map: after corrections, late labels and refinement."""
-        self._derive(self._table, rows, labels, ids, anchors)
+        """Derive landmarks anew from the map, after corrections, late labels and refinement: all,
+        or those in the view of a camera at T_map_camera."""
+        which = np.arange(len(self._table))
+        if seen_from:
+            camera, T_map_camera = seen_from
+            which = np.flatnonzero(within(self._table, camera, se3.inverse(T_map_camera)))
+        table = self._table[which]
+        self._derive(table, rows, labels, ids, anchors)
+        self._table[which] = table
 
     # --- state ------------------------------------------------------------------------------------
     @property

@@ -195,22 +195,17 @@ class SemanticMap:
             self._answers_without_images += 1
             return False
         self._by_labeller.update(claims.open_labels.tolist())
-        indices = self._map.made_by(keyframe).indices
-        self._label(self._map.views[keyframe], indices, claims, is_late=True)
-        self.refresh()
+        view, indices = self._map.views[keyframe], self._map.made_by(keyframe).indices
+        self._label(view, indices, claims, is_late=True)
+        self.refresh(view)
         return True
 
-    # --- the map changes --------------------------------------------------------------------------
-    def moved(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Keyframes were corrected, and the map with them: see `Objects.move`."""
-        self.objects.move(T_new_old)
-        self.refresh()
-
-    def refresh(self) -> None:
-        """Objects are what has become of their Gaussians."""
+    def refresh(self, view: View | None = None) -> None:
+        """Make objects what has become of their Gaussians, or those that a keyframe may show."""
         gaussians = self._map.gaussians
-        rows, labels = gaussians.rows, gaussians.labels
-        self.objects.refresh(rows, labels, gaussians.ids, gaussians.anchors)
+        known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
+        seen_from = view and (view.camera, view.T_map_camera)
+        self.objects.refresh(*known, seen_from=seen_from)
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """A wall with a thing before it, as Gaussians of one pixel each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,11 @@ from ldo_service.gaussians import render
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
 from ldo_service.semantics.assignment import AssignmentConfig
+from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.fusion import FusionConfig
-from ldo_service.semantics.label_images import label_image, top_image
+from ldo_service.semantics.label_images import label_image, reliable_image, top_image
 from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
-from ldo_service.semantics.labels import fields, new_labels, top_labels
+from ldo_service.semantics.labels import LabelConfig, fields, new_labels, top_labels
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
 THING = slice(20, 44), slice(36, 60)
@@ -95,6 +98,41 @@ def test_a_late_answer_lands_on_the_thing_and_misses_nothing_else() -> None:
     np.testing.assert_array_equal(
         fields(labels)["misses"][outside], fields(once)["misses"][outside]
     )
+
+
+def test_a_late_answer_that_the_detector_outweighs_is_not_counted_again() -> None:
+    sure, doubt = claims(detector=0.9), claims(detector=0.9, labeller=0.3)
+    _, once = labelled(LabellingConfig(), sure)
+    _, labels = labelled(LabellingConfig(), sure, late=doubt)
+    np.testing.assert_array_equal(labels, once)
+
+
+def test_pixels_that_were_asked_about_are_labelled_whatever_else_is_in_the_box() -> None:
+    upper = Foreground(20, 36, np.ones((10, 24), bool))
+    _, labels = labelled(LabellingConfig(), replace(claims(0, 0.9), parts=(upper,)))
+    got = (top_labels(labels) == LAMP).reshape(64, 96)
+    assert np.mean(got[20:30, 36:60]) > 0.9
+    assert not got[32:].any()
+
+
+def test_a_detector_cannot_miss_what_it_does_not_know() -> None:
+    config = LabellingConfig(labels=LabelConfig(least_px=20))
+    rows, labels = labelled(config, late=claims(0, 0.9))
+    at = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
+    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    lamps, spared = labels.copy(), np.zeros(256, bool)
+    spared[LAMP] = True
+    for _ in range(9):
+        label_keyframe(rows, lamps, *at, nothing, config, spared=spared)
+        label_keyframe(rows, labels, *at, nothing, config)
+    assert np.mean(top_labels(lamps).reshape(64, 96)[thing()] == LAMP) > 0.9
+    assert not top_labels(labels).any(), "what it knows, it can miss"
+
+
+def test_a_pixel_has_a_reliable_name_where_its_gaussian_has() -> None:
+    labels, top = new_labels(3), np.array([[0, 1], [2, -1]])
+    fields(labels)["weights"][:2, 0], fields(labels)["ids"][:2, 0] = [0.7, 0.5], CHAIR
+    assert reliable_image(labels, top, 0.6).tolist() == [[True, False], [False, False]]
 
 
 def test_a_keyframe_without_claims_counts_misses_of_what_is_in_view() -> None:

@@ -12,7 +12,19 @@ from ldo_service.semantics.labels import fields
 from ldo_service.semantics.landmarks import believed, entropies, rows_of
 from ldo_service.semantics.objects import Objects, ObjectsConfig
 
-from .staged import NAMES, SHELL, THINGS, Claims, Shot, Stage, Thing, poses, shoot, true_things
+from .staged import (
+    CAMERA,
+    NAMES,
+    SHELL,
+    THINGS,
+    Claims,
+    Shot,
+    Stage,
+    Thing,
+    poses,
+    shoot,
+    true_things,
+)
 
 COUCH, VASE, BALL = THINGS[0], THINGS[2], THINGS[5]
 AHEAD = poses(1)[0]
@@ -245,6 +257,34 @@ def test_objects_go_with_their_gaussians() -> None:
     # beyond rounding: boxes, and with them strays, may be taken along other axes
     np.testing.assert_allclose(after["centroid"], expected, atol=0.02)
     assert after["id"].tolist() == before["id"].tolist()
+
+
+def test_only_what_a_camera_may_show_is_refreshed() -> None:
+    stage = Stage()
+    stand(stage, (BALL, VASE), 4)
+    gaussians, before = stage.builder.gaussians, stage.objects.landmarks
+    rows = gaussians.rows.copy()
+    rows[:, 0] += 0.01
+    now = rows, stage.labels(), gaussians.ids, gaussians.anchors
+    away = AHEAD @ np.diag([-1.0, 1, -1, 1])
+    stage.objects.refresh(*now, seen_from=(CAMERA, away))
+    np.testing.assert_array_equal(stage.objects.landmarks, before)
+    stage.objects.refresh(*now, seen_from=(CAMERA, AHEAD))
+    moved_m = stage.objects.landmarks["centroid"] - before["centroid"]
+    np.testing.assert_allclose(moved_m, np.tile([0.01, 0, 0], (2, 1)), atol=2e-3)
+
+
+def test_what_the_detector_does_not_know_is_missed_only_where_its_place_is_empty() -> None:
+    stage, spared = Stage(Objects(ObjectsConfig(min_side_px=10))), np.zeros(256, bool)
+    stand(stage, (BALL,), 4)
+    spared[BALL.label] = True
+    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    for there, missed in (((BALL,), 0), ((), 1)):
+        shot = shoot(there, AHEAD, stage.keyframe)
+        stage.builder.add(shot.frame, shot.T_map_camera, stage.keyframe, 0)
+        stage.objects.observe(stage.view(shot, nothing), spared)
+        stage.keyframe += 1
+        assert stage.objects.landmarks["missed"].tolist() == [missed]
 
 
 def test_objects_whose_gaussians_sleep_stay_what_they_are() -> None:
