@@ -14,11 +14,12 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.views import View
 
+from .class_names import normalised
 from .foreground import Foreground, surfaces
 from .labelling import Claims
-from .regions_to_name import Opinion, Question, RegionConfig, RegionsToName
+from .regions_to_name import Answer, Opinion, Question, RegionConfig, RegionsToName
 from .trigger import TriggerConfig, candidates, named_objects, standing_apart
-from .vocabulary import BACKGROUND, Vocabulary
+from .vocabulary import Vocabulary
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,8 @@ class NamingConfig:
     trigger: TriggerConfig = field(default_factory=TriggerConfig)
     regions: RegionConfig = field(default_factory=RegionConfig)
     reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
+    structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")  # no objects, whoever
+    # says so: they stay background
     most_open: int = 96  # questions without an answer, some 10 kB each: the labeller has 32 regions
     # waiting, and may be asked three times about each
 
@@ -36,10 +39,13 @@ class NamingConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Asked:
-    """What a question was about: a part of a box in a keyframe, and the detector's word on it."""
+    """What a question was about: a part of a box in a keyframe, where it was in that camera's frame
+    [3] and how large, and the detector's word on it."""
 
     box_px: np.ndarray
     part: Foreground
+    p_camera: np.ndarray
+    size_m: float
     label: str
     score: float
 
@@ -89,7 +95,9 @@ class Naming:
     def _remember(self, question: Question) -> None:
         region, of = question.region, question.candidate
         self._questions += 1
-        self._open[region.id, region.keyframe] = Asked(of.box_px, of.part, of.label, of.score)
+        place = region.p_camera, region.size_m
+        asked = Asked(of.box_px, of.part, *place, of.label, of.score)
+        self._open[region.id, region.keyframe] = asked
         while len(self._open) > self.config.most_open:
             del self._open[next(iter(self._open))]
             self._overdue += 1
@@ -104,13 +112,15 @@ class Naming:
         if asked is None:
             self._unknown += 1
             return None
-        is_name = confidence > 0 and vocabulary.find(label) != BACKGROUND
+        name = "" if normalised(label) in self.config.structure else label
+        answer = Answer(name, confidence, keyframe, asked.p_camera, asked.size_m)
+        self._regions.answered(region, answer)
+        is_name = bool(name) and confidence > 0
         self._named += is_name
         self._unnamed += not is_name
         if not is_name:
             return None
-        self._regions.answered(region, label, confidence)
-        said = vocabulary.index(label)
+        said = vocabulary.index(name)
         return Claims(
             np.reshape(asked.box_px, (1, 4)).astype(np.float32),
             np.array([vocabulary.index(asked.label) if asked.label else said]),
@@ -174,12 +184,11 @@ def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocab
 def _packed(asked: Asked) -> list[Any]:
     part = asked.part
     place = part.row, part.column, *part.mask.shape
-    return [asked.box_px, place, np.packbits(part.mask), asked.label, asked.score]
+    seen = asked.p_camera, asked.size_m, asked.label, asked.score
+    return [asked.box_px, place, np.packbits(part.mask), *seen]
 
 
-def _unpacked(
-    box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, label: str, score: float
-) -> Asked:
+def _unpacked(box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any) -> Asked:
     row, column, height, width = place
     mask = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
-    return Asked(box_px, Foreground(row, column, mask), label, score)
+    return Asked(box_px, Foreground(row, column, mask), *seen)

@@ -26,16 +26,29 @@ class RegionConfig:
     settled: float = 0.6  # of an answer that needs no second one
     near: float = 0.5  # of its size, between two sightings of a region
     least_quality: float = 0.02  # of a view: worse ones show a labeller nothing
+    alike: float = 0.5  # its size of what an answer spoke of, or the other way round, to be that
     most: int = 256  # regions; the one not seen for longest is forgotten
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
         if min(self.views, self.views_first, self.most_questions, self.most) < 1:
             raise ConfigError(f"{self}: counts must be at least 1.")
-        if not 0 <= self.least_quality <= 1:
-            raise ConfigError(f"{self}: least_quality must be within 0..1.")
+        if not (0 <= self.least_quality <= 1 and 0 <= self.alike <= 1):
+            raise ConfigError(f"{self}: least_quality and alike must be within 0..1.")
         if self.views_first > self.views or not (self.gain > 1 and self.near > 0):
             raise ConfigError(f"{self}: views_first at most views, gain over 1, near positive.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Answer:
+    """What a labeller takes a region for, 0..1 `sure`, and where and how large it was in the
+    keyframe it speaks of; no label: it is no object."""
+
+    label: str
+    sure: float
+    keyframe: int
+    p_camera: np.ndarray
+    size_m: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,7 +59,7 @@ class Region:
     views           the best, the best first
     label, score    of the surest detector so far
     questions       asked so far; `quality` of the views, summed, when it was asked last
-    name, sure      the labeller's surest answer
+    answer          the surest
     """
 
     id: int
@@ -59,8 +72,7 @@ class Region:
     score: float = 0.0
     questions: int = 0
     quality: float = 0.0
-    name: str = ""
-    sure: float = 0.0
+    answer: Answer | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -133,27 +145,47 @@ class RegionsToName:
                 quality = sum(view.quality for view in region.views)
                 region = replace(region, questions=region.questions + 1, quality=quality)
                 asked.append(Question(region, candidate))
-            opinions += self._keep(region, candidate)
+            self._keep(region)
+            opinions += self._said_of(region, sighting, candidate, T_map_keyframe)
         for candidate in named:
             sighting = _sighting(keyframe, candidate, depth_m, camera)
             region = sighting and self._same(sighting, T_map_keyframe, taken)
-            if sighting and region and region.name:
-                taken.add(region.id)
-                opinions += self._keep(_moved(region, sighting), candidate)
+            if sighting and region:
+                said = self._said_of(region, sighting, candidate, T_map_keyframe)
+                if said:
+                    taken.add(region.id)
+                    self._keep(_moved(region, sighting))
+                opinions += said
         self._forget()
         return Sightings(asked, opinions)
 
-    def _keep(self, region: Region, candidate: Candidate) -> list[Opinion]:
-        """As the one seen last; what was said of it."""
+    def _keep(self, region: Region) -> None:
+        """As the one seen last."""
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
-        return [Opinion(candidate, region.name, region.sure)] if region.name else []
 
-    def answered(self, region: int, label: str, confidence: float) -> None:
+    def _said_of(
+        self,
+        region: Region,
+        sighting: Region,
+        candidate: Candidate,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> list[Opinion]:
+        """The answer, where what is seen now is where that spoke of, and about as large: what
+        stands on a table is near enough to be the same region, and no table."""
+        answer = region.answer
+        if answer is None or not answer.label or answer.keyframe not in T_map_keyframe:
+            return []
+        small, large = sorted((answer.size_m, sighting.size_m))
+        gap_m = np.linalg.norm(_in_map(answer, T_map_keyframe) - _in_map(sighting, T_map_keyframe))
+        is_it = small >= self.config.alike * large and gap_m < self.config.near * small
+        return [Opinion(candidate, answer.label, answer.sure)] if is_it else []
+
+    def answered(self, region: int, answer: Answer) -> None:
         """The labeller has spoken of it; a confident answer needs no second one."""
         known = self._regions.get(region)
-        if known is not None and confidence > known.sure:
-            self._regions[region] = replace(known, name=label, sure=confidence)
+        if known is not None and answer.sure > (known.answer.sure if known.answer else 0):
+            self._regions[region] = replace(known, answer=answer)
 
     def _same(
         self, sighting: Region, T_map_keyframe: Mapping[int, np.ndarray], taken: set[int]
@@ -181,7 +213,8 @@ class RegionsToName:
         return replace(region, views=tuple(views[: self.config.views]))
 
     def _is_due(self, region: Region) -> bool:
-        if region.sure >= self.config.settled or region.questions >= self.config.most_questions:
+        is_settled = region.answer is not None and region.answer.sure >= self.config.settled
+        if is_settled or region.questions >= self.config.most_questions:
             return False
         if region.questions == 0:
             return len(region.views) >= self.config.views_first
@@ -209,13 +242,15 @@ class RegionsToName:
 def _packed(region: Region) -> dict[str, Any]:
     views = [{name: getattr(view, name) for name in RegionView.__slots__} for view in region.views]
     plain = {name: getattr(region, name) for name in Region.__slots__}
-    return {**plain, "p_camera": region.p_camera.tolist(), "views": views}
+    answer = region.answer and [getattr(region.answer, name) for name in Answer.__slots__]
+    return {**plain, "p_camera": region.p_camera.tolist(), "views": views, "answer": answer}
 
 
 def _unpacked(row: Mapping[str, Any]) -> Region:
     views = tuple(RegionView(**{**view, "box_px": tuple(view["box_px"])}) for view in row["views"])
     changed = {"box_px": tuple(row["box_px"]), "p_camera": np.array(row["p_camera"])}
-    return Region(**{**row, **changed, "views": views})
+    answer = row["answer"] and Answer(*row["answer"])
+    return Region(**{**row, **changed, "views": views, "answer": answer})
 
 
 def _sighting(
@@ -253,6 +288,6 @@ def _moved(region: Region, sighting: Region) -> Region:
     )
 
 
-def _in_map(region: Region, T_map_keyframe: Mapping[int, np.ndarray]) -> np.ndarray:
+def _in_map(region: Region | Answer, T_map_keyframe: Mapping[int, np.ndarray]) -> np.ndarray:
     T = T_map_keyframe[region.keyframe]
     return T[:3, :3] @ region.p_camera + T[:3, 3]

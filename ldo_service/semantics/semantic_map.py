@@ -123,7 +123,7 @@ class SemanticMap:
         claims, asked = self._with_names(view, made_by.top, found or NOTHING)
         # what they are
         labelled = self._label(view, made_by.indices, claims, is_late=found is None)
-        self._boxes += len(claims.boxes)
+        self._boxes += len(found.boxes) if found else 0
         self._disagreement = labelled.disagreement
         # which objects they are
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims.boxes)

@@ -298,6 +298,16 @@ def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:
     assert facts["label_names_refused"] >= 1
 
 
+def test_walls_and_floors_are_background_whoever_names_them() -> None:
+    mapper = Mapper(CONFIG, has_labeller=True)
+    made = walk(mapper, WAY[:4], known=())
+    for request in of(LabelRequest, made):
+        made += mapper.handle(answer(request, "Ceiling"))
+    made += mapper.finish()
+    assert not top_labels(followed(made).map.labels).any()
+    assert mapper.facts()["answers_unnamed"] > 0
+
+
 def test_an_answer_about_a_forgotten_keyframe_labels_nothing() -> None:
     mapper = Mapper(CONFIG, has_labeller=True)
     made = walk(mapper, WAY[:4], known=())

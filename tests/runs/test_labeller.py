@@ -48,13 +48,14 @@ def test_answers_however_late_leave_poses_and_map_to_the_bit(
     room: Sequence, tmp_path: Path, alone: Path, latency: int
 ) -> None:
     with serving(says("samovar", 0.9)) as server:
-        run(room, tmp_path / "run", server, latency)
-        assert server.asked
+        record = run(room, tmp_path / "run", server, latency)
+        assert record.summary["vlm_calls"] > 0
     for name in ("trajectory_online.txt", "trajectory.txt", "map.ply", "keyframes.json"):
         assert (tmp_path / "run" / name).read_bytes() == (alone / name).read_bytes(), name
     assert labelled(tmp_path / "run") == {"samovar"}
-    names = {one.name for one in read_objects(tmp_path / "run").objects}
-    assert names <= {"samovar"}
+    objects = read_objects(tmp_path / "run").objects
+    assert {one.name for one in objects} <= {"samovar"}
+    assert record.summary["objects"] == len(objects)
     assert not (alone / "objects.json").exists()
 
 

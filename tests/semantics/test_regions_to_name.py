@@ -16,7 +16,7 @@ from ldo_service.semantics.region_views import (
     region_view,
     sharpness_factor,
 )
-from ldo_service.semantics.regions_to_name import RegionConfig, RegionsToName
+from ldo_service.semantics.regions_to_name import Answer, RegionConfig, RegionsToName
 from ldo_service.semantics.trigger import Candidate
 from ldo_service.wire import crops_of, label_request_message
 
@@ -52,6 +52,13 @@ class Walk:
         depth_m = np.full(SHAPE, 2.0, np.float32)
         args = keyframe, found, color, depth_m, CAMERA, self.T_map_keyframe
         return [question.region.id for question in self.regions.see(*args).questions]
+
+    def answered(self, label: str, sure: float, region: int = 0) -> None:
+        """About the first region as it was seen last."""
+        seen = self.regions.get(0)
+        assert seen is not None
+        answer = Answer(label, sure, seen.keyframe, seen.p_camera, seen.size_m)
+        self.regions.answered(region, answer)
 
 
 def test_a_region_is_asked_about_when_it_was_seen_twice() -> None:
@@ -103,17 +110,17 @@ def test_a_confident_answer_settles_it_and_another_does_not() -> None:
         walk = Walk()
         walk.see(thing(), color=blurred)
         walk.see(thing(), color=blurred)
-        walk.regions.answered(0, "cup", confidence)
+        walk.answered("cup", confidence)
         assert walk.see(thing()) == more
-    walk.regions.answered(99, "cup", 1.0)
+    walk.answered("cup", 1.0, region=99)
 
 
 def test_what_was_said_of_a_region_is_told_where_it_is_seen_again() -> None:
     walk = Walk()
     walk.see(thing())
     walk.see(thing())
-    walk.regions.answered(0, "teapot", 0.5)
-    walk.regions.answered(0, "kettle", 0.4)
+    walk.answered("teapot", 0.5)
+    walk.answered("kettle", 0.4)
     keyframe, depth_m = 2, np.full(SHAPE, 2.0, np.float32)
     walk.T_map_keyframe[keyframe] = moved()
     at = COLOR, depth_m, CAMERA, walk.T_map_keyframe
@@ -122,7 +129,8 @@ def test_what_was_said_of_a_region_is_told_where_it_is_seen_again() -> None:
     assert (opinion.of, opinion.label, opinion.sure) == (asked_about, "teapot", 0.5)
     seen = walk.regions.see(keyframe, [], *at, named=[known, other])
     assert [(one.of, one.label) for one in seen.opinions] == [(known, "teapot")]
-    assert len(walk.regions) == 1, "what has a name already is no new region"
+    on_it, around_it = thing(left=70, top=50, side=10), thing(left=20, top=5, side=110)
+    assert walk.regions.see(keyframe, [on_it], *at, named=[around_it]).opinions == []
 
 
 def test_a_view_that_shows_nothing_is_not_shown() -> None:
