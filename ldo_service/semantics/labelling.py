@@ -146,7 +146,8 @@ def observations(
         claims.open_confidences[of],
         config.fusion,
     )
-    labels[hit], confidences[hit] = both.labels, both.confidences
+    labels[hit] = np.where(both.confidences > 0, both.labels, NOT_SEEN)
+    confidences[hit] = both.confidences
     if is_late:
         labels[np.flatnonzero(hit)[2 * both.by_detector >= both.confidences]] = NOT_SEEN
     corners = np.reshape(claims.boxes, (-1, 2, 2))

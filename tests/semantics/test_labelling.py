@@ -115,6 +115,12 @@ def test_pixels_that_were_asked_about_are_labelled_whatever_else_is_in_the_box()
     assert not got[32:].any()
 
 
+def test_by_the_detector_alone_what_only_the_labeller_says_is_not_heard() -> None:
+    rule, ema = FusionConfig(rule="detector"), LabelConfig(ema="paper")
+    _, labels = labelled(LabellingConfig(fusion=rule, labels=ema), claims(0, 0.9))
+    assert not labels[thing().ravel()].any()
+
+
 def test_a_detector_cannot_miss_what_it_does_not_know() -> None:
     config = LabellingConfig(labels=LabelConfig(least_px=20))
     rows, labels = labelled(config, late=claims(0, 0.9))
