@@ -1,16 +1,16 @@
 """The map of Gaussians.                                                        actors/mapper.py
 
-in   keyframe/new          Keyframe             Lossless(8)   a missing one is a hole in the map
-in   detection/boxes       DetectionBoxes       Lossless(8)   a keyframe without it has no labels
-in   label/open            LabelOpen            Latest(1 per region)   late by design
-in   graph/correction      Correction           Latest(1)     a versioned absolute state
-in   map/refine            MapRefine            Latest(1)     what was asked last
+in   keyframe/new          Keyframe             Lossless(8)       a missing one is a hole in the map
+in   detection/boxes       DetectionBoxes       Lossless(8)       without it there are no labels
+in   label/open            LabelOpen            Latest(1 per key) the newest look at a region
+in   graph/correction      Correction           Latest(1)         a versioned absolute state
+in   map/refine            MapRefine            Latest(1)         what was asked last
 out  map/view              ModelView            the map as rendered at the newest keyframe
 out  map/delta             MapDelta             what changed
 out  map/snapshot          MapSnapshot          the whole of it, in parts, now and then
 out  label/request         LabelRequest         what a labeller is to name, if there is one
-out  map/objects           MapObjects           what stands in it
-out  object/observation    ObjectObservation    where a keyframe shows them, or ought to
+out  map/objects           MapObjects           what stands in it, once somebody looked
+out  object/observation    ObjectObservation    where a keyframe shows that, or ought to
 out  keyframe/refinement   KeyframeRefinement   where the renderer wants the keyframes
 """
 
