@@ -29,6 +29,17 @@ def read_depth(path: Path) -> np.ndarray:
     return image
 
 
+def read_labels(path: Path, dtype: type[np.unsignedinteger]) -> np.ndarray:
+    """Numbers [H, W] of `dtype`, as stored. Raises FrameError with the path."""
+    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    if image.dtype != dtype or image.ndim != 2:
+        raise FrameError(
+            f"{path} is {image.dtype}{image.shape}: expected one number a pixel, "
+            f"{np.dtype(dtype).itemsize * 8} bits. Export the labels again as grey PNG."
+        )
+    return image
+
+
 def first_size(paths: list[Path]) -> tuple[int, int]:
     """Width and height of the first image that can be read. Raises the last one's FrameError."""
     for path in paths[:-1]:

@@ -4,6 +4,7 @@ results/frame*.jpg results/depth*.png    numbered images
 traj.txt                                 optional: 16 numbers a line, camera to world by rows
 cam_params.json                          here or one folder up: {"camera": {"w", "h", "fx",
                                          "fy", "cx", "cy", "scale"}}, scale in units per metre
+labels.json semantic_class/ instance/    optional: what the pixels show, see `replica_labels`
 """
 
 from pathlib import Path
@@ -15,8 +16,10 @@ from ldo_service.geometry import RawFrame, Trajectory, se3
 
 from .calibration import Calibration, number, pinhole, read_json
 from .images import read_color, read_depth
+from .labels import TrueLabels
 from .matrices import is_rigid
 from .numbered import numbered, paired
+from .replica_labels import ReplicaLabels
 from .sequence import Sequence
 
 
@@ -51,6 +54,9 @@ class ReplicaSequence(Sequence):
         lines = self._files.numbers if len(poses) > len(self) else np.arange(len(self))
         known = lines < len(poses)
         return Trajectory(self.stamps_ns[known] / 1e9, poses[lines[known]])
+
+    def true_labels(self) -> TrueLabels | None:
+        return ReplicaLabels(self._folder, self._files.numbers).read()
 
 
 def _calibration(folder: Path) -> Calibration:

@@ -7,6 +7,8 @@ import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, Rectifier, RgbdFrame, Trajectory
 
+from .labels import TrueLabels
+
 
 class Sequence(ABC):
     """RGB-D frames in order of their stamps, from one camera.
@@ -32,6 +34,10 @@ class Sequence(ABC):
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """True `T_world_camera`, in a world of the data set's choice; None where unknown."""
+
+    def true_labels(self) -> TrueLabels | None:
+        """What the pixels show; None where unknown. Raises DataError for files that are broken."""
+        return None
 
     @property
     def camera(self) -> Camera:
@@ -65,3 +71,6 @@ class Cached(Sequence):
 
     def truth(self) -> Trajectory | None:
         return self._sequence.truth()
+
+    def true_labels(self) -> TrueLabels | None:
+        return self._sequence.true_labels()

@@ -6,7 +6,7 @@ stands there; the two rooms are furnished differently. As in the single room, ev
 built from + - * / and square roots of float64 in a fixed order: the same bytes on every machine.
 """
 
-from .labels import CLASS_NAMES, COCO_COUNT, FrameLabels
+from .labels import CLASS_NAMES, COCO_COUNT
 from .sequence import NAMED, FlatConfig, FlatSequence
 from .thing import Thing
 
@@ -16,6 +16,5 @@ __all__ = [
     "NAMED",
     "FlatConfig",
     "FlatSequence",
-    "FrameLabels",
     "Thing",
 ]

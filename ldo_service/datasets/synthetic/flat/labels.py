@@ -1,9 +1,5 @@
 """The classes of the flat: those of COCO in their usual order, others, and the building."""
 
-from dataclasses import dataclass
-
-import numpy as np
-
 # Lin et al., ECCV 2014; numbered 0-79 as detectors number them.
 COCO = (
     "person bicycle car motorcycle airplane bus train truck boat traffic_light fire_hydrant "
@@ -24,15 +20,3 @@ BUILDING = "wall floor ceiling"
 CLASS_NAMES = tuple(name.replace("_", " ") for name in f"{COCO} {OTHERS} {BUILDING}".split())
 COCO_COUNT = len(COCO.split())
 WALL, FLOOR, CEILING = (CLASS_NAMES.index(name) for name in BUILDING.split())
-
-
-@dataclass(frozen=True, slots=True)
-class FrameLabels:
-    """What each pixel shows, exact at pixel centres as depth is.
-
-    class_ids      [H, W] uint8, index into CLASS_NAMES
-    instance_ids   [H, W] uint16, 0 for the building, i + 1 for thing i
-    """
-
-    class_ids: np.ndarray
-    instance_ids: np.ndarray

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ldo_service.datasets.labels import FrameLabels, TrueLabels
 from ldo_service.datasets.sequence import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 
 from .cache import FrameCache, StoredFrame
-from .labels import CLASS_NAMES, FrameLabels
+from .labels import CLASS_NAMES
 from .render import FlatRenderer
 from .scene import Flat, furnished_flat
 from .sensor import Sensor
@@ -92,6 +93,9 @@ class FlatSequence(Sequence):
         """True class and instance per pixel of frame `index`, exact even where depth is not."""
         frame = self._frame(index)
         return FrameLabels(frame.class_ids, frame.instance_ids)
+
+    def true_labels(self) -> TrueLabels:
+        return TrueLabels(CLASS_NAMES, self.labels)
 
     def truth(self) -> Trajectory:
         return Trajectory(self.stamps_ns / 1e9, self._T_world_camera.copy())
