@@ -9,6 +9,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.geometry import Trajectory
+from ldo_service.semantics.saved import SavedSemantics
 
 STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond, as float64 seconds
 
@@ -48,13 +49,14 @@ class Exposures:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedMap:
-    """A map [N, 16] (see `gaussians.model`), T_map_camera of the frames that are not LOST, and the
-    exposures of its keyframes."""
+    """A map [N, 16] (see `gaussians.model`), T_map_camera of the frames that are not LOST, the
+    exposures of its keyframes, and what its Gaussians are if a detector looked."""
 
     name: str  # online: at the end of the stream; refined: after further iterations
     rows: np.ndarray
     trajectory: Trajectory
     exposures: Exposures
+    semantics: SavedSemantics | None = None
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
         """[4, 4]. Raises DataError when there is none."""
@@ -77,6 +79,7 @@ class FinishedRun:
     estimates: dict[str, Trajectory]
     # one of the final poses, perhaps one of the refined; none of a run that localised
     maps: tuple[PosedMap, ...]
+    vlm_calls: int | None = None  # of the labeller; None where the run does not say
 
     def frame(self, index: int) -> RunFrame:
         return next(frame for frame in self.frames if frame.index == index)

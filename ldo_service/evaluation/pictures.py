@@ -94,6 +94,24 @@ def contact_sheet(
     return sheet
 
 
+def legend(entries: list[tuple[str, Color]], width_px: int) -> np.ndarray:
+    """Names beside their colours [H, width, 3] uint8, in as many lines as they take."""
+    places, x, line = [], MARGIN_PX // 2, 0
+    for name, _ in entries:
+        wide = 34 + 9 * len(name)
+        if x + wide > width_px and x > MARGIN_PX // 2:
+            x, line = MARGIN_PX // 2, line + 1
+        places.append((x, line))
+        x += wide
+    strip = np.full(((line + 1) * CAPTION_PX, width_px, 3), 255, np.uint8)
+    for (name, color), (x, line) in zip(entries, places, strict=True):
+        y = line * CAPTION_PX
+        cv2.rectangle(strip, (x - 6, y + 6), (x + 6, y + 18), color, cv2.FILLED)
+        cv2.rectangle(strip, (x - 6, y + 6), (x + 6, y + 18), INK)
+        _text(strip, name, (x + 12, y + 17))
+    return strip
+
+
 @dataclass(frozen=True, slots=True)
 class _Line:
     points_m: np.ndarray  # [K, 3]

@@ -54,7 +54,7 @@ def _note(one: ViewErrors, views: tuple[ViewErrors, ...]) -> str:
 def _pictures(view: RenderedView) -> list[np.ndarray]:
     range_m = _range_m(view)
     return [
-        _shrunk(picture)
+        shrunk(picture)
         for picture in (
             view.frame.color,
             view.picture,
@@ -76,7 +76,8 @@ def _range_m(view: RenderedView) -> tuple[float, float]:
     return depth_range(measured_m if measured_m.any() else view.rendering.depth_m)
 
 
-def _shrunk(image: np.ndarray) -> np.ndarray:
+def shrunk(image: np.ndarray) -> np.ndarray:
+    """At most WIDTH_PX wide."""
     height, width = image.shape[:2]
     if width <= WIDTH_PX:
         return image

@@ -32,11 +32,22 @@ def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
     }
     if not has_map:
         return FinishedRun(folder, frames, estimates, ())
+    calls = vlm_calls(folder)
     maps = [MapFolder(folder).posed("online")]
     if has_refined(folder):
         maps.append(MapFolder(folder / REFINED).posed("refined"))
         estimates["refined"] = maps[1].trajectory
-    return FinishedRun(folder, frames, estimates, tuple(maps))
+    return FinishedRun(folder, frames, estimates, tuple(maps), calls)
+
+
+def vlm_calls(folder: Path) -> int | None:
+    """How often the labeller was asked; None where summary.json does not say."""
+    path = folder / "summary.json"
+    try:
+        found = json.loads(path.read_text())["vlm_calls"] if path.is_file() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return found if isinstance(found, int) else None
 
 
 def newest_map(folder: Path) -> "MapFolder":
@@ -78,8 +89,11 @@ class MapFolder:
 
     def semantics(self) -> SavedSemantics | None:
         """What the Gaussians are, row by row; None where no detector looked."""
+        return self._semantics(len(self.gaussians()))
+
+    def _semantics(self, gaussians: int) -> SavedSemantics | None:
         path = self.folder / SEMANTICS
-        return read_semantics(path, len(self.gaussians())) if path.is_file() else None
+        return read_semantics(path, gaussians) if path.is_file() else None
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every frame that has a pose, after the last correction."""
@@ -100,7 +114,9 @@ class MapFolder:
             return Exposures(stamps_ns, matrices.reshape(-1, 2, 3))
 
     def posed(self, name: str) -> PosedMap:
-        return PosedMap(name, self.gaussians(), self.trajectory(), self.exposures())
+        rows = self.gaussians()
+        labels = self._semantics(len(rows))
+        return PosedMap(name, rows, self.trajectory(), self.exposures(), labels)
 
     @contextmanager
     def _keyframes(self) -> Iterator[tuple[Path, list[dict[str, Any]]]]:

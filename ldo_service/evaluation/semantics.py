@@ -1,0 +1,214 @@
+"""Labels of a run's map beside the truth, seen from where the run says the camera was."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service import datasets
+from ldo_service.datasets.labels import FrameLabels
+from ldo_service.errors import DataError
+from ldo_service.gaussians.render import render
+from ldo_service.geometry import RgbdFrame, Trajectory, se3
+from ldo_service.semantics.label_images import label_image
+from ldo_service.semantics.saved import SavedSemantics
+
+from .cross_view import Agreement, Correspondences, agreement, correspondences
+from .finished_run import FinishedRun, PosedMap, RunFrame
+from .label_lists import LabelList, coco_list, full_list, object_labels
+from .open_names import Found, OpenNames
+from .segmentation import Segmentation, confusion, segmentation
+from .views import Judged
+
+APART = 3  # frames, between views that ought to agree
+GATES = {"from 0.2 %": 0.002, "all": 0.0}  # share of the pixels that a class must have
+SAME_STAMP_S = 0.02  # of a true pose, as for trajectories
+
+PROTOCOL = """\
+Labels are rendered for the frames of A and B above, at the same poses: a pixel has the label s of
+the largest sum_i w_i p_i(s) over its Gaussians. Pixels of all frames are pooled. Those whose truth
+is void do not count; a name that is not in the list is wrong wherever it is shown.
+COCO: background and the classes of COCO among those of the source, by semantics/synonyms.yaml; all
+other classes are background. All names: background (wall, floor, ceiling) and every object of the
+source by its own name, or by COCO's where COCO has one. mIoU, accuracy and IoU by frequency are
+means over classes: those with 0.2 % of the pixels, and all that occur. Pixel accuracy is of all
+pixels. Per image: the mean over frames of mIoU over the classes that are in the frame.
+Consistency: of pixels labelled an object in either of two frames 3 apart, the share that has the
+same label in both, warped by measured depth and true poses (the run's own where none are known).
+Beyond COCO: objects whose name COCO has no class for, in frames where they have 0.5 % of the
+pixels. An object is called what most of its pixels are. Recall is of those that truly have such a
+name, precision of those that are called by one; below that, the same of pixels."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ListErrors:
+    """One list of names: confusions [C, C + 1] of each frame."""
+
+    labels: LabelList
+    frames: tuple[int, ...]
+    confusions: tuple[np.ndarray, ...]
+
+    @property
+    def pooled(self) -> np.ndarray:
+        return np.sum(self.confusions, axis=0)
+
+    def figures(self, gate: float) -> Segmentation:
+        """Of all pixels."""
+        return segmentation(self.pooled, gate)
+
+    def per_image_iou(self) -> float:
+        """The mean over frames; NaN without any that counts."""
+        ious = [segmentation(counts).mean_iou for counts in self.confusions]
+        return float(np.nanmean(ious)) if np.any(np.isfinite(ious)) else float("nan")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LabelErrors:
+    """One map."""
+
+    map: str
+    lists: tuple[ListErrors, ...]
+    consistency: Agreement
+    pairs: int  # of frames, that consistency is of
+    objects: Found  # with names beyond COCO
+    pixels: Found
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LabelView:
+    """frame, truth, and what the map shows [H, W] uint8 by its own labels.
+
+    Raises DataError for truth of another size.
+    """
+
+    frame: RgbdFrame
+    truth: FrameLabels
+    shown: np.ndarray
+
+    def __post_init__(self) -> None:
+        if not self.truth.class_ids.shape == self.truth.instance_ids.shape == self.shown.shape:
+            raise DataError(
+                f"the true labels of frame {self.frame.index} are {self.truth.class_ids.shape} and "
+                f"{self.truth.instance_ids.shape} pixels, the frame {self.shown.shape}: export "
+                "them at the size of the frames."
+            )
+
+
+class MapLabels:
+    """What a map says of frames."""
+
+    def __init__(
+        self, sequence: datasets.Sequence, posed: PosedMap, saved: SavedSemantics, threads: int
+    ) -> None:
+        self.name, self.names = posed.name, saved.names
+        self._sequence, self._posed, self._saved = sequence, posed, saved
+        self._threads = threads
+
+    def image(self, frame: RunFrame) -> np.ndarray:
+        """[H, W] uint8. Raises DataError for a frame without a pose."""
+        rows, camera, threads = self._posed.rows, self._sequence.camera, self._threads
+        T_camera_map = se3.inverse(self._posed.T_map_camera(frame))
+        made = render(rows, camera, T_camera_map, threads=threads, contributions=True)
+        return label_image(rows, self._saved.labels, made, camera, T_camera_map, threads=threads)
+
+
+class LabelJudge:
+    """Takes view after view of one map."""
+
+    def __init__(self, map_names: Sequence[str], class_names: Sequence[str]) -> None:
+        self._lists = (coco_list(class_names), full_list(class_names))
+        self._tables = [(x.of_truth(class_names), x.of_map(map_names)) for x in self._lists]
+        self._confusions: list[list[np.ndarray]] = [[] for _ in self._lists]
+        self._frames: list[int] = []
+        self._open = OpenNames(self._lists[1], map_names)
+        self._objects = object_labels(map_names)
+        self._agreement, self._pairs = Agreement(), 0
+
+    def see(self, view: LabelView) -> None:
+        self._frames.append(view.frame.index)
+        for labels, tables, seen in zip(self._lists, self._tables, self._confusions, strict=True):
+            truth, shown = tables[0][view.truth.class_ids], tables[1][view.shown]
+            seen.append(confusion(truth, shown, len(labels.names)))
+        self._open.add(view.truth, self._tables[1][0][view.truth.class_ids], view.shown)
+
+    def compare(self, first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> None:
+        """Labels of the map [H, W] in two views."""
+        images = self._objects[first], self._objects[second]
+        self._agreement += agreement(*images, pixels)
+        self._pairs += 1
+
+    def errors(self, name: str) -> LabelErrors:
+        lists = (
+            ListErrors(labels, tuple(self._frames), tuple(confusions))
+            for labels, confusions in zip(self._lists, self._confusions, strict=True)
+        )
+        found = self._open.objects, self._open.pixels
+        return LabelErrors(name, tuple(lists), self._agreement, self._pairs, *found)
+
+
+def evaluate_labels(
+    sequence: datasets.Sequence,
+    run: FinishedRun,
+    judged: Judged,
+    advance: Callable[[int], None],
+    *,
+    threads: int = 1,
+) -> list[LabelErrors]:
+    """Each labelled map; none where the run has no labels or the source no truth for them.
+
+    advance  called with the number of frames done
+    Raises DataError when a frame has no labels or no pose.
+    """
+    labels, maps = sequence.true_labels(), labelled_maps(sequence, run, threads)
+    if labels is None or not maps:
+        return []
+    judges = [LabelJudge(map_.names, labels.class_names) for map_ in maps]
+    pairs = Pairs(sequence, run)
+    for done, frame in enumerate(judged.posed, 1):
+        image, truth = sequence[frame.index], labels.frame(frame.index)
+        other, pixels = pairs.of(frame, image)
+        for map_, judge in zip(maps, judges, strict=True):
+            shown = map_.image(frame)
+            judge.see(LabelView(image, truth, shown))
+            if other is not None and pixels is not None:
+                judge.compare(shown, map_.image(other), pixels)
+        advance(done)
+    return [judge.errors(map_.name) for map_, judge in zip(maps, judges, strict=True)]
+
+
+def labelled_maps(
+    sequence: datasets.Sequence, run: FinishedRun, threads: int = 1
+) -> list[MapLabels]:
+    return [
+        MapLabels(sequence, posed, posed.semantics, threads)
+        for posed in run.maps
+        if posed.semantics is not None
+    ]
+
+
+class Pairs:
+    """Frames of a run that are three apart, by index, and both have a pose."""
+
+    def __init__(self, sequence: datasets.Sequence, run: FinishedRun) -> None:
+        self._sequence = sequence
+        self._by_index = {frame.index: frame for frame in run.frames if not frame.is_lost}
+        self._known = sequence.truth() or run.estimates["final"]
+
+    def of(
+        self, frame: RunFrame, image: RgbdFrame
+    ) -> tuple[RunFrame | None, Correspondences | None]:
+        """The later frame, and which pixels of it show what those of `image` do; None for both
+        where there is none."""
+        other = self._by_index.get(frame.index + APART)
+        T_first = _at(self._known, frame.stamp_ns)
+        T_second = None if other is None else _at(self._known, other.stamp_ns)
+        if other is None or T_first is None or T_second is None:
+            return None, None
+        T_second_first = se3.inverse(T_second) @ T_first
+        return other, correspondences(image, self._sequence[other.index], T_second_first)
+
+
+def _at(known: Trajectory, stamp_ns: int) -> np.ndarray | None:
+    gaps_s = np.abs(known.stamps_s - stamp_ns * 1e-9)
+    is_known = len(gaps_s) > 0 and gaps_s.min() <= SAME_STAMP_S
+    return known.T_world_camera[gaps_s.argmin()] if is_known else None
