@@ -10,14 +10,15 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.evaluation import trajectory, views
+from ldo_service.evaluation import semantics, trajectory, views
 from ldo_service.evaluation.lpips import Lpips
-from ldo_service.evaluation.results import Results, evaluate_run, plain
+from ldo_service.evaluation.results import Results, evaluate_run, plain, work
 from ldo_service.evaluation.trajectory import TrajectoryErrors
-from ldo_service.evaluation.views import Judged, RenderingErrors
+from ldo_service.evaluation.views import RenderingErrors
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.finished import read_run, written
 
+from .label_tables import label_table, open_table
 from .options import Json, Source
 from .progress import progress
 
@@ -42,9 +43,11 @@ def evaluate(
     ] = None,
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Judge a run: its trajectory by the truth of its source, its map by the frames.
+    """Judge a run: its trajectory by the truth of its source, its map by the frames, what its map
+    calls things by the labels of the source.
 
-    Prints the protocol above the figures, and draws trajectory.png and rendering.png into DIR.
+    Prints the protocol above the figures, and draws trajectory.png, rendering.png and labels.png
+    into DIR.
     `ldo run --hold-out 5` leaves frames to judge the map by that it was not made from. Of a source
     without ground truth the map alone is judged.
 
@@ -58,7 +61,7 @@ def evaluate(
     run = read_run(folder, has_map=not localised)
     sequence = open_source(source, config.data.options())
     run.require_source(sequence)
-    with progress("eval", len(Judged.of(run.frames).posed), Console(stderr=True)) as advance:
+    with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:
         print(json.dumps({**plain(results), "lpips": lpips and str(lpips)}, indent=1))
@@ -83,6 +86,7 @@ def print_results(results: Results, lpips: Path | None, localised: str = "") -> 
         console.print(NO_MAP.format(folder=localised), soft_wrap=True)
     else:
         _print_renderings(console, results, lpips)
+        _print_labels(console, results)
     console.print("Pictures: " + ", ".join(map(str, results.pictures)), soft_wrap=True)
 
 
@@ -92,6 +96,17 @@ def _print_renderings(console: Console, results: Results, lpips: Path | None) ->
     console.print(f"LPIPS by {lpips}." if lpips else NO_LPIPS, style="dim")
     if results.renderings:
         console.print(rendering_table(results.renderings, has_lpips=lpips is not None))
+
+
+def _print_labels(console: Console, results: Results) -> None:
+    """Nothing where neither the map nor the source has labels."""
+    if results.unlabelled:
+        console.print(results.unlabelled, style="dim")
+    if not results.labels:
+        return
+    console.print(semantics.PROTOCOL, style="dim")
+    console.print(label_table(results.labels))
+    console.print(open_table(results.labels, results.vlm_calls_per_frame))
 
 
 def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:

@@ -11,12 +11,17 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Trajectory
 
-from . import trajectory, views
+from . import semantics, trajectory, views
 from .finished_run import FinishedRun, at_stamps
+from .label_results import finite, plain_labels, sheet_of_labels
 from .pictures import save_picture, trajectory_picture
+from .semantics import LabelErrors, evaluate_labels
 from .sheet import rendering_sheet
 from .trajectory import TrajectoryErrors, evaluate_trajectory
 from .views import FIGURES, Distance, Judged, RenderedView, RenderingErrors, view_of
+
+NO_TRUTH = "The source does not say what its pixels show, so the labels of the map are not judged."
+NO_LABELS = "The map has no labels to judge: `ldo run --set detector.model=NAME` makes some."
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +29,9 @@ class Results:
     trajectories: dict[str, TrajectoryErrors] | None  # None without ground truth
     judged: Judged
     renderings: list[RenderingErrors]
+    labels: list[LabelErrors]  # of maps that have some, where the source says what is true
+    unlabelled: str  # what is missing where only one of them has labels
+    vlm_calls_per_frame: float | None  # None where the run does not say
     pictures: list[Path]
 
 
@@ -35,10 +43,12 @@ def evaluate_run(
     distance: Distance | None = None,
     threads: int = 1,
 ) -> Results:
-    """Judge the trajectories by the truth of the sequence, the maps by its frames, and draw both.
+    """Judge the trajectories by the truth of the sequence, the maps by its frames, their labels by
+    its labels, and draw them.
 
-    `distance` and `advance` as for `views.evaluate_rendering`. Raises DataError when a file does
-    not fit or nothing can be judged, ConfigError when a picture cannot be written.
+    `distance` and `advance` as for `views.evaluate_rendering`; `work` says how much there is to do.
+    Raises DataError when a file does not fit or nothing can be judged, ConfigError when a picture
+    cannot be written.
     """
     judged, truth = Judged.of(run.frames), sequence.truth()
     if truth is None and not (judged.posed and run.maps):
@@ -51,10 +61,42 @@ def evaluate_run(
     renderings = views.evaluate_rendering(
         sequence, judged, run.maps, advance, distance=distance, threads=threads
     )
+    rendered = len(judged.posed)
+    labels = evaluate_labels(
+        sequence, run, judged, lambda done: advance(rendered + done), threads=threads
+    )
     pictures = {"trajectory.png": trajectory_picture(run.estimates["final"], truth)}
     if renderings:
         pictures["rendering.png"] = sheet_of_newest(run, sequence, renderings, threads)
-    return Results(trajectories, judged, renderings, draw(run.folder, pictures))
+    if labels and (sheet := sheet_of_labels(run, sequence, labels[-1], threads)) is not None:
+        pictures["labels.png"] = sheet
+    drawn, calls = draw(run.folder, pictures), calls_per_frame(run)
+    missing = missing_labels(run, sequence)
+    return Results(trajectories, judged, renderings, labels, missing, calls, drawn)
+
+
+def work(run: FinishedRun, sequence: Sequence) -> int:
+    """Frames to render, those to label counted again."""
+    labelled = has_labels(run) and sequence.true_labels() is not None
+    return len(Judged.of(run.frames).posed) * (1 + labelled)
+
+
+def has_labels(run: FinishedRun) -> bool:
+    return any(posed.semantics is not None for posed in run.maps)
+
+
+def missing_labels(run: FinishedRun, sequence: Sequence) -> str:
+    """Why labels are not judged; empty where they are, and where there is nothing to judge."""
+    has_truth = sequence.true_labels() is not None
+    if has_labels(run) and not has_truth:
+        return NO_TRUTH
+    return NO_LABELS if run.maps and has_truth and not has_labels(run) else ""
+
+
+def calls_per_frame(run: FinishedRun) -> float | None:
+    if run.vlm_calls is None or not run.frames:
+        return None
+    return run.vlm_calls / len(run.frames)
 
 
 def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
@@ -97,10 +139,13 @@ def plain(results: Results) -> dict[str, Any]:
         "protocol": {
             "trajectory": trajectory.PROTOCOL,
             "rendering": views.PROTOCOL,
+            "labels": semantics.PROTOCOL,
             "frames": results.judged.counts(),
         },
         "trajectory": trajectories and {k: _plain_errors(v) for k, v in trajectories.items()},
         "rendering": [_plain_rendering(row) for row in results.renderings],
+        "labels": [plain_labels(row) for row in results.labels],
+        "vlm_calls_per_frame": results.vlm_calls_per_frame,
         "pictures": [str(path) for path in results.pictures],
     }
 
@@ -114,14 +159,10 @@ def _plain_rendering(row: RenderingErrors) -> dict[str, Any]:
         "map": row.map,
         "protocol": row.protocol,
         "frames": len(row.views),
-        "mean": {figure: _finite(row.mean(figure)) for figure in FIGURES},
-        "median": {figure: _finite(row.median(figure)) for figure in FIGURES},
+        "mean": {figure: finite(row.mean(figure)) for figure in FIGURES},
+        "median": {figure: finite(row.median(figure)) for figure in FIGURES},
         "per_frame": [
-            {"frame": view.frame, **{f: _finite(getattr(view, f)) for f in FIGURES}}
+            {"frame": view.frame, **{f: finite(getattr(view, f)) for f in FIGURES}}
             for view in row.views
         ],
     }
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and np.isfinite(value) else None

@@ -70,7 +70,7 @@ WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
         *(PLACES, OBJECTS, SEMANTICS, f"{REFINED}/{SEMANTICS}", f"{REFINED}/{OBJECTS}"),
-        *("trajectory.png", "rendering.png", "views.png"),  # by `ldo eval` and `ldo demo`
+        *("trajectory.png", "rendering.png", "labels.png", "views.png"),  # by `eval` and `demo`
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
     }

@@ -1,0 +1,275 @@
+"""A run over some frames of a staged room, labelled by its truth, or by something wrong."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.datasets.labels import FrameLabels
+from ldo_service.errors import DataError
+from ldo_service.evaluation.finished_run import FinishedRun, RunFrame
+from ldo_service.evaluation.label_results import frames_to_show, plain_labels
+from ldo_service.evaluation.open_names import Found
+from ldo_service.evaluation.results import NO_LABELS, NO_TRUTH
+from ldo_service.evaluation.semantics import GATES, LabelErrors, ListErrors, evaluate_labels
+from ldo_service.evaluation.views import Judged
+from ldo_service.gaussians.model import new_labels
+from ldo_service.geometry import se3
+from ldo_service.runs.finished import read_run
+from ldo_service.runs.folder import SEMANTICS
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.semantics.labels import fields
+from ldo_service.semantics.saved import write_semantics
+from ldo_service.semantics.synonyms import coco_class
+from ldo_service.semantics.vocabulary import Vocabulary
+from tests.commands.test_cli import ldo
+from tests.runs.jobs import job
+from tests.semantics import staged
+
+FRAMES, SCALE = 9, 5000
+THINGS = (
+    *(
+        replace(thing, name="desk") if thing.name == "dining table" else thing
+        for thing in staged.THINGS[:4]
+    ),
+    replace(staged.THINGS[4], name="speaker"),
+    replace(staged.THINGS[5], name="globe"),
+)
+CLASSES = ("undefined", "wall", *dict.fromkeys(thing.name for thing in THINGS))
+COCO, ALL_NAMES = range(2)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The staged room in Replica's layout, 128x96; its chair is void."""
+    folder = tmp_path_factory.mktemp("data") / "room"
+    for kind in ("results", "semantic_class", "instance"):
+        (folder / kind).mkdir(parents=True)
+    poses = staged.poses(100)[:FRAMES]
+    for k, T_world_camera in enumerate(poses):
+        write_shot(folder, k, staged.shoot(THINGS, T_world_camera, k))
+    np.savetxt(folder / "traj.txt", poses.reshape(FRAMES, 16))
+    names = {str(k): name for k, name in enumerate(CLASSES)}
+    names[str(CLASSES.index("chair"))] = "undefined"
+    (folder / "labels.json").write_text(json.dumps({"classes": names}))
+    camera = {name: getattr(staged.CAMERA, name) for name in ("fx", "fy", "cx", "cy")}
+    params = {"w": staged.CAMERA.width, "h": staged.CAMERA.height, **camera, "scale": SCALE}
+    (folder / "cam_params.json").write_text(json.dumps({"camera": params}))
+    return folder
+
+
+def write_shot(folder: Path, k: int, shot: staged.Shot) -> None:
+    classes = np.array([1, *(CLASSES.index(thing.name) for thing in THINGS)], np.uint8)
+    images = {
+        f"results/frame{k:06d}.png": shot.frame.color[..., ::-1],
+        f"results/depth{k:06d}.png": np.round(shot.frame.depth_m * SCALE).astype(np.uint16),
+        f"semantic_class/{k:06d}.png": classes[shot.instances],
+        f"instance/{k:06d}.png": shot.instances.astype(np.uint16),
+    }
+    for name, image in images.items():
+        cv2.imwrite(str(folder / name), image)
+
+
+@pytest.fixture(scope="module")
+def sequence(folder: Path) -> Sequence:
+    return open_sequence(str(folder))
+
+
+@pytest.fixture(scope="module")
+def unlabelled(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run") / "room"
+    run_over_file(job(sequence, folder, "tracker.hold_out=5"), lambda _done: None)
+    return folder
+
+
+@pytest.fixture
+def labelled(unlabelled: Path, sequence: Sequence, tmp_path: Path) -> Path:
+    """A copy whose Gaussians are what the pixels truly show that they lie on, by COCO's names where
+    it has some."""
+    folder = shutil.copytree(unlabelled, tmp_path / "run")
+    run, names = read_run(folder), Vocabulary()
+    labels = new_labels(len(run.maps[0].rows))
+    for frame in run.frames:
+        gaussians, class_ids = on_surfaces(sequence, run, frame)
+        truth = sequence.true_labels()
+        assert truth is not None
+        known = [
+            names.index(coco_class(name) or name) if is_thing(name) else 0
+            for name in truth.class_names
+        ]
+        fields(labels)["ids"][gaussians, 0] = np.array(known)[class_ids]
+        fields(labels)["weights"][gaussians, 0] = 1
+    write_semantics(folder / SEMANTICS, labels, names.names)
+    return folder
+
+
+def on_surfaces(
+    sequence: Sequence, run: FinishedRun, frame: RunFrame
+) -> tuple[np.ndarray, np.ndarray]:
+    """Gaussians whose depth is that of the pixel they lie on, and the classes of these pixels."""
+    shown, truth, posed = sequence[frame.index], sequence.true_labels(), run.maps[0]
+    assert truth is not None
+    p_camera = se3.transform(se3.inverse(posed.T_map_camera(frame)), posed.rows[:, :3])
+    u, v = np.rint(shown.camera.project(p_camera)).astype(int).T
+    height, width = shown.depth_m.shape
+    i = np.flatnonzero((p_camera[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
+    i = i[np.abs(shown.depth_m[v[i], u[i]] - p_camera[i, 2]) < 0.03]
+    return i, truth.frame(frame.index).class_ids[v[i], u[i]]
+
+
+def is_thing(name: str) -> bool:
+    return name not in ("", "undefined", "wall", "floor", "ceiling")
+
+
+def renamed(folder: Path, other: dict[str, str]) -> Path:
+    """The same labels, some by another name."""
+    saved = read_run(folder).maps[0].semantics
+    assert saved is not None
+    names = tuple(other.get(name, name) for name in saved.names)
+    write_semantics(folder / SEMANTICS, saved.labels, names)
+    return folder
+
+
+def errors_of(sequence: Sequence, folder: Path) -> LabelErrors:
+    run = read_run(folder)
+    (errors,) = evaluate_labels(sequence, run, Judged.of(run.frames), lambda _done: None)
+    return errors
+
+
+def test_a_map_that_knows_the_truth_is_nearly_right(sequence: Sequence, labelled: Path) -> None:
+    errors = errors_of(sequence, labelled)
+    coco, full = errors.lists
+    assert (coco.labels.name, full.labels.name) == ("COCO", "all names")
+    assert "chair" not in coco.labels.names, "void"
+    for row in errors.lists:
+        assert row.frames == (4, 0, 6), "held out, then every fifth of the others"
+        found = row.figures(GATES["from 0.2 %"])
+        assert found.mean_iou > 0.8
+        assert found.object_iou > 0.75
+        assert found.pixel_accuracy > 0.95
+        assert row.figures(0).classes >= found.classes >= 4
+        assert 0.7 < row.per_image_iou() <= 1
+    assert (errors.pairs, errors.consistency.share > 0.9) == (2, True), "0 to 3, and 4 to 7"
+    assert errors.objects == Found(right=2, wanted=2, named=2), "speaker and globe"
+    assert errors.pixels.recall > 0.9
+    assert errors.pixels.precision > 0.9
+
+
+def test_names_that_nobody_has_are_wrong_everywhere(sequence: Sequence, labelled: Path) -> None:
+    right = errors_of(sequence, labelled)
+    wrong = errors_of(sequence, renamed(labelled, {"couch": "elephant", "globe": "samovar"}))
+    couches, elephants = (row.lists[COCO].labels.names.index("couch") for row in (right, wrong))
+    assert right.lists[COCO].pooled[couches, couches] > 1000
+    assert wrong.lists[COCO].pooled[elephants, elephants] == 0
+    assert wrong.consistency == right.consistency, "which looks at no truth"
+    assert wrong.objects.named == right.objects.named
+    assert wrong.objects.right < right.objects.right
+    assert wrong.lists[ALL_NAMES].figures(0).pixel_accuracy < (
+        right.lists[ALL_NAMES].figures(0).pixel_accuracy - 0.05
+    )
+
+
+def test_a_detector_alone_names_nothing_beyond_coco(sequence: Sequence, labelled: Path) -> None:
+    saved = read_run(labelled).maps[0].semantics
+    assert saved is not None
+    labels = saved.labels.copy()
+    beyond = fields(labels)["ids"][:, 0] >= 82
+    fields(labels)["weights"][beyond] = 0
+    write_semantics(labelled / SEMANTICS, labels, saved.names[:82])
+    errors = errors_of(sequence, labelled)
+    assert errors.objects.recall == 0
+    assert np.isnan(errors.objects.precision)
+    assert errors.lists[COCO].figures(0).object_iou > 0.7
+
+
+def test_the_command_prints_protocol_and_tables_and_draws(
+    capsys, labelled: Path, folder: Path
+) -> None:
+    code, out, _ = ldo(capsys, "eval", labelled, folder)
+    assert code == 0
+    parts = ("PSNR dB", "Labels are rendered", "COCO, from 0.2 %", "all names, all", "consistency")
+    assert [out.index(part) for part in parts] == sorted(out.index(part) for part in parts)
+    sheet = cv2.imread(str(labelled / "labels.png"))
+    assert sheet is not None
+    assert sheet.shape[0] > 3 * 96, "a row for each frame"
+
+
+def test_json_has_every_figure_of_every_list(capsys, labelled: Path, folder: Path) -> None:
+    code, out, _ = ldo(capsys, "eval", labelled, folder, "--json")
+    assert code == 0
+    found = json.loads(out)
+    (row,) = found["labels"]
+    errors = errors_of(open_sequence(str(folder)), labelled)
+    assert row == json.loads(json.dumps(plain_labels(errors)))
+    assert row["lists"]["COCO"]["classes"]["couch"]["iou"] > 0.8
+    assert row["lists"]["COCO"]["all"]["mean_iou"] > 0.7
+    assert found["vlm_calls_per_frame"] == 0
+    assert "Consistency" in found["protocol"]["labels"]
+
+
+@pytest.mark.parametrize(
+    ("summary", "expected"),
+    [('{"vlm_calls": 3}', pytest.approx(1 / 3)), ("{}", None), ("[", None), (None, None)],
+)
+def test_calls_of_the_labeller_are_those_that_the_run_counted(
+    capsys, labelled: Path, folder: Path, summary: str | None, expected
+) -> None:
+    (labelled / "summary.json").unlink()
+    if summary is not None:
+        (labelled / "summary.json").write_text(summary)
+    _, out, _ = ldo(capsys, "eval", labelled, folder, "--json")
+    assert json.loads(out)["vlm_calls_per_frame"] == expected
+
+
+def test_without_labels_on_either_side_it_says_which(
+    capsys, unlabelled: Path, labelled: Path, folder: Path, tmp_path: Path
+) -> None:
+    run = shutil.copytree(unlabelled, tmp_path / "plain")
+    _, out, _ = ldo(capsys, "eval", run, folder)
+    assert NO_LABELS in " ".join(out.split())
+    assert not (run / "labels.png").exists()
+    untold = shutil.copytree(folder, tmp_path / "untold")
+    (untold / "labels.json").unlink()
+    _, out, _ = ldo(capsys, "eval", labelled, untold)
+    assert NO_TRUTH in " ".join(out.split())
+    assert "mIoU" not in out
+    _, out, _ = ldo(capsys, "eval", run, untold)
+    assert NO_TRUTH not in " ".join(out.split())
+    assert NO_LABELS not in " ".join(out.split())
+
+
+def test_labels_of_another_size_are_one_clear_error(
+    monkeypatch, sequence: Sequence, labelled: Path
+) -> None:
+    truth = sequence.true_labels()
+    assert truth is not None
+
+    def halved(index: int) -> FrameLabels:
+        whole = truth.frame(index)
+        return replace(whole, class_ids=whole.class_ids[::2])
+
+    monkeypatch.setattr(sequence, "true_labels", lambda: replace(truth, frame=halved))
+    with pytest.raises(DataError, match="export them at the size"):
+        errors_of(sequence, labelled)
+
+
+def test_the_frames_shown_go_from_the_worst_to_the_best() -> None:
+    def half_right(share: float) -> np.ndarray:
+        return np.array([[50, 0, 0], [round(100 * (1 - share)), round(100 * share), 0]])
+
+    shares = (0.5, 0.1, 0.9, 0.2, 0.6, 0.7, 0.3, 0.4)
+    nothing = np.array([[99, 1, 0], [0, 0, 0]])
+    rows = (*map(half_right, shares), nothing)
+    chosen = frames_to_show(ListErrors(None, tuple(range(10, 19)), rows), count=4)  # type: ignore[arg-type]
+    assert [frame for frame, _ in chosen] == sorted(frame for frame, _ in chosen)
+    notes = dict(chosen)
+    assert notes[11] == "frame 11: 10% right, the worst"
+    assert notes[12] == "frame 12: 90% right, the best"
+    assert len(chosen) == 4
+    assert 18 not in notes, "a frame with next to no object shows nothing"
+    assert frames_to_show(ListErrors(None, (3,), (nothing,))) == []  # type: ignore[arg-type]
