@@ -1,196 +1,164 @@
 """How well the map's labels agree with the truth, by rule, beside painting each frame alone.
 
     LDO_WEIGHTS=... python tests/bench/bench_labels.py SOURCE [--only TEXT] [--pictures DIR]
+                                                       [--fusion P] [--background NAME ...]
 
-SOURCE: a Replica folder with `semantic_class/`, `instance/`, `labels.json` and true poses. Every
-second frame is a keyframe, where it really was; labels are fused as the map grows and judged at the
-end, on all frames. Truth `undefined` is left out; classes that COCO has by another name are in
-SYNONYMS, all others are background. mIoU is over background and the classes that have 0.2 % of the
-pixels, and over all. Consistency: of pixels labelled an object in either of two frames 3 apart, the
-share that agrees when warped by true depth and pose.
+SOURCE: labelled, with true poses. Every second frame is a keyframe, where it really was; labels are
+fused as the map grows and judged at the end, on all frames, as `ldo eval` judges them: background
+and the classes of COCO, those that have 0.2 % of the pixels, in brackets all that occur.
+`--background` names classes that count as background whatever the synonyms say.
+
+"true boxes" are those of the true objects that cover 0.5 % of the pixels, each of score 1.
+
+`--fusion P` adds an oracle in the labeller's place, which knows the truth, and errs: of each region
+that the detector is less than 0.6 sure of, it says at once, and P sure, the true name of what most
+of its foreground shows, with probability P (seeded); else any other name of the source.
 """
 
 import argparse
-import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import cv2
 import numpy as np
-import onnxruntime
 
+from ldo_service.datasets.labels import FrameLabels, TrueLabels
+from ldo_service.evaluation.cross_view import Correspondences, correspondences
+from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
+from ldo_service.evaluation.label_sheet import LabelPicture, label_sheet
+from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelJudge, LabelView
 from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.render import Rendering
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.recordings.sequence import open_source
 from ldo_service.semantics.assignment import AssignmentConfig
-from ldo_service.semantics.foreground import ForegroundConfig, foreground, pixels_of, surfaces
+from ldo_service.semantics.detectors import OnnxDetector
+from ldo_service.semantics.foreground import (
+    ForegroundConfig,
+    Surfaces,
+    foreground,
+    pixels_of,
+    surfaces,
+)
+from ldo_service.semantics.fusion import FusionConfig
 from ldo_service.semantics.label_images import label_image, top_image
 from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
 from ldo_service.semantics.labels import LabelConfig, new_labels, top_labels
+from ldo_service.semantics.trigger import TriggerConfig
+from ldo_service.semantics.vocabulary import Vocabulary
 
-VOID, FIRST = 255, 2  # truth that does not count; the label of the first COCO class
-SYNONYMS = {
-    "bike": "bicycle",
-    "computer-keyboard": "keyboard",
-    "hair-dryer": "hair drier",
-    "indoor-plant": "pottedplant",
-    "monitor": "tvmonitor",
-    "phone": "cell phone",
-    "remote-control": "remote",
-    "table": "diningtable",
-    "tv-screen": "tvmonitor",
-}
-MIN_SCORE, MAX_IOU, GATE, STEP = 0.25, 0.45, 0.002, 3
-Detect = Callable[[np.ndarray], Claims]
+NETWORKS = {"YOLOX-Nano": "yolox_nano.onnx", "YOLOv5n": "yolov5n_480x640_w16.onnx"}
+TRUE_BOXES, LEAST_SHARE = "true boxes", 0.005
+DEFAULT = "foreground coverage corrected"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """frames, where they truly were, what they truly show; names of the labels."""
+
+    frames: list[RgbdFrame]
+    T_map_camera: np.ndarray
+    truth: TrueLabels
+    vocabulary: Vocabulary
+
+    @cached_property
+    def pairs(self) -> list[Correspondences]:
+        """Of each frame and the one that comes three later."""
+        T, frames = self.T_map_camera, self.frames
+        return [
+            correspondences(frames[k], frames[k + APART], se3.inverse(T[k + APART]) @ T[k])
+            for k in range(len(frames) - APART)
+        ]
+
+    @staticmethod
+    def of(source: str, most: int | None, background: Sequence[str]) -> "Scene":
+        sequence = open_source(source)
+        poses, truth = sequence.truth(), sequence.true_labels()
+        assert poses is not None, "needs true poses"
+        assert truth is not None, "needs true labels"
+        frames = [sequence[k] for k in range(len(sequence))[:most]]
+        T = np.asarray(poses.T_world_camera)[: len(frames)]
+        names = tuple("wall" if name in background else name for name in truth.class_names)
+        known = TrueLabels(names, truth.frame)
+        return Scene(frames, se3.inverse(T[0]) @ T, known, Vocabulary())
 
 
 # --- what is claimed ------------------------------------------------------------------------------
-def best(boxes: np.ndarray, scores: np.ndarray) -> Claims:
-    """Of centres and sizes [P, 4], px, and scores [P, 80]: those that suppress the others."""
-    label, score = scores.argmax(axis=1), scores.max(axis=1)
-    kept = score >= MIN_SCORE
-    corners = np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, 2:]], axis=1)[kept]
-    label, score = label[kept], score[kept]
-    chosen = cv2.dnn.NMSBoxesBatched(corners.tolist(), score.tolist(), label.tolist(), 0, MAX_IOU)
-    i = np.array(sorted(chosen, key=lambda k: -score[k]), int)
-    corners[:, 2:] += corners[:, :2]
-    return Claims.of_detector(corners[i], FIRST + label[i], score[i].astype(np.float32))
+def detected(scene: Scene, weights: Path) -> list[Claims]:
+    network = OnnxDetector(weights)
+    index = np.array([scene.vocabulary.index(name) for name in network.labels])
+    found = [network.find(frame.color) for frame in scene.frames]
+    return [
+        Claims.of_detector(f.boxes_px, index[f.class_ids], f.scores.astype(np.float32))
+        for f in found
+    ]
 
 
-def letterboxed(
-    image: np.ndarray, size: tuple[int, int], centred: bool
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """The image in grey of (height, width); its scale; its first pixel."""
-    scale = min(size[0] / image.shape[0], size[1] / image.shape[1])
-    height, width = round(image.shape[0] * scale), round(image.shape[1] * scale)
-    top, left = ((size[0] - height) // 2, (size[1] - width) // 2) if centred else (0, 0)
-    out = np.full((*size, 3), 114, np.uint8)
-    out[top : top + height, left : left + width] = cv2.resize(image, (width, height))
-    return out, scale, np.array([left, top, 0, 0], np.float32)
+def true_boxes(scene: Scene) -> list[Claims]:
+    labels = coco_list(scene.truth.class_names)
+    table = labels.of_truth(scene.truth.class_names)
+    frames = map(scene.truth.frame, range(len(scene.frames)))
+    return [_boxes_of(frame, table[frame.class_ids], labels.names, scene) for frame in frames]
 
 
-def session(weights: Path) -> onnxruntime.InferenceSession:
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(weights, options, providers=["CPUExecutionProvider"])
+def _boxes_of(frame: FrameLabels, truth: np.ndarray, names: tuple[str, ...], s: Scene) -> Claims:
+    boxes, labels = [], []
+    for instance in np.flatnonzero(np.bincount(frame.instance_ids.ravel()) >= _least(truth)):
+        mask = frame.instance_ids == instance
+        label = int(np.bincount(truth[mask]).argmax())
+        if label not in (0, VOID):
+            v, u = np.nonzero(mask)
+            boxes.append([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
+            labels.append(s.vocabulary.index(names[label]))
+    ones = np.ones(len(boxes), np.float32)
+    return Claims.of_detector(np.reshape(boxes, (-1, 4)), np.array(labels, int), ones)
 
 
-def yolox(weights: Path) -> Detect:
-    network, cells = (
-        session(weights),
-        [
-            np.stack(np.meshgrid(np.arange(416 // s), np.arange(416 // s)), -1).reshape(-1, 2)
-            for s in (8, 16, 32)
-        ],
-    )
-    grid = np.concatenate(cells)
-    stride = np.repeat([8, 16, 32], [len(c) for c in cells])[:, None]
-
-    def detect(rgb: np.ndarray) -> Claims:
-        image, scale, _ = letterboxed(rgb[..., ::-1], (416, 416), centred=False)
-        tensor = image.transpose(2, 0, 1)[None].astype(np.float32)
-        out = np.asarray(network.run(None, {"images": tensor})[0])[0]
-        boxes = np.hstack([(out[:, :2] + grid) * stride, np.exp(out[:, 2:4]) * stride]) / scale
-        boxes[:, :2] += 0.5 / scale - 0.5
-        return best(boxes, out[:, 4:5] * out[:, 5:])
-
-    return detect
+def _least(image: np.ndarray) -> float:
+    return LEAST_SHARE * image.size
 
 
-def yolov5(weights: Path) -> Detect:
-    network = session(weights)
-
-    def detect(rgb: np.ndarray) -> Claims:
-        image, scale, start = letterboxed(rgb, (480, 640), centred=True)
-        tensor = (image.transpose(2, 0, 1)[None] / 255).astype(np.float32)
-        out = np.asarray(network.run(None, {"images": tensor})[0])[0]
-        boxes = (out[:, :4] - start) / scale
-        boxes[:, :2] += 0.5 / scale - 0.5
-        return best(boxes, out[:, 4:5] * out[:, 5:])
-
-    return detect
-
-
-# --- what is true ---------------------------------------------------------------------------------
-def read(path: Path) -> np.ndarray:
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    assert image is not None, path
-    return image
-
-
-class Truth:
-    def __init__(self, folder: Path, coco: list[str]) -> None:
-        names = json.loads((folder / "labels.json").read_text())
-        self._of_class = np.zeros(256, np.uint8)
-        self._of_class[0] = VOID
-        for number, name in names["classes"].items():
-            name = SYNONYMS.get(str(name), str(name))
-            if name in coco:
-                self._of_class[int(number)] = FIRST + coco.index(name)
-        self._class_of = {int(k): v["class_id"] for k, v in names["instances"].items()}
-        self._semantic = sorted((folder / "semantic_class").glob("*.png"))
-        self._instance = sorted((folder / "instance").glob("*.png"))
-
-    def image(self, k: int) -> np.ndarray:
-        return self._of_class[read(self._semantic[k])]
-
-    def boxes(self, k: int) -> Claims:
-        """Of objects that have 0.5 % of the pixels."""
-        image = read(self._instance[k]).astype(int)
-        boxes, labels = [], []
-        for i in np.flatnonzero(np.bincount(image.ravel()) >= 0.005 * image.size):
-            label = self._of_class[self._class_of.get(int(i), 0)]
-            if label not in (0, VOID):
-                v, u = np.nonzero(image == i)
-                boxes.append([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
-                labels.append(label)
-        ones = np.ones(len(boxes), np.float32)
-        return Claims.of_detector(np.reshape(boxes, (-1, 4)), np.array(labels, int), ones)
-
-
-def confusion(truth: Iterable[np.ndarray], images: Iterable[np.ndarray]) -> np.ndarray:
-    """[256, 256] pixels of each label that are shown as each."""
-    out = np.zeros((256, 256), np.int64)
-    for a, b in zip(truth, images, strict=True):
-        out += np.bincount(256 * a.ravel().astype(int) + b.ravel(), minlength=65536).reshape(
-            256, -1
-        )
-    out[VOID] = 0
+def asked(scene: Scene, claims: list[Claims], reliability: float) -> list[Claims]:
+    """With the answers of the oracle to what the detector is unsure of."""
+    rng, names = np.random.default_rng(0), scene.truth.class_names
+    usable = [k for k, name in enumerate(names) if not is_void(name)]
+    out = []
+    for k, (said, frame) in enumerate(zip(claims, scene.frames, strict=True)):
+        shown = scene.truth.frame(k).class_ids
+        labels, sure = said.labels.copy(), np.zeros(len(said.boxes), np.float32)
+        found = surfaces(frame.depth_m, frame.camera, ForegroundConfig())
+        for i in np.flatnonzero(said.confidences < TriggerConfig().sure):
+            mask = region(said.boxes[i], frame, found)
+            true = np.bincount(shown[mask], minlength=len(names))[usable]
+            right, wrong = usable[int(true.argmax())], usable[rng.integers(len(usable))]
+            is_right = rng.random() < reliability
+            labels[i] = scene.vocabulary.index(names[right if is_right else wrong])
+            sure[i] = reliability
+        out.append(replace(said, open_labels=labels, open_confidences=sure))
     return out
 
 
-def mean_iou(counts: np.ndarray, gate: float) -> float:
-    true, shown, right = counts.sum(axis=1), counts.sum(axis=0), np.diag(counts)
-    judged = true > gate * true.sum()
-    return 100 * float(np.mean(right[judged] / (true + shown - right)[judged]))
-
-
-def consistency(images: list[np.ndarray], frames: list[RgbdFrame], T: np.ndarray) -> float:
-    agree = total = 0
-    for a, b in zip(range(len(images)), range(STEP, len(images)), strict=False):
-        camera, depth_m = frames[a].camera, frames[a].depth_m
-        p = se3.transform(se3.inverse(T[b]) @ T[a], camera.backproject(depth_m).reshape(-1, 3))
-        i = np.flatnonzero((depth_m.ravel() > 0) & (p[:, 2] > 0.05))
-        u, v = np.rint(camera.project(p[i])).astype(int).T
-        inside = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
-        i, u, v = i[inside], u[inside], v[inside]
-        same = np.abs(frames[b].depth_m[v, u] / p[i, 2] - 1) < 0.02
-        first, second = images[a].ravel()[i[same]], images[b][v[same], u[same]]
-        objects = (first > 0) | (second > 0)
-        agree, total = agree + np.sum((first == second) & objects), total + np.sum(objects)
-    return agree / max(total, 1)
+def region(box: np.ndarray, frame: RgbdFrame, found: Surfaces) -> np.ndarray:
+    """[H, W] bool: the foreground in a box; all of the box where there is none."""
+    part = foreground(box, frame.depth_m, found, frame.camera, ForegroundConfig())
+    mask = part.image(frame.depth_m.shape)
+    if not mask.any():
+        mask[pixels_of(box, mask.shape)] = True
+    return mask
 
 
 # --- runs -----------------------------------------------------------------------------------------
 def variants() -> dict[str, LabellingConfig]:
     out = {}
-    for region in ("foreground", "box"):
+    for area in ("foreground", "box"):
         for rule in ("coverage", "iou"):
             for ema in ("corrected", "paper"):
                 labels = LabelConfig(ema=ema, hold_back=0.0 if ema == "paper" else 1.0)
-                out[f"{region} {rule} {ema}"] = LabellingConfig(
-                    region=region, assignment=AssignmentConfig(rule), labels=labels
+                out[f"{area} {rule} {ema}"] = LabellingConfig(
+                    region=area, assignment=AssignmentConfig(rule), labels=labels
                 )
     return out
 
@@ -198,146 +166,155 @@ def variants() -> dict[str, LabellingConfig]:
 class Follower:
     """Labels of a map that grows and loses Gaussians."""
 
-    def __init__(self, config: LabellingConfig) -> None:
-        self.config, self.labels, self._ids = config, new_labels(0), np.zeros(0, np.int64)
+    def __init__(self, name: str, what: str, claims: list[Claims], config: LabellingConfig) -> None:
+        self.name, self.what, self.claims, self.config = name, what, claims, config
+        self.labels, self._ids = new_labels(0), np.zeros(0, np.int64)
 
     def follow(self, ids: np.ndarray) -> None:
         labels, (_, new, old) = new_labels(len(ids)), np.intersect1d(ids, self._ids, True, True)
         labels[new] = self.labels[old]
         self.labels, self._ids = labels, ids.copy()
 
+    @property
+    def is_summed(self) -> bool:
+        """Whether it is judged by the sum over all Gaussians of a pixel too, which takes longer."""
+        return self.what == DEFAULT
 
-def painted(claims: Claims, frame: RgbdFrame, region: str) -> np.ndarray:
+
+def followers(
+    scene: Scene, claims: dict[str, list[Claims]], only: str, reliability: float | None
+) -> Iterator[Follower]:
+    for name, said in claims.items():
+        for what, config in variants().items():
+            if only in what and (name != TRUE_BOXES or "coverage corrected" in what):
+                yield Follower(name, what, said, config)
+        if reliability is not None and name != TRUE_BOXES:
+            answered = asked(scene, said, reliability)
+            calls = np.mean([np.any(c.open_confidences > 0) for c in answered])
+            print(f"{name}: the oracle is asked on {calls:.0%} of the frames")
+            for rule in ("fixed", "adaptive"):
+                config = LabellingConfig(fusion=FusionConfig(rule=rule))
+                yield Follower(name, f"{DEFAULT}, {rule} fusion", answered, config)
+
+
+def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
+    builder = MapBuilder()
+    for k in range(0, len(scene.frames), 2):
+        frame, T = scene.frames[k], scene.T_map_camera[k]
+        builder.add(frame, T, k, iterations)
+        shown = builder.seen_from(frame.camera, T, contributions=True)
+        assert shown.contributions is not None
+        indices, gaussians = shown.contributions.indices, builder.gaussians
+        for run in runs:
+            run.follow(gaussians.ids)
+            view = frame.camera, T, frame.depth_m, run.claims[k]
+            label_keyframe(gaussians.rows, run.labels, indices, *view, run.config)
+    return builder
+
+
+def painted(claims: Claims, frame: RgbdFrame, area: str) -> np.ndarray:
     """The regions of one frame, the surest on top."""
     image, config = np.zeros(frame.depth_m.shape, np.uint8), ForegroundConfig()
-    found = surfaces(frame.depth_m, frame.camera, config)
+    found = surfaces(frame.depth_m, frame.camera, config) if area == "foreground" else None
     for box, label in zip(claims.boxes[::-1], claims.labels[::-1], strict=True):
-        if region == "box":
+        if found is None:
             image[pixels_of(box, image.shape)] = label
         else:
             part = foreground(box, frame.depth_m, found, frame.camera, config)
-            image[part.image(frame.depth_m.shape)] = label
+            image[part.image(image.shape)] = label
     return image
 
 
-def overlay(rgb: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    colors = np.random.default_rng(1).integers(60, 256, (256, 3))
-    return np.where(labels[..., None] > 0, 0.4 * rgb + 0.6 * colors[labels], rgb)
+# --- what is printed ------------------------------------------------------------------------------
+class Report:
+    def __init__(self, scene: Scene, pictures: Path | None) -> None:
+        self._scene, self._pictures = scene, pictures
+        print("| claims | rule | mIoU | all names | consistency | beyond COCO | labelled |")
+        print("|---|---|---|---|---|---|---|")
+
+    def line(self, name: str, what: str, image: Callable[[int], np.ndarray], share: str) -> None:
+        errors = self._errors(image)
+        coco, full = (
+            " (".join(f"{100 * row.figures(gate).mean_iou:.1f}" for gate in GATES.values()) + ")"
+            for row in errors.lists
+        )
+        beyond = "".join(
+            f"{100 * found.recall:.0f} % of {found.wanted}, {100 * found.precision:.0f} % right"
+            for found in (errors.objects,)
+            if found.named
+        )
+        agreed = f"{errors.consistency.share:.3f}"
+        print(f"| {name} | {what} | {coco} | {full} | {agreed} | {beyond} | {share} |", flush=True)
+
+    def _errors(self, image: Callable[[int], np.ndarray]) -> LabelErrors:
+        scene, images = self._scene, {}
+        judge = LabelJudge(scene.vocabulary.names, scene.truth.class_names)
+        for k, frame in enumerate(scene.frames):
+            images[k] = image(k)
+            judge.see(LabelView(frame, scene.truth.frame(k), images[k]))
+            if (first := k - APART) in images:
+                judge.compare(images.pop(first), images[k], scene.pairs[first])
+        return judge.errors("")
+
+    def show(self, name: str, image: Callable[[int], np.ndarray]) -> None:
+        if self._pictures is None:
+            return
+        self._pictures.mkdir(parents=True, exist_ok=True)
+        scene, views = self._scene, []
+        for k in (np.linspace(0.05, 0.95, 6) * len(scene.frames)).astype(int).tolist():
+            view = LabelView(scene.frames[k], scene.truth.frame(k), image(k))
+            views.append(LabelPicture(f"frame {k}", view))
+        sheet = label_sheet(views, scene.vocabulary.names, scene.truth.class_names)
+        cv2.imwrite(str(self._pictures / f"{name.replace(' ', '_')}.jpg"), sheet[..., ::-1])
+
+
+def judge_all(scene: Scene, runs: list[Follower], builder: MapBuilder, report: Report) -> None:
+    frames, T = scene.frames, scene.T_map_camera
+    shown: list[Rendering] = [
+        builder.seen_from(frame.camera, T[k], contributions=True) for k, frame in enumerate(frames)
+    ]
+    rows = builder.gaussians.rows
+    for run in sorted(runs, key=lambda run: run.what != DEFAULT):
+        share = f"{100 * np.mean(top_labels(run.labels) > 0):.3f} %"
+        report.line(run.name, run.what, lambda k, r=run: top_image(r.labels, shown[k]), share)
+
+        def summed(k: int, run: Follower = run) -> np.ndarray:
+            view = frames[k].camera, se3.inverse(T[k])
+            return label_image(rows, run.labels, shown[k], *view, threads=2)
+
+        if run.is_summed:
+            report.line(run.name, f"{run.what}, sum of w p", summed, share)
+        if run.what == DEFAULT:
+            report.show(run.name, summed)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("source", type=Path)
+    parser.add_argument("source")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--only", default="", help="rules whose name holds this")
+    parser.add_argument("--fusion", type=float, metavar="P")
+    parser.add_argument("--background", nargs="+", default=(), metavar="NAME")
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--iterations", type=int, default=6)
     arguments = parser.parse_args()
     weights = Path(os.environ["LDO_WEIGHTS"])
-    coco = (weights / "coco_classes.txt").read_text().split("\n")[:80]
-    truth, source = Truth(arguments.source, coco), open_source(str(arguments.source))
-    frames = list(source)[: arguments.max_frames]
-    known = source.truth()
-    assert known is not None, "needs true poses"
-    T = np.asarray(known.T_world_camera)[: len(frames)]
-    T = se3.inverse(T[0]) @ T
-    networks = {
-        "YOLOX-Nano": yolox(weights / "yolox_nano.onnx"),
-        "YOLOv5n": yolov5(weights / "yolov5n_480x640_w16.onnx"),
-    }
-    claims = {name: [net(f.color) for f in frames] for name, net in networks.items()}
-    claims["true boxes"] = [truth.boxes(k) for k in range(len(frames))]
-    runs = {
-        (name, what): Follower(config)
-        for name in claims
-        for what, config in variants().items()
-        if arguments.only in what and (name != "true boxes" or "coverage corrected" in what)
-    }
-    builder = MapBuilder()
-    for k in range(0, len(frames), 2):
-        frame = frames[k]
-        builder.add(frame, T[k], k, arguments.iterations)
-        shown = builder.seen_from(frame.camera, T[k], contributions=True)
-        assert shown.contributions is not None
-        indices, gaussians = shown.contributions.indices, builder.gaussians
-        for (name, _), run in runs.items():
-            run.follow(gaussians.ids)
-            view = frame.camera, T[k], frame.depth_m, claims[name][k]
-            label_keyframe(gaussians.rows, run.labels, indices, *view, run.config)
-    report(builder, frames, T, truth, claims, runs, arguments.pictures)
-
-
-def report(
-    builder: MapBuilder,
-    frames: list[RgbdFrame],
-    T: np.ndarray,
-    truth: Truth,
-    claims: dict[str, list[Claims]],
-    runs: dict[tuple[str, str], Follower],
-    pictures: Path | None,
-) -> None:
-    true = [truth.image(k) for k in range(len(frames))]
-    shown = [builder.seen_from(f.camera, T[k], contributions=True) for k, f in enumerate(frames)]
-    print(f"{len(frames)} frames, {len(builder.gaussians)} Gaussians, {coco_share(true)}")
-    print("| claims | rule | mIoU | all classes | consistency | labelled Gaussians |")
-    print("|---|---|---|---|---|---|")
-
-    def line(name: str, what: str, images: list[np.ndarray], share: str, judged: bool) -> None:
-        counts = confusion(true, images)
-        agreed = f"{consistency(images, frames, T):.3f}" if judged else ""
-        both = f"{mean_iou(counts, GATE):.1f} | {mean_iou(counts, 0):.1f}"
-        print(f"| {name} | {what} | {both} | {agreed} | {share} |", flush=True)
-
-    for name in claims:
-        for region in ("foreground", "box"):
-            images = [painted(c, f, region) for c, f in zip(claims[name], frames, strict=True)]
-            line(name, f"{region} painted", images, "", region == "foreground")
-        for (whose, what), run in runs.items():
-            if whose != name:
-                continue
-            share = f"{100 * np.mean(top_labels(run.labels) > 0):.3f} %"
-            images = [top_image(run.labels, s) for s in shown]
-            is_default = what == "foreground coverage corrected"
-            line(name, what, images, share, is_default)
-            if is_default:
-                images = summed(builder, run, shown, frames, T)
-                line(name, f"{what}, sum of w p", images, share, True)
-                show(pictures, name, frames, images, true)
-
-
-def summed(
-    builder: MapBuilder, run: Follower, shown: list, frames: list[RgbdFrame], T: np.ndarray
-) -> list[np.ndarray]:
-    rows = builder.gaussians.rows
-    return [
-        label_image(rows, run.labels, shown[k], frame.camera, se3.inverse(T[k]))
-        for k, frame in enumerate(frames)
-    ]
-
-
-def coco_share(true: list[np.ndarray]) -> str:
-    counts = np.sum([np.bincount(image.ravel(), minlength=256) for image in true], 0)[:VOID]
-    gated = np.flatnonzero(counts > GATE * counts.sum())
-    return f"labels with 0.2 %: {gated.tolist()}"
-
-
-def show(
-    folder: Path | None,
-    name: str,
-    frames: list[RgbdFrame],
-    images: list[np.ndarray],
-    true: list[np.ndarray],
-) -> None:
-    if folder is None:
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    chosen = np.linspace(0.05, 0.95, 6) * len(frames)
-    rows = [
-        np.hstack([overlay(frames[k].color, label % VOID) for label in (images[k], true[k])])
-        for k in chosen.astype(int)
-    ]
-    path = folder / f"{name.replace(' ', '_')}.jpg"
-    cv2.imwrite(str(path), np.vstack(rows).astype(np.uint8)[..., ::-1])
+    scene = Scene.of(arguments.source, arguments.max_frames, arguments.background)
+    claims = {name: detected(scene, weights / file) for name, file in NETWORKS.items()}
+    claims[TRUE_BOXES] = true_boxes(scene)
+    runs = list(followers(scene, claims, arguments.only, arguments.fusion))
+    builder = grown(scene, runs, arguments.iterations)
+    print(f"{len(scene.frames)} frames, {len(builder.gaussians)} Gaussians")
+    report = Report(scene, arguments.pictures)
+    for name, said in claims.items():
+        for area in ("foreground", "box"):
+            report.line(
+                name,
+                f"{area} painted",
+                lambda k, s=said, a=area: painted(s[k], scene.frames[k], a),
+                "",
+            )
+    judge_all(scene, runs, builder, report)
 
 
 if __name__ == "__main__":
