@@ -47,9 +47,8 @@ def evaluate(
     calls things by the labels of the source.
 
     Prints the protocol above the figures, and draws trajectory.png, rendering.png and labels.png
-    into DIR.
-    `ldo run --hold-out 5` leaves frames to judge the map by that it was not made from. Of a source
-    without ground truth the map alone is judged.
+    into DIR. `ldo run --hold-out 5` leaves frames to judge the map by that it was not made from. Of
+    a source without ground truth the map alone is judged.
 
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out 5
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
@@ -57,16 +56,16 @@ def evaluate(
     config = run_config(folder)
     threads = config.mapper.thread_count()
     distance = Lpips(lpips, threads=threads) if lpips else None
-    localised = config.tracker.localise
-    run = read_run(folder, has_map=not localised)
+    run = read_run(folder, has_map=not config.tracker.localise)
     sequence = open_source(source, config.data.options())
     run.require_source(sequence)
     with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:
-        print(json.dumps({**plain(results), "lpips": lpips and str(lpips)}, indent=1))
+        told = {"lpips": lpips and str(lpips), "labelled_by": labelled_by(config)}
+        print(json.dumps({**plain(results), **told}, indent=1))
     else:
-        print_results(results, lpips, localised)
+        print_results(results, lpips, config)
 
 
 def run_config(folder: Path) -> Config:
@@ -74,19 +73,25 @@ def run_config(folder: Path) -> Config:
     return load_config(written(folder, "config.yaml"))
 
 
-def print_results(results: Results, lpips: Path | None, localised: str = "") -> None:
-    """`localised` is the folder of the map of a run that made none."""
+def labelled_by(config: Config) -> dict[str, str]:
+    """Who named things in a run; empty for nobody."""
+    labeller = config.vlm_labeller.model or config.vlm_labeller.url
+    return {"detector": config.detector.model, "labeller": labeller}
+
+
+def print_results(results: Results, lpips: Path | None, config: Config) -> None:
+    """`config` is that of the run."""
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
     if results.trajectories is None:
         console.print(NO_TRUTH)
     else:
         console.print(trajectory.PROTOCOL, style="dim")
         console.print(trajectory_table(results.trajectories))
-    if localised:
-        console.print(NO_MAP.format(folder=localised), soft_wrap=True)
+    if config.tracker.localise:
+        console.print(NO_MAP.format(folder=config.tracker.localise), soft_wrap=True)
     else:
         _print_renderings(console, results, lpips)
-        _print_labels(console, results)
+        _print_labels(console, results, labelled_by(config))
     console.print("Pictures: " + ", ".join(map(str, results.pictures)), soft_wrap=True)
 
 
@@ -98,13 +103,15 @@ def _print_renderings(console: Console, results: Results, lpips: Path | None) ->
         console.print(rendering_table(results.renderings, has_lpips=lpips is not None))
 
 
-def _print_labels(console: Console, results: Results) -> None:
+def _print_labels(console: Console, results: Results, who: dict[str, str]) -> None:
     """Nothing where neither the map nor the source has labels."""
     if results.unlabelled:
         console.print(results.unlabelled, style="dim")
     if not results.labels:
         return
     console.print(semantics.PROTOCOL, style="dim")
+    named = (f"{kind}: {name or 'none'}" for kind, name in who.items())
+    console.print(f"Labels by {', '.join(named)}.", style="dim", soft_wrap=True)
     console.print(label_table(results.labels))
     console.print(open_table(results.labels, results.vlm_calls_per_frame))
 

@@ -192,7 +192,14 @@ def test_the_command_prints_protocol_and_tables_and_draws(
 ) -> None:
     code, out, _ = ldo(capsys, "eval", labelled, folder)
     assert code == 0
-    parts = ("PSNR dB", "Labels are rendered", "COCO, from 0.2 %", "all names, all", "consistency")
+    parts = (
+        "PSNR dB",
+        "Labels are rendered",
+        "labeller: none",
+        "COCO, from 0.2 %",
+        "all names, all",
+        "consistency",
+    )
     assert [out.index(part) for part in parts] == sorted(out.index(part) for part in parts)
     sheet = cv2.imread(str(labelled / "labels.png"))
     assert sheet is not None
@@ -209,6 +216,7 @@ def test_json_has_every_figure_of_every_list(capsys, labelled: Path, folder: Pat
     assert row["lists"]["COCO"]["classes"]["couch"]["iou"] > 0.8
     assert row["lists"]["COCO"]["all"]["mean_iou"] > 0.7
     assert found["vlm_calls_per_frame"] == 0
+    assert found["labelled_by"] == {"detector": "", "labeller": ""}
     assert "Consistency" in found["protocol"]["labels"]
 
 
