@@ -6,6 +6,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Trajectory, associate, se3
+from ldo_service.geometry.umeyama import align
 
 ASSOCIATION_TOLERANCE_S = 0.020
 RPE_INTERVAL_S = 1.0
@@ -85,20 +86,6 @@ def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
             f"{FEWEST_POSES} are needed. Check that both use the same clock."
         )
     return pairs
-
-
-def align(points: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """T_target_points [4, 4] minimising sum |T p_k - q_k|^2 over p, q [M, 3], without scale.
-
-    Umeyama, PAMI 1991, eq. 40-42, with the reflection guarded. Points on one line leave the
-    rotation about it free; the residuals are the smallest all the same.
-    """
-    mean_p, mean_q = points.mean(axis=0), target.mean(axis=0)
-    U, _, Vt = np.linalg.svd((target - mean_q).T @ (points - mean_p))
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
-    T[:3, 3] = mean_q - T[:3, :3] @ mean_p
-    return T
 
 
 def _relative_errors(T_estimate: np.ndarray, T_truth: np.ndarray, interval: int) -> np.ndarray:
