@@ -4,7 +4,7 @@ A place is a keyframe's thumbnail, its strongest ORB features with their points,
 and depth at the working resolution, compressed: from these it can be tracked against again.
 """
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from statistics import median
@@ -76,7 +76,7 @@ class Place:
     def features_across_scales(self, config: FeatureConfig) -> Features:
         """SIFT of the small image, detected when first asked for; half as many as of a frame."""
         if "_across_scales" not in self.__dict__:
-            image = self._gray, self._depth_m, self.camera
+            image = self._gray, self.depth_m, self.camera
             seen = detect_across_scales(*image, config.count_across_scales // 2, config)
             self.__dict__["_across_scales"] = seen
         return self.__dict__["_across_scales"]
@@ -105,9 +105,22 @@ class Place:
 
     def keyframe(self, config: PyramidConfig) -> Keyframe:
         """The keyframe as frames can be aligned to it; bitwise equal each time."""
-        view = build_pyramid(self._gray, self._depth_m, self.camera, config)
+        view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return Keyframe(
             view, self.T_odom_keyframe, self.id, self.segment, kept_features=self.features
+        )
+
+    def without(self, left_out: np.ndarray) -> "Place":
+        """The same with nothing known of pixels [H, W] bool, at the size of its camera."""
+        if not left_out.any():
+            return self
+        kept = _are_still(self.points_camera.astype(float), self.camera, left_out)
+        return replace(
+            self,
+            points_camera=self.points_camera[kept],
+            descriptors=self.descriptors[kept],
+            gray=_gray_bytes(self._gray, left_out),
+            depth=_depth_bytes(self.depth_m, left_out),
         )
 
     @property
@@ -116,7 +129,7 @@ class Place:
         return np.asarray(gray, np.uint8)
 
     @property
-    def _depth_m(self) -> np.ndarray:
+    def depth_m(self) -> np.ndarray:
         width, height = self.camera.width, self.camera.height
         steps = codecs.decode_depth("z16+zstd", width, height, memoryview(self.depth))
         return steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
@@ -133,10 +146,6 @@ def place_of(
     left_out = resized(keyframe.left_out, level.depth_m.shape)
     seen = detect(view, replace(features, count=config.features))
     kept = _are_still(seen.points_camera, level.camera, left_out)
-    steps = np.rint(level.depth_m * DEPTH_STEPS_PER_M)
-    steps[left_out | (steps > np.iinfo(np.uint16).max)] = 0
-    shades = np.where(left_out, 0, np.rint(level.texels[..., 0]))
-    _, gray = cv2.imencode(".png", shades.astype(np.uint8))
     return Place(
         id=keyframe.id,
         segment=keyframe.segment,
@@ -148,9 +157,20 @@ def place_of(
         points_camera=seen.points_camera[kept].astype(np.float32),
         descriptors=seen.descriptors[kept],
         camera=level.camera,
-        gray=gray.tobytes(),
-        depth=codecs.encode_depth(steps.astype(np.uint16))[1],
+        gray=_gray_bytes(np.rint(level.texels[..., 0]), left_out),
+        depth=_depth_bytes(level.depth_m, left_out),
     )
+
+
+def _gray_bytes(gray: np.ndarray, left_out: np.ndarray) -> bytes:
+    _, png = cv2.imencode(".png", np.where(left_out, 0, gray).astype(np.uint8))
+    return png.tobytes()
+
+
+def _depth_bytes(depth_m: np.ndarray, left_out: np.ndarray) -> bytes:
+    steps = np.rint(depth_m * DEPTH_STEPS_PER_M)
+    steps[left_out | (steps > np.iinfo(np.uint16).max)] = 0
+    return codecs.encode_depth(steps.astype(np.uint16))[1]
 
 
 def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.ndarray:
@@ -184,7 +204,7 @@ class Places:
         leaves the smallest gap is gone."""
         kept = (*self._others(place, config), place)
         if len(kept) > config.count:
-            spare = int(np.argmin(_gaps(kept))) + 1
+            spare = int(np.argmin(gaps(kept))) + 1
             kept = (*kept[:spare], *kept[spare + 1 :])
         return Places(kept)
 
@@ -216,7 +236,7 @@ class Places:
         )
 
 
-def _gaps(path: tuple[Place, ...]) -> np.ndarray:
+def gaps(path: Sequence[Place]) -> np.ndarray:
     """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`.
 
     Infinite where they are of two segments.
@@ -235,7 +255,7 @@ def _extents(places: tuple[Place, ...], other: Place) -> np.ndarray:
     return np.where(segment == other.segment, extents, np.inf)
 
 
-def _poses(places: tuple[Place, ...]) -> np.ndarray:
+def _poses(places: Sequence[Place]) -> np.ndarray:
     return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
 
 
