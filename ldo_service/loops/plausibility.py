@@ -1,0 +1,115 @@
+"""What the map says of a pose: how far odometry may have drifted, and whether a twin fits as well.
+
+Rooms are furnished alike, and no image tells them apart; where the camera went does. Conventions:
+`ldo_service.geometry`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.tracking.motion import extent
+
+from .subgraph import View
+from .verification import Proposal
+
+
+@dataclass(frozen=True, slots=True)
+class PlausibilityConfig:
+    drift_m: float = 0.5  # that a loop may close in any case, and
+    drift: float = 0.1  # m for each m of the way since: ten times what depth cameras drift
+    turn_rad: float = 0.35  # likewise of the heading, and
+    turn_rad_per_m: float = 0.02  # 1.1 degrees for each m
+    view_rad: float = 1.5  # between cameras that see one place, beyond the drift: a view's width
+    view_depths: float = 2.0  # median depths between them, likewise
+    rival_inliers: float = 0.5  # of the best: a candidate with more that says
+    rival_rad: float = 1.0  # the camera is this far elsewhere (57 degrees, or a median depth)
+
+    def __post_init__(self) -> None:
+        if min(getattr(self, name) for name in self.__slots__) < 0 or self.rival_inliers > 1:
+            raise ConfigError(f"{self}: nothing may be negative, rival_inliers at most 1.")
+
+
+class Plausibility:
+    """Judges by poses of the keyframes that are known; `joined` are segments, each with the older
+    one whose frame it is in. Of two segments that are apart nothing is known."""
+
+    def __init__(
+        self, poses: KeyframePoses, joined: Mapping[int, int], config: PlausibilityConfig
+    ) -> None:
+        self._poses, self._joined, self._config = poses, joined, config
+
+    def may_meet(self, views: Sequence[Sequence[View]], new: View) -> np.ndarray:
+        """[S] bool: which of S groups of views a keyframe may show again, wherever it looks."""
+        return np.array([self._may_meet(group[0], new) for group in views], bool)
+
+    def _may_meet(self, old: View, new: View) -> bool:
+        if not self._is_known(old, new):
+            return True
+        gap_m, turn_rad = self._drift(old, new, np.eye(4))
+        limit_m, limit_rad = self._limits(old, new)
+        reach_m = self._config.view_depths * max(v.place.median_depth_m for v in (old, new))
+        return gap_m <= limit_m + reach_m and turn_rad <= limit_rad + self._config.view_rad
+
+    def judged(self, proposal: Proposal) -> Proposal:
+        """Refused where no drift since then explains it."""
+        old, new = proposal.old, proposal.new
+        if proposal.refused or not self._is_known(old, new):
+            return proposal
+        gap_m, turn_rad = self._drift(old, new, proposal.T_old_new)
+        limit_m, limit_rad = self._limits(old, new)
+        way_m = abs(new.path_m - old.path_m)
+        if gap_m > limit_m:
+            return replace(proposal, refused=f"{gap_m:.1f} m of drift after {way_m:.0f} m")
+        if turn_rad > limit_rad:
+            reason = f"{np.degrees(turn_rad):.0f} degrees of drift after {way_m:.0f} m"
+            return replace(proposal, refused=reason)
+        return proposal
+
+    def without_twins(self, proposals: Sequence[Proposal]) -> list[Proposal]:
+        """Those refused whose view another place far elsewhere explains nearly as well."""
+        return [
+            replace(proposal, refused="a twin elsewhere fits as well")
+            if not proposal.refused and any(self._is_twin(proposal, o) for o in proposals)
+            else proposal
+            for proposal in proposals
+        ]
+
+    def _is_twin(self, proposal: Proposal, other: Proposal) -> bool:
+        enough = self._config.rival_inliers * proposal.inliers
+        if other.refused or other.evidence != proposal.evidence or other.inliers < enough:
+            return False
+        if not self._is_known(proposal.old, other.old):
+            return False
+        T, T_other = (self._T_map(p, proposal.new) for p in (proposal, other))
+        apart_rad = extent(se3.inverse(T) @ T_other, proposal.new.place.median_depth_m)
+        return apart_rad > self._config.rival_rad
+
+    def _T_map(self, proposal: Proposal, new: View) -> np.ndarray:
+        """Where a keyframe of the new subgraph is [4, 4], as a proposal says."""
+        T_new_odom = se3.inverse(proposal.new.place.T_odom_keyframe)
+        T_map_newodom = self._poses[proposal.old.keyframe] @ proposal.T_old_new @ T_new_odom
+        return T_map_newodom @ new.place.T_odom_keyframe
+
+    def _is_known(self, old: View, new: View) -> bool:
+        """Whether the map says where both are to each other."""
+        roots = {self._joined.get(v.place.segment, v.place.segment) for v in (old, new)}
+        return len(roots) == 1 and old.keyframe in self._poses and new.keyframe in self._poses
+
+    def _drift(self, old: View, new: View, T_old_new: np.ndarray) -> tuple[float, float]:
+        """m and rad between where a pose and the map have the new keyframe."""
+        T_map_new = self._poses[old.keyframe] @ T_old_new
+        T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
+        return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)
+
+    def _limits(self, old: View, new: View) -> tuple[float, float]:
+        """m and rad of drift between them."""
+        way_m, config = abs(new.path_m - old.path_m), self._config
+        return (
+            config.drift_m + config.drift * way_m,
+            config.turn_rad + config.turn_rad_per_m * way_m,
+        )
