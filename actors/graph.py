@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.localiser import LocalisingTracker
+from ldo_service.actors.loop_closer import LoopCloser
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
@@ -74,16 +75,11 @@ GRAPH: tuple[Box, ...] = (
         "keeps the map of Gaussians, and what stands in it",
         lambda config: Mapper(config.mapper, has_labeller=config.vlm_labeller.is_chosen),
     ),
-    Box(
-        "loop_closer",
+    _built(
+        LoopCloser,
         "recognises places",
-        inputs=(
-            In(t.KEYFRAME_NEW, Lossless(8)),
-            In(t.DETECTION_BOXES, Lossless(8)),
-            In(t.MAP_OBJECTS, Latest(1)),
-            In(t.GRAPH_CORRECTION, Latest(1)),
-        ),
-        outputs=(Out(t.LOOP_CLOSURE), Out(t.LOOP_CANDIDATE)),
+        lambda config: LoopCloser(config.loop_closer),
+        later=(In(t.MAP_OBJECTS, Latest(1)),),
     ),
     _built(
         Optimizer,

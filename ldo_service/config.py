@@ -27,6 +27,7 @@ import yaml
 
 from ldo_service.actors.detector import DetectorConfig
 from ldo_service.actors.frame_source import FrameSourceConfig
+from ldo_service.actors.loop_closer import LoopCloserConfig
 from ldo_service.actors.mapper import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.tracker import TrackerConfig
@@ -77,6 +78,7 @@ class RunConfig:
 
     mapper_latency_frames: int = 3  # a keyframe is in the map so many frames later, on any machine
     optimizer_latency_frames: int = 3
+    loop_closer_latency_frames: int = 10  # it looks at five places at a time
     detector_latency_frames: int = 3
     vlm_labeller_latency_frames: int = 30  # a second: its answers are late by design
     max_rejected: float = 0.1  # share of unreadable frames over which the data is called bad
@@ -91,6 +93,7 @@ class RunConfig:
         """By actor; the others answer within the frame."""
         return {
             "detector": self.detector_latency_frames,
+            "loop_closer": self.loop_closer_latency_frames,
             "mapper": self.mapper_latency_frames,
             "optimizer": self.optimizer_latency_frames,
             "vlm_labeller": self.vlm_labeller_latency_frames,
@@ -104,6 +107,7 @@ class Config:
     detector: DetectorConfig = field(default_factory=DetectorConfig)
     vlm_labeller: VlmLabellerConfig = field(default_factory=VlmLabellerConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
+    loop_closer: LoopCloserConfig = field(default_factory=LoopCloserConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     data: DataConfig = field(default_factory=DataConfig)
     run: RunConfig = field(default_factory=RunConfig)

@@ -7,6 +7,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
 from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.loops import Finding
 from ldo_service.schemas import (
     Array,
     CameraModel,
@@ -18,6 +19,8 @@ from ldo_service.schemas import (
     Image,
     Keyframe,
     LabelRequest,
+    LoopCandidate,
+    LoopClosure,
     MapObject,
     MapObjects,
     MeasuredPose,
@@ -35,6 +38,10 @@ from ldo_service.semantics.landmarks import distributions, labels_of
 from ldo_service.semantics.objects import Objects, Observed
 from ldo_service.semantics.regions_to_name import Region
 from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
+from ldo_service.tracking.movable import Box as MovableBox
+from ldo_service.tracking.moving import resized
+from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of
 
 
 def pose_message(T: np.ndarray) -> Pose:
@@ -118,6 +125,18 @@ def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
         camera=camera_of(message.camera),
         stamp_ns=message.stamp_ns,
         index=message.frame,
+    )
+
+
+def keyframe_of(message: Keyframe, config: PyramidConfig) -> TrackedKeyframe:
+    """A keyframe that others can be aligned to, without what moves in it."""
+    view = pyramid_of(rgbd_of(message), config)
+    return TrackedKeyframe(
+        view,
+        transform(message.T_odom_keyframe),
+        message.keyframe,
+        message.segment,
+        left_out=resized(mask_of(message.is_moving), view.levels[0].depth_m.shape),
     )
 
 
@@ -336,3 +355,44 @@ def _vector3(v: np.ndarray) -> tuple[float, float, float]:
 def _box(box: np.ndarray) -> Box:
     x0, y0, x1, y1 = box.tolist()
     return x0, y0, x1, y1
+
+
+def boxes_in(detections: Sequence[Detection], times: float) -> list[MovableBox]:
+    """Detections as edges of pixels, in an image that is so many times smaller."""
+    return [
+        MovableBox(one.label, *((edge + 0.5) / times for edge in one.box_px)) for one in detections
+    ]
+
+
+def loop_closure_message(finding: Finding) -> LoopClosure:
+    """Raises ValueError for a candidate that was refused."""
+    if finding.closure is None:
+        raise ValueError(f"a candidate that was refused is no closure: {finding.check.refused}")
+    return LoopClosure(
+        stamp_ns=finding.check.proposal.new.stamp_ns,
+        pose=measured_message(finding.closure),
+        overlap=finding.check.overlap,
+        rmse_m=finding.check.rmse_m,
+        entropy=finding.check.proposal.semantics.entropy,
+    )
+
+
+def loop_candidate_message(finding: Finding) -> LoopCandidate:
+    check, old, new = finding.check, finding.likeness.subgraph, finding.new
+    proposal = check.proposal
+    return LoopCandidate(
+        stamp_ns=new.stamp_ns,
+        keyframe=new.keyframes[-1],
+        reference=old.keyframes[-1],
+        keyframes=new.keyframes,
+        references=old.keyframes,
+        similarity=finding.likeness.similarity,
+        appearance=finding.likeness.appearance,
+        evidence=proposal.evidence,
+        inliers=proposal.inliers,
+        divergence=proposal.semantics.divergence,
+        entropy=proposal.semantics.entropy,
+        overlap=check.overlap,
+        rmse_m=check.rmse_m,
+        refused=check.refused,
+    )

@@ -5,12 +5,14 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.evaluation import semantics, trajectory, views
+from ldo_service.evaluation import loops, semantics, trajectory, views
+from ldo_service.evaluation.loops import LoopErrors
 from ldo_service.evaluation.lpips import Lpips
 from ldo_service.evaluation.results import Results, evaluate_run, plain, work
 from ldo_service.evaluation.trajectory import TrajectoryErrors
@@ -43,8 +45,8 @@ def evaluate(
     ] = None,
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Judge a run: its trajectory by the truth of its source, its map by the frames, what its map
-    calls things by the labels of the source.
+    """Judge a run: trajectory and loops by the truth of its source, its map by the frames, what its
+    map calls things by the labels of the source.
 
     Prints the protocol above the figures, and draws trajectory.png, rendering.png and labels.png
     into DIR. `ldo run --hold-out 5` leaves frames to judge the map by that it was not made from. Of
@@ -87,6 +89,9 @@ def print_results(results: Results, lpips: Path | None, config: Config) -> None:
     else:
         console.print(trajectory.PROTOCOL, style="dim")
         console.print(trajectory_table(results.trajectories))
+    if results.loops is not None:
+        console.print(loops.PROTOCOL, style="dim")
+        console.print(loops_table(results.loops))
     if config.tracker.localise:
         console.print(NO_MAP.format(folder=config.tracker.localise), soft_wrap=True)
     else:
@@ -129,6 +134,30 @@ def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:
             )
         table.add_row(name, str(errors.poses), *(f"{100 * m:.2f} cm" for m in lengths), rpe)
     return table
+
+
+def loops_table(errors: LoopErrors) -> Table:
+    table = Table("loops", "precision", "recall", "position", "rotation", "ms p50", "p95")
+    table.add_row(
+        f"{errors.closures} of {errors.candidates}",
+        _share(errors.precision),
+        f"{_share(errors.recall)} of {errors.queries}",
+        _spread(errors.position_errors_m, 100, "cm"),
+        _spread(errors.rotation_errors_deg, 1, "deg"),
+        *(f"{np.percentile(errors.ms, q):.0f}" if errors.ms else "-" for q in (50, 95)),
+    )
+    return table
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1%}"
+
+
+def _spread(values: tuple[float, ...], factor: float, unit: str) -> str:
+    """Median and maximum."""
+    if not values:
+        return "-"
+    return f"{factor * np.median(values):.2f}, at most {factor * max(values):.2f} {unit}"
 
 
 def rendering_table(rows: list[RenderingErrors], *, has_lpips: bool) -> Table:

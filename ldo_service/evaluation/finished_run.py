@@ -1,6 +1,7 @@
 """What is judged of a run. `ldo_service.runs.finished` reads it from a folder."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.geometry import Trajectory
 from ldo_service.semantics.saved import SavedSemantics
+
+from .loops import FoundLoops
 
 STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond, as float64 seconds
 
@@ -80,6 +83,8 @@ class FinishedRun:
     # one of the final poses, perhaps one of the refined; none of a run that localised
     maps: tuple[PosedMap, ...]
     vlm_calls: int | None = None  # of the labeller; None where the run does not say
+    loops: FoundLoops | None = None  # None: it looked for none
+    keyframes: Mapping[int, int] = field(default_factory=dict)  # id to index of the frame
 
     def frame(self, index: int) -> RunFrame:
         return next(frame for frame in self.frames if frame.index == index)

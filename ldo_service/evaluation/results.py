@@ -11,9 +11,10 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Trajectory
 
-from . import semantics, trajectory, views
+from . import loops, semantics, trajectory, views
 from .finished_run import FinishedRun, at_stamps
 from .label_results import finite, plain_labels, sheet_of_labels
+from .loops import LoopErrors, evaluate_loops, seen_keyframes
 from .pictures import save_picture, trajectory_picture
 from .semantics import LabelErrors, evaluate_labels
 from .sheet import rendering_sheet
@@ -33,6 +34,7 @@ class Results:
     unlabelled: str  # what is missing where only one of them has labels
     vlm_calls_per_frame: float | None  # None where the run does not say
     pictures: list[Path]
+    loops: LoopErrors | None = None  # None without ground truth, or where none were looked for
 
 
 def evaluate_run(
@@ -72,7 +74,8 @@ def evaluate_run(
         pictures["labels.png"] = sheet
     drawn, calls = draw(run.folder, pictures), calls_per_frame(run)
     missing = missing_labels(run, sequence)
-    return Results(trajectories, judged, renderings, labels, missing, calls, drawn)
+    judged_loops = None if truth is None else judge_loops(run, sequence, truth)
+    return Results(trajectories, judged, renderings, labels, missing, calls, drawn, judged_loops)
 
 
 def work(run: FinishedRun, sequence: Sequence) -> int:
@@ -97,6 +100,13 @@ def calls_per_frame(run: FinishedRun) -> float | None:
     if run.vlm_calls is None or not run.frames:
         return None
     return run.vlm_calls / len(run.frames)
+
+
+def judge_loops(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> LoopErrors | None:
+    """None where the run looked for none."""
+    if run.loops is None:
+        return None
+    return evaluate_loops(run.loops, seen_keyframes(run.keyframes, sequence, truth))
 
 
 def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
@@ -139,6 +149,7 @@ def plain(results: Results) -> dict[str, Any]:
         "protocol": {
             "trajectory": trajectory.PROTOCOL,
             "rendering": views.PROTOCOL,
+            "loops": loops.PROTOCOL,
             "labels": semantics.PROTOCOL,
             "frames": results.judged.counts(),
         },
@@ -146,12 +157,17 @@ def plain(results: Results) -> dict[str, Any]:
         "rendering": [_plain_rendering(row) for row in results.renderings],
         "labels": [plain_labels(row) for row in results.labels],
         "vlm_calls_per_frame": results.vlm_calls_per_frame,
+        "loops": results.loops and _plain_loops(results.loops),
         "pictures": [str(path) for path in results.pictures],
     }
 
 
 def _plain_errors(errors: TrajectoryErrors) -> dict[str, Any]:
     return {**asdict(errors), "T_truth_estimate": errors.T_truth_estimate.tolist()}
+
+
+def _plain_loops(errors: LoopErrors) -> dict[str, Any]:
+    return {**asdict(errors), "precision": errors.precision, "recall": errors.recall}
 
 
 def _plain_rendering(row: RenderingErrors) -> dict[str, Any]:

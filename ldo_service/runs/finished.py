@@ -21,6 +21,7 @@ from ldo_service.semantics.saved import SavedSemantics, read_semantics
 from ldo_service.volumes import Viewpoint
 
 from .folder import CAMERA, REFINED, SEMANTICS
+from .loops_file import read_loops
 
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
@@ -37,7 +38,8 @@ def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
     if has_refined(folder):
         maps.append(MapFolder(folder / REFINED).posed("refined"))
         estimates["refined"] = maps[1].trajectory
-    return FinishedRun(folder, frames, estimates, tuple(maps), calls)
+    loops, keyframes = read_loops(folder), MapFolder(folder).keyframes()
+    return FinishedRun(folder, frames, estimates, tuple(maps), calls, loops, keyframes)
 
 
 def vlm_calls(folder: Path) -> int | None:
@@ -112,6 +114,11 @@ class MapFolder:
             stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
             matrices = np.array([keyframe["exposure"] for keyframe in exposed], float)
             return Exposures(stamps_ns, matrices.reshape(-1, 2, 3))
+
+    def keyframes(self) -> dict[int, int]:
+        """Index of the frame of each, by id."""
+        with self._keyframes() as (_, keyframes):
+            return {int(k["keyframe"]): int(k["frame_index"]) for k in keyframes}
 
     def posed(self, name: str) -> PosedMap:
         rows = self.gaussians()

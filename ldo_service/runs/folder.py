@@ -10,6 +10,7 @@ map.ply                 the Gaussians that hang on keyframes in the map's frame
 semantics.npz           what those Gaussians are, if a detector looked: see `semantics.saved`
 objects.json            the objects among them, if a detector looked: see `objects_file`
 places.msgpack          what `--localise` finds the camera by, at the newest poses
+loops.json              places that were compared, and why each pair was refused: `runs.loops_file`
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
 refined/                trajectory, keyframes and map after more iterations, if they were asked for
@@ -40,6 +41,8 @@ from ldo_service.schemas import (
     DetectionBoxes,
     Keyframe,
     LabelOpen,
+    LoopCandidate,
+    LoopClosure,
     MapDelta,
     MapObject,
     MapObjects,
@@ -51,6 +54,7 @@ from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.saved import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
+from .loops_file import LOOPS, LoopRecord
 from .objects_file import OBJECTS, write_objects
 from .places import PlaceRecord
 
@@ -69,7 +73,7 @@ EXPORTED = {  # by `ldo export`, per format
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
-        *(PLACES, OBJECTS, SEMANTICS, f"{REFINED}/{SEMANTICS}", f"{REFINED}/{OBJECTS}"),
+        *(PLACES, OBJECTS, LOOPS, SEMANTICS, f"{REFINED}/{SEMANTICS}", f"{REFINED}/{OBJECTS}"),
         *("trajectory.png", "rendering.png", "labels.png", "views.png"),  # by `eval` and `demo`
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
@@ -135,6 +139,7 @@ class RunFolder:
         self.follower = MapFollower()
         self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
+        self.loops = LoopRecord()
         self.corrections = 0
         self.boxes = 0  # that a detector found
         self.labeller_calls = 0  # regions that a labeller looked at
@@ -162,6 +167,8 @@ class RunFolder:
                 self.labeller_calls += bool(message.labeller)
             case MapObjects():
                 self._objects = message
+            case LoopCandidate() | LoopClosure():
+                self.loops.observe(message, step_ms)
             case MapDelta() | MapSnapshot():
                 self.follower.take(message)
 
@@ -214,6 +221,7 @@ class RunFolder:
         self.summary = summary
         self.online().save(self.folder / "trajectory_online.txt")
         self._write_map(self.folder)
+        self.loops.save(self.folder)
         write_json(self.folder / "summary.json", summary)
 
     def in_map(self) -> np.ndarray:

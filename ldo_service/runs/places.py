@@ -8,11 +8,9 @@ import numpy as np
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.runtime.state_store import encode_state
 from ldo_service.schemas import Keyframe
-from ldo_service.tracking import OdometryConfig, pyramid_of
-from ldo_service.tracking import keyframes as tracking
-from ldo_service.tracking.moving import resized
+from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.places import Places, place_of
-from ldo_service.wire import mask_of, rgbd_of, transform
+from ldo_service.wire import keyframe_of
 
 
 class PlaceRecord:
@@ -23,15 +21,8 @@ class PlaceRecord:
         self._places = Places()
 
     def add(self, message: Keyframe) -> None:
-        config, view = self._config, pyramid_of(rgbd_of(message), self._config.pyramid)
-        keyframe = tracking.Keyframe(
-            view,
-            transform(message.T_odom_keyframe),
-            message.keyframe,
-            message.segment,
-            left_out=resized(mask_of(message.is_moving), view.levels[0].depth_m.shape),
-        )
-        place = place_of(keyframe, config.features, config.places)
+        config = self._config
+        place = place_of(keyframe_of(message, config.pyramid), config.features, config.places)
         self._places = self._places.added(place, config.places)
 
     def save(self, path: Path, poses: KeyframePoses, joined: dict[int, int]) -> None:

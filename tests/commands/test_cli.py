@@ -126,12 +126,6 @@ def test_a_publisher_without_a_service_is_told_to_start_one(capsys) -> None:
     assert "ldo serve" in err
 
 
-def test_a_declared_actor_cannot_be_served(capsys) -> None:
-    code, _, err = ldo(capsys, "serve", "--only", "loop_closer")
-    assert code == 2
-    assert "declared" in err
-
-
 def test_a_robot_name_that_breaks_topics_is_refused(capsys) -> None:
     code, _, err = ldo(capsys, "serve", "--robot", "a/b")
     assert code == 2

@@ -1,0 +1,251 @@
+"""Places that are seen again.                                            actors/loop_closer.py
+
+in   keyframe/new       Keyframe         Lossless(8)   a missing one would be no place to come back
+in   detection/boxes    DetectionBoxes   Lossless(8)   what is there, for every keyframe
+in   graph/correction   Correction       Latest(1)     a versioned absolute state: the newest says
+out  loop/closure    LoopClosure
+out  loop/candidate  LoopCandidate
+
+A keyframe waits for its boxes. Without a detector these come too, and say that nobody looked.
+"""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ldo_service.geometry.keyframe_poses import KeyframePoses
+from ldo_service.loops import Finding, LoopsConfig, Recogniser
+from ldo_service.loops.landmarks import Sightings, sightings_of
+from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.schemas import (
+    Correction,
+    Detection,
+    DetectionBoxes,
+    Keyframe,
+    LoopCandidate,
+    LoopClosure,
+)
+from ldo_service.schemas.message import decode, encode
+from ldo_service.schemas.topics import (
+    DETECTION_BOXES,
+    GRAPH_CORRECTION,
+    KEYFRAME_NEW,
+    LOOP_CANDIDATE,
+    LOOP_CLOSURE,
+)
+from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.tracking.movable import MovableConfig, movable_pixels
+from ldo_service.tracking.places import Place, place_of
+from ldo_service.wire import (
+    boxes_in,
+    keyframe_of,
+    keyframe_poses_of,
+    loop_candidate_message,
+    loop_closure_message,
+    transform,
+)
+
+log = logging.getLogger(__name__)
+
+MOST_WAITING = 16  # keyframes, or boxes: two windows of their inputs; what waits longer was lost
+RECENT_KEYFRAMES = 32  # that the optimizer may not have placed yet, as the tracker keeps
+
+
+@dataclass(frozen=True, slots=True)
+class LoopCloserConfig:
+    loops: LoopsConfig = field(default_factory=LoopsConfig)
+    movable: MovableConfig = field(default_factory=MovableConfig)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Waiting:
+    """A keyframe whose boxes are under way."""
+
+    place: Place
+    frame: int
+    stamp_ns: int
+    width_px: int  # of the image that the boxes are in
+
+    @property
+    def packed(self) -> dict[str, Any]:
+        """`place` is one and the same object each time."""
+        return {
+            "place": self.place.packed,
+            "facts": (self.frame, self.stamp_ns, self.width_px),
+        }
+
+
+class LoopCloser(Actor):
+    """Only says what it found; the optimizer decides how far to believe it."""
+
+    name = "loop_closer"
+    inputs = (
+        In(KEYFRAME_NEW, Lossless(8)),
+        In(DETECTION_BOXES, Lossless(8)),
+        In(GRAPH_CORRECTION, Latest(1)),
+    )
+    outputs = (Out(LOOP_CLOSURE), Out(LOOP_CANDIDATE))
+
+    def __init__(self, config: LoopCloserConfig | None = None) -> None:
+        super().__init__()
+        self.config = config or LoopCloserConfig()
+        self._recogniser = Recogniser(self.config.loops)
+        self._vocabulary = Vocabulary()
+        self._poses = KeyframePoses()  # of the keyframes kept, and the newest
+        self._joined: dict[int, int] = {}  # segments placed in an older one
+        self._waiting: dict[int, Waiting] = {}  # by keyframe
+        self._boxes: dict[int, DetectionBoxes] = {}  # that came before their keyframe, or wait
+        self._newest = -1  # keyframe taken
+        self._accepted = self._refused = self._without_boxes = self._repeated = 0
+        self._parts: dict[str, Any] | None = None  # of the state
+
+    def handle(
+        self, message: Keyframe | DetectionBoxes | Correction
+    ) -> Iterator[LoopClosure | LoopCandidate]:
+        self._parts = None
+        if isinstance(message, Correction):
+            T_map = keyframe_poses_of(message, only=self._poses)
+            self._poses.correct(message.graph_version, T_map)
+            self._joined = dict(message.joined)
+            return
+        if isinstance(message, Keyframe):
+            self._take(message)
+        elif message.keyframe > self._newest or message.keyframe in self._waiting:
+            self._boxes[message.keyframe] = message
+        for keyframe in self._ready():
+            yield from self._recognise(keyframe)
+
+    def _take(self, message: Keyframe) -> None:
+        if message.keyframe <= self._newest:
+            self._repeated += 1  # sent again after a restart
+            return
+        self._newest = message.keyframe
+        self._poses.chain(
+            message.keyframe,
+            message.reference,
+            transform(message.T_reference_keyframe),
+            transform(message.T_odom_keyframe),
+            message.segment,
+        )
+        loops = self.config.loops
+        place = place_of(keyframe_of(message, loops.pyramid), loops.features, loops.places)
+        width_px = message.camera.width
+        self._waiting[message.keyframe] = Waiting(place, message.frame, message.stamp_ns, width_px)
+
+    def _ready(self) -> list[int]:
+        """Keyframes whose turn it is: boxes come in order, so those of older ones will not come."""
+        newest = max(self._boxes.keys() & self._waiting.keys(), default=-1)
+        ready = [k for k in self._waiting if k <= newest]
+        late = len(self._waiting) - len(ready) - MOST_WAITING
+        return ready or list(self._waiting)[: max(late, 0)]
+
+    # --- recognising ------------------------------------------------------------------------------
+    def _recognise(self, keyframe: int) -> Iterator[LoopClosure | LoopCandidate]:
+        waiting, boxes = self._waiting.pop(keyframe), self._boxes.pop(keyframe, None)
+        self._boxes = {k: b for k, b in self._boxes.items() if k > keyframe}
+        self._without_boxes += boxes is None
+        place, sightings = self._seen(waiting, boxes)
+        findings = self._recogniser.add(
+            place, waiting.frame, waiting.stamp_ns, sightings, self._poses, self._joined
+        )
+        for finding in findings:
+            yield from self._told(finding)
+        if findings or not self._recogniser.is_open:
+            self._poses.keep_only(self._needed())
+
+    def _seen(
+        self, waiting: Waiting, boxes: DetectionBoxes | None
+    ) -> tuple[Place, Sightings | None]:
+        """The place without what may move by itself, and what stands there."""
+        if boxes is None or not boxes.network:
+            return waiting.place, None
+        place, movable = waiting.place, self.config.movable
+        times = waiting.width_px / place.camera.width
+        found = boxes_in(boxes.detections, times)
+        place = place.without(movable_pixels(found, place.depth_m, movable))
+        return place, self._sightings(boxes.detections, place, times)
+
+    def _sightings(
+        self, detections: tuple[Detection, ...], place: Place, times: float
+    ) -> Sightings:
+        standing = [d for d in detections if d.label not in self.config.movable.classes]
+        boxes = np.array([d.box_px for d in standing], float).reshape(-1, 4)
+        return sightings_of(
+            np.array([self._vocabulary.index(d.label) for d in standing], np.uint8),
+            np.array([d.score for d in standing], np.float32),
+            (boxes + 0.5) / times - 0.5,
+            place.depth_m,
+            place.camera,
+            self.config.loops.verification.landmarks,
+        )
+
+    def _told(self, finding: Finding) -> Iterator[LoopClosure | LoopCandidate]:
+        closure = finding.closure
+        if closure is None:
+            self._refused += 1
+        else:
+            self._accepted += 1
+            log.info("keyframe %d closes a loop with %d", closure.b, closure.a)
+            yield loop_closure_message(finding)
+        yield loop_candidate_message(finding)
+
+    def _needed(self) -> list[int]:
+        """Keyframes that are kept as views, and those that the optimizer may not have placed."""
+        views = {v.keyframe for s in self._recogniser.subgraphs for v in s.views}
+        return [k for k in self._poses if k > self._newest - RECENT_KEYFRAMES or k in views]
+
+    # --- state ------------------------------------------------------------------------------------
+    def snapshot(self) -> dict[str, Any]:
+        """A part for each subgraph and waiting keyframe, written once, and one for the rest."""
+        if self._parts is None:
+            self._parts = self._all_parts()
+        return self._parts
+
+    def _all_parts(self) -> dict[str, Any]:
+        state = self._recogniser.state()
+        subgraphs = {f"subgraph_{s['keyframes'][0]}": s for s in state.pop("subgraphs")}
+        views = {f"view_{view['place']['id']}": view for view in state.pop("views")}
+        waiting = {f"waiting_{k}": w.place.packed for k, w in self._waiting.items()}
+        now = {
+            **state,
+            "waiting": {k: w.packed["facts"] for k, w in self._waiting.items()},
+            "boxes": [encode(boxes) for boxes in self._boxes.values()],
+            "newest": self._newest,
+            "joined": list(self._joined.items()),
+            "vocabulary": self._vocabulary.packed,
+            "poses": self._poses.snapshot(),
+        }
+        return {**subgraphs, **views, **waiting, "now": now}
+
+    def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        now = state["now"]
+
+        def parts(kind: str) -> list[Any]:
+            names = [name for name in state if name.startswith(kind)]
+            return [state[name] for name in sorted(names, key=lambda n: int(n[len(kind) :]))]
+
+        kept = {"subgraphs": parts("subgraph_"), "views": parts("view_")}
+        self._recogniser.restore({**now, **kept})
+        self._waiting = {
+            int(k): Waiting(Place.unpacked(state[f"waiting_{k}"]), *facts)
+            for k, facts in now["waiting"].items()
+        }
+        boxes = [decode(body, DetectionBoxes) for body in now["boxes"]]
+        self._boxes = {one.keyframe: one for one in boxes}
+        self._newest, self._joined = now["newest"], dict(map(tuple, now["joined"]))
+        self._vocabulary = Vocabulary.unpacked(now["vocabulary"])
+        self._poses = KeyframePoses()
+        self._poses.restore(now["poses"])
+        self._parts = None
+
+    def facts(self) -> dict[str, float]:
+        return {
+            "subgraphs": len(self._recogniser.subgraphs),
+            "loops_accepted": self._accepted,
+            "loops_refused": self._refused,
+            "keyframes_without_boxes": self._without_boxes,  # that never came
+            "keyframes_repeated": self._repeated,
+        }

@@ -1,0 +1,202 @@
+"""Loops that were closed, and those that could have been. Conventions: `ldo_service.geometry`."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.datasets import Sequence as Frames
+from ldo_service.geometry import Camera, Trajectory, associate, se3
+
+from .trajectory import ASSOCIATION_TOLERANCE_S
+
+APART_FRAMES = 100
+LEAST_OVERLAP = 0.3
+KEPT_ACROSS, ASKED_ACROSS = 160, 40  # pixels in a row of depth, and those asked for a partner
+SAME_M, SAME_SHARE = 0.05, 0.03  # of depth: nearer to each other two depths are one surface
+LEFTOVER = 5  # keyframes of a subgraph that loops.json does not name
+
+PROTOCOL = """\
+Loops: a pair of subgraphs is true when a keyframe of one and a keyframe of the other each see more
+than 30 % of the other's measured pixels, by the source's depth (within 5 cm + 3 %) and true poses,
+and are more than 100 frames apart. Precision: closures between true pairs, of all closures. Recall:
+newer subgraphs that closed a true pair, of those that have one; keyframes that loops.json puts into
+no subgraph are taken five at a time. Errors: of the pose of each closure against the true one.
+Time: of the whole search over its candidates, per candidate."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairCompared:
+    """Two subgraphs, by the ids of their keyframes."""
+
+    newer: tuple[int, ...]
+    older: tuple[int, ...]
+    is_closure: bool
+    ms: float | None  # None: not measured
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LoopClosed:
+    """T_reference_keyframe [4, 4] between an old keyframe and a new one."""
+
+    keyframe: int
+    reference: int
+    T_reference_keyframe: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class FoundLoops:
+    candidates: tuple[PairCompared, ...]
+    closures: tuple[LoopClosed, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SeenKeyframe:
+    """A keyframe with its true pose T_world_camera [4, 4] and depth [H, W] in m."""
+
+    id: int
+    frame: int
+    T_world_camera: np.ndarray
+    camera: Camera
+    depth_m: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class LoopErrors:
+    """`PROTOCOL` says how each is computed; None where there is nothing to divide by."""
+
+    closures: int
+    true_closures: int
+    queries: int  # subgraphs that have a true partner
+    closed_queries: int
+    candidates: int
+    position_errors_m: tuple[float, ...]  # of the closures
+    rotation_errors_deg: tuple[float, ...]
+    ms: tuple[float, ...]  # of the candidates
+
+    @property
+    def precision(self) -> float | None:
+        return self.true_closures / self.closures if self.closures else None
+
+    @property
+    def recall(self) -> float | None:
+        return self.closed_queries / self.queries if self.queries else None
+
+
+def seen_keyframes(
+    frames: Mapping[int, int], sequence: Frames, truth: Trajectory
+) -> dict[int, SeenKeyframe]:
+    """By id: keyframes whose frame index `frames` gives, and that have a true pose within 20 ms."""
+    stamps_s = 1e-9 * sequence.stamps_ns[list(frames.values())]
+    pairs = associate(stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
+    ids = list(frames)
+    return {
+        ids[k]: _seen(ids[k], frames[ids[k]], sequence, truth.T_world_camera[at])
+        for k, at in pairs.tolist()
+    }
+
+
+def _seen(id: int, index: int, sequence: Frames, T_world_camera: np.ndarray) -> SeenKeyframe:
+    """With every n-th pixel of its depth, which tells what overlaps."""
+    frame = sequence[index]
+    step = max(1, frame.camera.width // KEPT_ACROSS)
+    first, camera = step // 2, frame.camera
+    depth_m = frame.depth_m[first::step, first::step].copy()
+    small = Camera(
+        depth_m.shape[1],
+        depth_m.shape[0],
+        camera.fx / step,
+        camera.fy / step,
+        (camera.cx - first) / step,
+        (camera.cy - first) / step,
+    )
+    return SeenKeyframe(id, index, T_world_camera, small, depth_m)
+
+
+def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> LoopErrors:
+    """Judge by PROTOCOL; `keyframes` by id, those without a true pose left out."""
+    subgraphs = _subgraphs(found, keyframes)
+    index = {subgraph: number for number, subgraph in enumerate(subgraphs)}
+    partners = _true_pairs(subgraphs, keyframes)
+    pairs = [(index.get(c.newer), index.get(c.older)) for c in found.candidates if c.is_closure]
+    right = {pair for pair in pairs if pair in partners}
+    have_partner = {newer for newer, _ in partners}
+    errors = [_error(c, keyframes) for c in found.closures if _are_known(c, keyframes)]
+    return LoopErrors(
+        closures=len(pairs),
+        true_closures=sum(pair in partners for pair in pairs),
+        queries=len(have_partner),
+        closed_queries=len({newer for newer, _ in right}),
+        candidates=len(found.candidates),
+        position_errors_m=tuple(m for m, _ in errors),
+        rotation_errors_deg=tuple(deg for _, deg in errors),
+        ms=tuple(c.ms for c in found.candidates if c.ms is not None),
+    )
+
+
+def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
+    """Share of the measured pixels of `new`, some 40 in a row, whose surface `old` measured."""
+    step = max(1, new.camera.width // ASKED_ACROSS)
+    sampled = np.zeros(new.depth_m.shape, bool)
+    sampled[step // 2 :: step, step // 2 :: step] = True
+    v, u = np.nonzero(sampled & (new.depth_m > 0))
+    if not len(v):
+        return 0.0
+    z = new.depth_m[v, u].astype(float)
+    camera = new.camera
+    rays = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
+    p_new = np.column_stack([rays, np.ones(len(rays))]) * z[:, None]
+    p_old = se3.transform(se3.inverse(old.T_world_camera) @ new.T_world_camera, p_new)
+    p_old = p_old[p_old[:, 2] > 0]
+    pixels = np.rint(old.camera.project(p_old)).astype(np.int64)
+    inside = np.all((pixels >= 0) & (pixels < [old.camera.width, old.camera.height]), axis=1)
+    there_m = old.depth_m[pixels[inside, 1], pixels[inside, 0]]
+    gap_m = np.abs(p_old[inside, 2] - there_m)
+    return float(np.sum((there_m > 0) & (gap_m < SAME_M + SAME_SHARE * there_m)) / len(v))
+
+
+def _subgraphs(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> list[tuple[int, ...]]:
+    """Those that were compared, and the keyframes between them."""
+    named = {subgraph for c in found.candidates for subgraph in (c.newer, c.older)}
+    taken = {keyframe for subgraph in named for keyframe in subgraph}
+    left = [keyframe for keyframe in sorted(keyframes) if keyframe not in taken]
+    groups: list[list[int]] = []
+    for keyframe in left:
+        if not groups or keyframe != groups[-1][-1] + 1 or len(groups[-1]) == LEFTOVER:
+            groups.append([])
+        groups[-1].append(keyframe)
+    return sorted([*named, *map(tuple, groups)])
+
+
+def _true_pairs(
+    subgraphs: Sequence[tuple[int, ...]], keyframes: Mapping[int, SeenKeyframe]
+) -> set[tuple[int | None, int | None]]:
+    """(newer, older) indices of subgraphs."""
+    members = [[keyframes[k] for k in subgraph if k in keyframes] for subgraph in subgraphs]
+    return {
+        (newer, older)
+        for newer in range(len(members))
+        for older in range(newer)
+        if any(_are_partners(a, b) for a in members[newer] for b in members[older])
+    }
+
+
+def _are_partners(new: SeenKeyframe, old: SeenKeyframe) -> bool:
+    if abs(new.frame - old.frame) <= APART_FRAMES:
+        return False
+    looks_away = new.T_world_camera[:3, 2] @ old.T_world_camera[:3, 2] < 0
+    if looks_away or overlap(new, old) <= LEAST_OVERLAP:
+        return False
+    return overlap(old, new) > LEAST_OVERLAP
+
+
+def _are_known(closure: LoopClosed, keyframes: Mapping[int, SeenKeyframe]) -> bool:
+    return closure.keyframe in keyframes and closure.reference in keyframes
+
+
+def _error(closure: LoopClosed, keyframes: Mapping[int, SeenKeyframe]) -> tuple[float, float]:
+    """m and degrees between a closure and the truth."""
+    old, new = keyframes[closure.reference], keyframes[closure.keyframe]
+    T_true = se3.inverse(old.T_world_camera) @ new.T_world_camera
+    T = se3.inverse(T_true) @ closure.T_reference_keyframe
+    return float(np.linalg.norm(T[:3, 3])), float(np.degrees(se3.rotation_angle(T)))

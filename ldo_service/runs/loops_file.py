@@ -1,0 +1,106 @@
+"""loops.json of a run: every pair of places that was compared, and the loops that were closed.
+
+candidates   as the message `loop/candidate`: keyframe, reference, keyframes, references,
+             similarity, appearance, evidence, inliers, divergence, entropy, overlap, rmse_m, and
+             refused, which is "" where it became a closure; ms is the time of its comparison, null
+             where it was not measured
+closures     as `loop/closure`: keyframe, reference, T_reference_keyframe [4, 4], information
+             [6, 6], overlap, rmse_m, entropy
+"""
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.evaluation.loops import FoundLoops, LoopClosed, PairCompared
+from ldo_service.schemas import LoopCandidate, LoopClosure
+from ldo_service.wire import transform
+
+LOOPS = "loops.json"
+
+
+class LoopRecord:
+    """Takes note of what the loop closer says."""
+
+    def __init__(self) -> None:
+        self._candidates: list[tuple[LoopCandidate, float]] = []  # with ms of their whole step
+        self._closures: list[LoopClosure] = []
+
+    def observe(self, message: LoopCandidate | LoopClosure, step_ms: float) -> None:
+        if isinstance(message, LoopClosure):
+            self._closures.append(message)
+        else:
+            self._candidates.append((message, step_ms))
+
+    @property
+    def accepted(self) -> int:
+        return len(self._closures)
+
+    @property
+    def rejected(self) -> int:
+        return sum(bool(candidate.refused) for candidate, _ in self._candidates)
+
+    def save(self, folder: Path) -> None:
+        at_once = Counter(candidate.keyframe for candidate, _ in self._candidates)
+        value = {
+            "candidates": [
+                _candidate(candidate, step_ms / at_once[candidate.keyframe])
+                for candidate, step_ms in self._candidates
+            ],
+            "closures": [_closure(closure) for closure in self._closures],
+        }
+        (folder / LOOPS).write_text(json.dumps(value, indent=1) + "\n")
+
+
+def _candidate(message: LoopCandidate, ms: float) -> dict[str, Any]:
+    fields = msgspec.to_builtins(message)
+    return {
+        **{name: value for name, value in fields.items() if name not in ("type", "stamp_ns")},
+        "stamp_ns": message.stamp_ns,
+        "ms": round(ms, 3) if ms else None,
+    }
+
+
+def _closure(message: LoopClosure) -> dict[str, Any]:
+    return {
+        "keyframe": message.pose.keyframe,
+        "reference": message.pose.reference,
+        "T_reference_keyframe": transform(message.pose.T_reference_keyframe).tolist(),
+        "information": np.reshape(message.pose.information, (6, 6)).tolist(),
+        "overlap": message.overlap,
+        "rmse_m": message.rmse_m,
+        "entropy": message.entropy,
+    }
+
+
+def read_loops(folder: Path) -> FoundLoops | None:
+    """None where the run wrote none; raises DataError where it is not what a run writes."""
+    path = folder / LOOPS
+    if not path.is_file():
+        return None
+    try:
+        value = json.loads(path.read_text())
+        return FoundLoops(
+            tuple(map(_compared, value["candidates"])), tuple(map(_closed, value["closures"]))
+        )
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
+
+
+def _compared(row: dict[str, Any]) -> PairCompared:
+    subgraphs = tuple(map(int, row["keyframes"])), tuple(map(int, row["references"]))
+    return PairCompared(*subgraphs, is_closure=not row["refused"], ms=row["ms"])
+
+
+def _closed(row: dict[str, Any]) -> LoopClosed:
+    T = np.array(row["T_reference_keyframe"], float)
+    if T.shape != (4, 4) or not np.all(np.isfinite(T)):
+        raise ValueError(f"T_reference_keyframe of {row['keyframe']} is no finite 4x4 matrix")
+    return LoopClosed(int(row["keyframe"]), int(row["reference"]), T)
