@@ -92,9 +92,9 @@ class LoopCloser(Actor):
     def __init__(self, config: LoopCloserConfig | None = None) -> None:
         super().__init__()
         self.config = config or LoopCloserConfig()
-        self._recogniser = Recogniser(self.config.loops)
+        self.recogniser = Recogniser(self.config.loops)
         self._vocabulary = Vocabulary()
-        self._poses = KeyframePoses()  # of the keyframes kept, and the newest
+        self.poses = KeyframePoses()  # of the keyframes kept, and the newest
         self._joined: dict[int, int] = {}  # segments placed in an older one
         self._waiting: dict[int, Waiting] = {}  # by keyframe
         self._boxes: dict[int, DetectionBoxes] = {}  # that came before their keyframe, or wait
@@ -107,8 +107,8 @@ class LoopCloser(Actor):
     ) -> Iterator[LoopClosure | LoopCandidate]:
         self._parts = None
         if isinstance(message, Correction):
-            T_map = keyframe_poses_of(message, only=self._poses)
-            self._poses.correct(message.graph_version, T_map)
+            T_map = keyframe_poses_of(message, only=self.poses)
+            self.poses.correct(message.graph_version, T_map)
             self._joined = dict(message.joined)
             return
         if isinstance(message, Keyframe):
@@ -123,7 +123,7 @@ class LoopCloser(Actor):
             self._repeated += 1  # sent again after a restart
             return
         self._newest = message.keyframe
-        self._poses.chain(
+        self.poses.chain(
             message.keyframe,
             message.reference,
             transform(message.T_reference_keyframe),
@@ -148,13 +148,13 @@ class LoopCloser(Actor):
         self._boxes = {k: b for k, b in self._boxes.items() if k > keyframe}
         self._without_boxes += boxes is None
         place, sightings = self._seen(waiting, boxes)
-        findings = self._recogniser.add(
-            place, waiting.frame, waiting.stamp_ns, sightings, self._poses, self._joined
+        findings = self.recogniser.add(
+            place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._joined
         )
         for finding in findings:
             yield from self._told(finding)
-        if findings or not self._recogniser.is_open:
-            self._poses.keep_only(self._needed())
+        if findings or not self.recogniser.is_open:
+            self.poses.keep_only(self._needed())
 
     def _seen(
         self, waiting: Waiting, boxes: DetectionBoxes | None
@@ -194,8 +194,8 @@ class LoopCloser(Actor):
 
     def _needed(self) -> list[int]:
         """Keyframes that are kept as views, and those that the optimizer may not have placed."""
-        views = {v.keyframe for s in self._recogniser.subgraphs for v in s.views}
-        return [k for k in self._poses if k > self._newest - RECENT_KEYFRAMES or k in views]
+        views = {v.keyframe for s in self.recogniser.subgraphs for v in s.views}
+        return [k for k in self.poses if k > self._newest - RECENT_KEYFRAMES or k in views]
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -205,7 +205,7 @@ class LoopCloser(Actor):
         return self._parts
 
     def _all_parts(self) -> dict[str, Any]:
-        state = self._recogniser.state()
+        state = self.recogniser.state()
         subgraphs = {f"subgraph_{s['keyframes'][0]}": s for s in state.pop("subgraphs")}
         views = {f"view_{view['place']['id']}": view for view in state.pop("views")}
         waiting = {f"waiting_{k}": w.place.packed for k, w in self._waiting.items()}
@@ -216,7 +216,7 @@ class LoopCloser(Actor):
             "newest": self._newest,
             "joined": list(self._joined.items()),
             "vocabulary": self._vocabulary.packed,
-            "poses": self._poses.snapshot(),
+            "poses": self.poses.snapshot(),
         }
         return {**subgraphs, **views, **waiting, "now": now}
 
@@ -228,7 +228,7 @@ class LoopCloser(Actor):
             return [state[name] for name in sorted(names, key=lambda n: int(n[len(kind) :]))]
 
         kept = {"subgraphs": parts("subgraph_"), "views": parts("view_")}
-        self._recogniser.restore({**now, **kept})
+        self.recogniser.restore({**now, **kept})
         self._waiting = {
             int(k): Waiting(Place.unpacked(state[f"waiting_{k}"]), *facts)
             for k, facts in now["waiting"].items()
@@ -237,13 +237,13 @@ class LoopCloser(Actor):
         self._boxes = {one.keyframe: one for one in boxes}
         self._newest, self._joined = now["newest"], dict(map(tuple, now["joined"]))
         self._vocabulary = Vocabulary.unpacked(now["vocabulary"])
-        self._poses = KeyframePoses()
-        self._poses.restore(now["poses"])
+        self.poses = KeyframePoses()
+        self.poses.restore(now["poses"])
         self._parts = None
 
     def facts(self) -> dict[str, float]:
         return {
-            "subgraphs": len(self._recogniser.subgraphs),
+            "subgraphs": len(self.recogniser.subgraphs),
             "loops_accepted": self._accepted,
             "loops_refused": self._refused,
             "keyframes_without_boxes": self._without_boxes,  # that never came
