@@ -1,0 +1,39 @@
+"""Between transforms, against SciPy's interpolation and one at a time."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.blending import blended, quaternions
+
+RNG = np.random.default_rng(3)
+
+
+def some(count: int) -> np.ndarray:
+    return np.array([se3.exp(RNG.normal(size=6)) for _ in range(count)])
+
+
+def test_rotations_follow_the_geodesic_and_positions_a_line() -> None:
+    T_a, T_b, share = some(7), some(7), RNG.random(7)
+    T = blended(T_a, T_b, share)
+    for k in range(7):
+        ends = Rotation.from_matrix([T_a[k, :3, :3], T_b[k, :3, :3]])
+        np.testing.assert_allclose(
+            T[k, :3, :3], Slerp([0, 1], ends)(share[k]).as_matrix(), atol=1e-12
+        )
+        line = (1 - share[k]) * T_a[k, :3, 3] + share[k] * T_b[k, :3, 3]
+        np.testing.assert_allclose(T[k, :3, 3], line, atol=1e-12)
+
+
+def test_the_ends_are_the_transforms_themselves() -> None:
+    T_a, T_b = some(3), some(3)
+    np.testing.assert_allclose(blended(T_a, T_b, np.zeros(3)), T_a, atol=1e-12)
+    np.testing.assert_allclose(blended(T_a, T_b, np.ones(3)), T_b, atol=1e-12)
+
+
+def test_quaternions_of_many_are_those_of_each() -> None:
+    T = some(50)
+    one_by_one = [se3.quaternion(R) for R in T[:, :3, :3]]
+    np.testing.assert_allclose(quaternions(T[:, :3, :3]), one_by_one, atol=1e-12)
+    assert quaternions(np.zeros((0, 3, 3))).shape == (0, 4)
+    assert blended(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0)).shape == (0, 4, 4)
