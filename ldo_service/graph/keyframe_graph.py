@@ -1,74 +1,93 @@
-"""Keyframe poses from relative measurements, by incremental smoothing (iSAM2)."""
+"""Keyframe poses from relative measurements and landmarks, by incremental smoothing (iSAM2)."""
 
-from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from typing import Any
 
-import gtsam
 import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
 
+from .closures import Closures, ClosuresConfig, Pair, Verdict
+from .condensing import group_to_condense
+from .factors import NoiseConfig, Sight, information
+from .measurements import Measurements
+from .packing import pack_relative, pack_sights, unpack_relative, unpack_sights
+from .solver import Name, Solver, Variables, point_key, solved
+
 
 @dataclass(frozen=True, slots=True)
 class KeyframeGraphConfig:
-    first_sigma: float = 1e-6  # rad and m: the first keyframe is the origin of its component
-    sigma_rotation_max_rad: float = 0.2  # a degenerate direction is believed no worse than this,
-    sigma_translation_max_m: float = 0.5  # or the linear system becomes singular
-    sigma_odometry_rad: float = 0.05  # of odometry over a missed keyframe
-    sigma_odometry_m: float = 0.1
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    closures: ClosuresConfig = field(default_factory=ClosuresConfig)
+    condense_keyframes: int = 10  # of which one stays a variable (paper, III.C: every 10)
+    window_keyframes: int = 20  # the newest stay as they are: they are still measured anew
+    most_changes: int = 64  # between two rebuilds: what a successor repeats to hold the same bits
 
     def __post_init__(self) -> None:
-        if min(getattr(self, name) for name in self.__slots__) <= 0:
-            raise ConfigError(f"{self}: every sigma must be positive.")
+        if min(self.condense_keyframes, self.window_keyframes, self.most_changes) < 1:
+            raise ConfigError(f"{self}: keyframes and changes must be at least 1.")
 
 
 class KeyframeGraph:
-    """min over T_map_k of  sum |log(T_a_b^-1 T_map_a^-1 T_map_b)|^2_information.
+    """min F(T, mu) of `ldo_service.graph`, over the keyframes that are variables.
 
     Keyframes that measurements connect are a component, whose frame its first keyframe fixes; a
     measurement between two components makes them one, in the frame of the older.
 
-    iSAM2 relinearises what moved. An update that throws has already changed the object, so the
-    graph is rebuilt from the kept measurements. Deterministic: the same measurements in the same
-    order give the same bits.
+    iSAM2 relinearises what moved. It cannot be saved, and another one built from the same
+    measurements differs in the last digits. So what is saved is the state at the last rebuild, and
+    the changes since, which a successor repeats: it goes on with the same bits. Rebuilt every few
+    keyframes anyway, when old ones are condensed, and where an update throws, which has already
+    changed the object. Deterministic: the same measurements in the same order give the same bits.
     """
 
     def __init__(self, config: KeyframeGraphConfig = KeyframeGraphConfig()) -> None:
         self._config = config
-        self._floor = np.diag(
-            [config.sigma_rotation_max_rad**-2] * 3 + [config.sigma_translation_max_m**-2] * 3
-        )
-        self._initial: dict[int, np.ndarray] = {}  # the value each keyframe was inserted with
-        self._measured: dict[tuple[int, int], RelativePose] = {}
-        self._places: dict[tuple[int, int], int] = {}  # of their factors in the solver
-        self._first_of: dict[int, int] = {}  # the first keyframe of each one's component
-        self._isam = self._new_isam()
+        self._known = Measurements(config.noise, config.closures)
+        self._initial: Variables = {}  # the value each variable was inserted with
+        self._solver = Solver()
+        self._base = self._packed()
+        self._changes: list[tuple[str, dict[str, Any]]] = []  # since the last rebuild
+        self.solved_times = 0
 
     def __contains__(self, keyframe: int) -> bool:
-        return keyframe in self._initial
+        return keyframe in self._known.first_of
 
     def __len__(self) -> int:
-        return len(self._initial)
+        return len(self._known.first_of)
 
     @property
     def keyframes(self) -> Set[int]:
-        return self._initial.keys()
+        return self._known.first_of.keys()
 
     @property
     def newest(self) -> int | None:
-        return max(self._initial, default=None)
+        return max(self.keyframes, default=None)
 
+    @property
+    def variables(self) -> int:
+        """Keyframes that are variables; the others follow them."""
+        return len(self) - len(self._known.rows)
+
+    @property
+    def closures(self) -> Closures:
+        return self._known.closures
+
+    # --- keyframes --------------------------------------------------------------------------------
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
         """The keyframe that fixes the frame of a new component."""
+        self._note("first", keyframe=keyframe, T_map=T_map_keyframe)
         self._initial[keyframe] = np.array(T_map_keyframe, float)
-        self._first_of[keyframe] = keyframe
-        self._update([], [keyframe])
+        self._known.first_of[keyframe] = keyframe
+        self._known.active.append(keyframe)
+        self._update([("first", keyframe)], [keyframe])
 
     def first_of(self, keyframe: int) -> int:
         """The first keyframe of its component. Raises KeyError when it is not known."""
-        return self._first_of[keyframe]
+        return self._known.first_of[keyframe]
 
     def add(self, measured: RelativePose, *more: RelativePose) -> None:
         """A new keyframe `b`, measured from a known one, and from `more` of them.
@@ -78,144 +97,212 @@ class KeyframeGraph:
         every = (measured, *more)
         if any(m.b != measured.b for m in every):
             raise ValueError(f"keyframes {sorted({m.b for m in every})} cannot be added at once.")
-        for m in every:
-            if m.a not in self:
-                raise KeyError(m.a)
+        self._require(m.a for m in every)
+        self._note("add", measured=pack_relative(every))
         self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
-        self._first_of[measured.b] = self._first_of[measured.a]
-        self._measured.update({(m.a, m.b): m for m in every})
-        self._update(every, [measured.b])
+        self._known.first_of[measured.b] = self.first_of(measured.a)
+        self._known.active.append(measured.b)
+        self._update([self._known.measure(m) for m in every], [measured.b])
+        self._condense()
 
     def replace(self, measured: Sequence[RelativePose]) -> None:
-        """Believe these in place of what was measured between the same keyframes before.
+        """Believe these in place of what was measured between the same keyframes before. One that
+        follows others is put where they say.
 
         Raises KeyError for a keyframe that is not known.
         """
-        for m in measured:
-            if m.a not in self or m.b not in self:
-                raise KeyError((m.a, m.b))
-        old = [self._places[m.a, m.b] for m in measured if (m.a, m.b) in self._places]
-        self._measured.update({(m.a, m.b): m for m in measured})
-        self._update(measured, [], old)
+        self._require(k for m in measured for k in (m.a, m.b))
+        self._note("replace", measured=pack_relative(measured))
+        names = [self._known.measure_anew(m, self.pose) for m in measured]
+        self._update([name for name in names if name], [])
 
+    def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
+        """Odometry between keyframes of which those between were missed: believed less."""
+        noise = self._config.noise
+        own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)
+        return RelativePose(a, b, T_a_b, own)
+
+    def _require(self, keyframes: Iterable[int]) -> None:
+        for keyframe in keyframes:
+            if keyframe not in self:
+                raise KeyError(keyframe)
+
+    # --- components and loops ---------------------------------------------------------------------
     def connect(self, measured: RelativePose) -> None:
         """A measurement between two known keyframes. Raises KeyError when one is not known.
 
         When it joins two components, the younger one moves as a whole into the older one's frame,
         T_new_old = T_map_a T_a_b T_map_b^-1 (or its inverse), before everything is solved again.
         """
-        first_a, first_b = self._first_of[measured.a], self._first_of[measured.b]
+        first_a, first_b = self.first_of(measured.a), self.first_of(measured.b)
         if first_a == first_b:
             self.replace([measured])
             return
         T_new_old = self.pose(measured.a) @ measured.T_a_b @ se3.inverse(self.pose(measured.b))
         if first_a > first_b:
             T_new_old = se3.inverse(T_new_old)
-        self._move(max(first_a, first_b), min(first_a, first_b), se3.orthonormalised(T_new_old))
-        self._measured[measured.a, measured.b] = measured
-        self._rebuild()
+        T_new_old = se3.orthonormalised(T_new_old)
+        younger, older = max(first_a, first_b), min(first_a, first_b)
+        moved = self._known.move_component(younger, older, T_new_old, self._solver.variables())
+        self._known.joins[measured.a, measured.b] = measured
+        self._rebase(moved)
 
-    def _move(self, younger: int, older: int, T_new_old: np.ndarray) -> None:
-        """All of a component into another; everything is solved from where it is now."""
-        self._initial = poses = self.poses()
-        for keyframe in [k for k, first in self._first_of.items() if first == younger]:
-            self._initial[keyframe] = T_new_old @ poses[keyframe]
-            self._first_of[keyframe] = older
+    def close(self, closure: RelativePose) -> Verdict:
+        """A loop closure between known keyframes: is it believed, and what left for it.
 
-    def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
-        """Odometry between keyframes of which those between were missed: believed less."""
-        sigmas = [self._config.sigma_odometry_rad] * 3 + [self._config.sigma_odometry_m] * 3
-        return RelativePose(a, b, T_a_b, np.diag(np.array(sigmas) ** -2))
+        See `closures`; a refused one leaves no trace in any pose. Between two components there is
+        nothing to judge it by, and it joins them. Raises KeyError when a keyframe is not known.
+        """
+        if self.first_of(closure.a) != self.first_of(closure.b):
+            self.connect(closure)
+            return Verdict(True)
+        start, known = self._solver.variables(), self._known
+        verdict, variables = known.closures.judged(
+            closure,
+            lambda closures: solved(known.with_closures(closures, self._initial), start),
+            known.closure_sigmas,
+        )
+        self.solved_times += 1
+        known.closures = known.closures.after(closure, verdict)
+        if verdict.changes:
+            self._rebase(variables)
+        else:
+            self._note("refuse", measured=pack_relative([closure]))
+        return verdict
 
+    # --- landmarks --------------------------------------------------------------------------------
+    def see(self, sights: Sequence[Sight], placed: Mapping[int, np.ndarray]) -> None:
+        """Landmarks in the images of known keyframes; `placed` [3], in the map, are those that are
+        new. Raises KeyError for a keyframe that is not known."""
+        self._require(s.keyframe for s in sights)
+        self._note(
+            "see", sights=pack_sights(sights), ids=list(placed), points=list(placed.values())
+        )
+        self._initial |= {point_key(k): np.array(p, float) for k, p in placed.items()}
+        self._known.sights |= {(s.keyframe, s.landmark): s for s in sights}
+        names = [("sight", s.keyframe, s.landmark) for s in sights]
+        self._update(names, [point_key(k) for k in placed])
+
+    def unsee(self, pairs: Iterable[Pair]) -> None:
+        """Forget sights, by keyframe and landmark; with its last sight a landmark is forgotten."""
+        known = [pair for pair in pairs if pair in self._known.sights]
+        if not known:
+            return
+        self._note("unsee", pairs=[list(pair) for pair in known])
+        for pair in known:
+            del self._known.sights[pair]
+        left = {landmark for _, landmark in self._known.sights}
+        for landmark in {landmark for _, landmark in known} - left:
+            self._initial.pop(point_key(landmark), None)
+        self._update([], [], [("sight", *pair) for pair in known])
+
+    def landmarks(self) -> dict[int, np.ndarray]:
+        """mu [3] in the map of each, by id."""
+        variables = self._solver.variables()
+        return {k: variables[point_key(k)] for k in sorted({k for _, k in self._known.sights})}
+
+    # --- poses ------------------------------------------------------------------------------------
     def pose(self, keyframe: int) -> np.ndarray:
         """T_map_keyframe [4, 4], as estimated now."""
-        return self._isam.calculateEstimatePose3(keyframe).matrix()
+        row = self._known.rows.get(keyframe)
+        if row is None:
+            return self._solver.pose(keyframe)
+        follower = self._known.followers.only(row)
+        ends = int(follower.heads[0]), int(follower.tails[0])
+        T_head, T_tail = (self._solver.pose(k)[None] for k in ends)
+        return follower.placed(T_head, T_tail)[0]
 
     def poses(self) -> dict[int, np.ndarray]:
         """T_map_keyframe of every keyframe, ascending by id."""
-        estimate = self._isam.calculateEstimate()
-        return {k: estimate.atPose3(k).matrix() for k in sorted(self._initial)}
+        keyframes, T_map = self.placed()
+        return dict(zip(keyframes.tolist(), T_map, strict=True))
+
+    def placed(self) -> tuple[np.ndarray, np.ndarray]:
+        """All keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
+        variables, followers = self._solver.variables(), self._known.followers
+        keys = np.array([k for k in variables if k in self], np.int64)
+        T_map = np.array([variables[k] for k in keys.tolist()]).reshape(-1, 4, 4)
+        heads, tails = (np.searchsorted(keys, ids) for ids in (followers.heads, followers.tails))
+        keyframes = np.concatenate([keys, followers.keyframes])
+        order = np.argsort(keyframes)
+        every = np.concatenate([T_map, followers.placed(T_map[heads], T_map[tails])])
+        return keyframes[order], every[order]
 
     # --- iSAM2 ------------------------------------------------------------------------------------
-    def _new_isam(self) -> gtsam.ISAM2:
-        solver = gtsam.ISAM2GaussNewtonParams()
-        solver.setWildfireThreshold(0.0)  # 0.001 by default: smaller changes would not be passed on
-        parameters = gtsam.ISAM2Params()
-        parameters.setOptimizationParams(solver)
-        parameters.findUnusedFactorSlots = True  # or the list grows with every replacement
-        parameters.setRelinearizeThreshold(0.01)  # rad and m, gtsam's advice for poses
-        parameters.relinearizeSkip = 1
-        return gtsam.ISAM2(parameters)
-
     def _update(
-        self,
-        measured: Sequence[RelativePose],
-        keyframes: Sequence[int],
-        old_places: Sequence[int] = (),
+        self, names: Sequence[Name], variables: Sequence[int], gone: Sequence[Name] = ()
     ) -> None:
+        if not names and not gone:
+            return
+        self.solved_times += 1
+        factors = {name: self._known.factor(name, self._initial) for name in names}
         try:
-            self._apply(measured, keyframes, old_places)
+            self._solver.update(factors, {k: self._initial[k] for k in variables}, gone)
         except RuntimeError:
             self._rebuild()
 
-    def _apply(
-        self,
-        measured: Sequence[RelativePose],
-        keyframes: Sequence[int],
-        old_places: Sequence[int] = (),
-    ) -> None:
-        """New factors and keyframes in, the factors at `old_places` out."""
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        for m in measured:
-            graph.add(self._factor(m))
-        for keyframe in keyframes:
-            values.insert(keyframe, gtsam.Pose3(self._initial[keyframe]))
-        for keyframe in keyframes:
-            if self._first_of[keyframe] == keyframe:
-                graph.add(self._first_factor(keyframe))
-        places = self._isam.update(graph, values, list(old_places)).getNewFactorsIndices()
-        self._places.update({(m.a, m.b): place for m, place in zip(measured, places, strict=False)})
-
     def _rebuild(self) -> None:
         """All measurements into a new object. Raises RuntimeError when they cannot be solved."""
-        self._isam = self._new_isam()
-        self._apply(list(self._measured.values()), list(self._initial))
+        factors = {name: self._known.factor(name, self._initial) for name in self._known.names()}
+        self._solver = Solver()
+        if factors:
+            self._solver.update(factors, self._initial)
 
-    def _first_factor(self, keyframe: int) -> gtsam.NonlinearFactor:
-        noise = gtsam.noiseModel.Isotropic.Sigma(6, self._config.first_sigma)
-        return gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(self._initial[keyframe]), noise)
-
-    def _factor(self, measured: RelativePose) -> gtsam.NonlinearFactor:
-        information = 0.5 * (measured.information + measured.information.T) + self._floor
-        return gtsam.BetweenFactorPose3(
-            measured.a,
-            measured.b,
-            gtsam.Pose3(measured.T_a_b),
-            gtsam.noiseModel.Gaussian.Information(information),
+    def _condense(self) -> None:
+        """What is due; and start anew from what is known now, often enough."""
+        config, known = self._config, self._known
+        group = group_to_condense(
+            known.active, known.odometry, config.condense_keyframes, config.window_keyframes
         )
+        if group:
+            known.condense(group, {k: self.pose(k) for k in group})
+        if group or len(self._changes) > config.most_changes:
+            followers = known.rows.keys()
+            variables = self._solver.variables()
+            self._rebase({k: v for k, v in variables.items() if k not in followers})
+
+    def _rebase(self, variables: Variables) -> None:
+        """Start anew from here."""
+        self._initial, self._changes = variables, []
+        self._base = self._packed()
+        self._rebuild()
 
     # --- state ------------------------------------------------------------------------------------
-    def snapshot(self) -> dict[str, np.ndarray]:
-        keyframes = sorted(self._initial)
-        measured = self._measured.values()
-        return {
-            "keyframes": np.array(keyframes, np.int64),
-            "first_of": np.array([self._first_of[k] for k in keyframes], np.int64),
-            "initial": np.array([self._initial[k] for k in keyframes]).reshape(-1, 4, 4),
-            "pairs": np.array([(m.a, m.b) for m in measured], np.int64).reshape(-1, 2),
-            "T_a_b": np.array([m.T_a_b for m in measured]).reshape(-1, 4, 4),
-            "information": np.array([m.information for m in measured]).reshape(-1, 6, 6),
-        }
+    def _note(self, change: str, **what: Any) -> None:
+        self._changes.append((change, what))
 
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        keyframes = [int(k) for k in state["keyframes"]]
-        self._initial = dict(zip(keyframes, state["initial"], strict=True))
-        self._first_of = dict(zip(keyframes, map(int, state["first_of"]), strict=True))
-        self._measured = {
-            (int(a), int(b)): RelativePose(int(a), int(b), T_a_b, information)
-            for (a, b), T_a_b, information in zip(
-                state["pairs"], state["T_a_b"], state["information"], strict=True
-            )
-        }
-        if keyframes:
-            self._rebuild()
+    def _packed(self) -> dict[str, Any]:
+        initial = list(self._initial), [v.ravel() for v in self._initial.values()]
+        return {"keys": initial[0], "values": initial[1], "known": self._known.packed()}
+
+    def snapshot(self) -> dict[str, Any]:
+        """`base` is the same object until the next rebuild."""
+        return {"base": self._base, "changes": list(self._changes)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on with the same bits."""
+        self._base, self._changes = state["base"], []
+        values = [v.reshape(4, 4) if v.size == 16 else v for v in self._base["values"]]
+        self._initial = dict(zip(self._base["keys"], values, strict=True))
+        self._known.unpack(self._base["known"])
+        self._rebuild()
+        for change, what in state["changes"]:
+            self._repeat(change, what)
+
+    def _repeat(self, change: str, what: Mapping[str, Any]) -> None:
+        match change:
+            case "first":
+                self.add_first(what["keyframe"], what["T_map"])
+            case "add":
+                self.add(*unpack_relative(what["measured"]))
+            case "replace":
+                self.replace(unpack_relative(what["measured"]))
+            case "see":
+                points = dict(zip(what["ids"], what["points"], strict=True))
+                self.see(unpack_sights(what["sights"]), points)
+            case "unsee":
+                self.unsee([(keyframe, landmark) for keyframe, landmark in what["pairs"]])
+            case "refuse":
+                (closure,) = unpack_relative(what["measured"])
+                self._note(change, **what)
+                self._known.closures = self._known.closures.after(closure, Verdict(False))

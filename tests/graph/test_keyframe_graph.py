@@ -3,12 +3,18 @@
 import gtsam
 import numpy as np
 import pytest
+import scipy.optimize
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
-from ldo_service.graph.keyframe_graph import KeyframeGraph
+from ldo_service.graph.factors import NoiseConfig
+from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
+from ldo_service.runtime.state_store import decode_state, encode_state
+
+from .walks import ate_m, closures, kitchen, odometry, round_trips, walked
 
 INFORMATION = np.diag([1e4, 1e4, 1e4, 1e3, 1e3, 1e3])
+LOOP = np.diag([400.0] * 6)
 
 
 def circle(count: int) -> list[np.ndarray]:
@@ -108,6 +114,7 @@ def test_small_changes_of_a_link_reach_every_keyframe_behind_it() -> None:
     truth = circle(16)
     graph = built(truth, measured(truth, [(i, i + 1) for i in range(15)], 0.0))
     T_0_1 = se3.inverse(truth[0]) @ truth[1]
+    T = T_0_1
     for step in range(1, 21):
         T = T_0_1 @ se3.exp(np.array([0, 0, 0, step * 5e-4, 0, 0]))
         graph.replace([RelativePose(0, 1, T, INFORMATION)])
@@ -129,7 +136,7 @@ def test_a_replaced_measurement_counts_once_before_and_after_a_restore() -> None
     restored.restore(graph.snapshot())
     for keyframe, T in graph.poses().items():
         np.testing.assert_allclose(T, truth[keyframe], atol=5e-3)  # not relinearised below 0.01
-        np.testing.assert_allclose(restored.pose(keyframe), truth[keyframe], atol=1e-6)
+        np.testing.assert_array_equal(restored.pose(keyframe), T)
 
 
 def test_a_measurement_of_an_unknown_keyframe_replaces_nothing() -> None:
@@ -206,3 +213,113 @@ def test_a_joined_graph_grows_on_and_survives_a_restart() -> None:
         one.connect(*measured(truth, [(0, 11)], 0.0))
         np.testing.assert_allclose(one.pose(11), truth[11], atol=1e-5)
         assert one.first_of(11) == 0
+
+
+# --- condensing -----------------------------------------------------------------------------------
+WHOLE = KeyframeGraphConfig(window_keyframes=10_000)  # nothing is ever condensed
+
+
+def test_old_keyframes_follow_those_that_stay_variables() -> None:
+    truth = kitchen(150)
+    graph = walked(truth[0], odometry(truth, 1, window=3, sigma=0.0))
+    assert len(graph) == 150
+    assert graph.variables == 150 - 9 * 12
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, truth[keyframe], atol=1e-6)
+        np.testing.assert_allclose(graph.pose(keyframe), T, atol=1e-9)
+
+
+def test_a_condensed_graph_answers_a_loop_as_the_whole_one_does() -> None:
+    """Judge: the graph of all keyframes and measurements."""
+    truth = round_trips(240, 120)
+    measured = list(odometry(truth, 3, window=3, drift_share=0.01, drift_rad_per_m=0.009))
+    loops = closures(truth, 15, 100, 3)
+    condensed, whole = (walked(truth[0], measured, loops, config=c) for c in (None, WHOLE))
+    off = np.linalg.norm(condensed.placed()[1][:, :3, 3] - whole.placed()[1][:, :3, 3], axis=1)
+    drifted = ate_m(walked(truth[0], measured), truth)
+    assert len(loops) == len(condensed.closures.accepted) == len(whole.closures.accepted) == 8
+    assert np.sqrt(np.mean(off**2)) < 0.1 * drifted
+    assert ate_m(condensed, truth) < 1.2 * ate_m(whole, truth)
+
+
+def test_what_is_saved_goes_on_with_the_same_bits() -> None:
+    truth = round_trips(150, 60)
+    measured = list(odometry(truth, 4, window=3))
+    loops = closures(truth, 7, 40, 4)
+    for at in (64, 111, 141):
+        first = walked(truth[0], measured[: at - 1], loops)
+        second = KeyframeGraph()
+        second.restore(decode_state(encode_state(first.snapshot())))
+        for graph in (first, second):
+            for one in measured[at - 1 :]:
+                graph.add(*one)
+                if one[0].b in loops:
+                    graph.close(loops[one[0].b])
+        np.testing.assert_array_equal(first.placed()[1], second.placed()[1])
+        assert encode_state(first.snapshot()) == encode_state(second.snapshot())
+
+
+def test_a_follower_measured_anew_is_placed_where_it_was_measured() -> None:
+    truth = kitchen(60)
+    graph = walked(truth[0], odometry(truth, 1, sigma=0.0))
+    T_3_4 = se3.inverse(truth[3]) @ truth[4] @ se3.exp(np.array([0, 0.01, 0, 0.02, 0, 0]))
+    graph.replace([RelativePose(3, 4, T_3_4, INFORMATION)])
+    np.testing.assert_allclose(graph.pose(4), truth[3] @ T_3_4, atol=1e-6)
+    np.testing.assert_allclose(graph.pose(5), truth[5], atol=1e-6)
+
+
+def test_a_later_keyframe_that_hangs_on_a_follower_alone_is_kept() -> None:
+    truth = kitchen(60)
+    graph = KeyframeGraph()
+    graph.add_first(0, truth[0])
+    for b in range(1, 60):
+        a = 5 if b == 25 else b - 1
+        graph.add(RelativePose(a, b, se3.inverse(truth[a]) @ truth[b], INFORMATION))
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, truth[keyframe], atol=1e-5)
+
+
+def test_an_update_that_fails_is_solved_from_what_is_kept(monkeypatch) -> None:
+    truth = kitchen(12)
+    measured = list(odometry(truth, 1))
+    graph, judge = (walked(truth[0], measured[:9]) for _ in range(2))
+    update, calls = type(graph._solver).update, []
+
+    def fails_once(*arguments: object) -> None:
+        calls.append(arguments)
+        update(*arguments)
+        if len(calls) == 1:
+            raise RuntimeError("half way through")
+
+    monkeypatch.setattr(type(graph._solver), "update", fails_once)
+    graph.add(*measured[9])
+    monkeypatch.undo()
+    judge.add(*measured[9])
+    assert len(calls) == 2
+    np.testing.assert_allclose(graph.placed()[1], judge.placed()[1], atol=1e-6)
+
+
+def test_incremental_poses_with_loops_equal_a_batch_solution_of_the_stated_objective() -> None:
+    """Judge: SciPy on the residuals as `ldo_service.graph` writes them."""
+    truth = round_trips(14, 11, radius_m=1.0)
+    measured = list(odometry(truth, 2, sigma=5e-3))
+    loop = RelativePose(0, 11, se3.inverse(truth[0]) @ truth[11] @ se3.exp(np.full(6, 4e-3)), LOOP)
+    noise = NoiseConfig(drift_rad_per_sqrt_m=0, drift_m_per_sqrt_m=0)
+    graph = walked(truth[0], measured, {11: loop}, config=KeyframeGraphConfig(noise))
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        T = [truth[0], *(truth[i] @ se3.exp(x[6 * i - 6 : 6 * i]) for i in range(1, 14))]
+        out = []
+        for m in [m for one in measured for m in one]:
+            root = np.linalg.cholesky(m.information + noise.floor).T
+            out.append(root @ se3.log(se3.inverse(m.T_a_b) @ se3.inverse(T[m.a]) @ T[m.b]))
+        e = se3.log(se3.inverse(loop.T_a_b) @ se3.inverse(T[0]) @ T[11])
+        d2 = e @ np.linalg.inv(np.linalg.inv(LOOP + noise.floor) + 1e-4 * np.eye(6)) @ e
+        k = noise.robust_sigmas
+        return np.concatenate([*out, [np.sqrt(k**2 * np.log1p(d2 / k**2))]])
+
+    x = scipy.optimize.least_squares(residuals, np.zeros(78), xtol=1e-14, ftol=1e-14).x
+    for i in range(1, 14):
+        np.testing.assert_allclose(
+            graph.pose(i), truth[i] @ se3.exp(x[6 * i - 6 : 6 * i]), atol=2e-4
+        )

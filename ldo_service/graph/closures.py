@@ -1,0 +1,134 @@
+"""Which loop closures are believed: false ones are worse than missed ones."""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry.relative_pose import RelativePose
+
+from .packing import pack_relative, unpack_relative
+from .solver import Variables
+
+Pair = tuple[int, int]
+Solve = Callable[[Collection[RelativePose]], tuple[Variables, float]]
+Sigmas = Callable[[Variables, RelativePose], float]
+
+
+@dataclass(frozen=True, slots=True)
+class ClosuresConfig:
+    # What a closure may add to the sum of squares: chi^2 of six numbers at 3 sigma (99.73 %). Its
+    # own residual would not do: a chain of a hundred links bends by a metre and leaves it 2 sigma.
+    most_cost: float = 20.06
+    most_sigmas: float = 3.0  # of a residual that stays, in any direction (RTAB-Map's guard)
+    rivals: int = 3  # earlier closures that may leave in place of a new one, the least fitting
+    remembered: int = 256  # refused ones, so that one that is sent again is not solved again
+
+    def __post_init__(self) -> None:
+        if min(self.most_cost, self.most_sigmas) <= 0 or min(self.rivals, self.remembered) < 0:
+            raise ConfigError(f"{self}: gates must be positive, counts not negative.")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    is_accepted: bool
+    dropped: tuple[Pair, ...] = ()  # accepted earlier, and refuted by now
+
+    @property
+    def changes(self) -> bool:
+        return self.is_accepted or bool(self.dropped)
+
+
+@dataclass(frozen=True, slots=True)
+class Closures:
+    """Those in the graph, and those that were refused or left it."""
+
+    config: ClosuresConfig = field(default_factory=ClosuresConfig)
+    accepted: Mapping[Pair, RelativePose] = field(default_factory=dict)
+    refused: tuple[Pair, ...] = ()
+    left: tuple[Pair, ...] = ()
+
+    def judged(
+        self, closure: RelativePose, solve: Solve, sigmas: Sigmas
+    ) -> tuple[Verdict, Variables]:
+        """Is it to be believed, and where is everything then.
+
+        `solve` gives the solution with some closures and its sum of squares; `sigmas` the largest
+        residual of one in a solution. A new closure that costs too much is refused, unless the
+        solution costs less without an earlier one: then that one was false. In the end whichever
+        is still off by too much leaves.
+        """
+        before = [c for pair, c in self.accepted.items() if pair != pair_of(closure)]
+        _, cost_before = solve(before)
+        chosen = [*before, closure]
+        variables, cost = solve(chosen)
+        if cost - cost_before > self.config.most_cost:
+            rival = self._rival(closure, before, cost_before, solve, variables, sigmas)
+            if rival is None:
+                return Verdict(False), variables
+            chosen = [c for c in chosen if c is not rival]
+            variables, cost = solve(chosen)
+        while chosen and (worst := max(chosen, key=lambda c: sigmas(variables, c))):
+            if sigmas(variables, worst) <= self.config.most_sigmas:
+                break
+            chosen = [c for c in chosen if c is not worst]
+            variables, cost = solve(chosen)
+        kept = {pair_of(c) for c in chosen}
+        dropped = tuple(pair for pair in self.accepted if pair not in kept)
+        return Verdict(pair_of(closure) in kept, dropped), variables
+
+    def _rival(
+        self,
+        closure: RelativePose,
+        before: list[RelativePose],
+        cost_before: float,
+        solve: Solve,
+        variables: Variables,
+        sigmas: Sigmas,
+    ) -> RelativePose | None:
+        """The earlier closure without which the new one fits, and everything fits better."""
+        fitting = sorted(before, key=lambda c: sigmas(variables, c), reverse=True)
+        best, best_cost = None, cost_before
+        for rival in fitting[: self.config.rivals]:
+            others = [c for c in before if c is not rival]
+            _, cost_others = solve(others)
+            _, cost = solve([*others, closure])
+            if cost < best_cost and cost - cost_others <= self.config.most_cost:
+                best, best_cost = rival, cost
+        return best
+
+    def after(self, closure: RelativePose, verdict: Verdict) -> "Closures":
+        accepted = {pair: c for pair, c in self.accepted.items() if pair not in verdict.dropped}
+        if verdict.is_accepted:
+            return replace(
+                self,
+                accepted=accepted | {pair_of(closure): closure},
+                left=self._remembered(*self.left, *verdict.dropped),
+            )
+        return replace(
+            self,
+            accepted=accepted,
+            refused=self._remembered(*self.refused, pair_of(closure)),
+            left=self._remembered(*self.left, *verdict.dropped),
+        )
+
+    def _remembered(self, *pairs: Pair) -> tuple[Pair, ...]:
+        """The newest of them."""
+        return tuple(dict.fromkeys(pairs))[-self.config.remembered :]
+
+    def packed(self) -> dict[str, Any]:
+        return {
+            "accepted": pack_relative(self.accepted.values()),
+            "refused": self.refused,
+            "left": self.left,
+        }
+
+    @staticmethod
+    def unpacked(config: ClosuresConfig, packed: Mapping[str, Any]) -> "Closures":
+        accepted = {pair_of(c): c for c in unpack_relative(packed["accepted"])}
+        refused, left = (tuple((a, b) for a, b in packed[name]) for name in ("refused", "left"))
+        return Closures(config, accepted, refused, left)
+
+
+def pair_of(measured: RelativePose) -> Pair:
+    return measured.a, measured.b

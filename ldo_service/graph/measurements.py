@@ -1,0 +1,210 @@
+"""All that is known of keyframes and landmarks, and the factors that say it."""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.relative_pose import RelativePose
+
+from .closures import Closures, ClosuresConfig, Pair
+from .condensing import bridges, carried, condensed
+from .factors import (
+    NoiseConfig,
+    Sight,
+    closure_information,
+    closure_residual,
+    first_factor,
+    odometry_information,
+    relative_factor,
+    sight_factor,
+)
+from .followers import Followers
+from .packing import pack_relative, pack_sights, unpack_relative, unpack_sights
+from .solver import Name, Variables, point_key
+
+
+class Measurements:
+    """Between keyframes that are variables, and others that follow them rigidly: what is measured
+    of a follower is measured of the variable that it follows, its head."""
+
+    def __init__(self, noise: NoiseConfig, closures: ClosuresConfig) -> None:
+        self._noise = noise
+        self.first_of: dict[int, int] = {}  # the first keyframe of each one's component
+        self.active: list[int] = []  # variables that are not condensed, ascending
+        self.odometry: dict[Pair, RelativePose] = {}  # between variables
+        self.condensed: dict[Pair, RelativePose] = {}  # heads, each in the one before
+        self.joins: dict[Pair, RelativePose] = {}  # between what were components
+        self.closures = Closures(closures)
+        self.sights: dict[Pair, Sight] = {}  # by keyframe and landmark
+        self.followers = Followers.none()
+        self.rows: dict[int, int] = {}  # of followers
+
+    # --- what changes -----------------------------------------------------------------------------
+    def measure(self, m: RelativePose) -> Name:
+        """The factor's name; in place of what was measured between the same variables."""
+        m = self.between_variables(m)
+        self.odometry[m.a, m.b] = m
+        return ("odometry", m.a, m.b)
+
+    def measure_anew(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> Name | None:
+        """The name of the factor that is another one now; of a follower, which is placed where it
+        was measured, there is none. `pose` tells T_map_keyframe [4, 4]."""
+        row = self.rows.get(m.b)
+        if row is not None:
+            self.followers = self.followers.moved(row, self._in_head_of_b(m, pose))
+            return None
+        if (m.a, m.b) in self.joins:
+            self.joins[m.a, m.b] = m
+            return ("join", m.a, m.b)
+        between = self.between_variables(m)
+        pair = between.a, between.b
+        if pair not in self.condensed:
+            return self.measure(between)
+        own = self.condensed[pair].information
+        self.condensed[pair] = RelativePose(*pair, between.T_a_b, own)
+        return ("condensed", *pair)
+
+    def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
+        (head_a, T_a), (head_b, _) = self.in_head(m.a), self.in_head(m.b)
+        if head_a == head_b:
+            return T_a @ m.T_a_b
+        return se3.inverse(pose(head_b)) @ pose(m.a) @ m.T_a_b
+
+    def condense(self, group: list[int], T_map: Mapping[int, np.ndarray]) -> None:
+        """All of a group but its head and tail follow from now on.
+
+        What was measured within it is in the edge from head to tail. Later keyframes that were
+        measured against followers are measured against later ones too, and that is given up, but
+        where nothing else would hold them.
+        """
+        one = condensed(group, self.odometry, T_map, self._noise)
+        followers = set(group[1:-1])
+        gone = [self.odometry.pop(p) for p in list(self.odometry) if followers.intersection(p)]
+        self.odometry.pop((group[0], group[-1]), None)
+        self.condensed[one.edge.a, one.edge.b] = one.edge
+        self.followers = self.followers.joined_by(one.followers)
+        self.rows = self.followers.index()
+        self.active = [k for k in self.active if k not in group[:-1]]
+        outside = [self.between_variables(m) for m in gone if not {m.a, m.b} <= set(group)]
+        for m in bridges(outside, [(m.a, m.b) for m in self._relative()]):
+            self.measure(m)
+
+    def _relative(self) -> Iterable[RelativePose]:
+        """All that holds variables together for good."""
+        yield from self.odometry.values()
+        yield from self.condensed.values()
+        yield from map(self.between_variables, self.joins.values())
+
+    # --- heads ------------------------------------------------------------------------------------
+    def in_head(self, keyframe: int) -> tuple[int, np.ndarray]:
+        """The variable that stands for a keyframe, and T_variable_keyframe [4, 4]."""
+        row = self.rows.get(keyframe)
+        if row is None:
+            return keyframe, np.eye(4)
+        return int(self.followers.heads[row]), self.followers.T_head[row]
+
+    def between_variables(self, m: RelativePose) -> RelativePose:
+        (a, T_a), (b, T_b) = self.in_head(m.a), self.in_head(m.b)
+        if (a, b) == (m.a, m.b):
+            return m
+        return carried(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
+
+    def _ends_covariance(self, m: RelativePose) -> np.ndarray:
+        """[6, 6] of followers among its ends: their share of what their group is known by."""
+        total = np.zeros((6, 6))
+        for row in (self.rows[k] for k in (m.a, m.b) if k in self.rows):
+            pair = int(self.followers.heads[row]), int(self.followers.tails[row])
+            total += self.followers.shares[row] * np.linalg.inv(self.condensed[pair].information)
+        return total
+
+    # --- factors ----------------------------------------------------------------------------------
+    def names(self) -> Iterable[Name]:
+        """Of all factors, in a fixed order."""
+        yield from (("first", k) for k, first in self.first_of.items() if k == first)
+        for kind in ("odometry", "condensed", "joins"):
+            yield from ((kind.removesuffix("s"), *pair) for pair in getattr(self, kind))
+        yield from (("closure", *pair) for pair in self.closures.accepted)
+        yield from (("sight", *pair) for pair in self.sights)
+
+    def factor(self, name: Name, initial: Variables) -> gtsam.NonlinearFactor:
+        kind, pair = name[0], name[1:]
+        match kind:
+            case "first":
+                return first_factor(name[1], initial[name[1]], self._noise.first_sigma)
+            case "odometry":
+                return self._odometry_factor(self.odometry[pair])
+            case "condensed":
+                m = self.condensed[pair]
+                return relative_factor(m.a, m.b, m.T_a_b, m.information)
+            case "join":
+                return self._odometry_factor(self.between_variables(self.joins[pair]))
+            case "closure":
+                return self._closure_factor(self.closures.accepted[pair], self._noise.robust_sigmas)
+        sight = self.sights[pair]
+        return sight_factor(sight, *self.in_head(sight.keyframe), self._noise.robust_sigmas)
+
+    def with_closures(
+        self, closures: Iterable[RelativePose], initial: Variables
+    ) -> list[gtsam.NonlinearFactor]:
+        """All factors, but of closures these, without a robust kernel: what they cost is
+        compared."""
+        others = [self.factor(name, initial) for name in self.names() if name[0] != "closure"]
+        return [*others, *(self._closure_factor(closure, 0.0) for closure in closures)]
+
+    def closure_sigmas(self, variables: Variables, closure: RelativePose) -> float:
+        """The largest of its six whitened residuals."""
+        m = self._closure(closure)
+        residual = closure_residual(variables[m.a], variables[m.b], m)
+        return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
+
+    def _odometry_factor(self, m: RelativePose) -> gtsam.NonlinearFactor:
+        return relative_factor(m.a, m.b, m.T_a_b, odometry_information(m, self._noise))
+
+    def _closure_factor(self, closure: RelativePose, robust_sigmas: float) -> gtsam.NonlinearFactor:
+        m = self._closure(closure)
+        return relative_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
+
+    def _closure(self, m: RelativePose) -> RelativePose:
+        """Between variables, as much as it is believed."""
+        own = closure_information(m, self._noise, self._ends_covariance(m))
+        return self.between_variables(RelativePose(m.a, m.b, m.T_a_b, own))
+
+    # --- components -------------------------------------------------------------------------------
+    def move_component(
+        self, younger: int, older: int, T_new_old: np.ndarray, variables: Variables
+    ) -> Variables:
+        """All of a component into another: its variables and its landmarks."""
+        theirs = {k for k, first in self.first_of.items() if first == younger}
+        self.first_of.update(dict.fromkeys(theirs, older))
+        points = {point_key(s.landmark) for s in self.sights.values() if s.keyframe in theirs}
+        moved = {k: T_new_old @ variables[k] for k in variables.keys() & theirs}
+        moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}
+        return {k: moved.get(k, value) for k, value in variables.items()}
+
+    # --- state ------------------------------------------------------------------------------------
+    def packed(self) -> dict[str, Any]:
+        return {
+            "keyframes": np.array(list(self.first_of), np.int64),
+            "first_of": np.array(list(self.first_of.values()), np.int64),
+            "active": np.array(self.active, np.int64),
+            "odometry": pack_relative(self.odometry.values()),
+            "condensed": pack_relative(self.condensed.values()),
+            "joins": pack_relative(self.joins.values()),
+            "closures": self.closures.packed(),
+            "sights": pack_sights(self.sights.values()),
+            "followers": self.followers.packed(),
+        }
+
+    def unpack(self, packed: Mapping[str, Any]) -> None:
+        keyframes = packed["keyframes"].tolist()
+        self.first_of = dict(zip(keyframes, packed["first_of"].tolist(), strict=True))
+        self.active = packed["active"].tolist()
+        for name in ("odometry", "condensed", "joins"):
+            setattr(self, name, {(m.a, m.b): m for m in unpack_relative(packed[name])})
+        self.closures = Closures.unpacked(self.closures.config, packed["closures"])
+        self.sights = {(s.keyframe, s.landmark): s for s in unpack_sights(packed["sights"])}
+        self.followers = Followers(**packed["followers"])
+        self.rows = self.followers.index()

@@ -1,0 +1,89 @@
+"""False closures are refused or leave; true ones undo the drift."""
+
+import numpy as np
+import pytest
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.graph.keyframe_graph import KeyframeGraph
+
+from .walks import (
+    REFINED,
+    ate_m,
+    closures,
+    false_closures,
+    kitchen,
+    odometry,
+    round_trips,
+    walked,
+)
+
+FALSE_AT = (60, 95, 130, 165)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_four_planted_false_closures_change_nothing(seed: int) -> None:
+    truth = kitchen()
+    measured = list(odometry(truth, seed, window=3, drift_share=0.005, drift_rad_per_m=0.004))
+    true = closures(truth, 12, 40, seed)
+    false = false_closures(truth, FALSE_AT, 30, seed)
+    chain, without, planted = (
+        walked(truth[0], measured, *loops) for loops in ((), (true,), (false, true))
+    )
+    assert len(false) == 4
+    assert not {(c.a, c.b) for c in false.values()} & planted.closures.accepted.keys()
+    assert len(planted.closures.accepted) == len(true) == 8
+    assert ate_m(planted, truth) < 1.1 * ate_m(without, truth)
+    assert ate_m(without, truth) < 0.5 * ate_m(chain, truth)
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2))])
+def test_true_closures_undo_the_drift(seed: int) -> None:
+    """1 % of the way and 0.5 deg/m, twice around."""
+    truth = round_trips(380, 180)
+    drift = {"drift_share": 0.01, "drift_rad_per_m": np.radians(0.5)}
+    measured = list(odometry(truth, seed, window=3, **drift))
+    loops = closures(truth, 8, 90, seed)
+    closed = walked(truth[0], measured, loops)
+    assert len(closed.closures.accepted) == len(loops) > 20
+    assert ate_m(closed, truth) < 0.2 * ate_m(walked(truth[0], measured), truth)
+
+
+def test_a_refused_closure_leaves_the_same_bits() -> None:
+    truth = kitchen(100)
+    graph = walked(truth[0], odometry(truth, 1, window=3))
+    before = graph.placed()[1]
+    ((_, false),) = false_closures(truth, [99], 30, 1).items()
+    verdict = graph.close(false)
+    assert not verdict.changes
+    assert graph.closures.refused == ((false.a, false.b),)
+    np.testing.assert_array_equal(graph.placed()[1], before)
+
+
+def off_by(truth: list[np.ndarray], a: int, b: int, *xi: float) -> RelativePose:
+    T = se3.inverse(truth[a]) @ truth[b] @ se3.exp(np.array(xi))
+    return RelativePose(a, b, T, REFINED)
+
+
+def test_a_false_closure_that_seemed_possible_leaves_when_true_ones_refute_it() -> None:
+    truth = round_trips(120, 100)
+    graph = walked(truth[0], odometry(truth, 2, window=3))
+    seemed = off_by(truth, 3, 103, 0, 0.1, 0, 0.25, 0, 0)
+    assert graph.close(seemed).is_accepted, "the chain is long enough to bend so far"
+    bent_m = ate_m(graph, truth)
+    verdict = graph.close(off_by(truth, 8, 108, *[0] * 6))
+    assert verdict.is_accepted
+    assert verdict.dropped == graph.closures.left == ((3, 103),)
+    assert ate_m(graph, truth) < 0.3 * bent_m
+
+
+def test_a_closure_between_components_joins_them() -> None:
+    truth = kitchen(20)
+    graph = KeyframeGraph()
+    for first in (0, 10):
+        graph.add_first(first, truth[first] if first == 0 else np.eye(4))
+        for b in range(first + 1, first + 10):
+            graph.add(RelativePose(b - 1, b, se3.inverse(truth[b - 1]) @ truth[b], REFINED))
+    assert graph.close(off_by(truth, 2, 17, *[0] * 6)).is_accepted
+    for keyframe, T in graph.poses().items():
+        np.testing.assert_allclose(T, truth[keyframe], atol=1e-5)
