@@ -85,10 +85,6 @@ GRAPH: tuple[Box, ...] = (
         Optimizer,
         "makes keyframe poses agree",
         lambda config: Optimizer(config.optimizer),
-        later=(
-            In(t.LOOP_CLOSURE, Lossless(8)),
-            In(t.OBJECT_OBSERVATION, Lossless(8)),
-        ),
     ),
 )
 

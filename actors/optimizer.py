@@ -2,6 +2,8 @@
 
 in   keyframe/new          Keyframe             Lossless(8)   a missing link would break the chain
 in   keyframe/refinement   KeyframeRefinement   Lossless(8)   the better measurement
+in   loop/closure          LoopClosure          Lossless(8)   seldom, and costly to find
+in   object/observation    ObjectObservation    Lossless(8)   evidence adds up
 out  graph/correction   Correction
 
 gtsam holds the GIL during every call: by default this actor runs in a process of its own.
@@ -9,19 +11,45 @@ gtsam holds the GIL during every call: by default this actor runs in a process o
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import msgspec
 import numpy as np
 
-from ldo_service.geometry import se3
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
+from ldo_service.graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
 from ldo_service.runtime import Actor, In, Lossless, Out
-from ldo_service.schemas import Correction, Keyframe, KeyframeRefinement, MeasuredPose
-from ldo_service.schemas.topics import GRAPH_CORRECTION, KEYFRAME_NEW, KEYFRAME_REFINEMENT
-from ldo_service.wire import correction_message, measured_of, measurements_of, transform
+from ldo_service.schemas import (
+    Correction,
+    GraphLandmark,
+    Keyframe,
+    KeyframeRefinement,
+    LoopClosure,
+    MeasuredPose,
+    ObjectObservation,
+    decode,
+    encode,
+)
+from ldo_service.schemas.topics import (
+    GRAPH_CORRECTION,
+    KEYFRAME_NEW,
+    KEYFRAME_REFINEMENT,
+    LOOP_CLOSURE,
+    OBJECT_OBSERVATION,
+)
+from ldo_service.wire import (
+    camera_of,
+    correction_message,
+    dense_distribution,
+    landmark_message,
+    measured_of,
+    measurements_of,
+    transform,
+)
 
 log = logging.getLogger(__name__)
 
@@ -29,48 +57,94 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class OptimizerConfig:
     graph: KeyframeGraphConfig = field(default_factory=KeyframeGraphConfig)
+    landmarks: LandmarksConfig = field(default_factory=LandmarksConfig)
+    most_early: int = 512  # closures and observations that wait for their keyframe; it is under way
+    cameras: int = 64  # of the newest keyframes: observations come a few keyframes late
+
+    def __post_init__(self) -> None:
+        if min(self.most_early, self.cameras) < 1:
+            raise ConfigError(f"{self}: most_early and cameras must be at least 1.")
 
 
 class Optimizer(Actor):
     """The one owner of keyframe poses in the map, and of which segments are joined."""
 
     name = "optimizer"
-    inputs = (In(KEYFRAME_NEW, Lossless(8)), In(KEYFRAME_REFINEMENT, Lossless(8)))
+    inputs = (
+        In(KEYFRAME_NEW, Lossless(8)),
+        In(KEYFRAME_REFINEMENT, Lossless(8)),
+        In(LOOP_CLOSURE, Lossless(8)),
+        In(OBJECT_OBSERVATION, Lossless(8)),
+    )
     outputs = (Out(GRAPH_CORRECTION),)
 
     def __init__(self, config: OptimizerConfig | None = None) -> None:
         super().__init__()
         self.config = config or OptimizerConfig()
         self._graph = KeyframeGraph(self.config.graph)
+        self._landmarks = Landmarks(self.config.landmarks, self.config.graph.noise)
+        self._classes: list[str] = ["other"]  # as they were first named
+        self._cameras: dict[int, Camera] = {}  # of the newest keyframes
         self._version = 0
         self._newest: dict[int, tuple[int, np.ndarray]] = {}  # by segment: id and T_odom_keyframe
         self._first: dict[int, int] = {}  # keyframe of each segment
         self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
+        self._early_closures: list[LoopClosure] = []
+        self._early_observations: list[ObjectObservation] = []
         self._waiting_number = 0  # of the last refinement that came
         self._refinements = 0  # number of the last one that all poses agree with
-        self._repeated = self._bridged = self._refined = 0
-        self._saved: dict[str, Any] = {}
+        self._repeated = self._bridged = self._refined = self._too_early = 0
 
-    def handle(self, message: Keyframe | KeyframeRefinement) -> Iterator[Correction]:
-        if isinstance(message, KeyframeRefinement):
-            self._refine(message.poses)
-            self._waiting_number = message.number
-        elif message.keyframe in self._graph:
-            self._repeated += 1  # sent again after a restart
-            return
-        else:
-            self._add(message)
-            self._refine(())
+    def handle(
+        self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
+    ) -> Iterator[Correction]:
+        match message:
+            case ObjectObservation():
+                self._early_observations.append(message)
+                self._observe()
+                return
+            case LoopClosure():
+                self._early_closures.append(message)
+                if not self._close():
+                    return
+            case KeyframeRefinement():
+                self._refine(message.poses)
+                self._waiting_number = message.number
+            case Keyframe() if message.keyframe in self._graph:
+                self._repeated += 1  # sent again after a restart
+                return
+            case Keyframe():
+                self._take(message)
+        yield self._correction(message.stamp_ns)
+
+    def _correction(self, stamp_ns: int) -> Correction:
         self._version += 1
         if not self._early:
             self._refinements = self._waiting_number
-        yield correction_message(
-            message.stamp_ns,
+        closures = self._graph.closures
+        return correction_message(
+            stamp_ns,
             self._version,
             self._graph.poses(),
             self._refinements,
             self._joined(),
+            closures=closures.accepted,
+            not_believed=sorted({*closures.refused, *closures.left}),
+            landmarks=self._placed_landmarks(),
         )
+
+    # --- keyframes --------------------------------------------------------------------------------
+    def _take(self, message: Keyframe) -> None:
+        """Place it; then what waited for it."""
+        if self._landmarks.is_due():
+            self._landmarks.settle(self._graph)
+        self._add(message)
+        self._cameras[message.keyframe] = camera_of(message.camera)
+        while len(self._cameras) > self.config.cameras:
+            del self._cameras[next(iter(self._cameras))]
+        self._refine(())
+        self._close()
+        self._observe()
 
     def _refine(self, poses: tuple[MeasuredPose, ...]) -> None:
         """Replace measurements; those of a keyframe that is still under way wait for it."""
@@ -119,45 +193,135 @@ class Optimizer(Actor):
             return
         before = self._joined()
         self._graph.connect(measured_of(pose))
+        self._tell_joined(before)
+
+    def _tell_joined(self, before: dict[int, int]) -> None:
         for segment, older in self._joined().items() - before.items():
             log.info("segment %d is placed in %d now", segment, older)
 
+    # --- loops and objects ------------------------------------------------------------------------
+    def _close(self) -> bool:
+        """Judge closures whose keyframes are known; False: there were none."""
+        known = [c for c in self._early_closures if self._is_known(c.pose)]
+        later = [c for c in self._early_closures if not self._is_known(c.pose)]
+        self._early_closures = self._bounded(later)
+        for closure in known:
+            self._judge(closure)
+        return bool(known)
+
+    def _is_known(self, pose: MeasuredPose) -> bool:
+        return pose.reference in self._graph and pose.keyframe in self._graph
+
+    def _judge(self, closure: LoopClosure) -> None:
+        before = self._joined()
+        weight = self._landmarks.weight(closure.entropy)
+        measured = measured_of(closure.pose)
+        verdict = self._graph.close(replace(measured, information=weight * measured.information))
+        pair = closure.pose.reference, closure.pose.keyframe
+        log.info("loop %d-%d is %s", *pair, "closed" if verdict.is_accepted else "not believed")
+        for reference, keyframe in verdict.dropped:
+            log.info("loop %d-%d is taken back: others refute it", reference, keyframe)
+        self._tell_joined(before)
+
+    def _observe(self) -> None:
+        """Take note of objects in keyframes that are known; the graph learns of them later."""
+        later = []
+        for seen in self._early_observations:
+            camera = self._cameras.get(seen.keyframe)
+            if camera is not None:
+                self._landmarks.observe(self._observation(seen, camera))
+            elif seen.keyframe not in self._graph:
+                later.append(seen)
+        self._early_observations = self._bounded(later)
+
+    def _observation(self, seen: ObjectObservation, camera: Camera) -> Observation:
+        return Observation(
+            seen.keyframe,
+            seen.object,
+            np.array(seen.box_px),
+            dense_distribution(seen.distribution, self._class, CLASSES),
+            seen.entropy,
+            seen.is_miss,
+            np.array(astuple(camera)[:6]),
+        )
+
+    def _class(self, name: str) -> int:
+        """Its index; of one too many that of `other`."""
+        if name not in self._classes and len(self._classes) < CLASSES:
+            self._classes.append(name)
+        return self._classes.index(name) if name in self._classes else 0
+
+    def _bounded(self, waiting: list[Any]) -> list[Any]:
+        """The newest; what waits for a keyframe that was lost is given up in the end."""
+        excess = max(0, len(waiting) - self.config.most_early)
+        self._too_early += excess
+        return waiting[excess:]
+
+    def _placed_landmarks(self) -> list[GraphLandmark]:
+        known = self._landmarks.known
+        return [
+            landmark_message(k, centroid, known[k].distribution, self._classes)
+            for k, centroid in self._graph.landmarks().items()
+        ]
+
+    # --- segments ---------------------------------------------------------------------------------
     def _joined(self) -> dict[int, int]:
         """Segments that are placed in an older one, and in which."""
         segments = {first: segment for segment, first in self._first.items()}
         placed = {s: segments[self._graph.first_of(first)] for s, first in self._first.items()}
         return {segment: older for segment, older in placed.items() if older < segment}
 
+    # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        if self._saved.get("version") != self._version:
-            self._saved = {
-                "version": self._version,
-                "segments": [
-                    (segment, self._first[segment], *newest)
-                    for segment, newest in self._newest.items()
-                ],
-                "refinements": (self._waiting_number, self._refinements),
-                "graph": self._graph.snapshot(),
-                "early": [msgspec.msgpack.encode(pose) for pose in self._early.values()],
-            }
-        return {"graph": self._saved}
+        """The graph at its last rebuild, which stays the same part for some keyframes; the changes
+        since; and the rest."""
+        graph = self._graph.snapshot()
+        rest = {
+            "version": self._version,
+            "segments": [
+                (segment, self._first[segment], *newest) for segment, newest in self._newest.items()
+            ],
+            "refinements": (self._waiting_number, self._refinements),
+            "changes": graph["changes"],
+            "early": [msgspec.msgpack.encode(pose) for pose in self._early.values()],
+            "closures": [encode(closure) for closure in self._early_closures],
+            "observations": [encode(seen) for seen in self._early_observations],
+            "cameras": [(k, astuple(camera)) for k, camera in self._cameras.items()],
+            "classes": list(self._classes),
+        }
+        landmarks = self._landmarks.snapshot()
+        rest |= {"waiting": landmarks["waiting"], "skipped": landmarks["skipped"]}
+        return {"graph": graph["base"], "landmarks": landmarks["known"], "rest": rest}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
-        saved = state["graph"]
+        saved = state["rest"]
         self._version = saved["version"] + 1  # one more may have been sent and not saved
         self._first = {segment: first for segment, first, *_ in saved["segments"]}
         self._newest = {segment: (newest, T) for segment, _, newest, T in saved["segments"]}
         self._waiting_number, self._refinements = saved["refinements"]
-        self._graph.restore(saved["graph"])
+        self._graph.restore({"base": state["graph"], "changes": saved["changes"]})
+        self._landmarks.restore({**saved, "known": state["landmarks"]})
         early = [msgspec.msgpack.decode(body, type=MeasuredPose) for body in saved["early"]]
         self._early = {(pose.reference, pose.keyframe): pose for pose in early}
+        self._early_closures = [decode(body, LoopClosure) for body in saved["closures"]]
+        self._early_observations = [decode(b, ObjectObservation) for b in saved["observations"]]
+        self._cameras = {k: Camera(*numbers) for k, numbers in saved["cameras"]}
+        self._classes = list(saved["classes"])
 
     def facts(self) -> dict[str, float]:
+        graph = self._graph
         return {
-            "keyframes": len(self._graph),
-            "optimizations": self._version,
+            "keyframes": len(graph),
+            "keyframes_solved": graph.variables,
+            "optimizations": graph.solved_times,
+            "optimizations_saved": self._landmarks.skipped,
+            "closures": len(graph.closures.accepted),
+            "closures_refused": len(graph.closures.refused),
+            "closures_dropped": len(graph.closures.left),
+            "landmarks": len(graph.landmarks()),
             "keyframes_repeated": self._repeated,
             "keyframes_bridged": self._bridged,
             "keyframes_refined": self._refined,
+            "waited_in_vain": self._too_early,
             "segments_apart": len(self._first) - len(self._joined()),
         }

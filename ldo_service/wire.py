@@ -1,11 +1,12 @@
 """Between messages and numerics: the one place that knows both."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
+from ldo_service.geometry.blending import quaternions
 from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.loops import Finding
 from ldo_service.schemas import (
@@ -16,6 +17,7 @@ from ldo_service.schemas import (
     Detection,
     DetectionBoxes,
     FrameRgbd,
+    GraphLandmark,
     Image,
     Keyframe,
     LabelRequest,
@@ -219,16 +221,46 @@ def correction_message(
     T_map_keyframe: dict[int, np.ndarray],
     refinements: int = 0,
     joined: Mapping[int, int] | None = None,
+    *,
+    closures: Iterable[tuple[int, int]] = (),
+    not_believed: Iterable[tuple[int, int]] = (),
+    landmarks: Iterable[GraphLandmark] = (),
 ) -> Correction:
-    rows = [np.r_[T[:3, 3], se3.quaternion(T[:3, :3])] for T in T_map_keyframe.values()]
+    T = np.array(list(T_map_keyframe.values())).reshape(-1, 4, 4)
+    rows = np.concatenate([T[:, :3, 3], quaternions(T[:, :3, :3])], axis=1)
     return Correction(
         stamp_ns=stamp_ns,
         graph_version=graph_version,
         keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
-        T_map_keyframe=Array.of(np.array(rows, np.float64).reshape(-1, 7)),
+        T_map_keyframe=Array.of(rows),
         refinements=refinements,
         joined=tuple(sorted((joined or {}).items())),
+        closures=tuple(closures),
+        not_believed=tuple(not_believed),
+        landmarks=tuple(landmarks),
     )
+
+
+def landmark_message(
+    landmark: int, centroid: np.ndarray, p: np.ndarray, names: Sequence[str]
+) -> GraphLandmark:
+    """`names` of the classes that have been seen; what `p` [C] gives to others is on none."""
+    return GraphLandmark(
+        object=landmark,
+        centroid=_vector3(centroid),
+        distribution=_distribution_message(p[: len(names)], names),
+        entropy=max(float(entropy(p)), 0.0),
+    )
+
+
+def dense_distribution(
+    distribution: Distribution, index: Callable[[str], int], classes: int
+) -> np.ndarray:
+    """[C], sums to one; `index` of a name. What is missing from one belongs to `other`."""
+    p = np.zeros(classes)
+    for name, weight in (*distribution, ("other", 1 - sum(w for _, w in distribution))):
+        p[index(name)] += max(weight, 0.0)
+    return p / p.sum()
 
 
 def keyframe_poses_of(

@@ -17,7 +17,7 @@ from ldo_service.schemas.frames import (
     FrameRgbd,
     Image,
 )
-from ldo_service.schemas.graph import Correction
+from ldo_service.schemas.graph import Correction, GraphLandmark
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement, MeasuredPose
 from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
@@ -49,6 +49,7 @@ __all__ = [
     "DetectionBoxes",
     "FrameRgbd",
     "Gaussians",
+    "GraphLandmark",
     "Health",
     "Image",
     "InputCount",

@@ -1,10 +1,34 @@
-"""What the optimizer says: where the keyframes are in the map."""
+"""What the optimizer says: where the keyframes and landmarks are in the map."""
 
+import msgspec
 import numpy as np
 
 from ldo_service.schemas.array import Array
-from ldo_service.schemas.message import Message, require_count
+from ldo_service.schemas.message import Message, require_count, require_finite
+from ldo_service.schemas.objects import (
+    Distribution,
+    Vector3,
+    require_distribution,
+    require_entropy,
+)
 from ldo_service.schemas.pose import QUATERNION_TOLERANCE
+
+Pair = tuple[int, int]
+
+
+class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
+    """An object as the observations of all keyframes together place and name it."""
+
+    object: int  # id, as in map/objects
+    centroid: Vector3  # map frame, metres
+    distribution: Distribution
+    entropy: float  # of it, nats, before it was cut to its heaviest classes
+
+    def __post_init__(self) -> None:
+        require_count("object", self.object)
+        require_finite("centroid", self.centroid)
+        require_distribution(self.distribution)
+        require_entropy(self.entropy)
 
 
 class Correction(Message, frozen=True, kw_only=True):
@@ -14,7 +38,10 @@ class Correction(Message, frozen=True, kw_only=True):
     keyframes: Array  # i8 [K], ids, ascending
     T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
     refinements: int = 0  # number of the last keyframe/refinement that it takes into account
-    joined: tuple[tuple[int, int], ...] = ()  # segments, each with the older one it is placed in
+    joined: tuple[Pair, ...] = ()  # segments, each with the older one it is placed in
+    closures: tuple[Pair, ...] = ()  # loop closures that it agrees with: reference and keyframe
+    not_believed: tuple[Pair, ...] = ()  # that were refused or have left, the newest 512
+    landmarks: tuple[GraphLandmark, ...] = ()  # by id
 
     def check(self) -> None:
         require_count("graph_version", self.graph_version)

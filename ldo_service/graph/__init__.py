@@ -8,7 +8,7 @@ its distribution over C classes. The paper's four kinds of edges, and what they 
 
     odometry      |log(T_ab^-1 T_a^-1 T_b)|^2_Omega          consecutive keyframes, refinements
     loops         rho(|log(T_ab^-1 T_a^-1 T_b)|^2_Omega)     verified pairs
-    observations  w_kl rho(|pi(T_k^-1 mu_l) - z_kl|^2 / sigma_px^2) + lambda w_kl KL(p_l || q_kl)
+    observations  rho(w_kl |pi(T_k^-1 mu_l) - z_kl|^2 / sigma_px^2) + lambda w_kl KL(p_l || q_kl)
     similarity    w_sem / 2 (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j],
                   landmarks i, j that a keyframe shows together
 

@@ -104,7 +104,7 @@ def relative_factor(
 def sight_factor(
     sight: Sight, variable: int, T_variable_keyframe: np.ndarray, robust_sigmas: float
 ) -> gtsam.NonlinearFactor:
-    """w rho(|pi(T_k^-1 mu) - z|^2 / sigma^2); `variable` is the keyframe, or what it follows.
+    """rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2); `variable` is the keyframe, or what it follows.
 
     A point behind the camera costs a constant and pulls nowhere."""
     sigma = sight.sigma_px / np.sqrt(sight.weight)

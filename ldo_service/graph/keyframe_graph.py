@@ -196,6 +196,9 @@ class KeyframeGraph:
             self._initial.pop(point_key(landmark), None)
         self._update([], [], [("sight", *pair) for pair in known])
 
+    def has_landmark(self, landmark: int) -> bool:
+        return point_key(landmark) in self._initial
+
     def landmarks(self) -> dict[int, np.ndarray]:
         """mu [3] in the map of each, by id."""
         variables = self._solver.variables()
@@ -239,6 +242,15 @@ class KeyframeGraph:
         try:
             self._solver.update(factors, {k: self._initial[k] for k in variables}, gone)
         except RuntimeError:
+            self._rebuild_or_forget_landmarks()
+
+    def _rebuild_or_forget_landmarks(self) -> None:
+        """Keyframes hold each other; a landmark may have been placed where rays hardly cross."""
+        try:
+            self._rebuild()
+        except RuntimeError:
+            self._known.sights = {}
+            self._initial = {k: v for k, v in self._initial.items() if v.ndim == 2}
             self._rebuild()
 
     def _rebuild(self) -> None:
@@ -265,7 +277,7 @@ class KeyframeGraph:
         """Start anew from here."""
         self._initial, self._changes = variables, []
         self._base = self._packed()
-        self._rebuild()
+        self._rebuild_or_forget_landmarks()
 
     # --- state ------------------------------------------------------------------------------------
     def _note(self, change: str, **what: Any) -> None:
@@ -285,7 +297,7 @@ class KeyframeGraph:
         values = [v.reshape(4, 4) if v.size == 16 else v for v in self._base["values"]]
         self._initial = dict(zip(self._base["keys"], values, strict=True))
         self._known.unpack(self._base["known"])
-        self._rebuild()
+        self._rebuild_or_forget_landmarks()
         for change, what in state["changes"]:
             self._repeat(change, what)
 

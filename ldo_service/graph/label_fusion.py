@@ -1,6 +1,6 @@
 """What landmarks are, from what was observed of them: min G(p) of `ldo_service.graph`."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +38,7 @@ def fused(
     lambda_sem: float = 0.5,
     w_sem: float = 0.1,
     start: Mapping[int, np.ndarray] | None = None,
+    only: Collection[int] | None = None,
     sweeps: int = 20,
     tolerance: float = 1e-9,
 ) -> dict[int, np.ndarray]:
@@ -46,13 +47,16 @@ def fused(
         min_p  lambda sum_lk w_k KL(p_l || q_lk)
              + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
 
-    `covisible` pairs count once each. `start` are estimates from before, else the geometric means.
+    `covisible` pairs count once each. `start` are estimates from before, else the geometric means;
+    where `only` some are asked for, the others stay at their start.
     Which pairs are of one argmax is decided anew before each sweep; sweeps end when no p changes by
     `tolerance`. Deterministic: Gauss-Seidel in the order of the ids. Paper, III.C.
     """
     p = {k: geometric_mean(evidence[k]) for k in sorted(evidence)}
     p |= {k: v for k, v in (start or {}).items() if k in p}
     neighbours = _neighbours(covisible, p)
+    if only is not None:
+        neighbours = {k: others for k, others in neighbours.items() if k in only}
     for _ in range(sweeps):
         largest = 0.0
         for k, others in neighbours.items():

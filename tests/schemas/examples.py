@@ -27,6 +27,7 @@ from ldo_service.schemas import (
     DetectionBoxes,
     FrameRgbd,
     Gaussians,
+    GraphLandmark,
     Health,
     Image,
     InputCount,
@@ -208,6 +209,22 @@ EXAMPLES: dict[str, Message] = {
         ),
         refinements=1,
         joined=((1, 0), (2, 0)),
+    ),
+    "correction_with_landmarks": Correction(
+        stamp_ns=9,
+        graph_version=5,
+        keyframes=Array.of(np.array([4], np.int64)),
+        T_map_keyframe=Array.of(np.array([[1, 2, 3, 0.6, 0, 0.8, 0]], float)),
+        closures=((0, 4), (1, 9)),
+        not_believed=((2, 7),),
+        landmarks=(
+            GraphLandmark(
+                object=3,
+                centroid=(1.0, -2.0, 0.5),
+                distribution=(("chair", 0.75), ("other", 0.25)),
+                entropy=0.5623351446188083,
+            ),
+        ),
     ),
     "tracked_pose": TrackedPose(
         stamp_ns=4,

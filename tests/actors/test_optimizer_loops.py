@@ -1,0 +1,173 @@
+"""Loop closures and objects as messages: what corrections say then."""
+
+from collections.abc import Iterable, Iterator
+
+import msgspec
+import numpy as np
+
+from ldo_service.actors.optimizer import Optimizer
+from ldo_service.geometry import se3
+from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.schemas import (
+    Array,
+    CameraModel,
+    Correction,
+    Keyframe,
+    LoopClosure,
+    Message,
+    ObjectObservation,
+)
+from ldo_service.wire import keyframe_poses_of, matrix6_message, measured_message, pose_message
+
+CAMERA = CameraModel(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
+COLOR, DEPTH = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
+INFORMATION = np.diag([1e4] * 6)
+CENTER = np.array([0.0, 0.0, 0.0])  # of the circle, where an object stands
+
+
+def circle(count: int, each: int, radius_m: float = 2.0) -> list[np.ndarray]:
+    """Around an object, always looking at it."""
+    poses = []
+    for angle in 2 * np.pi * np.arange(count) / each:
+        T = se3.exp(np.array([0, angle, 0, 0, 0, 0]))
+        T[:3, 3] = -radius_m * T[:3, 2]
+        poses.append(T)
+    return poses
+
+
+TRUTH = circle(90, 40)
+
+
+def T_of_step(k: int) -> np.ndarray:
+    """As odometry measures it, which drifts."""
+    T = se3.inverse(TRUTH[k - 1]) @ TRUTH[k]
+    T[:3, 3] *= 1.01
+    return T @ se3.exp(np.array([0, 1.5e-3, 0, 0, 0, 0]))
+
+
+def keyframes() -> Iterator[Keyframe]:
+    T_odom = TRUTH[0]
+    for k in range(len(TRUTH)):
+        T_odom = T_odom @ T_of_step(k) if k else T_odom
+        yield Keyframe(
+            stamp_ns=k * 10**8,
+            keyframe=k,
+            frame=3 * k,
+            camera=CAMERA,
+            color=Array.of(COLOR),
+            depth_m=Array.of(DEPTH),
+            reference=k - 1 if k else None,
+            T_reference_keyframe=pose_message(T_of_step(k) if k else np.eye(4)),
+            information=matrix6_message(INFORMATION),
+            T_odom_keyframe=pose_message(T_odom),
+        )
+
+
+def closure(a: int, b: int, T_a_b: np.ndarray | None = None) -> LoopClosure:
+    T_a_b = se3.inverse(TRUTH[a]) @ TRUTH[b] if T_a_b is None else T_a_b
+    pose = measured_message(RelativePose(a, b, T_a_b, INFORMATION))
+    return LoopClosure(stamp_ns=b * 10**8, pose=pose, overlap=0.6, rmse_m=0.01)
+
+
+def seen(k: int, p: float = 0.9, entropy: float = 0.4) -> ObjectObservation:
+    u, v, z = se3.transform(se3.inverse(TRUTH[k]), CENTER)
+    u, v = 250 * u / z + 159.5, 250 * v / z + 119.5
+    return ObjectObservation(
+        stamp_ns=k * 10**8,
+        keyframe=k,
+        object=4,
+        box_px=(u - 20, v - 20, u + 20, v + 20),
+        distribution=(("chair", p), ("couch", (1 - p) / 2)),
+        entropy=entropy,
+    )
+
+
+def story() -> Iterator[Message]:
+    """Keyframes, the object in most of them a little late, and a closure every five."""
+    for message in keyframes():
+        k = message.keyframe
+        yield message
+        if k % 3 != 0 and k > 1:
+            yield seen(k - 1)
+        if k > 50 and k % 5 == 0:
+            yield closure(k - 40, k)
+
+
+def corrections(optimizer: Optimizer, messages: Iterable[Message]) -> list[Correction]:
+    return [out for message in messages for out in optimizer.handle(message)]
+
+
+def error_m(correction: Correction) -> float:
+    T_map = keyframe_poses_of(correction)
+    off = [T[:3, 3] - TRUTH[k][:3, 3] for k, T in T_map.items()]
+    return float(np.sqrt(np.mean(np.square(off).sum(axis=1))))
+
+
+def test_closures_undo_what_odometry_drifted() -> None:
+    drifted = corrections(Optimizer(), keyframes())[-1]
+    optimizer = Optimizer()
+    *_, last = corrections(optimizer, story())
+    assert last.closures == tuple((k - 40, k) for k in range(55, 90, 5))
+    assert last.not_believed == ()
+    assert error_m(last) < error_m(drifted) / 3, "steps that are 1 % too long stay so"
+    assert optimizer.facts()["closures"] == 7
+    assert optimizer.facts()["keyframes_solved"] < 40
+
+
+def test_a_false_closure_is_told_as_not_believed_and_moves_nothing() -> None:
+    optimizer = Optimizer()
+    *_, before = corrections(optimizer, keyframes())
+    (after,) = corrections(optimizer, [closure(10, 70, np.eye(4))])
+    assert after.closures == ()
+    assert after.not_believed == ((10, 70),)
+    assert bytes(after.T_map_keyframe.data) == bytes(before.T_map_keyframe.data)
+    assert optimizer.facts()["closures_refused"] == 1
+
+
+def test_a_closure_waits_for_its_keyframe() -> None:
+    messages = list(keyframes())
+    optimizer = Optimizer()
+    corrections(optimizer, messages[:60])
+    assert corrections(optimizer, [closure(20, 60)]) == []
+    (correction,) = corrections(optimizer, messages[60:61])
+    assert correction.closures == ((20, 60),)
+
+
+def test_an_object_becomes_a_landmark_with_its_name() -> None:
+    *_, last = corrections(Optimizer(), story())
+    (landmark,) = last.landmarks
+    assert landmark.object == 4
+    assert landmark.distribution[0][0] == "chair"
+    assert dict(landmark.distribution)["chair"] > 0.85
+    assert np.linalg.norm(np.subtract(landmark.centroid, CENTER)) < 0.1
+
+
+def test_observations_are_taken_in_when_enough_of_them_wait() -> None:
+    optimizer = Optimizer()
+    corrections(optimizer, story())
+    facts = optimizer.facts()
+    assert facts["landmarks"] == 1
+    assert facts["optimizations_saved"] > 40
+
+
+def test_an_observation_of_a_keyframe_that_is_under_way_waits_for_it() -> None:
+    messages = list(keyframes())
+    optimizer = Optimizer()
+    corrections(optimizer, messages[:10])
+    assert corrections(optimizer, [seen(10), *messages[10:13], seen(12)]) != []
+    assert optimizer.facts()["waited_in_vain"] == 0
+    assert len(optimizer.snapshot()["rest"]["waiting"]) == 2
+
+
+def test_a_successor_says_the_same_bits() -> None:
+    messages = list(story())
+    for split in (40, 101, 131):
+        first, second = Optimizer(), Optimizer()
+        corrections(first, messages[:split])
+        second.restore(decode_state(encode_state(first.snapshot())))
+        one, other = (
+            [msgspec.structs.replace(c, graph_version=0) for c in corrections(o, messages[split:])]
+            for o in (first, second)
+        )
+        assert list(map(msgspec.msgpack.encode, one)) == list(map(msgspec.msgpack.encode, other))
