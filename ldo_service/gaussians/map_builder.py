@@ -18,6 +18,7 @@ from .horizon import Horizon
 from .insertion import InsertionConfig, insert
 from .keyframe_store import KeyframeStore, KeyframeStoreConfig
 from .keyframe_views import KeyframeViews
+from .merging import MergingConfig, doubled
 from .model import GaussianMap, Piece
 from .optimise import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
@@ -54,6 +55,7 @@ class MapBuilderConfig:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     pruning: PruningConfig = field(default_factory=PruningConfig)
+    merging: MergingConfig = field(default_factory=MergingConfig)
     store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)
     sleep: SleepConfig = field(default_factory=SleepConfig)
     recent_cameras: int = 8  # what the last keyframes see stays awake
@@ -248,6 +250,21 @@ class MapBuilder:
                 len(known), size=iterations
             )
             self._fit([known[i] for i in chosen], rates)
+
+    # --- after a correction -----------------------------------------------------------------------
+    def mend(self, keyframe: int, iterations: int) -> int:
+        """A keyframe that was laid over earlier ones: what the map holds twice there is held once,
+        and a few iterations fit it to the keyframe. How many Gaussians went.
+
+        One keyframe at a time, so that nobody waits long.
+        """
+        if keyframe not in self.views.poses:
+            return 0
+        self._wake(self.views.placed(keyframe))
+        mask = doubled(self.gaussians.rows, self.gaussians.anchors, keyframe, self.config.merging)
+        self._remove(mask)
+        self._fit([keyframe] * iterations)
+        return int(np.count_nonzero(mask))
 
     # --- pruning ----------------------------------------------------------------------------------
     def _prune_misshapen(self, touched: np.ndarray) -> None:
