@@ -103,11 +103,10 @@ class KeyframePoses:
         for keyframe in sorted(k for k in old if k > newest or k in held):
             link = self._links[keyframe]
             self._T_map[keyframe] = self._placed(link, self._newest(link.segment, keyframe))
-        return {
-            k: self._T_map[k] @ se3.inverse(T_old)
-            for k, T_old in old.items()
-            if self._T_map[k] is not T_old
-        }
+        placed = [k for k, T_old in old.items() if self._T_map[k] is not T_old]
+        T_new = np.array([self._T_map[k] for k in placed]).reshape(-1, 4, 4)
+        T_old = np.array([old[k] for k in placed]).reshape(-1, 4, 4)
+        return dict(zip(placed, T_new @ se3.inverse(T_old), strict=True))
 
     def _placed(self, link: Link, newest: int | None) -> np.ndarray:
         """T_map_keyframe through its reference; without one through odometry from `newest`."""
