@@ -37,3 +37,18 @@ def test_quaternions_of_many_are_those_of_each() -> None:
     np.testing.assert_allclose(quaternions(T[:, :3, :3]), one_by_one, atol=1e-12)
     assert quaternions(np.zeros((0, 3, 3))).shape == (0, 4)
     assert blended(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0)).shape == (0, 4, 4)
+
+
+def test_half_turns_and_no_turns_keep_their_digits() -> None:
+    axes = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [0, 0.6, -0.8], [0, 0, 0]])
+    R = Rotation.from_rotvec(np.pi * axes).as_matrix()
+    np.testing.assert_allclose(se3.rotation(quaternions(R)), R, atol=1e-12)
+    tiny = np.array([se3.exp(np.r_[1e-12 * axis, 0, 0, 0]) for axis in axes])
+    halves = blended(np.tile(np.eye(4), (6, 1, 1)), tiny, np.full(6, 0.5))
+    np.testing.assert_allclose(halves[:, 2, 1], 0.5e-12 * axes[:, 0], atol=1e-16)
+
+
+def test_each_is_the_same_bits_whatever_the_others_are() -> None:
+    T_a, T_b, share = some(40), some(40), RNG.random(40)
+    alone = [blended(T_a[k : k + 1], T_b[k : k + 1], share[k : k + 1])[0] for k in range(40)]
+    np.testing.assert_array_equal(blended(T_a, T_b, share), alone)
