@@ -1,0 +1,164 @@
+"""What recognising places costs, and what it finds.
+
+    OMP_NUM_THREADS=1 python tests/bench/bench_loops.py [SOURCE ...] [--model FILE.onnx]
+        [--stages two_stage geometric semantic]
+
+SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apartment_floor1 in
+LDO_DATA, and synthetic:flat. Coarse: one subgraph among 1000 of random histograms. Fine: each
+source is tracked once, its keyframes are looked at by the detector, if one is named, and are given
+to the loop closer; CPU time is of one core, per candidate, with the finding of its pose and the
+proof. What is found is judged as by `ldo eval`.
+"""
+
+import argparse
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+
+from ldo_service.actors.detector import Detector, DetectorConfig
+from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
+from ldo_service.actors.optimizer import Optimizer
+from ldo_service.actors.tracker import Tracker
+from ldo_service.config import load_config
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.evaluation.loops import (
+    FoundLoops,
+    LoopClosed,
+    LoopErrors,
+    PairCompared,
+    SeenKeyframe,
+    evaluate_loops,
+    seen_keyframes,
+)
+from ldo_service.loops import LoopsConfig
+from ldo_service.loops.landmarks import LAYOUT_WORDS
+from ldo_service.loops.memory import Memory, RetrievalConfig, Stages
+from ldo_service.runs.source import Reader, Selection
+from ldo_service.runtime.logical_clock import LogicalClock
+from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopClosure, Message
+from ldo_service.semantics.labels import MOST_LABELS
+from ldo_service.wire import transform
+
+SUBGRAPHS = 1000
+STAGES: tuple[Stages, ...] = ("two_stage", "geometric", "semantic")
+
+
+def coarse_ms(repeats: int = 20) -> float:
+    """CPU time of one search among 1000 subgraphs, in the median."""
+    rng = np.random.default_rng(0)
+    config = LoopsConfig()
+    memory = Memory(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
+
+    def subgraph(number: int):
+        return SimpleNamespace(
+            first_frame=20 * number,
+            last_frame=20 * number + 15,
+            names=rng.poisson(0.02, MOST_LABELS).astype(np.float32),
+            layout=rng.poisson(0.05, LAYOUT_WORDS).astype(np.float32),
+            words=rng.poisson(2.0, config.words.count).astype(np.float32),
+        )
+
+    for number in range(SUBGRAPHS):
+        memory.add(subgraph(number))
+    new, is_possible, times_ms = subgraph(SUBGRAPHS + 100), np.ones(SUBGRAPHS, bool), []
+    for _ in range(repeats):
+        start_s = time.process_time()
+        assert memory.alike(new, is_possible)
+        times_ms.append(1e3 * (time.process_time() - start_s))
+    return float(np.median(times_ms))
+
+
+def tracked(sequence: Sequence, model: str) -> list[Message]:
+    """What the loop closer would be given."""
+    config, taken = load_config(), []
+    kinds = (Keyframe, DetectionBoxes, Correction)
+    actors = [
+        FrameSource(config.frame_source),
+        Tracker(config.tracker),
+        Detector(DetectorConfig(model=model)),
+        Optimizer(config.optimizer),
+    ]
+
+    def observe(_actor: str, message: Message, _ms: float) -> None:
+        if isinstance(message, kinds):
+            taken.append(message)
+
+    with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
+        for _ in clock.run(Reader(sequence, Selection().indices(sequence), print)):
+            pass
+    return taken
+
+
+def closed(messages: list[Message], seen: dict[int, SeenKeyframe], stages: Stages) -> LoopErrors:
+    actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(stages=stages)))
+    candidates, closures = [], []
+    for message in messages:
+        start_s = time.process_time()
+        said = list(actor.handle(message))
+        ms = 1e3 * (time.process_time() - start_s)
+        compared = [one for one in said if not isinstance(one, LoopClosure)]
+        closures += [one for one in said if isinstance(one, LoopClosure)]
+        candidates += [
+            PairCompared(one.keyframes, one.references, not one.refused, ms / len(compared))
+            for one in compared
+        ]
+    poses = [
+        LoopClosed(p.keyframe, p.reference, transform(p.T_reference_keyframe))
+        for p in (closure.pose for closure in closures)
+    ]
+    return evaluate_loops(FoundLoops(tuple(candidates), tuple(poses)), seen)
+
+
+def row(errors: LoopErrors) -> str:
+    def share(value: float | None) -> str:
+        return "-" if value is None else f"{value:.3f}"
+
+    p50, p95 = np.percentile(errors.ms or (0.0,), [50, 95])
+    cm = 100 * np.array(errors.position_errors_m or (0.0,))
+    deg = np.array(errors.rotation_errors_deg or (0.0,))
+    return (
+        f"{errors.candidates} | {errors.closures} | {share(errors.precision)} | "
+        f"{errors.closed_queries} of {errors.queries} | {share(errors.recall)} | "
+        f"{np.median(cm):.2f} / {cm.max():.2f} | {np.median(deg):.2f} / {deg.max():.2f} | "
+        f"{p50:.0f} / {p95:.0f} |"
+    )
+
+
+def default_sources() -> Iterator[str]:
+    for name in ("tum/kitchen", "replica/apartment_floor1"):
+        folder = Path(os.environ.get("LDO_DATA", "")) / name
+        if folder.is_dir():
+            yield str(folder)
+    yield "synthetic:flat"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sources", nargs="*", metavar="SOURCE")
+    parser.add_argument("--model", default="", metavar="FILE.onnx")
+    parser.add_argument("--stages", nargs="*", default=STAGES, choices=STAGES)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    print(f"coarse: {coarse_ms():.2f} ms CPU among {SUBGRAPHS} subgraphs\n")
+    print("| source | stages | candidates | closures | precision | closed | recall ", end="")
+    print("| cm p50 / max | deg p50 / max | CPU ms p50 / p95 |\n|" + "---|" * 10)
+    for source in arguments.sources or default_sources():
+        sequence = open_sequence(source)
+        messages = tracked(sequence, arguments.model)
+        frames = {m.keyframe: m.frame for m in messages if isinstance(m, Keyframe)}
+        truth = sequence.truth()
+        assert truth is not None, f"{sequence.name} has no ground truth"
+        seen = seen_keyframes(frames, sequence, truth)
+        for stages in arguments.stages:
+            errors = closed(messages, seen, stages)
+            print(f"| {sequence.name} | {stages} | {row(errors)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
