@@ -22,7 +22,6 @@ that config.yaml names in tracker.localise.
 import csv
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +53,7 @@ from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.saved import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
+from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
 from .loops_file import LOOPS, LoopRecord
 from .objects_file import OBJECTS, write_objects
 from .places import PlaceRecord
@@ -110,17 +110,6 @@ def prepare(folder: Path, overwrite: bool) -> None:
         raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
 
 
-@dataclass(frozen=True, slots=True)
-class TrackedFrame:
-    """What the final trajectory needs of a frame."""
-
-    stamp_ns: int
-    reference: int | None
-    T_reference_camera: np.ndarray
-    T_map_camera_online: np.ndarray
-    segment: int
-
-
 class RunFolder:
     """Observes what the actors make; `close` writes what is only known at the end."""
 
@@ -133,7 +122,7 @@ class RunFolder:
         self._csv = csv.writer(self._csv_file)
         self._csv.writerow(COLUMNS)
         self._tracked: list[TrackedFrame] = []
-        self._poses = KeyframePoses()
+        self._poses, self._final_poses = KeyframePoses(), FinalPoses()
         self._joined: dict[int, int] = {}  # segments placed in an older one
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.follower = MapFollower()
@@ -205,6 +194,9 @@ class RunFolder:
             transform(keyframe.T_odom_keyframe),
             keyframe.segment,
         )
+        T_reference_keyframe = transform(keyframe.T_reference_keyframe)
+        measured = MeasuredKeyframe(keyframe.stamp_ns, keyframe.keyframe, T_reference_keyframe)
+        self._final_poses.add(measured, keyframe.reference)
         self._places.add(keyframe)
         self.newest_stamp_ns = keyframe.stamp_ns
         self._keyframes[keyframe.keyframe] = {
@@ -265,17 +257,9 @@ class RunFolder:
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
-        """T_map_camera from where the reference keyframes are now."""
+        """T_map_camera from where the keyframes around each frame are now."""
         frames = [frame for frame in self._tracked if self._root(frame.segment) == 0]
-        return _trajectory(
-            frames,
-            [
-                frame.T_map_camera_online
-                if frame.reference is None
-                else self._poses[frame.reference] @ frame.T_reference_camera
-                for frame in frames
-            ],
-        )
+        return _trajectory(frames, self._final_poses.of(frames, self._poses))
 
     def _root(self, segment: int) -> int:
         """The oldest that it is joined to, itself where there is none."""
@@ -303,7 +287,9 @@ class RunFolder:
         return msgspec.structs.replace(found, objects=placed)
 
 
-def _trajectory(frames: Sequence[TrackedFrame], T_map_camera: list[np.ndarray]) -> Trajectory:
+def _trajectory(
+    frames: Sequence[TrackedFrame], T_map_camera: Sequence[np.ndarray] | np.ndarray
+) -> Trajectory:
     stamps_s = np.array([frame.stamp_ns for frame in frames]) * 1e-9
     return Trajectory(stamps_s, np.array(T_map_camera).reshape(-1, 4, 4))
 
