@@ -4,20 +4,39 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
+from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.state_store import decode_state, encode_state
-from ldo_service.schemas import Array, Correction, FrameRgbd, Keyframe, OdometryPrior, TrackedPose
+from ldo_service.schemas import (
+    Array,
+    Correction,
+    FrameRgbd,
+    Keyframe,
+    KeyframeRefinement,
+    LoopClosure,
+    OdometryPrior,
+    TrackedPose,
+)
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.segments import SegmentConfig
-from ldo_service.wire import correction_message, pose_message, rgbd_message, rgbd_of, transform
+from ldo_service.wire import (
+    correction_message,
+    keyframe_poses_of,
+    measured_message,
+    pose_message,
+    rgbd_message,
+    rgbd_of,
+    transform,
+)
 
 
 def poses_of(messages) -> list[TrackedPose]:
@@ -104,6 +123,37 @@ def test_a_correction_moves_the_map_and_not_the_odometry(frames, keyframes) -> N
     assert pose.T_odom_camera == expected.T_odom_camera
     assert pose.graph_version == 7
     np.testing.assert_allclose(transform(pose.T_map_odom), shift, atol=1e-9)
+
+
+def test_odometry_does_not_jump_when_a_loop_is_closed(frames, tracked) -> None:
+    tracker, optimizer = Tracker(), Optimizer()
+    poses: list[TrackedPose] = []
+    for number, frame in enumerate(frames):
+        out = handled(tracker, [frame])
+        poses += poses_of(out)
+        made = [message for message in out if isinstance(message, Keyframe)]
+        said = [c for keyframe in made for c in optimizer.handle(keyframe)]
+        if number == 25:
+            newest = poses[-1].reference or 0
+            said += optimizer.handle(closure_off_by(0.03, newest, poses[-1].stamp_ns, optimizer))
+            assert said[-1].closures == ((0, newest),)
+        handled(tracker, said)
+    assert [p.T_odom_camera for p in poses] == [p.T_odom_camera for p in poses_of(tracked)]
+    step_m = np.diff([p.T_map_odom.translation for p in poses], axis=0)
+    jumped = np.flatnonzero(np.linalg.norm(step_m, axis=1) > 1e-3)
+    assert list(jumped) == [25], "the map moves under the camera, once"
+
+
+def closure_off_by(
+    distance_m: float, keyframe: int, stamp_ns: int, optimizer: Optimizer
+) -> LoopClosure:
+    """Between the first keyframe and another, where odometry has it but for a step."""
+    *_, correction = optimizer.handle(KeyframeRefinement(stamp_ns=stamp_ns, poses=()))
+    T_map = keyframe_poses_of(correction)
+    T_0_keyframe = se3.inverse(T_map[0]) @ T_map[keyframe]
+    T_0_keyframe[0, 3] += distance_m
+    measured = RelativePose(0, keyframe, T_0_keyframe, 1e6 * np.eye(6))
+    return LoopClosure(stamp_ns=stamp_ns, pose=measured_message(measured), overlap=0.5, rmse_m=0.01)
 
 
 def test_an_older_correction_is_ignored(frames) -> None:
