@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
@@ -46,7 +46,7 @@ def doubled(
     if not len(own) or not len(older):
         return mask
     count = min(config.neighbours, len(older))
-    tree = cKDTree(rows[older, :3])
+    tree = KDTree(rows[older, :3])
     _, found = tree.query(rows[own, :3], k=[*range(1, count + 1)])
     for near in found.T:
         mask[own] |= _stands_for(rows[older[near]], rows[own], config)

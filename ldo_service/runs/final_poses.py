@@ -60,8 +60,8 @@ class FinalPoses:
             before.append(self._seen_from(a, frame, T_map))
             after.append(self._seen_from(b, frame, T_map))
             shares.append(share)
-        both = (np.array(T).reshape(-1, 4, 4) for T in (before, after))
-        return blended(*both, np.array(shares, float))
+        T_a, T_b = (np.array(T).reshape(-1, 4, 4) for T in (before, after))
+        return blended(T_a, T_b, np.array(shares, float))
 
     def _around(
         self, frame: TrackedFrame

@@ -259,7 +259,8 @@ class RunFolder:
     def final(self) -> Trajectory:
         """T_map_camera from where the keyframes around each frame are now."""
         frames = [frame for frame in self._tracked if self._root(frame.segment) == 0]
-        return _trajectory(frames, self._final_poses.of(frames, self._poses))
+        T_map = {keyframe: self._poses[keyframe] for keyframe in self._poses}
+        return _trajectory(frames, self._final_poses.of(frames, T_map))
 
     def _root(self, segment: int) -> int:
         """The oldest that it is joined to, itself where there is none."""
