@@ -104,6 +104,11 @@ class MapperConfig:
     checkpoint_keyframes: int = 5  # between saved states; a crash costs at most so many of the map
     motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
     motion_min_rad: float = 2e-4  # As builder.refined_m: what is not told must not be taken back
+    mending_min_m: float = 0.01  # a keyframe that a correction moves farther is mended: it may lie
+    mending_min_rad: float = 0.01  # over surface that the map holds already. Less is refined anyway
+    mended_keyframes: int = 2  # per new one: a closure that moves a hundred is mended in fifty
+    mended_at_end: int = 200  # when the stream ends, the newest: half a minute
+    mending_iterations: int = 3  # of the optimiser, as for a new keyframe when many wait
 
     def __post_init__(self) -> None:
         counts = (
@@ -112,6 +117,10 @@ class MapperConfig:
         )
         if min(self.iterations, self.least_iterations) < 0:
             raise ConfigError("mapper.iterations and least_iterations must not be negative.")
+        if min(self.mended_keyframes, self.mended_at_end, self.mending_iterations) < 0:
+            raise ConfigError(
+                "mapper.mended_keyframes, mended_at_end and mending_iterations: none is negative."
+            )
         if min(counts) < 1 or self.threads < 0 or self.snapshot_growth < 0:
             raise ConfigError(
                 f"mapper: counts {counts} must be at least 1, threads {self.threads} and "
@@ -162,6 +171,8 @@ class Mapper(Actor):
         self._links = KeyframeLinks(self._poses)
         self._teller = MapTeller(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
+        self._to_mend: list[int] = []  # keyframes that corrections moved far
+        self._mended = 0  # Gaussians that the map held twice
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -199,6 +210,7 @@ class Mapper(Actor):
         moving = mask_of(message.is_moving)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         learnt = self._semantics.mapped(message.keyframe)
+        self._mend(self.config.mended_keyframes)
         # tell
         yield from self._refinement()
         yield from self._teller.keyframe(self._now())
@@ -260,7 +272,11 @@ class Mapper(Actor):
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         held = self._links.acknowledged(message.refinements)
         self._poses.correct(message.graph_version, keyframe_poses_of(message), held=held)
-        motions = tuple(self._motion(keyframe) for keyframe in self._misplaced())
+        config = self.config
+        torn = self._misplaced(config.mending_min_m, config.mending_min_rad)
+        misplaced = self._misplaced(config.motion_min_m, config.motion_min_rad)
+        motions = tuple(self._motion(keyframe) for keyframe in misplaced)
+        self._to_mend = sorted({*self._to_mend, *torn})
         if motions:
             T_new_old = {m.keyframe: transform(m.T_new_old) for m in motions}
             self._map.move(T_new_old)
@@ -268,17 +284,23 @@ class Mapper(Actor):
             yield self._teller.delta(self._now(), motions=motions)
             yield from self._objects()
 
-    def _misplaced(self) -> list[int]:
-        """Keyframes that are not where their Gaussians are; too little to show adds up until it is
-        enough."""
+    def _misplaced(self, least_m: float, least_rad: float) -> list[int]:
+        """Keyframes that are so far from where their Gaussians are; too little to show adds up
+        until it is enough."""
         poses = self._map.views.poses
         are_far = se3.differ(
             np.array([self._poses[keyframe] for keyframe in poses]),
             np.array(list(poses.values())),
-            self.config.motion_min_m,
-            self.config.motion_min_rad,
+            least_m,
+            least_rad,
         )
         return [keyframe for keyframe, is_far in zip(poses, are_far, strict=True) if is_far]
+
+    def _mend(self, most: int) -> None:
+        """Some of the keyframes that corrections laid over others, the newest first."""
+        for _ in range(min(most, len(self._to_mend))):
+            keyframe = self._to_mend.pop()
+            self._mended += self._map.mend(keyframe, self.config.mending_iterations)
 
     def _motion(self, keyframe: int) -> AnchorMotion:
         """From where its Gaussians are to where the keyframe is."""
@@ -308,6 +330,7 @@ class Mapper(Actor):
     def finish(self) -> Iterator[Output]:
         """The whole map, so that whoever listens ends with it."""
         if self._map.size():
+            self._mend(self.config.mended_at_end)
             self._semantics.refresh()
             yield from self._teller.snapshot(self._now())
             yield from self._objects()
@@ -338,6 +361,7 @@ class Mapper(Actor):
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
             "told": self._teller.state(),
+            "to_mend": self._to_mend,
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -349,11 +373,14 @@ class Mapper(Actor):
         self._poses.restore(saved["poses"])
         self._links.restore(saved["links"])
         self._teller.restore(saved["told"])
+        self._to_mend = list(saved["to_mend"])
 
     def facts(self) -> dict[str, float]:
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
+            "keyframes_to_mend": len(self._to_mend),
+            "gaussians_mended": self._mended,  # held twice after a correction, and removed
             **self._map.statistics(),
             **self._semantics.statistics(),
         }

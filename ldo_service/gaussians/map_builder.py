@@ -260,6 +260,7 @@ class MapBuilder:
         """
         if keyframe not in self.views.poses:
             return 0
+        self._shown = None
         self._wake(self.views.placed(keyframe))
         mask = doubled(self.gaussians.rows, self.gaussians.anchors, keyframe, self.config.merging)
         self._remove(mask)

@@ -20,6 +20,7 @@ from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Detection,
     DetectionBoxes,
+    Keyframe,
     KeyframeRefinement,
     MapDelta,
     MapRefine,
@@ -37,6 +38,7 @@ from ldo_service.wire import (
     mask_of,
     matrix6_message,
     measurements_of,
+    pose_message,
     rgbd_of,
     transform,
 )
@@ -267,6 +269,52 @@ def test_a_correction_moves_gaussians_with_their_keyframes(keyframes, correction
         mine = anchors == k.keyframe
         T = se3.exp(np.array([0, 0.01, 0, 0.02, 0, 0]) * (1 + k.keyframe))
         np.testing.assert_allclose(after.map.means[mine], se3.transform(T, means[mine]), atol=1e-5)
+
+
+def around_again(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
+    """The same views, as a camera that has drifted makes them; ids from `first` on."""
+    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
+    again, before, T_before = [], keyframes[-1].keyframe, poses[keyframes[-1].keyframe]
+    for k in keyframes:
+        T = T_drift @ poses[k.keyframe]
+        again.append(
+            msgspec.structs.replace(
+                k,
+                keyframe=first + k.keyframe,
+                reference=before,
+                T_reference_keyframe=pose_message(se3.inverse(T_before) @ T),
+                T_odom_keyframe=pose_message(T),
+                window=(),
+            )
+        )
+        before, T_before = first + k.keyframe, T
+    return again
+
+
+def test_surface_that_a_correction_lays_over_itself_is_held_once(keyframes) -> None:
+    """The second time around is 10 cm off, so it is mapped again; then the loop is closed."""
+    T_drift = se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))
+    second = around_again(keyframes[:3], T_drift, first=100)
+    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes[:3]}
+    closed = correction_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
+    frame, T_map_camera = rgbd_of(keyframes[0]), poses[keyframes[0].keyframe]
+    added, quality = {}, {}
+    for mended in (0, 10):
+        mapper = Mapper(replace(CONFIG, mended_at_end=mended))
+        messages = handled(mapper, keyframes[:3])
+        once = mapper.facts()["gaussians"]
+        messages += handled(mapper, [*second, closed])
+        held_twice = mapper.facts()["gaussians"]
+        messages += mapper.finish()
+        assert mapper.facts()["keyframes_to_mend"] == 3 * (mended == 0)
+        held = mapper.facts()["gaussians"]
+        assert held_twice - held >= mapper.facts()["gaussians_mended"]
+        added[mended] = held - once
+        follower = followed(messages)
+        assert follower.map.rows.tobytes() == mapper._map.gaussians.all().rows.tobytes()
+        quality[mended] = seen_psnr(follower.map.rows, frame, T_map_camera)
+    assert added[10] < 0.6 * added[0]
+    assert quality[10] > quality[0] - 0.3
 
 
 def test_a_correction_that_moves_nothing_says_nothing(keyframes) -> None:
