@@ -47,8 +47,8 @@ def doubled(
         return mask
     count = min(config.neighbours, len(older))
     tree = KDTree(rows[older, :3])
-    _, found = tree.query(rows[own, :3], k=[*range(1, count + 1)])
-    for near in found.T:
+    _, found = tree.query(rows[own, :3], k=count)
+    for near in np.reshape(found, (len(own), count)).T:
         mask[own] |= _stands_for(rows[older[near]], rows[own], config)
     return mask
 
