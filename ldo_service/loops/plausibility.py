@@ -43,17 +43,30 @@ class Plausibility:
     ) -> None:
         self._poses, self._joined, self._config = poses, joined, config
 
-    def may_meet(self, views: Sequence[Sequence[View]], new: View) -> np.ndarray:
-        """[S] bool: which of S groups of views a keyframe may show again, wherever it looks."""
-        return np.array([self._may_meet(group[0], new) for group in views], bool)
-
-    def _may_meet(self, old: View, new: View) -> bool:
-        if not self._is_known(old, new):
-            return True
-        gap_m, turn_rad = self._drift(old, new, np.eye(4))
-        limit_m, limit_rad = self._limits(old, new)
-        reach_m = self._config.view_depths * max(v.place.median_depth_m for v in (old, new))
-        return gap_m <= limit_m + reach_m and turn_rad <= limit_rad + self._config.view_rad
+    def may_meet(self, old: Sequence[View], new: View) -> np.ndarray:
+        """[S] bool: which of S views a keyframe may show again, wherever it looks: all but those
+        that are farther or turned more than drift and the width of a view explain."""
+        known = np.array([self._is_known(view, new) for view in old], bool)
+        may = ~known
+        at = np.flatnonzero(known)
+        if not len(at):
+            return may
+        views, config, T_new = (
+            [old[k] for k in at.tolist()],
+            self._config,
+            self._poses[new.keyframe],
+        )
+        T_old = np.array([self._poses[view.keyframe] for view in views])
+        way_m = np.abs(new.path_m - np.array([view.path_m for view in views]))
+        depth_m = np.array([view.place.median_depth_m for view in views])
+        reach_m = config.view_depths * np.maximum(depth_m, new.place.median_depth_m)
+        gap_m = np.linalg.norm(T_old[:, :3, 3] - T_new[:3, 3], axis=1)
+        cosine = (np.einsum("nij,ij->n", T_old[:, :3, :3], T_new[:3, :3]) - 1) / 2
+        turn_rad = np.arccos(np.clip(cosine, -1, 1))
+        may[at] = (gap_m <= config.drift_m + config.drift * way_m + reach_m) & (
+            turn_rad <= config.turn_rad + config.turn_rad_per_m * way_m + config.view_rad
+        )
+        return may
 
     def judged(self, proposal: Proposal) -> Proposal:
         """Refused where no drift since then explains it."""
@@ -97,8 +110,12 @@ class Plausibility:
 
     def _is_known(self, old: View, new: View) -> bool:
         """Whether the map says where both are to each other."""
-        roots = {self._joined.get(v.place.segment, v.place.segment) for v in (old, new)}
-        return len(roots) == 1 and old.keyframe in self._poses and new.keyframe in self._poses
+        if old.keyframe not in self._poses or new.keyframe not in self._poses:
+            return False
+        return self._root(old.place.segment) == self._root(new.place.segment)
+
+    def _root(self, segment: int) -> int:
+        return self._joined.get(segment, segment)
 
     def _drift(self, old: View, new: View, T_old_new: np.ndarray) -> tuple[float, float]:
         """m and rad between where a pose and the map have the new keyframe."""

@@ -147,7 +147,7 @@ class Recogniser:
     ) -> list[Finding]:
         """Coarse, then fine: the surest candidate that nothing speaks against closes the loop."""
         known = Plausibility(poses, joined, self._config.plausibility)
-        is_possible = known.may_meet([old.views for old in self.subgraphs], new.views[-1])
+        is_possible = known.may_meet([old.views[0] for old in self.subgraphs], new.views[-1])
         likely = self._memory.alike(new, is_possible)
         proposals = [known.judged(self._proposal(like.subgraph, new)) for like in likely]
         proposals = known.without_twins(proposals)
