@@ -13,6 +13,7 @@ does not take in time is dropped on its side.
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
@@ -20,8 +21,9 @@ import numpy as np
 import zenoh
 
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.links import Header, encode
-from ldo_service.runtime.zenoh_transport import ALIVE, DEFAULT_ENDPOINT, Network, open_session
+from ldo_service.runtime.keys import Keys
+from ldo_service.runtime.links import ALIVE, Header, encode
+from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
 from ldo_service.schemas import (
     CameraColor,
     CameraDepth,
@@ -320,8 +322,13 @@ def _message(sample: Any, of: type[M]) -> M:
 
 
 @contextmanager
-def connect(robot: str = "robot", endpoint: str = DEFAULT_ENDPOINT) -> Iterator[Client]:
-    """Connect to a running service. Raises ConfigError when nobody answers."""
-    network = Network(robot, endpoint)
+def connect(
+    robot: str = "robot", endpoint: str = DEFAULT_ENDPOINT, keys: str | Path | None = None
+) -> Iterator[Client]:
+    """Connect to a running service; with `keys`, a folder that `ldo keys` made, over TLS.
+
+    Raises ConfigError when nobody answers, or refuses the keys.
+    """
+    network = Network(robot, endpoint, Keys.of(keys))
     with open_session(network) as session:
         yield Client(session, network)

@@ -34,6 +34,8 @@ from ldo_service.actors.tracker import TrackerConfig
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
+from ldo_service.metrics import LOOPBACK
+from ldo_service.runtime.network import MAX_MESSAGE_MB
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.stage import StageConfig
 
@@ -46,10 +48,14 @@ class ServiceConfig:
     drain_s: float = 10.0  # a soft stop waits so long for each stage to finish what it has
     silent_after_s: float = 10.0  # a process without a heartbeat for so long is killed
     control_timeout_s: float = 10.0  # for each actor to obey; the slowest step measured is 0.6 s
+    max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped; a 4K frame can have 58 MB
+    metrics_address: str = LOOPBACK  # who reads them sees when the robot works; 0.0.0.0: everybody
 
     def __post_init__(self) -> None:
         if self.drain_s < 0 or min(self.silent_after_s, self.control_timeout_s) <= 0:
             raise ConfigError(f"{self}: times must be positive.")
+        if not 1 <= self.max_message_mb <= 1000:
+            raise ConfigError(f"service.max_message_mb={self.max_message_mb} must be in 1..1000.")
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""`ldo serve --metrics PORT`: the actors' health messages for Prometheus, on loopback.
+"""`ldo serve --metrics PORT`: the actors' health messages for Prometheus, by default on loopback.
 
 Counters restart from 0 with their actor's process, as Prometheus expects of counters.
 """
@@ -17,6 +17,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 
 LOOPBACK = "127.0.0.1"  # anyone who may read them may also see where the robot is at work
+MOST_ACTORS = 64  # that are kept; a name is what a message says
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
@@ -60,7 +61,8 @@ class HealthCollector(Collector):
         except msgspec.DecodeError:
             return
         with self._lock:
-            self._last[health.actor] = (time.monotonic(), health)
+            if health.actor in self._last or len(self._last) < MOST_ACTORS:
+                self._last[health.actor] = (time.monotonic(), health)
 
     def collect(self) -> Iterator[Metric]:
         with self._lock:
@@ -119,21 +121,21 @@ def _facts(actors: list[Health]) -> Metric:
 
 
 @contextmanager
-def exported(collector: HealthCollector, port: int) -> Iterator[None]:
-    """Serve http://127.0.0.1:PORT/metrics inside the block.
+def exported(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
+    """Serve http://ADDRESS:PORT/metrics inside the block.
 
-    Raises ConfigError when the port cannot be had.
+    Raises ConfigError when the port or the address cannot be had.
     """
     if not 0 < port < 65536:
         raise ConfigError(f"--metrics {port}: a port is a number in 1..65535.")
     registry = CollectorRegistry()
     registry.register(collector)
     try:
-        server, thread = start_http_server(port, LOOPBACK, registry)
+        server, thread = start_http_server(port, address, registry)
     except OSError as error:
         raise ConfigError(
-            f"--metrics {port}: cannot listen on {LOOPBACK}:{port} ({error.strerror}). Is another "
-            "service exporting there? Choose another port."
+            f"--metrics {port}: cannot listen on {address}:{port} ({error.strerror}). Is another "
+            "service exporting there? Choose another port, or service.metrics_address."
         ) from error
     try:
         yield

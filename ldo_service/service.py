@@ -53,8 +53,9 @@ class Service:
     network: Network
     state: Path
     only: tuple[str, ...] = ()
+    is_router: bool = True  # False: there is one on the network already
     is_state_kept: bool = True  # the folder outlives the service
-    metrics_port: int | None = None  # for Prometheus, on loopback
+    metrics_port: int | None = None  # for Prometheus
     recording: Path | None = None  # what every actor takes is recorded there
 
     def run(self) -> None:
@@ -72,8 +73,9 @@ class Service:
             if not self.only:
                 claim_state(self.state, stack)
             if self.metrics_port is not None:
-                stack.enter_context(exported(health, self.metrics_port))
-            session = stack.enter_context(open_session(self.network, router=not self.only))
+                address = self.config.service.metrics_address
+                stack.enter_context(exported(health, self.metrics_port, address))
+            session = stack.enter_context(open_session(self.network, router=self.is_router))
             try:
                 asyncio.run(self._serve(session, health))
             except StageStalled as error:
@@ -169,7 +171,8 @@ class Service:
         config.write_text(config_yaml(self.config))
         command = python_command(
             *("serve", "--only", box.name, "--robot", self.network.robot),
-            *("--endpoint", self.network.endpoint),
+            *("--endpoint", self.network.local_endpoint),
+            *(("--keys", str(self.network.keys.folder)) if self.network.keys else ()),
             *("--config", str(config), "--state", str(self.state)),
             *(("--record", str(self.recording)) if self.recording else ()),
         )

@@ -9,7 +9,7 @@ from ldo_service.errors import ConfigError, StageError
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas.map import MOST_ITERATIONS
 
-from .options import Endpoint, Robot
+from .options import Endpoint, KeysFolder, Robot
 
 Verb = Annotated[
     Literal["pause", "resume", "save", "reset", "refine", "add-label"],
@@ -34,6 +34,7 @@ def control(
     name: Name = "",
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
+    keys: KeysFolder = None,
     iterations: Iterations = 200,
 ) -> None:
     """Pause, resume, save or reset a running service; done when all its actors have done it.
@@ -47,7 +48,7 @@ def control(
     """
     if bool(name) != (verb == "add-label"):
         raise ConfigError("`ldo control add-label NAME` takes a name, and no other verb does.")
-    with connect(robot, endpoint) as service:
+    with connect(robot, endpoint, keys) as service:
         if verb == "refine":
             ask_to_refine(service, iterations)
         elif verb == "add-label":

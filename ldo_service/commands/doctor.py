@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from rich.console import Console
 
@@ -21,7 +22,7 @@ from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
 
-from .options import Endpoint, Robot
+from .options import Endpoint, KeysFolder, Robot
 
 LIBRARIES = {  # name on the package index: name to import
     "numpy": "numpy",
@@ -36,7 +37,11 @@ LIBRARIES = {  # name on the package index: name to import
     "safetensors": "safetensors",
     "zstandard": "zstandard",
 }
-EXTRAS = {"viewer": ("viser", "gsply"), "cuda": ("torch", "gsplat")}
+EXTRAS = {
+    "viewer": ("viser", "gsply"),
+    "keys": ("cryptography",),
+    "cuda": ("torch", "gsplat"),
+}
 LISTEN_S = 1.5  # three heartbeats
 MARKS = {
     "ok": "[green]ok[/]     ",
@@ -52,14 +57,22 @@ class Finding:
     text: str
 
 
-def doctor(robot: Robot = "robot", endpoint: Endpoint = DEFAULT_ENDPOINT) -> None:
+def doctor(
+    robot: Robot = "robot", endpoint: Endpoint = DEFAULT_ENDPOINT, keys: KeysFolder = None
+) -> None:
     """Say what this machine has, what is missing and how to get it, and how a running service is.
 
     Exit code 1 when something is bad.
     """
     console = Console(highlight=False, soft_wrap=True)
     bad = 0
-    for finding in (*machine(), *libraries(), *extras(), *networks(), *service(robot, endpoint)):
+    for finding in (
+        *machine(),
+        *libraries(),
+        *extras(),
+        *networks(),
+        *service(robot, endpoint, keys),
+    ):
         console.print(MARKS[finding.mark] + finding.text)
         bad += finding.mark == "bad"
     if bad:
@@ -116,27 +129,33 @@ def networks() -> Iterator[Finding]:
             yield Finding("bad", f"network {name}: {error}")
 
 
-def service(robot: str, endpoint: str) -> Iterator[Finding]:
+def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
     try:
-        actors = seen(robot, endpoint)
-    except ConfigError:
-        yield Finding("absent", f"no service on {endpoint}: `ldo serve` starts one")
+        actors = seen(robot, endpoint, keys)
+    except ConfigError as error:
+        if keys is not None:
+            yield Finding("bad", str(error))
+        else:
+            yield Finding("absent", f"no service on {endpoint}: `ldo serve` starts one")
         return
     if not any(actor.has_token or actor.health for actor in actors):
         yield Finding(
             "bad",
             f"something answers on {endpoint}, and no actor of robot {robot!r} is heard: is that "
-            "its name, and does the router's access control let this client subscribe?",
+            "its name, and do this client's keys let it read (viewer or operator)?",
         )
         return
     for actor in actors:
         yield from of_actor(actor)
 
 
-def seen(robot: str, endpoint: str) -> list[Seen]:
+def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[Seen]:
     """Every actor of the graph, listened to for a while. Raises ConfigError when nobody answers."""
     heard: dict[str, tuple[float, Health]] = {}
-    with connect(robot, endpoint) as client, client.listen(f"{HEALTH.name}/*", Health) as inbox:
+    with (
+        connect(robot, endpoint, keys) as client,
+        client.listen(f"{HEALTH.name}/*", Health) as inbox,
+    ):
         until_s = time.monotonic() + LISTEN_S
         while time.monotonic() < until_s:
             for health in inbox():

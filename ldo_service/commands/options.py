@@ -67,6 +67,14 @@ Robot = Annotated[
 Endpoint = Annotated[
     str, tyro.conf.arg(metavar="ADDRESS", help="where the service's router listens")
 ]
+KeysFolder = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        name="keys",
+        metavar="DIR",
+        help="keys for TLS, a folder that `ldo keys add` made; ADDRESS is then tls/HOST:PORT",
+    ),
+]
 Overwrite = Annotated[bool, tyro.conf.arg(help="replace an earlier run in the folder")]
 Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing else")]
 

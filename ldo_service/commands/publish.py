@@ -17,7 +17,7 @@ from ldo_service.runs.source import Selection
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.wire import camera_rgbd_message
 
-from .options import ConfigFile, Endpoint, MaxFrames, Robot, Settings, Source, Stride
+from .options import ConfigFile, Endpoint, KeysFolder, MaxFrames, Robot, Settings, Source, Stride
 from .progress import progress
 
 MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad
@@ -27,6 +27,7 @@ def publish(
     source: Source,
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
+    keys: KeysFolder = None,
     rate: Annotated[
         float | None, tyro.conf.arg(metavar="HZ", help="frames per second; default: as recorded")
     ] = None,
@@ -52,7 +53,7 @@ def publish(
     indices = Selection(stride, max_frames).indices(sequence)
     console = Console(stderr=True)
     with (
-        connect(robot, endpoint) as service,
+        connect(robot, endpoint, keys) as service,
         progress("publish", len(indices), console) as advance,
     ):
         camera = Camera(service, sequence, restamp, console.print)

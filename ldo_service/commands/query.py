@@ -20,7 +20,7 @@ from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.semantics.search import Encode, nearest_names, search
 from ldo_service.wire import transform
 
-from .options import Endpoint, Json, Robot
+from .options import Endpoint, Json, KeysFolder, Robot
 
 LIVE = "live"
 
@@ -47,6 +47,7 @@ def query(
     text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT", help="its name")],
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
+    keys: KeysFolder = None,
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
     """Tell where things are: boxes in the map, the likeliest first.
@@ -56,7 +57,9 @@ def query(
       ldo query DIR "potted plant"
       ldo query live chair --json
     """
-    found, eye = _live(robot, endpoint) if where == LIVE else _of_run(Path(where).expanduser())
+    found, eye = (
+        _live(robot, endpoint, keys) if where == LIVE else _of_run(Path(where).expanduser())
+    )
     answers = answer(text, found, eye)
     if json_:
         print(json.dumps([_plain(one) for one in answers]))
@@ -99,9 +102,9 @@ def _of_run(folder: Path) -> tuple[MapObjects, np.ndarray | None]:
     return found, T_map_camera[-1, :3, 3] if len(T_map_camera) else None
 
 
-def _live(robot: str, endpoint: str) -> tuple[MapObjects, np.ndarray | None]:
+def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.ndarray | None]:
     """The objects, and where the camera is."""
-    with connect(robot, endpoint) as service:
+    with connect(robot, endpoint, keys) as service:
         found, poses = service.objects(), service.last(POSE_TRACKED)
     eye = None
     for pose in poses:

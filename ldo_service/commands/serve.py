@@ -7,12 +7,14 @@ from typing import Annotated
 import tyro
 
 from ldo_service.config import load_config
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network
+from ldo_service.runtime.keys import Keys
+from ldo_service.runtime.network import DEFAULT_ENDPOINT, Network
 from ldo_service.service import Service, state_folder
 
 from .options import (
     ConfigFile,
     Endpoint,
+    KeysFolder,
     Localise,
     Only,
     Robot,
@@ -34,10 +36,18 @@ def serve(
         Path | None,
         tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
     ] = None,
+    keys: KeysFolder = None,
+    without_keys: Annotated[
+        bool, tyro.conf.arg(help="listen on a network where everybody may do everything")
+    ] = False,
+    join: Annotated[
+        bool, tyro.conf.arg(help="be a client of the router at ADDRESS, and open none")
+    ] = False,
     metrics: Annotated[
         int | None,
         tyro.conf.arg(
-            metavar="PORT", help="export every actor's health for Prometheus on 127.0.0.1:PORT"
+            metavar="PORT",
+            help="export every actor's health for Prometheus on PORT of service.metrics_address",
         ),
     ] = None,
 ) -> None:
@@ -48,13 +58,19 @@ def serve(
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
+    settings = localising(load_config(config, set), localise)
+    network = Network(robot, endpoint, Keys.of(keys), settings.service.max_message_mb)
+    is_router = not (only or join)
+    if is_router and not without_keys:
+        network.require_safe()
     with ExitStack() as stack:
         folder = state_folder(state, stack)
         Service(
-            localising(load_config(config, set), localise),
-            Network(robot, endpoint),
+            settings,
+            network,
             folder,
             tuple(only),
+            is_router=is_router,
             is_state_kept=state is not None,
             metrics_port=metrics,
             recording=record,
@@ -73,6 +89,7 @@ def record(
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
+    keys: KeysFolder = None,
 ) -> None:
     """Run the service as `ldo serve` does, and record what every actor takes.
 
@@ -82,4 +99,4 @@ def record(
       ldo record recordings/desk
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
-    serve(robot, endpoint, only, config, set, state, record=out)
+    serve(robot, endpoint, only, config, set, state, record=out, keys=keys)

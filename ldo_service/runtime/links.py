@@ -19,6 +19,7 @@ import msgspec
 from ldo_service.schemas import decode
 
 MAX_SEQ = 1 << 62
+ALIVE = "link/alive"  # tokens of the actors that are there
 
 
 class Header(msgspec.Struct, frozen=True, array_like=True):

@@ -7,7 +7,7 @@ Facts of zenoh-python 1.x that shape this file:
   control DROP: with BLOCK one stalled subscriber stalls the sender for seconds and then loses
   messages all the same. What must arrive is sent again by the links above.
 - The default configuration listens on every interface: scouting, gossip and shared memory are
-  switched off here, and the service listens on loopback.
+  switched off here, and the service listens on loopback, or over TLS to those whom it knows.
 """
 
 import asyncio
@@ -16,62 +16,32 @@ import logging
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from threading import BoundedSemaphore, Lock
 from typing import Any
 
 import zenoh
 
 from ldo_service.errors import ConfigError
-from ldo_service.schemas.topics import ROBOT_PREFIX
 
+from .links import ALIVE
+from .network import CLOSED, DEFAULT_ENDPOINT, Network
 from .transport import LastValues, OnMessage, OnPresence, call_soon
 from .worker import Worker
 
 log = logging.getLogger(__name__)
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-ALIVE = "link/alive"
 MAX_QUERIES = 16  # that may wait for their answer; who asks more often gets an error
+CONNECT_WITHIN_MS = 3000
 LEAVE_WITHIN_S = 2.0  # for what is still being sent when a transport closes
-
-
-@dataclass(frozen=True, slots=True)
-class Network:
-    """Where the robot's topics are."""
-
-    robot: str = "robot"
-    endpoint: str = DEFAULT_ENDPOINT
-
-    def __post_init__(self) -> None:
-        if not self.robot or any(c in self.robot for c in "/*$?#@ "):
-            raise ConfigError(
-                f"robot name {self.robot!r}: it becomes a part of every topic, so it must not be "
-                "empty nor hold any of / * $ ? # @ or a space."
-            )
-
-    def expression(self, key: str) -> str:
-        return f"{ROBOT_PREFIX}/{self.robot}/{key}"
 
 
 def open_session(network: Network, router: bool = False) -> zenoh.Session:
     """Open the service's router, or a client of it. Use it in a `with` block.
 
-    Raises ConfigError when the port is taken or nobody answers there.
+    Raises ConfigError when the port is taken, nobody answers there, or the keys are refused.
     """
-    settings = {
-        "mode": "router" if router else "client",
-        "listen/endpoints" if router else "connect/endpoints": [network.endpoint],
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "adminspace/enabled": False,
-        "transport/shared_memory/enabled": False,
-        "connect/timeout_ms": 3000,
-    }
-    config = zenoh.Config()
     try:
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
+        config = _session_config(network, router)
     except zenoh.ZError as error:
         raise ConfigError(
             f"endpoint {network.endpoint!r}: write it like {DEFAULT_ENDPOINT}."
@@ -79,14 +49,43 @@ def open_session(network: Network, router: bool = False) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        advice = (
-            f"cannot listen on {network.endpoint}: is another `ldo serve` running there? "
-            "Stop it, or choose another port with --endpoint."
-            if router
-            else f"nobody answers on {network.endpoint}: start `ldo serve`, "
-            "or name its address with --endpoint."
-        )
+        advice = _why_not_listening(network) if router else _why_not_connected(network)
         raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from error
+
+
+def _session_config(network: Network, router: bool) -> zenoh.Config:
+    settings = {
+        "mode": "router" if router else "client",
+        "listen/endpoints" if router else "connect/endpoints": [network.endpoint],
+        **CLOSED,
+        "transport/link/rx/max_message_size": network.max_message_mb * 1_000_000,
+        "connect/timeout_ms": CONNECT_WITHIN_MS,
+        **(network.keys.settings(router) if network.keys else {}),
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _why_not_listening(network: Network) -> str:
+    return (
+        f"cannot listen on {network.endpoint}: is another `ldo serve` running there? "
+        "Stop it, or choose another port with --endpoint."
+    )
+
+
+def _why_not_connected(network: Network) -> str:
+    host, port = network.address
+    if network.keys and port.isdecimal() and (why := network.keys.why_refused(host, int(port))):
+        return (
+            f"{network.endpoint} and the keys in {network.keys.folder} do not accept each other: "
+            f"{why}. `ldo keys list` tells what is valid; keys of one network have one authority."
+        )
+    return (
+        f"nobody answers on {network.endpoint}: start `ldo serve`, "
+        "or name its address with --endpoint."
+    )
 
 
 class ZenohTransport:
