@@ -106,11 +106,17 @@ def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     words = line.split(maxsplit=1)
     try:
         stamp_ns = int(Decimal(words[0]) * 10**9)  # a float has no room for nanoseconds since 1970
-        return stamp_ns, words[1].strip()
+        name = words[1].strip()
     except (InvalidOperation, ValueError, OverflowError, IndexError):
         raise DataError(
             f"{path}, line {line_number}: expected `stamp file`, found {line[:80]!r}."
         ) from None
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise DataError(
+            f"{path}, line {line_number}: {name[:80]} lies outside of the folder. Copy or link the "
+            "images into it."
+        )
+    return stamp_ns, name
 
 
 def _calibration(folder: Path) -> Calibration:

@@ -17,13 +17,14 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
+from zstandard import ZstdError, frame_content_size
 
 from ldo_service.errors import DataError
 
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the body
 
+LARGEST_CHUNK_BYTES = 1 << 28  # ours have none; other tools fill them to 1 or 4 MB
 UNREADABLE = (
     *(OSError, struct.error, McapError, ZstdError, ValueError, LookupError),
     *(MemoryError, OverflowError),  # a damaged length asks for too much
@@ -114,5 +115,9 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
 
 def _read_chunk(file: BinaryIO) -> bytes:
     """The uncompressed data of the chunk whose content begins here."""
-    data, length = get_chunk_data_stream(Chunk.read(ReadDataStream(file)))
+    chunk = Chunk.read(ReadDataStream(file))
+    announced = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0
+    if max(announced, chunk.uncompressed_size) > LARGEST_CHUNK_BYTES:
+        raise ValueError(f"a chunk says that it unpacks to over {LARGEST_CHUNK_BYTES} bytes")
+    data, length = get_chunk_data_stream(chunk)
     return data.read(length)

@@ -8,8 +8,6 @@ extent_mm [N] uint16         side of the object that it was last seen as a part 
 misses    [N] uint8          keyframes since then that expected it to be one
 """
 
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,9 +17,11 @@ import numpy as np
 from ldo_service.errors import DataError
 from ldo_service.gaussians.model import new_labels
 
+from .arrays_file import UNREADABLE, read_arrays
 from .labels import MOST_LABELS, ROW, fields
 
 COLUMNS = ROW.names or ()
+LARGEST_BYTES = 1 << 32  # of 128 million Gaussians
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,9 +47,9 @@ def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
     Raises DataError for a file that cannot be read, is something else, or fits another map.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as saved:
-            arrays = {name: saved[name] for name in ("names", *COLUMNS)}
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        saved = read_arrays(path, LARGEST_BYTES)
+        arrays = {name: saved[name] for name in ("names", *COLUMNS)}
+    except UNREADABLE as error:
         raise DataError(f"{path} cannot be read as labels: {error}") from error
     labels = new_labels(len(arrays["weights"]))
     for name in COLUMNS:

@@ -1,6 +1,5 @@
 """Where names lie in the space that images and texts share: computed, or read from a file."""
 
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,12 +7,14 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from ldo_service.errors import ModelError
+from ldo_service.semantics.arrays_file import UNREADABLE, read_arrays
 from ldo_service.semantics.class_names import is_name, normalised
 from ldo_service.semantics.network import Network
 from ldo_service.semantics.synonyms import canonical
 
 from .byte_pairs import BytePairs
 
+LARGEST_BYTES = 1 << 30  # of 260,000 names in 1024 dimensions
 CONTEXT = 77  # tokens of a text, where a network takes any number: CLIP's
 
 
@@ -51,7 +52,7 @@ class CachedEmbeddings:
         try:
             names, arrays = _safetensors(path) if path.suffix == ".safetensors" else _npz(path)
             embeddings = np.asarray(arrays["embeddings"], np.float32)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile, SafetensorError) as error:
+        except (*UNREADABLE, SafetensorError) as error:
             raise ModelError(
                 f"{path} holds no embeddings ({error}): `names` and `embeddings` are expected, "
                 ".npz or .safetensors."
@@ -108,8 +109,7 @@ def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
 
 
 def _npz(path: Path) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
-    with np.load(path, allow_pickle=False) as file:
-        arrays = {name: file[name] for name in file.files}
+    arrays = read_arrays(path, LARGEST_BYTES)
     return tuple(map(str, arrays.pop("names").tolist())), arrays
 
 

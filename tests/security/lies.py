@@ -1,0 +1,231 @@
+"""Names that lead elsewhere, and files that are not what they say: what must come of them."""
+
+import gzip
+import io
+import struct
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import onnx
+import zstandard
+from mcap.opcode import Opcode
+from mcap.writer import MCAP0_MAGIC
+
+from ldo_service.actors.graph import box_named
+from ldo_service.authority import Authority
+from ldo_service.datasets import open_sequence
+from ldo_service.errors import LdoError
+from ldo_service.gaussians.ply import read_ply
+from ldo_service.geometry import codecs
+from ldo_service.models import Models
+from ldo_service.runtime.mcap_index import McapIndex
+from ldo_service.runtime.network import Network
+from ldo_service.semantics.detectors import NetworkConfig
+from ldo_service.semantics.labellers import text_space
+from ldo_service.semantics.labellers.byte_pairs import BytePairs
+from ldo_service.semantics.labellers.text_space import CachedEmbeddings
+from ldo_service.semantics.saved import read_semantics
+from tests.semantics.networks import SQUARES
+
+from .attempt import Attempt, kept_in
+
+REFUSED = "refused"
+MUCH_BYTES = 100_000_000  # a file of some kilobytes must not take so much
+LIES: list[Attempt[Path]] = []
+attempt = kept_in(LIES)
+
+
+def told(*calls: Callable[[], object]) -> str:
+    """Whether each of them is refused by an error of ours, at little cost of memory."""
+    for call in calls:
+        tracemalloc.start()
+        try:
+            call()
+            return "taken"
+        except LdoError:
+            _, most_bytes = tracemalloc.get_traced_memory()
+            if most_bytes > MUCH_BYTES:
+                return f"refused after taking {most_bytes / 1e6:.0f} MB"
+        finally:
+            tracemalloc.stop()
+    return REFUSED
+
+
+# --- names ----------------------------------------------------------------------------------------
+@attempt("robots named `../up`, `a/b`, `*`, `**`, `$*`", REFUSED)
+def robots(_folder: Path) -> str:
+    names = ("../up", "a/b", "*", "**", "$*")
+    return told(*(lambda name=name: Network(name) for name in names))
+
+
+@attempt("models named `../up`, `/tmp/up`, `.hidden`", REFUSED)
+def models(folder: Path) -> str:
+    file = SQUARES["yolox"].write(folder / "net.onnx")
+    here = Models(folder / "models")
+    names = ("../up", "/tmp/up", ".hidden")
+    return told(*(lambda name=name: here.add(name, file, NetworkConfig()) for name in names))
+
+
+@attempt("removing a model named `../keep`, a folder beside those of models", "refused, kept")
+def removed_models(folder: Path) -> str:
+    (folder / "keep").mkdir()
+    (folder / "models").mkdir()
+    seen = told(lambda: Models(folder / "models").remove("../keep"))
+    return f"{seen}, {'kept' if (folder / 'keep').exists() else 'gone'}"
+
+
+@attempt("keys named `../up`, `a/b`, `.x`, removing keys named `..`", REFUSED)
+def keys(folder: Path) -> str:
+    authority = Authority.new(folder / "keys", days=1)
+    names = ("../up", "a/b", ".x")
+    adds = [lambda name=name: authority.add(name, "viewer", "*", 1) for name in names]
+    return told(*adds, lambda: authority.remove(".."))
+
+
+@attempt("an actor named `../../bin/sh` for a process of its own", REFUSED)
+def actors(_folder: Path) -> str:
+    return told(lambda: box_named("../../bin/sh"))
+
+
+@attempt("a data set that lists `../secret.png`, `/dev/zero`, `a/../../secret.png`", REFUSED)
+def listed(folder: Path) -> str:
+    def naming(name: str) -> Callable[[], object]:
+        def open_it() -> object:
+            for kind in ("rgb", "depth"):
+                (folder / f"{kind}.txt").write_text(f"1.0 {name}\n")
+            return open_sequence(str(folder))
+
+        return open_it
+
+    (folder / "camera.json").write_text('{"fx":1,"fy":1,"cx":1,"cy":1,"width":9,"height":9}')
+    return told(*map(naming, ("../secret.png", "/dev/zero", "a/../../secret.png")))
+
+
+# --- models ---------------------------------------------------------------------------------------
+@attempt("a model that is garbage", REFUSED)
+def garbage(folder: Path) -> str:
+    (folder / "net.onnx").write_bytes(b"\x08\x07garbage" * 100)
+    return told(lambda: Models(folder / "m").add("x", folder / "net.onnx", NetworkConfig()))
+
+
+@attempt("a model whose weights are said to lie in `../secret`", REFUSED)
+def external_weights(folder: Path) -> str:
+    (folder / "secret").write_bytes(bytes(1 << 20))
+    model = onnx.load(SQUARES["yolox"].write(folder / "net.onnx"))
+    for tensor in model.graph.initializer:
+        if not tensor.raw_data:
+            continue
+        tensor.ClearField("raw_data")
+        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.external_data.add(key="location", value="../secret")
+    onnx.save(model, folder / "net.onnx")
+    return told(lambda: Models(folder / "m").add("x", folder / "net.onnx", NetworkConfig()))
+
+
+@attempt("a registered model whose file was exchanged", REFUSED)
+def exchanged(folder: Path) -> str:
+    here = Models(folder / "models")
+    file = SQUARES["yolox"].write(folder / "net.onnx")
+    registered = here.add("x", file, NetworkConfig())
+    SQUARES["yolov8"].write(registered.file)
+    return told(here.get("x").verify)
+
+
+@attempt("byte pairs that unpack from 66 kB to 67 MB and more", REFUSED)
+def byte_pairs(folder: Path) -> str:
+    (folder / "bpe.txt.gz").write_bytes(gzip.compress(bytes(80_000_000)))
+    return told(lambda: BytePairs.read(folder / "bpe.txt.gz"))
+
+
+@attempt("embeddings with a pickle inside", "refused, not run")
+def pickled(folder: Path) -> str:
+    path, ran = folder / "e.npz", folder / "ran"
+    np.savez(path, names=np.array([Runs(ran)], object), embeddings=np.ones((1, 2), np.float32))
+    return f"{told(lambda: CachedEmbeddings(path))}, {'run' if ran.exists() else 'not run'}"
+
+
+class Runs:
+    """Leaves a file behind when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return Path.touch, (self.path,)
+
+
+# --- archives -------------------------------------------------------------------------------------
+@attempt(
+    "arrays that say that they are 2 TB, or unpack from 16 kB to 16 MB where 1 MB is most", REFUSED
+)
+def large_arrays(folder: Path) -> str:
+    names = npy(np.array(["a"]))
+    lying, packed = folder / "lying.npz", folder / "packed.npz"
+    with zipfile.ZipFile(lying, "w") as archive:
+        archive.writestr("names.npy", names)
+        archive.writestr("embeddings.npy", npy_header((1 << 39,)))
+    np.savez_compressed(packed, names=np.array(["a"]), embeddings=np.ones((1, 1 << 22), "f4"))
+    with patch.object(text_space, "LARGEST_BYTES", 1_000_000):
+        of_embeddings = told(lambda: CachedEmbeddings(lying), lambda: CachedEmbeddings(packed))
+    return of_embeddings if of_embeddings != REFUSED else told(lambda: read_semantics(lying))
+
+
+@attempt("labels in an archive with a member `../../up.npy`", "refused, nothing written")
+def members(folder: Path) -> str:
+    inner = folder / "a" / "b"
+    inner.mkdir(parents=True)
+    with zipfile.ZipFile(inner / "s.npz", "w") as archive:
+        archive.writestr("../../up.npy", npy(np.zeros(3)))
+    seen = told(lambda: read_semantics(inner / "s.npz"))
+    written = [path for path in folder.rglob("up*") if path.is_file()]
+    return f"{seen}, {'something' if written else 'nothing'} written"
+
+
+@attempt("a recording with a chunk that unpacks from 32 kB to 1 GB", REFUSED)
+def chunk(folder: Path) -> str:
+    body = zstandard.ZstdCompressor().compress(bytes(1 << 30))
+    return told(*(lambda n=n: McapIndex(recording(folder, body, says=n)) for n in (10, 1 << 30)))
+
+
+def recording(folder: Path, body: bytes, says: int) -> Path:
+    """With one chunk, which `says` how much it unpacks to."""
+    name = b"zstd"
+    content = struct.pack("<QQQI", 0, 1, says, 0) + struct.pack("<I", len(name)) + name
+    content += struct.pack("<Q", len(body)) + body
+    path = folder / f"{says}.mcap"
+    path.write_bytes(MCAP0_MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(content)) + content)
+    return path
+
+
+@attempt("a map that says that it has 10^12 Gaussians", REFUSED)
+def large_map(folder: Path) -> str:
+    properties = "".join(f"property float {name}\n" for name in ("x", "y", "z"))
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {10**12}\n{properties}end_header\n"
+    )
+    (folder / "map.ply").write_bytes(header.encode())
+    return told(lambda: read_ply(folder / "map.ply"))
+
+
+@attempt("a depth image of 4 kB that unpacks to 128 MB", REFUSED)
+def large_depth(_folder: Path) -> str:
+    body = memoryview(zstandard.ZstdCompressor().compress(bytes(1 << 27)))
+    return told(lambda: codecs.decode_depth("z16+zstd", 64, 48, body))
+
+
+def npy(values: np.ndarray) -> bytes:
+    file = io.BytesIO()
+    np.save(file, values)
+    return file.getvalue()
+
+
+def npy_header(shape: tuple[int, ...]) -> bytes:
+    """Of an array of float32, without the array."""
+    file = io.BytesIO()
+    about = {"descr": "<f4", "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_2_0(file, about)
+    return file.getvalue()
