@@ -1,0 +1,42 @@
+"""What strangers and careless programs may try, what must come of it, and what does.
+
+The attempts are those of `tests/security`, where they decide; here they are a table.
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).parent.parent.parent
+sys.path.insert(0, str(ROOT))
+
+from tests.security.attempt import Attempt, Where  # noqa: E402
+from tests.security.attempts import ATTEMPTS  # noqa: E402
+from tests.security.lab import lab  # noqa: E402
+from tests.security.lies import LIES  # noqa: E402
+
+
+def row(attempt: Attempt[Where], where: Where) -> bool:
+    seen = attempt.try_it(where)
+    is_as_expected = seen == attempt.expected
+    mark = "" if is_as_expected else " **not as expected**"
+    print(f"| {attempt.says} | {attempt.expected} | {seen}{mark} |", flush=True)
+    return is_as_expected
+
+
+def main() -> None:
+    print("| attempt | expected | seen |\n|---|---|---|")
+    results = []
+    with tempfile.TemporaryDirectory() as folder:
+        with lab(Path(folder) / "keys") as here:
+            results += [row(attempt, here) for attempt in ATTEMPTS]
+        for number, lie in enumerate(LIES):
+            own = Path(folder) / str(number)
+            own.mkdir()
+            results.append(row(lie, own))
+    print(f"\n{sum(results)} of {len(results)} as expected")
+    sys.exit(0 if all(results) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,135 @@
+"""A robot's router on the network, with keys, and all that anybody got through to it."""
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from ldo_service.authority import Authority
+from ldo_service.runtime.access import Role
+from ldo_service.runtime.keys import Keys
+from ldo_service.runtime.network import Network
+from ldo_service.runtime.zenoh_transport import open_session
+from ldo_service.schemas.topics import CONTROL, HEALTH, TOPICS
+from tests.runtime.conftest import free_port
+
+ROBOT, OTHER_ROBOT = "mule", "goat"
+LARGEST_MB = 1
+STEP_S, PATIENCE_S = 0.01, 20.0
+SETTLED = "settled"
+LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"  # a camera's keys that were made again; others
+ROLES: tuple[Role, ...] = ("service", "camera", "odometry", "viewer", "operator")
+INSIDE = ("link/order", "link/grant/keyframe/new", "link/welcome/keyframe/new")  # between actors
+NAMES = (*(f"{t.name}/mapper" if t is HEALTH else t.name for t in TOPICS), *INSIDE, SETTLED)
+
+
+@dataclass
+class Lab:
+    folder: Path
+    network: Network
+    session: zenoh.Session
+    got: list[tuple[str, int]] = field(default_factory=list)  # topic and bytes of what came through
+
+    def keys(self, name: str) -> Network:
+        return Network(ROBOT, self.network.endpoint, Keys(self.folder / name))
+
+    def through(self, act: Callable[[], None], *expected: str) -> list[str]:
+        """Topics on which something of what `act` puts came through, when all expected have, and
+        after them what a service put later."""
+        self.got.clear()
+        act()
+        eventually(lambda: set(expected) <= {topic for topic, _ in self.got})
+        with open_session(self.keys("service")) as sure:
+
+            def is_settled() -> bool:
+                sure.put(f"ldo/{ROBOT}/{SETTLED}", b"")
+                return any(topic == SETTLED for topic, _ in self.got)
+
+            eventually(is_settled)
+        return sorted({topic for topic, _ in self.got} - {SETTLED})
+
+
+@contextmanager
+def lab(folder: Path) -> Iterator[Lab]:
+    """`folder` becomes an authority with keys of each role, named as the role."""
+    authority = Authority.new(folder, days=2)
+    for role in (*ROLES, LOST):
+        authority.add(role, role if role in ROLES else "camera", ROBOT, days=1)
+    shutil.copytree(folder / LOST, folder / STOLEN)
+    authority.remove(LOST)
+    authority.add(LOST, "camera", ROBOT, days=1)
+    authority.add(EXPIRED, "camera", ROBOT, days=1, now=datetime.now(UTC) - timedelta(days=2))
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    network = Network(ROBOT, endpoint, Keys(folder / "service"), LARGEST_MB)
+    with open_session(network, router=True) as session:
+        here = Lab(folder, network, session)
+
+        def store(sample: zenoh.Sample) -> None:
+            topic = str(sample.key_expr).split("/", 2)[2]
+            here.got.append((topic, len(sample.payload.to_bytes())))
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                query.reply(f"ldo/{ROBOT}/{CONTROL.name}", b"obeyed")
+
+        for name in NAMES:
+            session.declare_subscriber(f"ldo/*/{name}", direct(store))
+        session.declare_queryable(f"ldo/{ROBOT}/{CONTROL.name}", direct(answer))
+        yield here
+
+
+def direct(call: Callable[[Any], None]) -> Any:
+    return zenoh.handlers.Callback(call, indirect=False)
+
+
+def puts(network: Network, *topics: str, robot: str = ROBOT, size: int = 3) -> Callable[[], None]:
+    """Connect and put on each topic, without asking whether anybody listens."""
+
+    def act() -> None:
+        with open_session(network) as session:
+            for topic in topics:
+                session.put(f"ldo/{robot}/{topic}", bytes(size))
+
+    return act
+
+
+def heard(there: Lab, network: Network, expressions: Sequence[str], *expected: str) -> list[str]:
+    """The topics that one hears who subscribes, while messages are put on every one of them, until
+    all expected were heard and a service heard the last."""
+    seen: set[str] = set()
+    last = threading.Event()
+    with open_session(network) as session, open_session(there.keys("service")) as sure:
+        for expression in expressions:
+            session.declare_subscriber(
+                f"ldo/{ROBOT}/{expression}",
+                direct(lambda sample: seen.add(str(sample.key_expr).split("/", 2)[2])),
+            )
+        sure.declare_subscriber(f"ldo/{ROBOT}/{SETTLED}", direct(lambda _sample: last.set()))
+
+        def is_heard() -> bool:
+            for name in NAMES:
+                there.session.put(f"ldo/{ROBOT}/{name}", b"1")
+            return set(expected) <= seen and last.is_set()
+
+        eventually(is_heard)
+    return sorted(seen)
+
+
+def eventually(true: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not true() and time.monotonic() < until_s:
+        time.sleep(STEP_S)
+
+
+def asked(network: Network, expression: str) -> list[bytes]:
+    """What a query is answered."""
+    with open_session(network) as session:
+        replies = session.get(f"ldo/{ROBOT}/{expression}", timeout=2.0)
+        return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]

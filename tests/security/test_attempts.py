@@ -1,0 +1,19 @@
+"""On the network, over TLS: each may do what it is there for, and nothing else."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from .attempts import ATTEMPTS, Attempt
+from .lab import Lab, lab
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
+    with lab(tmp_path_factory.mktemp("network") / "keys") as here:
+        yield here
+
+
+@pytest.mark.parametrize("attempt", ATTEMPTS, ids=lambda attempt: attempt.says)
+def test_an_attempt_comes_to_what_it_must(attempt: Attempt, here: Lab) -> None:
+    assert attempt.try_it(here) == attempt.expected
