@@ -36,6 +36,7 @@ from ldo_service.runtime.recording import prepare_recording
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.supervision import Runner, Stop, supervise
+from ldo_service.runtime.watchdog import Watchdog
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 
@@ -90,12 +91,17 @@ class Service:
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, stop.ask)
         watch = asyncio.create_task(self._stop_with_parent(stop))
+        watchdog = Watchdog({} if self.only else os.environ)
+        pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
         control = None if self.only else self._open_control(transport)
         log.info("serving %s on %s", ", ".join(r.name for r in runners), self.network.endpoint)
+        watchdog.tell("READY=1")
         try:
             await supervise(runners, stop, self.config.service.drain_s)
         finally:
+            watchdog.tell("STOPPING=1")
+            pings.cancel()
             watch.cancel()
             if control:
                 control.close()
