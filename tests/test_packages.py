@@ -1,5 +1,7 @@
 """What is built holds what is tracked: links to folders are easily lost in packages."""
 
+import os
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -68,3 +70,45 @@ def test_sdist_holds_what_a_build_needs(packages: Path) -> None:
     }
     assert needed - packed == set()
     assert not [name for name in packed if name.startswith((".ci", "build/"))]
+
+
+def without_compiler(folder: Path, *tools: str) -> dict[str, str]:
+    """An environment whose PATH is `folder`, with these tools alone."""
+    folder.mkdir(exist_ok=True)
+    for tool in tools:
+        found = shutil.which(tool, path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+        if found is None:
+            pytest.skip(f"needs {tool}, which a build brings along elsewhere")
+        (folder / tool).symlink_to(found)
+    kept = {name: value for name, value in os.environ.items() if name not in ("CC", "CXX")}
+    return {**kept, "PATH": str(folder)}
+
+
+def test_the_wheel_runs_where_there_is_no_compiler(packages: Path, tmp_path: Path) -> None:
+    """In a virtual environment of its own, with all that it depends on."""
+    (wheel,) = packages.glob("*.whl")
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "venv")], check=True)
+    ours = tmp_path / "venv" / "bin"
+    environment = without_compiler(tmp_path / "bin")
+    install = [ours / "python", "-m", "pip", "install", "--quiet", "--only-binary", ":all:", wheel]
+    done = subprocess.run(install, env=environment, capture_output=True, text=True)
+    if "No matching distribution" in done.stderr or "ConnectionError" in done.stderr:
+        pytest.skip("needs a package index to install what the wheel depends on")
+    assert done.returncode == 0, done.stderr[-3000:]
+    run = [ours / "ldo", "run", "synthetic:room", "--max-frames", "3", "--out", tmp_path / "out"]
+    done = subprocess.run(run, env=environment, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert (tmp_path / "out" / "map.ply").is_file()
+
+
+def test_a_source_without_a_compiler_says_so_in_one_line(tmp_path: Path) -> None:
+    environment = without_compiler(tmp_path / "bin", "cmake", "ninja")
+    command = [sys.executable, "-m", "pip", "install", "--no-build-isolation", "--no-deps"]
+    command += ["--target", str(tmp_path / "target"), "-C", f"build-dir={tmp_path / 'build'}"]
+    done = subprocess.run([*command, str(ROOT)], env=environment, capture_output=True, text=True)
+    assert done.returncode != 0
+    (line,) = [
+        line for line in done.stderr.splitlines() if "compiler" in line and "CXX" not in line
+    ]
+    assert "finds no C++17 compiler" in line
+    assert "apt install g++" in line
