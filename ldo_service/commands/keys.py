@@ -1,12 +1,12 @@
 """ldo keys"""
 
-import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -109,31 +109,32 @@ def keys(verb: Verb) -> None:
       ldo keys add DIR viewer desk
       ldo serve --endpoint tls/0.0.0.0:7447 --keys DIR/mule
     """
+    if isinstance(verb, Router):
+        access = read_access(verb.folder / ACCESS)
+        print(router_yaml(access, verb.keys, verb.port), end="")
+        return
     from ldo_service.authority import Authority  # the extra `keys`
 
-    if isinstance(verb, New):
-        Authority.new(verb.folder, verb.days)
-        print(f"{verb.folder} is an authority. `ldo keys add` makes keys; keep ca.key to yourself.")
-        return
-    authority = Authority(verb.folder)
     match verb:
+        case New():
+            Authority.new(verb.folder, verb.days)
+            print(f"{verb.folder} is an authority: `ldo keys add` makes keys. ca.key stays here.")
         case Add():
+            authority = Authority(verb.folder)
             made = authority.add(verb.name, verb.role, verb.robot, verb.days, verb.host)
             print(f"{made} is what {verb.name} needs: copy it there, for --keys.")
         case List():
-            Console(highlight=False, markup=False, soft_wrap=True).print(_table(authority))
+            table = _table(Authority(verb.folder))
+            Console(highlight=False, markup=False, soft_wrap=True).print(table)
         case Remove():
-            authority.remove(verb.name)
+            Authority(verb.folder).remove(verb.name)
             print(
                 f"{verb.name} may do nothing any more, where services have the new {ACCESS} and "
                 "were started anew."
             )
-        case Router():
-            access = read_access(verb.folder / ACCESS)
-            print(json.dumps(router_file(access, verb.keys, verb.port), indent=1))
 
 
-def router_file(access: Access, folder: Path, port: int) -> dict[str, Any]:
+def router_yaml(access: Access, folder: Path, port: int) -> str:
     """What makes `zenohd` do as a service's own router does."""
     settings = {
         "mode": "router",
@@ -149,7 +150,7 @@ def router_file(access: Access, folder: Path, port: int) -> dict[str, Any]:
         for name in sections:
             section = section.setdefault(name, {})
         section[last] = value
-    return file
+    return yaml.safe_dump(file, sort_keys=False, default_flow_style=None, width=100)
 
 
 def _table(authority: Any) -> Table:

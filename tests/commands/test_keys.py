@@ -1,7 +1,8 @@
 """ldo keys"""
 
-import json
 from pathlib import Path
+
+import yaml
 
 from .test_cli import assert_one_paragraph, ldo
 
@@ -26,7 +27,7 @@ def test_a_router_of_its_own_gets_the_same_rules(capsys, tmp_path: Path) -> None
     ldo(capsys, "keys", "new", keys)
     ldo(capsys, "keys", "add", keys, "camera", "front", "--robot", "mule")
     code, out, _ = ldo(capsys, "keys", "router", keys, "--keys", "/keys", "--port", "7448")
-    file = json.loads(out[out.index("{") :])
+    file = yaml.safe_load(out[out.index("mode:") :])
     assert code == 0
     assert file["listen"]["endpoints"] == ["tls/0.0.0.0:7448"]
     assert file["transport"]["link"]["tls"]["listen_private_key"] == "/keys/tls.key"
