@@ -48,6 +48,7 @@ class ServiceConfig:
     drain_s: float = 10.0  # a soft stop waits so long for each stage to finish what it has
     silent_after_s: float = 10.0  # a process without a heartbeat for so long is killed
     control_timeout_s: float = 10.0  # for each actor to obey; the slowest step measured is 0.6 s
+    keys: str = ""  # folder that `ldo keys add` made, for TLS; --keys names another
     max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped; a 4K frame can have 58 MB
     metrics_address: str = LOOPBACK  # who reads them sees when the robot works; 0.0.0.0: everybody
 

@@ -59,7 +59,8 @@ def serve(
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
     settings = localising(load_config(config, set), localise)
-    network = Network(robot, endpoint, Keys.of(keys), settings.service.max_message_mb)
+    folder_of_keys = Keys.of(keys or settings.service.keys or None)
+    network = Network(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
     is_router = not (only or join)
     if is_router and not without_keys:
         network.require_safe()

@@ -44,6 +44,14 @@ def test_what_is_there_is_not_overwritten(capsys, tmp_path: Path) -> None:
     assert "never overwritten" in err
 
 
+def test_keys_may_be_named_in_the_configuration(capsys, tmp_path: Path) -> None:
+    setting = ("--set", f"service.keys={tmp_path}")
+    code, _, err = ldo(capsys, "serve", "--endpoint", "tls/127.0.0.1:7447", *setting)
+    assert code == 2
+    assert f"{tmp_path}/ca.crt cannot be read" in err
+    assert_one_paragraph(err)
+
+
 def test_a_service_on_the_network_without_keys_is_refused(capsys) -> None:
     code, _, err = ldo(capsys, "serve", "--endpoint", "tcp/0.0.0.0:7447")
     assert code == 2

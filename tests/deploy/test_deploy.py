@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -160,6 +161,13 @@ def test_the_router_is_of_the_version_that_the_client_is() -> None:
     installed = ".".join(version("eclipse-zenoh").split(".")[:2])
     text = "".join(path.read_text() for path in DEPLOY.glob("*.yaml"))
     assert set(PIN.findall(text)) == {installed}
+
+
+def test_every_dependency_has_a_least_and_a_most() -> None:
+    project = tomllib.loads((DEPLOY.parent / "pyproject.toml").read_text())["project"]
+    extras = [one for extra in project["optional-dependencies"].values() for one in extra]
+    for dependency in (*project["dependencies"], *extras):
+        assert re.fullmatch(r"[\w-]+>=[\d.]+,<[\d.]+", dependency)
 
 
 # --- tools ----------------------------------------------------------------------------------------
