@@ -56,6 +56,7 @@ RECENT_KEYFRAMES = 32  # that the optimizer may not have placed yet, as the trac
 
 @dataclass(frozen=True, slots=True)
 class LoopCloserConfig:
+    is_on: bool = True  # False: no place is recognised, to see what closing loops is worth
     loops: LoopsConfig = field(default_factory=LoopsConfig)
     movable: MovableConfig = field(default_factory=MovableConfig)
 
@@ -105,6 +106,8 @@ class LoopCloser(Actor):
     def handle(
         self, message: Keyframe | DetectionBoxes | Correction
     ) -> Iterator[LoopClosure | LoopCandidate]:
+        if not self.config.is_on:
+            return
         self._parts = None
         if isinstance(message, Correction):
             T_map = keyframe_poses_of(message, only=self.poses)

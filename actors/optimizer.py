@@ -58,6 +58,7 @@ log = logging.getLogger(__name__)
 class OptimizerConfig:
     graph: KeyframeGraphConfig = field(default_factory=KeyframeGraphConfig)
     landmarks: LandmarksConfig = field(default_factory=LandmarksConfig)
+    uses_objects: bool = True  # False: poses alone, to see what landmarks are worth
     most_early: int = 512  # closures and observations that wait for their keyframe; it is under way
     cameras: int = 64  # of the newest keyframes: observations come a few keyframes late
 
@@ -99,6 +100,8 @@ class Optimizer(Actor):
         self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
     ) -> Iterator[Correction]:
         match message:
+            case ObjectObservation() if not self.config.uses_objects:
+                return
             case ObjectObservation():
                 self._early_observations.append(message)
                 self._observe()

@@ -218,6 +218,10 @@ def _without_path_sugar(message: str) -> str:
     return re.sub(r" - at `\$\.?(.*?)`$", r", in \1.", message)
 
 
+_FIELD = re.compile(r"^ {4}(?P<name>\w+): [^#]*(?:#\s*(?P<comment>.*))?$")
+_COMMENT = re.compile(r"^ {4,}# (?P<comment>.+)$")
+
+
 def _explain(config: Any, depth: int) -> list[str]:
     comments = _comments(type(config))
     lines = []
@@ -235,7 +239,20 @@ def _explain(config: Any, depth: int) -> list[str]:
 
 
 def _comments(schema: type) -> dict[str, str]:
-    """The comment beside each field in the source, with the lines that continue it."""
-    pattern = re.compile(r"^ {4}(\w+): [^#\n]*#\s*(.*(?:\n {4,}# .*)*)$", re.MULTILINE)
-    found = pattern.findall(inspect.getsource(schema))
-    return {name: re.sub(r"\n\s*# ", " ", comment) for name, comment in found}
+    """The comment of each field in the source: beside it, with the lines that continue it, or, of
+    one that has none beside it, the lines above it that begin a sentence."""
+    comments: dict[str, list[str]] = {}
+    last, block = "", list[str]()
+    for line in inspect.getsource(schema).splitlines():
+        if line.startswith(("    def ", "    @")):
+            break
+        if found := _FIELD.match(line):
+            name, beside = found["name"], found["comment"]
+            is_above = not beside and bool(block) and block[0][0].isupper()
+            comments[name] = [beside] if beside else block if is_above else []
+            comments.get(last, []).extend([] if is_above else block)
+            last, block = name, []
+        elif found := _COMMENT.match(line):
+            block.append(found["comment"])
+    comments.get(last, []).extend(block)
+    return {name: " ".join(lines) for name, lines in comments.items() if lines}

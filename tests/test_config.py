@@ -17,6 +17,16 @@ def test_the_printed_configuration_reads_back_as_the_same() -> None:
     assert config_of(yaml.safe_load(explained_yaml(config))) == config
 
 
+def test_a_reason_stands_with_its_own_setting() -> None:
+    """Beside it, going on below it, or above it."""
+    lines = explained_yaml(Config()).splitlines()
+    reasons = {key.strip(): reason for key, _, reason in (line.partition("  # ") for line in lines)}
+    assert reasons["begin_after_s: 3.0"].endswith("ORB-SLAM3's patience; 0: never")
+    assert reasons["look_every: 17"].startswith("Frames between looks")
+    assert reasons["look_every: 17"].endswith("mapping each time.")
+    assert reasons["confirm_after: 7"] == "frames between looks while a find is to be confirmed"
+
+
 def test_settings_change_what_the_file_left(tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("tracker:\n  hold_out: 5\nmapper:\n  threads: 3\n")

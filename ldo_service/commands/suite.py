@@ -10,7 +10,7 @@ from rich.console import Console
 from ldo_service.errors import ConfigError
 from ldo_service.suites import Entry, Work, load_suite, markdown
 
-from .options import Overwrite
+from .options import Overwrite, Settings
 
 TABLE = "table.md"
 
@@ -25,6 +25,7 @@ def suite(
     data: Annotated[
         Path, tyro.conf.arg(metavar="DIR", help="where the suite's folders of data lie")
     ] = Path(),
+    set: Settings = (),
     overwrite: Overwrite = False,
 ) -> None:
     """Run and judge a list of sequences and variants; one table with means and spread.
@@ -32,13 +33,14 @@ def suite(
     Prints the table in Markdown and writes it to DIR/table.md. Runs that are finished are not made
     again: an interrupted suite goes on where it stopped. Sequences whose data is not there are
     left out, and the table says so. Those that come with it are the tables of the paper, its
-    sensitivity and its ablation.
+    sensitivity and its ablation. `--set` is for all runs; variants say what differs.
 
       ldo suite table-1 --data ~/data --out suites/table-1
+      ldo suite table-9 --data ~/data --out suites/ablation --set detector.model=nano
       ldo suite my-suite.yaml --data ~/data --out suites/mine
     """
     chosen = load_suite(name)
-    work = Work(chosen, data.expanduser(), out.expanduser(), overwrite)
+    work = Work(chosen, data.expanduser(), out.expanduser(), set, overwrite)
     console, total = Console(stderr=True), len(work.entries())
     done: list[Entry] = []
 

@@ -22,6 +22,13 @@ class Judged:
         rows = [row for row in self.results["rendering"] if row["protocol"] == protocol]
         return rows[-1 if newest else 0]["mean"][figure]
 
+    def labels(self) -> dict[str, Any]:
+        """Of the newest map: classes of COCO that have 0.2 % of the pixels, and background."""
+        return self.results["labels"][-1]["lists"]["COCO"]["from 0.2 %"]
+
+    def consistency(self) -> float | None:
+        return self.results["labels"][-1]["consistency"]
+
 
 @dataclass(frozen=True, slots=True)
 class Figure:
@@ -69,6 +76,11 @@ FIGURES: dict[str, Figure] = {
         "SSIM, training views", ".3f", lambda run: run.rendering(TRAINING, "ssim")
     ),
     "depth_l1_cm": Figure("depth L1 cm", ".2f", _depth_l1_cm),
+    "miou": Figure("mIoU %", ".1f", lambda run: 100 * run.labels()["mean_iou"]),
+    "object_iou": Figure("object mIoU %", ".1f", lambda run: 100 * run.labels()["object_iou"]),
+    "consistency": Figure("consistency", ".3f", lambda run: run.consistency()),
+    "loop_precision": Figure("precision", ".3f", lambda run: run.results["loops"]["precision"]),
+    "loop_recall": Figure("recall", ".3f", lambda run: run.results["loops"]["recall"]),
     "fps": Figure("FPS", ".2f", lambda run: run.summary["fps"]),
     "tracking_s": Figure("tracking s/frame", ".3f", _seconds("tracker")),
     "mapping_s": Figure("mapping s/keyframe", ".3f", _seconds("mapper")),

@@ -34,11 +34,13 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """data: where the sources lie; out: where runs go."""
+    """data: where the sources lie; out: where runs go; settings: of all runs, before those of a
+    variant."""
 
     suite: Suite
     data: Path
     out: Path
+    settings: tuple[str, ...] = ()
     overwrite: bool = False
 
     def entries(self) -> list[Entry]:
@@ -63,7 +65,12 @@ class Work:
 
     def _told(self, entry: Entry) -> str:
         """What its figures depend on."""
-        told = {**asdict(entry), "options": self.suite.options(), "ldo": versions()["ldo-slam"]}
+        told = {
+            **asdict(entry),
+            "settings": (*self.settings, *entry.settings),
+            "options": self.suite.options(),
+            "ldo": versions()["ldo-slam"],
+        }
         return json.dumps(told, indent=1)
 
     def _is_finished(self, entry: Entry, folder: Path) -> bool:
@@ -72,7 +79,9 @@ class Work:
 
     def _run(self, entry: Entry, folder: Path) -> str:
         """Why it failed; empty when it did not."""
-        settings = [word for setting in entry.settings for word in ("--set", setting)]
+        settings = [
+            word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)
+        ]
         run = ("run", entry.source, "--out", str(folder), "--overwrite", *self.suite.options())
         (folder / TOLD).unlink(missing_ok=True)
         done = _ldo(*run, *settings)

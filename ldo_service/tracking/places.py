@@ -32,10 +32,8 @@ NO_PAST = History()
 class PlacesConfig:
     count: int = 1000  # places kept, 0.13 MB each at 640x480 (kitchen); then the path is thinned
     features: int = 500  # of each: half of a frame's, which halves the time to match
-    same: float = (
-        0.1  # rad, as `motion.extent`: a place so near is replaced by the newer one, which
-    )
-    # shows it as it is now. Half a step between keyframes: on a round the memory stops growing
+    same: float = 0.1  # rad, as `motion.extent`: a place so near is replaced by the newer one,
+    # which shows it as it is now. Half a step between keyframes: on a round memory stops growing
     recent: int = 16  # last places, which are all kept: new keyframes are measured against them
 
     def __post_init__(self) -> None:
