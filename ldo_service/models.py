@@ -1,4 +1,4 @@
-"""Networks that the user has registered: `ldo models`. None comes with the package.
+"""Networks that the user has registered: `ldo models`. Only `demo` comes with the package.
 
     <folder>/<name>/model.onnx    a copy of the file: a detector, or the image encoder of a pair
     <folder>/<name>/about.json    checksum, layout, classes, licence
@@ -21,6 +21,7 @@ from pathlib import Path
 
 import msgspec
 
+from ldo_service import demo_networks
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.semantics.detectors import NetworkConfig, OnnxDetector
 from ldo_service.semantics.labellers.dual_encoder import DualEncoder, DualEncoderConfig, Pair
@@ -170,6 +171,8 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
     What the configuration says of layout and names comes before what was registered.
     Raises ConfigError when there is neither, ModelError when it cannot be used.
     """
+    if model == demo_networks.NAME:
+        return demo_networks.open_detector(config)
     models = Models()
     if model not in models.names:
         path = Path(model).expanduser()
@@ -194,6 +197,8 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
     names  to choose from; empty: those it was registered with
     Raises ConfigError when there is neither, ModelError when it cannot be used.
     """
+    if model == demo_networks.NAME:
+        return demo_networks.open_labeller(config, names)
     models = Models()
     if model not in models.names:
         folder = Path(model).expanduser()
@@ -266,3 +271,5 @@ def _require_name(name: str) -> None:
             f"{name!r} is no name for a model: use letters, digits, '.', '-' and '_', at most 64, "
             "beginning with a letter or digit."
         )
+    if name == demo_networks.NAME:
+        raise ConfigError(f"{name!r} are the networks of the package: choose another name.")

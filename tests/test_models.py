@@ -205,3 +205,27 @@ def test_a_folder_of_a_pair_may_be_used_without_registering_it(
     labeller = open_labeller(str(tmp_path), ENCODERS)
     assert labeller.label([plain("blue")])[0][0] == "blue"
     assert models.names == []
+
+
+def test_the_networks_of_the_package_open_by_their_name(models: Models) -> None:
+    detector, labeller = open_detector("demo", CONFIG), open_labeller("demo", ENCODERS)
+    assert detector.layout == "yolov8"
+    assert detector.identity.startswith("demo ")
+    assert {"couch", "cup"} <= set(detector.names)
+    assert {"couch", "radiator"} <= set(labeller.names)
+    assert "wall" not in labeller.names
+    assert models.names == []
+
+
+def test_the_built_in_pair_takes_names_of_its_table_while_it_runs(models: Models) -> None:
+    labeller = open_labeller("demo", ENCODERS, ("lamp", "chair"))
+    labeller.add("radiator")
+    assert labeller.names == ("lamp", "chair", "radiator")
+    with pytest.raises(ConfigError, match="no text encoder"):
+        labeller.add("zebra")
+    assert models.names == []
+
+
+def test_the_name_of_the_built_in_networks_is_taken(models: Models, file: Path) -> None:
+    with pytest.raises(ConfigError, match="choose another name"):
+        models.add("demo", file, CONFIG)

@@ -8,6 +8,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ldo_service import demo_networks
 from ldo_service.errors import ConfigError, LdoError, ModelError
 from ldo_service.models import Model, Models
 from ldo_service.semantics.class_names import read_names
@@ -95,8 +96,8 @@ Verb = (
 def models(verb: Verb) -> None:
     """Register, list and remove the networks that find objects, and those that name regions.
 
-    None comes with the package. `detector.model` in the configuration takes a registered name, and
-    `vlm_labeller.model` that of a pair:
+    `detector.model` in the configuration takes a registered name, and `vlm_labeller.model` that of
+    a pair. Only `demo` comes with the package, a detector and a pair for the synthetic scenes:
 
       ldo models add nano yolox_nano.onnx
       ldo run SOURCE --out DIR --set detector.model=nano
@@ -155,6 +156,7 @@ def show(console: Console) -> None:
         console.print(table)
     else:
         console.print(f"none in {registered.folder}: `ldo models add NAME FILE` registers one.")
+    console.print(f"{demo_networks.NAME}, a detector and a pair, comes with the package.")
     if damaged:
         raise LdoError(f"{damaged} of the above must be removed and added again.")
 

@@ -1,0 +1,107 @@
+"""The detector's grids, and what each of their cells is to tell about a frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from ldo_service.datasets.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES, COCO_COUNT
+
+INPUT_PX = (320, 256)  # width, height
+STRIDES_PX = (8, 16, 32)
+SHAPES = tuple((INPUT_PX[1] // s, INPUT_PX[0] // s) for s in STRIDES_PX)
+CELL_COUNT = sum(rows * columns for rows, columns in SHAPES)
+THINGS = tuple(name for name in CLASS_NAMES if name in CATALOGUE)
+NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOGUE)  # those first
+NOTHING = len(THINGS)
+
+SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # root of the boxes' area that each grid is for
+BOXES_CELLS = 1.5  # from the middle of a cell to each side of its box, at first
+COVERED, OF_OBJECT = 0.4, 0.25  # of a cell, or of an object, so that the cell tells of the object
+UNCLEAR = 0.3  # of a cell covered by things of which none is told: it learns nothing
+NOTHING_WEIGHT = 0.1  # of a cell of the finest grid without a thing
+SMALLEST_PX = 20  # visible of an object that is told
+ID_COUNT = 256
+
+
+def grid() -> tuple[np.ndarray, np.ndarray]:
+    """Middles [N, 2] and sides [N, 1] of all cells, in pixels, the finest first."""
+    middles, sides = [], []
+    for stride, (rows, columns) in zip(STRIDES_PX, SHAPES, strict=True):
+        cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
+        middles.append((cells.reshape(-1, 2) + 0.5) * stride)
+        sides.append(np.full((rows * columns, 1), stride))
+    return np.concatenate(middles).astype(np.float32), np.concatenate(sides).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Visible:
+    """The M objects of a frame: ids in its plane, names, boxes [M, 4] in pixels, pixels."""
+
+    ids: np.ndarray
+    names: np.ndarray
+    boxes_px: np.ndarray
+    pixels: np.ndarray
+
+
+def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
+    """What a plane of ids [H, W] shows; `names` [256] are those of the ids, -1 for none."""
+    pixels = np.bincount(plane.ravel(), minlength=ID_COUNT)
+    ids = np.flatnonzero((pixels >= SMALLEST_PX) & (names >= 0))
+    extents = ndimage.find_objects(plane)
+    boxes = [
+        (columns.start, rows.start, columns.stop, rows.stop)
+        for rows, columns in (extents[k - 1] for k in ids)
+    ]
+    return Visible(ids, names[ids], np.array(boxes, np.float32).reshape(-1, 4), pixels[ids])
+
+
+def told(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
+    """Names [N], weights [N], boxes [N, 4] and whether to tell them [N], of all cells.
+
+    A cell tells of the smallest object that covers enough of it, or that it covers enough of.
+    """
+    order = np.argsort(objects.pixels, kind="stable")
+    place = np.full(ID_COUNT, len(order))
+    place[objects.ids[order]] = np.arange(len(order))
+    counts = _counts(place[plane], len(order) + 1)
+    sides = np.sqrt(np.prod(objects.boxes_px[:, 2:] - objects.boxes_px[:, :2], axis=1))[order]
+    parts = [
+        _of_grid(count, stride, objects.pixels[order], (sides >= low) & (sides < high))
+        for count, stride, (low, high) in zip(counts, STRIDES_PX, SIDES_PX, strict=True)
+    ]
+    owners, shares, tells_box = (np.concatenate(part) for part in zip(*parts, strict=True))
+    names = np.append(objects.names[order], NOTHING).astype(np.int32)[owners]
+    boxes = np.concatenate([objects.boxes_px[order], np.zeros((1, 4), np.float32)])[owners]
+    return names, shares.astype(np.float32), boxes, tells_box
+
+
+def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
+    """Pixels of each object in each cell [cells, kinds], grid by grid."""
+    rows, columns = SHAPES[0]
+    stride = STRIDES_PX[0]
+    v, u = np.divmod(np.arange(plane.size), plane.shape[1])
+    cell = v // stride * columns + u // stride
+    fine = np.bincount(cell * kinds + plane.ravel(), minlength=rows * columns * kinds)
+    counts = [fine.reshape(rows, columns, kinds)]
+    for rows, columns in SHAPES[1:]:
+        counts.append(counts[-1].reshape(rows, 2, columns, 2, kinds).sum(axis=(1, 3)))
+    return [count.reshape(-1, kinds) for count in counts]
+
+
+def _of_grid(
+    counts: np.ndarray, stride_px: int, pixels: np.ndarray, is_for: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Owner (M for none), weight, and whether it tells a box, of each cell."""
+    things = counts[:, :-1]
+    is_owned = (things >= COVERED * stride_px**2) | (things >= OF_OBJECT * pixels)
+    is_owned = np.column_stack((is_owned, np.ones(len(counts), bool)))
+    owners = is_owned.argmax(axis=1)  # the smallest comes first
+    sizes = np.bincount(owners, minlength=counts.shape[1])
+    weights = 1 / np.sqrt(np.maximum(sizes, 1))
+    weights[-1] = NOTHING_WEIGHT * stride_px / STRIDES_PX[0]
+    shares = weights[owners]
+    is_nothing = owners == len(pixels)
+    shares[is_nothing & (things.sum(axis=1) > UNCLEAR * stride_px**2)] = 0
+    return owners, shares, np.append(is_for, False)[owners]

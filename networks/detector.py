@@ -1,0 +1,154 @@
+"""The first look of the detector: every cell of three grids says what covers it.
+
+As in semantic segmentation, and beside that where the box of that object lies, and how well the box
+fits. So every cell has something to learn in every frame, and a network that sees few frames learns
+from all of each. It learns all names of the catalogue.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import training
+from cells import BOXES_CELLS, INPUT_PX, STRIDES_PX, THINGS, grid
+from layers import Graph, Live, Statistics, Weights, residual
+from views import Views
+
+from examples import batches
+
+WIDE, TOLD_BY = 48, 64  # channels of the neck and of the heads
+RATE = 2e-3
+BOX_WEIGHT, FIT_WEIGHT = 1.5, 1.0  # beside the names' entropy
+TOLD = (4, 1, len(THINGS) + 1)  # sides of the box, fit of the box, names and nothing
+
+
+def network(net: Live | Graph, image) -> list:
+    """For each grid: 4 distances in cells from a cell's middle, a logit of the fit, and names'."""
+    fine, middle, coarse = _trunk(net, image)
+    return [
+        _head(net, x, s) for x, s in zip(_neck(net, fine, middle, coarse), STRIDES_PX, strict=True)
+    ]
+
+
+def _trunk(net: Live | Graph, image) -> tuple:
+    """What is seen, on each grid."""
+    x = residual(net, net.conv(net.folded(image, 4), "stem", 32, size=1), "stage4", 32)
+    fine = net.conv(x, "down8", 64, stride=2)
+    for k in range(2):
+        fine = residual(net, fine, f"stage8.{k}", 64)
+    middle = net.conv(fine, "down16", 96, stride=2)
+    for k in range(3):
+        middle = residual(net, middle, f"stage16.{k}", 96)
+    coarse = net.conv(middle, "down32", 128, stride=2)
+    for k in range(3):
+        coarse = residual(net, coarse, f"stage32.{k}", 128)
+    return fine, middle, coarse
+
+
+def _neck(net: Live | Graph, fine, middle, coarse) -> list:
+    """What is seen at large helps at small: pooled, enlarged and added."""
+    x = net.conv(coarse, "pool.in", WIDE, size=1)
+    wide = net.widest(x)
+    c = net.conv(net.join([x, wide, net.widest(wide)]), "pool.out", WIDE, size=1)
+    m = net.add(net.conv(middle, "side16", WIDE, size=1), net.enlarged(c))
+    m = net.conv(m, "fuse16", WIDE)
+    f = net.add(net.conv(fine, "side8", WIDE, size=1), net.enlarged(m))
+    return [net.conv(f, "fuse8", WIDE), m, c]
+
+
+def _head(net: Live | Graph, x, stride_px: int):
+    x = net.conv(x, f"told{stride_px}", TOLD_BY)
+    return net.linear(x, f"tell{stride_px}", sum(TOLD))
+
+
+def predicted(net: Live, images):
+    """Corners [B, N, 4] in pixels, logits of the fit [B, N] and of names and nothing [B, N, T + 1].
+
+    images  [B, H, W, 3] in 0..1
+    """
+    levels = network(net, images)
+    flat = [level.reshape(level.shape[0], -1, level.shape[-1]) for level in levels]
+    rows = jnp.concatenate(flat, axis=1)
+    middles, sides = grid()
+    reach = (rows[..., :4] + BOXES_CELLS) * sides
+    corners = jnp.concatenate([middles - reach[..., :2], middles + reach[..., 2:]], -1)
+    return corners, rows[..., 4], rows[..., 5:]
+
+
+def loss(weights: Weights, batch: tuple):
+    """Cross entropies of names and fits, and GIoU of boxes.
+
+    batch  images [B, H, W, 3] uint8, and of each cell what it is to tell: names [B, N], weights
+           [B, N], boxes [B, N, 4] in pixels, and whether it is to tell the box [B, N]
+    """
+    images, names, shares, boxes, tells_box = batch
+    corners, fit, logits = predicted(Live(weights), images.astype(jnp.float32) / 255)
+    total = shares.sum()
+    right = jnp.take_along_axis(jax.nn.log_softmax(logits), names[..., None], -1)[..., 0]
+    iou, giou = overlaps(corners, boxes)
+    truth = jax.lax.stop_gradient(iou) * tells_box
+    fits = jnp.maximum(fit, 0) - fit * truth + jnp.log1p(jnp.exp(-jnp.abs(fit)))
+    own = shares * tells_box
+    misfit = (own * (1 - giou)).sum() / jnp.maximum(own.sum(), 1.0)
+    return (shares * (FIT_WEIGHT * fits - right)).sum() / total + BOX_WEIGHT * misfit
+
+
+def overlaps(a, b):
+    """IoU of corners [..., 4], and GIoU: Rezatofighi et al., CVPR 2019."""
+    low, high = jnp.maximum(a[..., :2], b[..., :2]), jnp.minimum(a[..., 2:], b[..., 2:])
+    common = jnp.maximum(high - low, 0).prod(-1)
+    union = jnp.maximum(_area(a) + _area(b) - common, 1e-6)
+    low, high = jnp.minimum(a[..., :2], b[..., :2]), jnp.maximum(a[..., 2:], b[..., 2:])
+    hull = jnp.maximum((high - low).prod(-1), 1e-6)
+    return common / union, common / union - (hull - union) / hull
+
+
+def _area(boxes):
+    return jnp.maximum(boxes[..., 2:] - boxes[..., :2], 0).prod(-1)
+
+
+@dataclass(frozen=True, slots=True)
+class First:
+    """A trained first look: weights, and the statistics of its normalised layers."""
+
+    weights: Weights
+    statistics: Statistics
+
+    def look(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Corners, fits and logits as `predicted`, of images [B, H, W, 3] uint8."""
+        live = Live(self.weights, self.statistics)
+        told = predicted(live, jnp.asarray(images, jnp.float32) / 255)
+        return tuple(map(np.asarray, told))
+
+
+def train(material: Views, steps: Sequence[int], seed: int) -> First:
+    """In rounds of so many steps: `training.ROUND_RATES`."""
+    rng = np.random.default_rng([seed, 1])
+    live = Live({}, rng=rng)
+    network(live, jnp.zeros((1, *INPUT_PX[::-1], 3)))
+    sources = rng, np.random.default_rng([seed, 6])
+    learned = training.fit_in_rounds(
+        loss, live.weights, [batches(material, source) for source in sources], steps, RATE
+    )
+    rng = np.random.default_rng([seed, 4])
+    images = (batch[0].astype(np.float32) / 255 for batch in batches(material, rng))
+    return First(learned, training.statistics(network, learned, images))
+
+
+def looked(graph: Graph) -> tuple[str, str, str]:
+    """The same as names in a graph: corners [1, N, 4], the fit [1, 1, N], logits [1, T + 1, N]."""
+    rows = []
+    for level in network(graph, "images"):
+        rows.append(graph.node("Reshape", level, graph.integers(1, sum(TOLD), -1)))
+    raw = graph.node("Concat", *rows, axis=2)
+    before, after, fit, logits = graph.split(raw, (2, 2, *TOLD[1:]))
+    middles, sides = (graph.constant(part.T[None].copy()) for part in grid())
+    start = graph.number(BOXES_CELLS)
+    before, after = (
+        graph.node("Mul", graph.node("Add", part, start), sides) for part in (before, after)
+    )
+    low, high = graph.node("Sub", middles, before), graph.node("Add", middles, after)
+    corners = graph.node("Concat", low, high, axis=1)
+    return graph.node("Transpose", corners, perm=[0, 2, 1]), fit, logits

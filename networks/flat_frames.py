@@ -1,0 +1,16 @@
+"""Frames of the flat, for the last scores alone."""
+
+import numpy as np
+import views
+from views import Seen
+
+from ldo_service.datasets.synthetic.flat import FlatSequence
+
+
+def flat_frames(stride: int) -> tuple[list[np.ndarray], Seen]:
+    """Every `stride`-th frame as recorded, and what it shows."""
+    sequence = FlatSequence.named("flat")
+    indices = range(0, len(sequence), stride)
+    planes = [sequence.labels(index) for index in indices]
+    seen = views.seen_in([(plane.class_ids, plane.instance_ids) for plane in planes])
+    return [sequence.read(index).color for index in indices], seen

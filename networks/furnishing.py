@@ -1,0 +1,197 @@
+"""Things at random places, where they meet nothing."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+from inventory import (
+    AT_WALLS,
+    BOARDS_M,
+    FLAT_SHAPES,
+    HUNG,
+    IN_SHELVES,
+    LYING,
+    ON_SEATS,
+    ON_SHELVES,
+    ON_TABLES,
+    ON_THE_FLOOR,
+    SEATS_M,
+    SHAPES,
+    STANDING,
+    TABLES,
+)
+
+from ldo_service.datasets.synthetic.flat.building import HEIGHT_M
+from ldo_service.datasets.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.datasets.synthetic.flat.paint import Paints
+from ldo_service.datasets.synthetic.flat.thing import Heading, Placement, Thing
+
+Point = tuple[float, float, float]
+
+GAP_M = 0.015  # less than this may things overlap: they stand on rugs
+TRIES = 12  # places for a thing before it is left out
+HEADROOM_M = 0.6  # above tables and seats
+
+# To the back wall, the front wall and the sides: which way the front of a thing there looks.
+TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
+ASKEW = ((1.0, 0.0), (0.96, 0.28), (0.8, 0.6), (0.8, -0.6), (0.96, -0.28))
+
+
+@dataclass
+class Builder:
+    """A room that is being furnished."""
+
+    rng: np.random.Generator
+    paint: Paints
+    size_m: tuple[float, float]
+    doorway: tuple[np.ndarray, np.ndarray]  # low and high corner [3] of what stays free
+    things: list[Thing] = field(default_factory=list)
+
+    def build(self, label: str, heading: Heading, shapes: tuple[int, ...] = ()) -> Thing:
+        """One of its shapes at the origin."""
+        shape = int(self.rng.choice(shapes or range(SHAPES.get(label, 1))))
+        solids = CATALOGUE[label](self.paint, shape)
+        turned = Placement((0.0, 0.0, 0.0), heading)
+        return Thing(label, tuple(turned(solid) for solid in solids))
+
+    def put(
+        self, thing: Thing, places: Iterable[Point], carrier: Thing | None = None
+    ) -> Thing | None:
+        """Where it first meets nothing but its carrier, or nowhere."""
+        for at in places:
+            placed = Thing(thing.label, tuple(Placement(at)(solid) for solid in thing.solids))
+            if self._is_free(*extent(placed), carrier):
+                self.things.append(placed)
+                return placed
+        return None
+
+    def between(self, low: float, high: float) -> float:
+        return float(low + (high - low) * self.rng.random())
+
+    def _is_free(self, low: np.ndarray, high: np.ndarray, carrier: Thing | None) -> bool:
+        half = np.array(self.size_m) / 2 + 1e-3
+        if (low[:2] < -half).any() or (high[:2] > half).any() or high[2] > HEIGHT_M:
+            return False
+        others = [self.doorway, *(extent(t) for t in self.things if t is not carrier)]
+        return not any(
+            (low < other_high - GAP_M).all() and (high > other_low + GAP_M).all()
+            for other_low, other_high in others
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Space:
+    """What may lie there, how many at most, between two corners [3]."""
+
+    labels: tuple[str, ...]
+    most: int
+    low: np.ndarray
+    high: np.ndarray
+
+
+def furnish(builder: Builder) -> None:
+    rng = builder.rng
+    for label in _some(rng, AT_WALLS, 15, 23):
+        thing = builder.build(label, TO_FRONT, STANDING.get(label, ()))
+        placed = builder.put(*_along_walls(builder, thing, on_floor=True))
+        if placed is not None:
+            _load(builder, placed)
+    for label in _some(rng, tuple(HUNG) * 2, 3, 6):
+        shapes = (FLAT_SHAPES[label],) if label in FLAT_SHAPES else ()
+        builder.put(*_along_walls(builder, builder.build(label, TO_FRONT, shapes), on_floor=False))
+    for label in _some(rng, ON_THE_FLOOR, 7, 13):
+        thing = _turned(builder, builder.build(label, TO_FRONT, STANDING.get(label, ())))
+        placed = builder.put(thing, _anywhere(builder))
+        if placed is not None:
+            _load(builder, placed)
+
+
+def _some(rng: np.random.Generator, labels: tuple[str, ...], least: int, most: int) -> list[str]:
+    """Some of them in the order they are listed, so that large things come first."""
+    count = int(rng.integers(least, most + 1))
+    chosen = np.sort(rng.permutation(len(labels))[:count])
+    return [labels[k] for k in chosen]
+
+
+def _turned(builder: Builder, thing: Thing) -> Thing:
+    """By any quarter turn, and a little more."""
+    quarter = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[int(builder.rng.integers(4))]
+    askew = ASKEW[int(builder.rng.integers(len(ASKEW)))]
+    turns = (Placement((0.0, 0.0, 0.0), quarter), Placement((0.0, 0.0, 0.0), askew))
+    return Thing(thing.label, tuple(turns[0](turns[1](solid)) for solid in thing.solids))
+
+
+def _along_walls(builder: Builder, thing: Thing, on_floor: bool) -> tuple[Thing, list[Point]]:
+    """The thing facing away from one wall, and places where its back touches that wall."""
+    wall = int(builder.rng.integers(4))
+    heading = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[wall]
+    if thing.label == "door":  # its leaf lies along the wall
+        heading = (TO_RIGHT, TO_LEFT, TO_FRONT, TO_BACK)[wall]
+    turned = Placement((0.0, 0.0, 0.0), heading)
+    thing = Thing(thing.label, tuple(turned(solid) for solid in thing.solids))
+    low, high = extent(thing)
+    half = np.array(builder.size_m) / 2
+    axis, sign = ((1, 1.0), (1, -1.0), (0, 1.0), (0, -1.0))[wall]
+    against = half[axis] - high[axis] if sign > 0 else -half[axis] - low[axis]
+    places = []
+    for _ in range(TRIES):
+        along = 1 - axis
+        free = builder.between(-half[along] - low[along], half[along] - high[along])
+        z = 0.0 if on_floor else builder.between(*HUNG[thing.label]) - (low[2] + high[2]) / 2
+        places.append((free, float(against), z) if axis == 1 else (float(against), free, z))
+    return thing, places
+
+
+def _anywhere(builder: Builder) -> Iterator[Point]:
+    half = np.array(builder.size_m) / 2
+    for _ in range(TRIES):
+        yield builder.between(-half[0], half[0]), builder.between(-half[1], half[1]), 0.0
+
+
+def _load(builder: Builder, carrier: Thing) -> None:
+    """Put what belongs there onto tables, seats and shelves."""
+    for space in _spaces(carrier):
+        for label in _some(builder.rng, space.labels, 1, space.most):
+            thing = _turned(builder, builder.build(label, TO_FRONT, LYING.get(label, ())))
+            low, high = extent(thing)
+            if (high - low <= space.high - space.low + np.array([0.02, 0.02, 0.0])).all():
+                builder.put(thing, list(_places_in(builder, space, low, high)), carrier)
+
+
+def _places_in(
+    builder: Builder, space: _Space, low: np.ndarray, high: np.ndarray
+) -> Iterator[Point]:
+    """For a thing of this extent, on the ground of a space."""
+    to_middle = (space.low + space.high) / 2 - (low + high) / 2
+    x, y = np.maximum((space.high - space.low - (high - low)) / 2, 0.0)[:2]
+    for _ in range(TRIES // 2):
+        at_x = to_middle[0] + builder.between(-x, x)
+        at_y = to_middle[1] + builder.between(-y, y)
+        yield float(at_x), float(at_y), float(space.low[2])
+
+
+def _spaces(carrier: Thing) -> Iterator[_Space]:
+    """On tables, seats and boards."""
+    low, high = extent(carrier)
+    above = high + np.array([0.0, 0.0, HEADROOM_M])
+    if carrier.label in TABLES:
+        yield _Space(ON_TABLES, 10, _at_height(low, high[2]), above)
+    if carrier.label in SEATS_M:
+        inset = 0.2 * (high - low) * [1, 1, 0]
+        yield _Space(ON_SEATS, 3, _at_height(low, SEATS_M[carrier.label]) + inset, above - inset)
+    if carrier.label == "shelf":
+        inset = np.array([0.04, 0.04, 0.0])
+        for level_m in BOARDS_M[high[2] > 1]:
+            top = _at_height(high, level_m + 0.32) - inset
+            yield _Space(IN_SHELVES, 2, _at_height(low, level_m) + inset, top)
+        yield _Space(ON_SHELVES, 2, _at_height(low, high[2]), above)
+
+
+def _at_height(corner: np.ndarray, z_m: float) -> np.ndarray:
+    return np.array([corner[0], corner[1], z_m])
+
+
+def extent(thing: Thing) -> tuple[np.ndarray, np.ndarray]:
+    """Low and high corner [3] along the axes."""
+    centre, size = thing.bounds_m
+    return centre - size / 2, centre + size / 2

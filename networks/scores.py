@@ -1,0 +1,179 @@
+"""What the shipped files find, read as anybody would read them: by onnxruntime alone."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cells
+import cv2
+import encoder
+import numpy as np
+import onnxruntime
+from crops import planes
+from views import Seen
+
+import examples
+from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES
+
+SCORE_MIN, NMS_IOU = 0.01, 0.45  # of boxes that precision and recall are measured over
+HIT_IOU = 0.5
+SHARE_MIN = 1e-3  # of the image, of an object that has to be found
+FRAME_PX = (320, 240)
+TOP_PX = (cells.INPUT_PX[1] - FRAME_PX[1]) // 2  # of the frame in the input
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Boxes in one frame of FRAME_PX: [M, 4] corners, scores [M], class ids [M]."""
+
+    boxes_px: np.ndarray
+    scores: np.ndarray
+    class_ids: np.ndarray
+
+
+@dataclass(frozen=True, slots=True)
+class ClassScore:
+    """One class over all frames."""
+
+    objects: int
+    average_precision: float  # all points, IoU 0.5
+    recall: float  # of boxes with a score of at least `at`
+    precision: float
+
+
+def session(path: Path) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    return onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def canvas(color: np.ndarray) -> np.ndarray:
+    """The detector's input [256, 320, 3] for a frame [H, W, 3] uint8 RGB in proportion 4:3."""
+    whole = np.full((*cells.INPUT_PX[::-1], 3), examples.PADDING, np.uint8)
+    whole[TOP_PX : TOP_PX + FRAME_PX[1]] = cv2.resize(color, FRAME_PX)
+    return whole
+
+
+def output(network: onnxruntime.InferenceSession, image: np.ndarray) -> np.ndarray:
+    """What the detector tells of each cell, [N, 4 + C]."""
+    values = image.transpose(2, 0, 1)[None].astype(np.float32) / 255
+    return np.asarray(network.run(None, {"images": values})[0])[0].T
+
+
+def find(network: onnxruntime.InferenceSession, color: np.ndarray) -> Found:
+    """Objects in a frame [H, W, 3] uint8 RGB in proportion 4:3."""
+    rows = output(network, canvas(color))
+    class_ids, scores = rows[:, 4:].argmax(axis=1), rows[:, 4:].max(axis=1)
+    corners = np.hstack((rows[:, :2] - rows[:, 2:4] / 2, rows[:, 2:4]))
+    ids = class_ids.astype(np.int32)
+    kept = cv2.dnn.NMSBoxesBatched(corners, scores, ids, SCORE_MIN, NMS_IOU)  # type: ignore[arg-type]
+    kept = np.array(kept, np.int64)
+    boxes = np.hstack((corners[:, :2], corners[:, :2] + corners[:, 2:]))[kept] - [
+        0,
+        TOP_PX,
+        0,
+        TOP_PX,
+    ]
+    return Found(np.clip(boxes, 0, [*FRAME_PX] * 2), scores[kept], class_ids[kept])
+
+
+def detection(found: Iterable[Found], seen: Seen, at: float = 0.25) -> dict[str, ClassScore]:
+    """Per class, with boxes of `seen` in pixels of FRAME_PX; small objects count neither way."""
+    frames = list(found)
+    truth = of_coco(seen)
+    return {
+        name: _class_score(frames, truth.chosen(truth.class_ids == k), k, at)
+        for k, name in enumerate(cells.NAMES)
+        if np.any((truth.class_ids == k) & _counts(truth))
+    }
+
+
+def mean_average_precision(scores: dict[str, ClassScore]) -> float:
+    return float(np.mean([score.average_precision for score in scores.values()]))
+
+
+def of_coco(seen: Seen) -> Seen:
+    """The objects of the classes that the detector has, with its class ids."""
+    own = {CLASS_NAMES.index(name): k for k, name in enumerate(cells.NAMES)}
+    chosen = seen.chosen(np.array([k in own for k in seen.class_ids.tolist()]))
+    return replace(chosen, class_ids=np.array([own[k] for k in chosen.class_ids.tolist()]))
+
+
+def _counts(truth: Seen) -> np.ndarray:
+    return truth.pixels >= SHARE_MIN * FRAME_PX[0] * FRAME_PX[1]
+
+
+def _class_score(frames: list[Found], truth: Seen, class_id: int, at: float) -> ClassScore:
+    """Boxes by falling score, each taking the free object that it overlaps most."""
+    counts = _counts(truth)
+    rows = []  # score, is a hit
+    for number, frame in enumerate(frames):
+        mine = np.flatnonzero(frame.class_ids == class_id)
+        mine = mine[np.argsort(-frame.scores[mine], kind="stable")]
+        free = list(np.flatnonzero(truth.frames == number))
+        for row in mine:
+            overlaps = _iou(frame.boxes_px[row], truth.boxes_px[free]) if free else np.zeros(1)
+            best = int(overlaps.argmax())
+            if overlaps[best] < HIT_IOU:
+                rows.append((frame.scores[row], 0))
+            elif counts[free.pop(best)]:
+                rows.append((frame.scores[row], 1))
+    table = np.array(sorted(rows, key=lambda r: -r[0])).reshape(-1, 2)
+    objects = int(counts.sum())
+    hits, confident = np.cumsum(table[:, 1]), table[:, 0] >= at
+    recall, precision = hits / objects, hits / np.arange(1, len(table) + 1)
+    envelope = np.maximum.accumulate(precision[::-1])[::-1]
+    area = float(np.sum(np.diff(recall, prepend=0.0) * envelope))
+    told, right = int(confident.sum()), int(table[confident, 1].sum())
+    return ClassScore(objects, area, right / objects, right / told if told else 1.0)
+
+
+def _iou(box: np.ndarray, others: np.ndarray) -> np.ndarray:
+    low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
+    common = np.maximum(high - low, 0).prod(axis=1)
+    areas = (others[:, 2:] - others[:, :2]).prod(axis=1)
+    return common / ((box[2:] - box[:2]).prod() + areas - common)
+
+
+@dataclass(frozen=True, slots=True)
+class Naming:
+    """Names given to N crops, and how sure.
+
+    truth, told   [N] indices into the encoder's names
+    confidence    [N] of the softmax
+    """
+
+    truth: np.ndarray
+    told: np.ndarray
+    confidence: np.ndarray
+
+    def accuracy(self, names: Iterable[str] = encoder.NAMES) -> float:
+        """Share of the crops with these true names that are named right."""
+        mine = np.isin(self.truth, [encoder.NAMES.index(name) for name in names])
+        return float(np.mean(self.told[mine] == self.truth[mine])) if mine.any() else float("nan")
+
+    def calibration_error(self, bins: int = 10) -> float:
+        """Expected difference of confidence and accuracy: Guo et al., ICML 2017."""
+        place = np.minimum((self.confidence * bins).astype(int), bins - 1)
+        right = self.told == self.truth
+        gaps = [
+            abs(np.mean(right[place == k]) - np.mean(self.confidence[place == k]))
+            * np.mean(place == k)
+            for k in range(bins)
+            if np.any(place == k)
+        ]
+        return float(np.sum(gaps))
+
+
+def embedded(network: onnxruntime.InferenceSession, crops: np.ndarray) -> np.ndarray:
+    """[N, D] of crops [N, 64, 64, 3] uint8."""
+    return np.asarray(network.run(None, {"pixel_values": planes(crops)})[0])
+
+
+def naming(folder: Path, crops: np.ndarray, truth: np.ndarray) -> Naming:
+    with np.load(folder / "text_embeddings.npz") as texts:
+        vectors, scale = texts["embeddings"], float(texts["logit_scale"])
+    cosines = embedded(session(folder / "image_encoder.onnx"), crops) @ vectors.T
+    logits = np.exp(scale * (cosines - cosines.max(axis=1, keepdims=True)))
+    softmax = logits / logits.sum(axis=1, keepdims=True)
+    return Naming(truth, softmax.argmax(axis=1), softmax.max(axis=1))

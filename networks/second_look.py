@@ -1,0 +1,145 @@
+"""The detector that ships, in the layout of YOLOv8: a second look at what the first one found.
+
+in   images   [1, 3, 256, 320]   RGB 0..1, the image centred on grey
+out  output0  [1, 4 + C, 1680]   cx, cy, w, h in pixels of the input, then a score per class of COCO
+
+The first look (`detector`) proposes boxes; the image encoder of the pair names the best of them.
+A score is the probability of the class by both, times how well the box fits; boxes that nobody
+looked at twice have none. As in two-stage detectors (Ren et al., NeurIPS 2015), but the second
+stage is a network of its own, that has learned from crops: that takes far fewer steps.
+"""
+
+from pathlib import Path
+
+import detector
+import jax
+import numpy as np
+from cells import CELL_COUNT, INPUT_PX, NAMES, THINGS
+from crops import DEVIATION, MARGIN, MEAN, crop, enlarged
+from crops import INPUT_PX as CROP_PX
+from detector import First
+from encoder import Pair, embedded
+from layers import Graph
+from onnx import TensorProto
+
+LOOKS = 40  # boxes that are looked at twice
+DISTINCT_IOU = 0.6  # boxes that overlap more are looked at once
+# Logits of both looks are added, each with less than its full weight: they see the same pixels.
+FIRST_WEIGHT, SECOND_WEIGHT = 0.75, 0.5  # the best on the rooms for calibration
+
+
+def export(first: First, pair: Pair, scale: float, path: Path) -> None:
+    """Write the detector; `scale` calibrates the pair's cosines."""
+    graph = Graph(first.weights, first.statistics)
+    # the first look
+    corners, fit, logits = detector.looked(graph)
+    fit = graph.node("Sigmoid", fit)
+    cells = _best(graph, corners, fit, logits)
+    boxes = graph.node("Gather", graph.node("Squeeze", corners, graph.integers(0)), cells, axis=0)
+    # the second
+    second = _second_logits(graph.beside(pair.weights, pair.statistics), boxes, pair, scale)
+    # both
+    names = graph.node("Softmax", _joined(graph, _rows(graph, logits, cells), second), axis=1)
+    names, _ = graph.split(names, (len(NAMES), len(THINGS) + 1 - len(NAMES)))
+    scores = graph.node("Mul", names, _rows(graph, fit, cells))
+    _write(graph, corners, cells, scores)
+    shapes = (1, 3, INPUT_PX[1], INPUT_PX[0]), (1, 4 + len(NAMES), CELL_COUNT)
+    about = {"names": str(dict(enumerate(NAMES))), "license": "Apache-2.0"}
+    graph.save(path, ("images", shapes[0]), ("output0", shapes[1]), about)
+
+
+def output(
+    first: First, pair: Pair, scale: float, image: np.ndarray, is_chosen: np.ndarray
+) -> np.ndarray:
+    """The plain twin [N, 4 + C] for an image [H, W, 3] uint8; `is_chosen` [N] for a second look."""
+    corners, fit, logits = (part[0] for part in first.look(image[None]))
+    cells = np.flatnonzero(is_chosen)
+    parts = np.array([crop(image, enlarged(corners[cell], MARGIN)) for cell in cells])
+    cosines = SECOND_WEIGHT * scale * pair.images(parts) @ pair.texts.T
+    nothing = np.log(np.exp(cosines[:, len(THINGS) :]).sum(axis=1, keepdims=True))
+    second = np.hstack((cosines[:, : len(THINGS)], nothing))
+    names = jax.nn.softmax(FIRST_WEIGHT * logits[cells] + second)[:, : len(NAMES)]
+    scores = np.zeros((len(corners), len(NAMES)))
+    scores[cells] = names / (1 + np.exp(-fit[cells, None]))
+    low, high = corners[:, :2], corners[:, 2:]
+    return np.hstack(((low + high) / 2, high - low, scores))
+
+
+def _best(graph: Graph, corners: str, fit: str, logits: str) -> str:
+    """Cells [K] whose boxes hold something, each another thing."""
+    _, nothing = graph.split(graph.node("Softmax", logits, axis=1), (len(THINGS), 1))
+    likely = graph.node("Mul", fit, graph.node("Sub", graph.number(1), nothing))
+    most, iou = graph.integers(LOOKS), graph.constant(np.array([DISTINCT_IOU], np.float32))
+    chosen = graph.node("NonMaxSuppression", corners, likely, most, iou)
+    return graph.node("Gather", chosen, graph.constant(np.array(2, np.int64)), axis=1)
+
+
+def _rows(graph: Graph, x: str, cells: str) -> str:
+    """[K, C] of [1, C, N]"""
+    rows = graph.node("Transpose", graph.node("Squeeze", x, graph.integers(0)), perm=[1, 0])
+    return graph.node("Gather", rows, cells, axis=0)
+
+
+def _second_logits(graph: Graph, boxes: str, pair: Pair, scale: float) -> str:
+    """[K, T + 1] of names and nothing, by the pair."""
+    images = embedded(graph, _crops(graph, boxes))
+    cosines = graph.node("MatMul", images, graph.constant(SECOND_WEIGHT * scale * pair.texts.T))
+    things, building = graph.split(cosines, (len(THINGS), len(pair.texts) - len(THINGS)))
+    nothing = graph.node("ReduceLogSumExp", building, axes=[1], keepdims=1)
+    return graph.node("Concat", things, nothing, axis=1)
+
+
+def _joined(graph: Graph, first: str, second: str) -> str:
+    return graph.node("Add", graph.node("Mul", first, graph.number(FIRST_WEIGHT)), second)
+
+
+def _crops(graph: Graph, boxes: str) -> str:
+    """`pixel_values` [K, 3, 64, 64], as `crops.crop` makes them."""
+    low, high = graph.split(boxes, (2, 2))
+    margin = graph.node("Mul", graph.node("Sub", high, low), graph.number(MARGIN))
+    low = graph.node("Max", graph.node("Sub", low, margin), graph.number(0))
+    ends = graph.constant(np.array([INPUT_PX], np.float32))
+    high = graph.node("Min", graph.node("Add", high, margin), ends)
+    sides = graph.node("Max", graph.node("Sub", high, low), graph.number(1))
+    half = graph.node("Mul", graph.node("ReduceMax", sides, axes=[1]), graph.number(0.5))
+    middle = graph.node("Mul", graph.node("Add", low, high), graph.number(0.5))
+    squares = graph.node(
+        "Concat", graph.node("Sub", middle, half), graph.node("Add", middle, half), axis=1
+    )
+    mean, deviation = (graph.constant(part[None, :, None, None]) for part in (MEAN, DEVIATION))
+    values = graph.node("Div", graph.node("Sub", "images", mean), deviation)
+    form = {"output_height": CROP_PX, "output_width": CROP_PX, "sampling_ratio": 0}
+    form |= {"coordinate_transformation_mode": "half_pixel", "mode": "avg"}
+    taken = graph.node("RoiAlign", values, squares, _zeros(graph, half), **form)
+    return _masked(graph, taken, graph.node("Div", sides, half))
+
+
+def _zeros(graph: Graph, like: str) -> str:
+    """Indices [K] of the one image, of [K, 1]."""
+    flat = graph.node("Squeeze", graph.node("Mul", like, graph.number(0)), graph.integers(1))
+    return graph.node("Cast", flat, to=TensorProto.INT64)
+
+
+def _masked(graph: Graph, crops: str, extents: str) -> str:
+    """What is beyond the sides [K, 2] of a box, in halves of its square, is CLIP's mean: zero."""
+    places = np.abs((np.arange(CROP_PX) + 0.5) * 2 / CROP_PX - 1).astype(np.float32)
+    shapes = (1, 1, 1, CROP_PX), (1, 1, CROP_PX, 1)
+    extents = graph.node("Mul", extents, graph.number(0.5))
+    for extent, shape in zip(graph.split(extents, (1, 1)), shapes, strict=True):
+        extent = graph.node("Unsqueeze", extent, graph.integers(2, 3))
+        is_inside = graph.node("Less", graph.constant(places.reshape(shape)), extent)
+        crops = graph.node("Mul", crops, graph.node("Cast", is_inside, to=TensorProto.FLOAT))
+    return crops
+
+
+def _write(graph: Graph, corners: str, cells: str, scores: str) -> None:
+    """`output0`: boxes of all cells, and scores of those that were looked at twice."""
+    empty = graph.constant(np.zeros((CELL_COUNT, len(NAMES)), np.float32))
+    rows = graph.node("Unsqueeze", cells, graph.integers(1))
+    scores = graph.node("ScatterND", empty, rows, scores)
+    scores = graph.node("Transpose", scores, perm=[1, 0])
+    scores = graph.node("Unsqueeze", scores, graph.integers(0))
+    low, high = graph.split(graph.node("Transpose", corners, perm=[0, 2, 1]), (2, 2))
+    centres = graph.node("Mul", graph.node("Add", low, high), graph.number(0.5))
+    extents = graph.node("Sub", high, low)
+    graph.node("Concat", centres, extents, scores, axis=1, output="output0")

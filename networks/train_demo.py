@@ -1,0 +1,179 @@
+"""Train the built-in networks of the semantic path and write them with their scores.
+
+    python networks/train_demo.py [--out DIR] [--work DIR] [--share SHARE]
+
+Renders rooms other than the flat (two processes), trains the detector's first look and the dual
+encoder beside each other (one thread each), fits the confidences on rooms kept apart, writes ONNX,
+and scores the files on rooms kept apart from both and, at the very end, on the flat. Nothing is
+chosen by those last scores. The same machine gives the same bytes.
+"""
+
+import argparse
+import json
+import logging
+import os
+import resource
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+# one thread an operation: sums keep their order, whatever the machine
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+os.environ["OPENBLAS_NUM_THREADS"] = "1"
+os.environ["JAX_PLATFORMS"] = "cpu"
+
+import card
+import cells
+import cv2
+import detector
+import encoder
+import numpy as np
+import scores
+import second_look
+from detector import First
+from flat_frames import flat_frames
+from material import Rooms, render_all, worsened
+from views import Seen, Views
+
+TRAINING = Rooms(range(120), 14)
+CALIBRATION = Rooms(range(160, 172), 12)
+HELD_OUT = Rooms(range(172, 190), 12)
+SEED = 0
+APART = 0.2  # of scores at most: the graph cuts its crops by other pixels
+DETECTOR_STEPS, ENCODER_STEPS = (2200, 1600), (9600, 7400)  # of two rounds each
+FLAT_STRIDE = 8  # of its frames that are scored
+SHIPPED = Path(__file__).parents[1] / "ldo_service" / "demo_networks"
+
+log = logging.getLogger(__name__)
+
+
+def main() -> None:
+    given = _arguments()
+    given.out.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+    # rooms
+    render_all([TRAINING, CALIBRATION, HELD_OUT], given.work, processes=2)
+    rendering_s = _children_s()
+    # networks, one process each
+    steps = {
+        name: [max(1, round(given.share * count)) for count in counts]
+        for name, counts in (("detector", DETECTOR_STEPS), ("encoder", ENCODER_STEPS))
+    }
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        first = pool.submit(train_detector, given.work, steps["detector"])
+        pair = pool.submit(train_encoder, given.work, steps["encoder"])
+        export(first.result(), pair.result(), given.work, given.out)
+    training_s = _children_s() - rendering_s
+    # scores
+    report = score(given.work, given.out)
+    report["seed"] = SEED
+    report["steps"] = {name: sum(counts) for name, counts in steps.items()}
+    report["cpu_min"] = {
+        "rendering": round(rendering_s / 60, 1),
+        "training": round(training_s / 60, 1),
+    }
+    (given.out / "scores.json").write_text(json.dumps(report, indent=1) + "\n")
+    (given.out / "CARD.md").write_text(card.written(report, given.out))
+    log.info("written to %s in %.0f s", given.out, time.monotonic() - started)
+
+
+def _children_s() -> float:
+    """CPU time of the processes that have ended."""
+    return sum(resource.getrusage(resource.RUSAGE_CHILDREN)[:2])
+
+
+def _arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=SHIPPED)
+    parser.add_argument("--work", type=Path, default=Path("build/networks"))
+    parser.add_argument(
+        "--share", type=float, default=1.0, help="of all steps; less is worse and sooner done"
+    )
+    start_logging()
+    return parser.parse_args()
+
+
+def start_logging() -> None:
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s")
+    cv2.setNumThreads(1)
+
+
+def train_detector(work: Path, steps: Sequence[int]) -> First:
+    start_logging()
+    return detector.train(TRAINING.load(work), steps, SEED)
+
+
+def train_encoder(work: Path, steps: Sequence[int]) -> encoder.Pair:
+    start_logging()
+    return encoder.train(TRAINING.load(work), steps, SEED)
+
+
+def export(first: First, pair: encoder.Pair, work: Path, out: Path) -> None:
+    """Calibrate, write the files, and require that they tell what was trained."""
+    views = CALIBRATION.load(work)
+    colors = _as_recorded(views)
+    crops, names = encoder.crops_of(views.seen, colors)
+    images = pair.images(crops)
+    scale = encoder.fitted_scale(images, pair.texts, names)
+    encoder.export(pair, scale, out)
+    theirs = scores.embedded(scores.session(out / "image_encoder.onnx"), crops)
+    _require_equal("image_encoder.onnx", images, theirs, 2e-2)
+    second_look.export(first, pair, scale, out / "detector.onnx")
+    network = scores.session(out / "detector.onnx")
+    for canvas in map(scores.canvas, colors[:4]):
+        theirs = scores.output(network, canvas)
+        mine = second_look.output(first, pair, scale, canvas, theirs[:, 4:].any(axis=1))
+        sides = np.maximum(theirs[:, 2:4].max(axis=1, keepdims=True), cells.STRIDES_PX[-1])
+        boxes = mine[:, :4] / sides, theirs[:, :4] / sides
+        _require_equal("boxes of detector.onnx, by their sides", *boxes, 0.05)
+        _require_equal("scores of detector.onnx", mine[:, 4:], theirs[:, 4:], APART)
+
+
+def _require_equal(what: str, mine: np.ndarray, theirs: np.ndarray, tolerance: float) -> None:
+    apart = float(np.abs(mine - theirs).max())
+    if apart > tolerance:
+        raise SystemExit(f"{what}: {apart:g} off what was trained; at most {tolerance:g} expected.")
+    log.info("%s: as trained, within %.2g", what, apart)
+
+
+def score(work: Path, out: Path) -> dict:
+    """Of the files in `out`, on the rooms kept apart and on the flat."""
+    held_out = HELD_OUT.load(work)
+    colors, seen = flat_frames(FLAT_STRIDE)
+    return {
+        "held_out": _scored(out, _as_recorded(held_out), held_out.seen),
+        "flat": _scored(out, colors, seen),
+    }
+
+
+def _as_recorded(views: Views) -> list[np.ndarray]:
+    """Frames made worse as a camera does, each in its own way, always the same."""
+    return [
+        worsened(color, np.random.default_rng([SEED, 3, k])) for k, color in enumerate(views.colors)
+    ]
+
+
+def _scored(out: Path, colors: list[np.ndarray], seen: Seen) -> dict:
+    network = scores.session(out / "detector.onnx")
+    found = [scores.find(network, color) for color in colors]
+    scale = scores.FRAME_PX[0] / colors[0].shape[1]
+    per_class = scores.detection(found, seen.scaled(scale))
+    crops, truth = encoder.crops_of(seen, colors)
+    pixels = encoder.learnable(seen)[0].pixels
+    is_large = pixels >= card.LARGE_SHARE * colors[0][..., 0].size
+    return {
+        "frames": len(colors),
+        "mAP50": scores.mean_average_precision(per_class),
+        "detector": {name: vars_of(one) for name, one in per_class.items()},
+        "encoder": card.naming_report(scores.naming(out, crops, truth), is_large),
+    }
+
+
+def vars_of(one: scores.ClassScore) -> dict[str, float]:
+    return {name: round(getattr(one, name), 4) for name in one.__slots__}
+
+
+if __name__ == "__main__":
+    main()

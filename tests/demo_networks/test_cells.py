@@ -1,0 +1,89 @@
+"""What a cell is to learn, on drawings whose answer is seen by eye."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+COUCH, CUP = 10, 20  # ids in the plane
+NAMES = {COUCH: 3, CUP: 5}
+
+
+@pytest.fixture
+def cells(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    import cells
+
+    yield cells
+    del sys.modules["cells"]
+
+
+def frame() -> tuple[np.ndarray, np.ndarray]:
+    """A couch of 160x96 pixels from (64, 64), a cup of 6x6 on it in the cell of (128, 96)."""
+    plane, names = np.zeros((256, 320), np.uint8), np.full(256, -1)
+    plane[64:160, 64:224] = COUCH
+    plane[97:103, 129:135] = CUP
+    for k, name in NAMES.items():
+        names[k] = name
+    return plane, names
+
+
+def told(cells: ModuleType, plane: np.ndarray, names: np.ndarray) -> dict[int, tuple]:
+    """Names, weights, boxes and whether they are told, in rows and columns of each grid."""
+    columns = cells.told(plane, cells.visible(plane, names))
+    grids, start = {}, 0
+    for stride, shape in zip(cells.STRIDES_PX, cells.SHAPES, strict=True):
+        end = start + shape[0] * shape[1]
+        grids[stride] = tuple(c[start:end].reshape(*shape, *c.shape[1:]) for c in columns)
+        start = end
+    return grids
+
+
+def test_the_small_object_has_its_cell_and_the_large_one_the_others(cells: ModuleType) -> None:
+    names, _, boxes, _ = told(cells, *frame())[8]
+    assert names[12, 16] == NAMES[CUP]
+    assert boxes[12, 16].tolist() == [129, 97, 135, 103]
+    is_couch = np.zeros(names.shape, bool)
+    is_couch[8:20, 8:28] = True
+    is_couch[12, 16] = False
+    assert (names[is_couch] == NAMES[COUCH]).all()
+    assert (boxes[is_couch] == [64, 64, 224, 160]).all()
+    is_couch[12, 16] = True
+    assert (names[~is_couch] == cells.NOTHING).all()
+
+
+def test_boxes_are_told_by_the_grids_of_their_size(cells: ModuleType) -> None:
+    grids = told(cells, *frame())
+    couch = (14, 10), (7, 5), (3, 3)  # a cell of each grid
+    tells = [bool(grids[s][3][row, column]) for s, (row, column) in zip(grids, couch, strict=True)]
+    assert tells == [False, True, True]  # the root of its area is 124 pixels
+    assert grids[8][3][12, 16]
+    assert not grids[8][3][0, 0]
+
+
+def test_cells_of_an_object_share_its_weight(cells: ModuleType) -> None:
+    names, weights, _, _ = told(cells, *frame())[8]
+    assert weights[12, 16] == 1
+    couch = weights[names == NAMES[COUCH]]
+    np.testing.assert_allclose(couch, 1 / np.sqrt(len(couch)), rtol=1e-6)
+    np.testing.assert_allclose(weights[names == cells.NOTHING], cells.NOTHING_WEIGHT)
+
+
+def test_a_cell_that_is_covered_by_a_third_learns_nothing(cells: ModuleType) -> None:
+    plane, names = frame()
+    plane[:, 64:69] = 0  # of the couch's first column 3 of 8 pixels are left
+    _, weights, _, _ = told(cells, plane, names)[8]
+    assert (weights[8:20, 8] == 0).all()
+    assert (weights[8:20, 9] > 0).all()
+
+
+def test_a_frame_without_objects_has_nothing_to_tell(cells: ModuleType) -> None:
+    _, names = frame()
+    grids = told(cells, np.zeros((256, 320), np.uint8), names)
+    for kinds, weights, _, tells_box in grids.values():
+        assert (kinds == cells.NOTHING).all()
+        assert not tells_box.any()
+        assert (weights > 0).all()

@@ -1,0 +1,46 @@
+"""Both readings of a network: what JAX computes is what the ONNX file tells."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import onnxruntime
+import pytest
+
+pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --group train")
+
+
+HALF = 2e-3  # kernels are kept in half precision
+
+
+@pytest.fixture
+def layers(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    import layers
+
+    yield layers
+    del sys.modules["layers"]
+
+
+def test_both_readings_of_a_network_tell_the_same(layers: ModuleType, tmp_path: Path) -> None:
+    def network(net, image):
+        x = net.conv(net.folded(image, 2), "stem", 8, size=1)
+        small = layers.residual(net, net.conv(x, "down", 8, stride=2), "block", 8)
+        joined = net.join([x, net.enlarged(net.widest(small))])
+        return net.linear(net.mean(net.conv(joined, "out", 6)), "told", 3, 0.5)
+
+    rng = np.random.default_rng(0)
+    image = rng.random((1, 16, 24, 3), np.float32)
+    drawn = layers.Live({}, rng=rng)
+    network(drawn, image)
+    moments = {name: tuple(map(np.asarray, pair)) for name, pair in drawn.observed.items()}
+    mine = np.asarray(network(layers.Live(drawn.weights, moments), image))[0, 0, 0]
+
+    graph = layers.Graph(drawn.weights, moments)
+    told = graph.node("Flatten", network(graph, "image"), output="told")
+    graph.save(tmp_path / "net.onnx", ("image", (1, 3, 16, 24)), (told, (1, 3)), {})
+    session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
+    theirs = np.asarray(session.run(None, {"image": image.transpose(0, 3, 1, 2).copy()})[0])[0]
+    np.testing.assert_allclose(theirs, mine, atol=HALF)
