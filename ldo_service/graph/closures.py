@@ -22,10 +22,10 @@ class ClosuresConfig:
     most_cost: float = 20.06
     most_sigmas: float = 3.0  # of a residual that stays, in any direction (RTAB-Map's guard)
     rivals: int = 3  # earlier closures that may leave in place of a new one, the least fitting
-    remembered: int = 256  # refused ones, so that one that is sent again is not solved again
+    remembered: int = 256  # refused ones, and ones that left, to tell
 
     def __post_init__(self) -> None:
-        if min(self.most_cost, self.most_sigmas) <= 0 or min(self.rivals, self.remembered) < 0:
+        if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0 or self.remembered < 1:
             raise ConfigError(f"{self}: gates must be positive, counts not negative.")
 
 
@@ -111,6 +111,10 @@ class Closures:
             refused=self._remembered(*self.refused, pair_of(closure)),
             left=self._remembered(*self.left, *verdict.dropped),
         )
+
+    def without(self, pairs: Collection[Pair]) -> "Closures":
+        """When other measurements hold what these say."""
+        return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
     def _remembered(self, *pairs: Pair) -> tuple[Pair, ...]:
         """The newest of them."""

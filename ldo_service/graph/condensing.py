@@ -13,7 +13,13 @@ import numpy as np
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
 
-from .factors import NoiseConfig, first_factor, odometry_information, relative_factor
+from .factors import (
+    NoiseConfig,
+    closure_information,
+    first_factor,
+    odometry_information,
+    relative_factor,
+)
 from .followers import Followers, between
 from .solver import graph_of, values_of, variables_of
 
@@ -45,13 +51,15 @@ def group_to_condense(
 def condensed(
     group: Sequence[int],
     measured: Mapping[tuple[int, int], RelativePose],
+    closures: Iterable[RelativePose],
     T_map: Mapping[int, np.ndarray],
     noise: NoiseConfig,
 ) -> Condensed:
     """What a group knows by itself: head, those that will follow, and the tail, the next head.
 
-    The measurements within the group alone are solved, with the head held, so that what loops did
-    to it is not counted twice and can be undone. Covariance is that of the tail, marginal.
+    The measurements and closures within the group alone are solved, with the head held, so that
+    what other loops did to it is not counted twice and can be undone. Covariance is that of the
+    tail, marginal.
     """
     head, *others, tail = group
     inside = set(group)
@@ -59,6 +67,10 @@ def condensed(
         relative_factor(m.a, m.b, m.T_a_b, odometry_information(m, noise))
         for pair, m in measured.items()
         if inside.issuperset(pair)
+    ]
+    factors += [
+        relative_factor(c.a, c.b, c.T_a_b, closure_information(c, noise, np.zeros((6, 6))))
+        for c in closures
     ]
     factors.append(first_factor(head, T_map[head], noise.first_sigma))
     graph, start = graph_of(factors), values_of({k: T_map[k] for k in group})

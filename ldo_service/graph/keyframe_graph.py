@@ -157,6 +157,8 @@ class KeyframeGraph:
             self.connect(closure)
             return Verdict(True)
         start, known = self._solver.variables(), self._known
+        if known.in_head(closure.a)[0] == known.in_head(closure.b)[0]:
+            return self._refuse(closure)  # too late: both hang on one variable by now
         verdict, variables = known.closures.judged(
             closure,
             lambda closures: solved(known.with_closures(closures, self._initial), start),
@@ -168,6 +170,12 @@ class KeyframeGraph:
             self._rebase(variables)
         else:
             self._note("refuse", measured=pack_relative([closure]))
+        return verdict
+
+    def _refuse(self, closure: RelativePose) -> Verdict:
+        verdict = Verdict(False)
+        self._known.closures = self._known.closures.after(closure, verdict)
+        self._note("refuse", measured=pack_relative([closure]))
         return verdict
 
     # --- landmarks --------------------------------------------------------------------------------

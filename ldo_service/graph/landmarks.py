@@ -78,6 +78,9 @@ class Landmark:
     misses: int = 0  # in a row
     last: int = -1  # keyframe that saw it
 
+    def knows(self, keyframe: int) -> bool:
+        return keyframe == self.last or any(sight.keyframe == keyframe for sight in self.sights)
+
     @property
     def entropy(self) -> float:
         p = self.distribution
@@ -132,6 +135,8 @@ class Landmarks:
             if old is not None:
                 self.known[seen.landmark] = replace(old, misses=old.misses + 1)
             return
+        if old is not None and old.knows(seen.keyframe):
+            return  # sent again after a restart
         old = old or Landmark(Evidence.none(CLASSES), np.full(CLASSES, 1 / CLASSES))
         evidence = old.evidence.with_observed(seen.distribution, self.weight(seen.entropy))
         sights = (*old.sights, self._sight(seen)) if seen.is_whole else old.sights
@@ -168,7 +173,8 @@ class Landmarks:
             kept = self._thinned(sights)
             self.known[k] = replace(self.known[k], sights=kept)
             if graph.has_landmark(k):
-                gone += [(s.keyframe, k) for s in sights if s not in kept]
+                left = {s.keyframe for s in kept}
+                gone += [(s.keyframe, k) for s in sights if s.keyframe not in left]
                 new += [s for s in kept if (s.keyframe, k) in waiting]
             elif (point := self._triangulated(kept, graph)) is not None:
                 placed[k] = point

@@ -76,12 +76,18 @@ class Measurements:
     def condense(self, group: list[int], T_map: Mapping[int, np.ndarray]) -> None:
         """All of a group but its head and tail follow from now on.
 
-        What was measured within it is in the edge from head to tail. Later keyframes that were
-        measured against followers are measured against later ones too, and that is given up, but
-        where nothing else would hold them.
+        What was measured within it, closures too, is in the edge from head to tail. Later
+        keyframes that were measured against followers are measured against later ones too, and
+        that is given up, but where nothing else would hold them.
         """
-        one = condensed(group, self.odometry, T_map, self._noise)
         followers = set(group[1:-1])
+        closed = {
+            pair: closure
+            for pair, closure in self.closures.accepted.items()
+            if set(pair) <= set(group) and followers.intersection(pair)
+        }
+        one = condensed(group, self.odometry, closed.values(), T_map, self._noise)
+        self.closures = self.closures.without(closed)
         gone = [self.odometry.pop(p) for p in list(self.odometry) if followers.intersection(p)]
         self.odometry.pop((group[0], group[-1]), None)
         self.condensed[one.edge.a, one.edge.b] = one.edge

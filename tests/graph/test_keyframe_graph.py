@@ -11,7 +11,7 @@ from ldo_service.graph.factors import NoiseConfig
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
 from ldo_service.runtime.state_store import decode_state, encode_state
 
-from .walks import ate_m, closures, kitchen, odometry, round_trips, walked
+from .walks import REFINED, ate_m, closures, kitchen, odometry, round_trips, walked
 
 INFORMATION = np.diag([1e4, 1e4, 1e4, 1e3, 1e3, 1e3])
 LOOP = np.diag([400.0] * 6)
@@ -240,6 +240,27 @@ def test_a_condensed_graph_answers_a_loop_as_the_whole_one_does() -> None:
     assert len(loops) == len(condensed.closures.accepted) == len(whole.closures.accepted) == 8
     assert np.sqrt(np.mean(off**2)) < 0.1 * drifted
     assert ate_m(condensed, truth) < 1.2 * ate_m(whole, truth)
+
+
+def test_a_closure_within_a_group_stays_in_what_it_becomes() -> None:
+    """Judge: the graph of all keyframes. Before it is condensed a closure ties 2 to 9; one that
+    comes when both hang on one variable says nothing any more."""
+    truth = kitchen(60)
+    measured = list(odometry(truth, 5, window=2, sigma=2e-2))
+    loops = {9: RelativePose(2, 9, se3.inverse(truth[2]) @ truth[9], REFINED)}
+    condensed, whole = (walked(truth[0], measured, loops, config=c) for c in (None, WHOLE))
+    alone = walked(truth[0], measured)
+
+    def off_m(graph: KeyframeGraph) -> float:
+        T_2_9 = se3.inverse(graph.pose(2)) @ graph.pose(9)
+        return float(np.linalg.norm((se3.inverse(loops[9].T_a_b) @ T_2_9)[:3, 3]))
+
+    assert off_m(condensed) < 1.1 * off_m(whole) + 1e-4
+    assert off_m(condensed) < 0.5 * off_m(alone)
+    before = condensed.poses()
+    late = RelativePose(3, 8, se3.inverse(truth[3]) @ truth[8], REFINED)
+    assert not condensed.close(late).is_accepted
+    assert all((condensed.pose(k) == T).all() for k, T in before.items())
 
 
 def test_what_is_saved_goes_on_with_the_same_bits() -> None:

@@ -150,6 +150,19 @@ def test_a_box_at_the_border_names_and_does_not_place() -> None:
     assert landmarks.known[5].distribution.argmax() == 7
 
 
+def test_an_observation_that_is_sent_again_counts_once() -> None:
+    truth = kitchen(40)
+    graph, landmarks = seen_on_a_walk(truth, LandmarksConfig())
+    known = dict(landmarks.known)
+    k, landmark = next((k, one) for k, one in known.items() if graph.has_landmark(k))
+    again = observed(truth, landmark.sights[0].keyframe, np.random.default_rng(8))
+    for seen in again:
+        landmarks.observe(seen)
+    landmarks.settle(graph)
+    assert landmarks.known[k].evidence == known[k].evidence
+    assert landmarks.known[k].sights == known[k].sights
+
+
 def test_ten_misses_in_a_row_end_a_landmark_and_five_a_vague_one() -> None:
     truth = kitchen(60)
     for p, misses in ((SURE, 10), (VAGUE, 5)):
