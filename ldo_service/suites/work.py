@@ -61,7 +61,11 @@ class Work:
             if failed:
                 log.error("%s: %s", entry.folder, failed)
                 return Outcome(entry, None, "failed")
-        return Outcome(entry, judged_in(folder))
+        try:
+            return Outcome(entry, judged_in(folder))
+        except ConfigError as error:
+            log.error("%s", error)
+            return Outcome(entry, None, "failed")
 
     def _told(self, entry: Entry) -> str:
         """What its figures depend on."""
@@ -83,7 +87,8 @@ class Work:
             word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)
         ]
         run = ("run", entry.source, "--out", str(folder), "--overwrite", *self.suite.options())
-        (folder / TOLD).unlink(missing_ok=True)
+        for name in (TOLD, RESULTS):  # `ldo run` replaces what it wrote, and nothing else
+            (folder / name).unlink(missing_ok=True)
         done = _ldo(*run, *settings)
         if done.returncode:
             return _reason(done)

@@ -38,6 +38,14 @@ def test_a_suite_runs_what_it_can_and_goes_on_where_it_stopped(capsys, suite: Pa
     before = made.stat().st_mtime_ns
     assert ldo(capsys, *words)[1] == out
     assert made.stat().st_mtime_ns == before, "it is not run again"
+    assert ldo(capsys, *words, "--set", "mapper.iterations=1")[1] != "", (
+        "other settings, other runs"
+    )
+    assert made.stat().st_mtime_ns > before
+    (made.parent / "eval.json").write_text("{")
+    assert (
+        "| failed | no data | failed |" in ldo(*(capsys, *words, "--set", "mapper.iterations=1"))[1]
+    )
 
 
 def test_a_suite_that_is_not_there_is_named(capsys, tmp_path: Path) -> None:
