@@ -107,7 +107,7 @@ class MapperConfig:
     mending_min_m: float = 0.01  # a keyframe that a correction moves farther is mended: it may lie
     mending_min_rad: float = 0.01  # over surface that the map holds already. Less is refined anyway
     mended_keyframes: int = 2  # per new one: a closure that moves a hundred is mended in fifty
-    mended_at_end: int = 200  # when the stream ends, the newest: half a minute
+    mended_at_end: int = 200  # when the stream ends, the newest: some seconds
     mending_iterations: int = 3  # of the optimiser, as for a new keyframe when many wait
 
     def __post_init__(self) -> None:
@@ -210,7 +210,7 @@ class Mapper(Actor):
         moving = mask_of(message.is_moving)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         learnt = self._semantics.mapped(message.keyframe)
-        self._mend(self.config.mended_keyframes)
+        self._mend(self.config.mended_keyframes, self.config.mending_iterations)
         # tell
         yield from self._refinement()
         yield from self._teller.keyframe(self._now())
@@ -296,11 +296,11 @@ class Mapper(Actor):
         )
         return [keyframe for keyframe, is_far in zip(poses, are_far, strict=True) if is_far]
 
-    def _mend(self, most: int) -> None:
-        """Some of the keyframes that corrections laid over others, the newest first."""
+    def _mend(self, most: int, iterations: int) -> None:
+        """Some of the keyframes that corrections laid over others, the newest first. At the end
+        without iterations: they would move keyframes, and nobody takes a refinement any more."""
         for _ in range(min(most, len(self._to_mend))):
-            keyframe = self._to_mend.pop()
-            self._mended += self._map.mend(keyframe, self.config.mending_iterations)
+            self._mended += self._map.mend(self._to_mend.pop(), iterations)
 
     def _motion(self, keyframe: int) -> AnchorMotion:
         """From where its Gaussians are to where the keyframe is."""
@@ -330,7 +330,7 @@ class Mapper(Actor):
     def finish(self) -> Iterator[Output]:
         """The whole map, so that whoever listens ends with it."""
         if self._map.size():
-            self._mend(self.config.mended_at_end)
+            self._mend(self.config.mended_at_end, iterations=0)
             self._semantics.refresh()
             yield from self._teller.snapshot(self._now())
             yield from self._objects()
@@ -361,7 +361,7 @@ class Mapper(Actor):
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
             "told": self._teller.state(),
-            "to_mend": self._to_mend,
+            "to_mend": list(self._to_mend),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]

@@ -34,7 +34,7 @@ class PlacesConfig:
     features: int = 500  # of each: half of a frame's, which halves the time to match
     same: float = 0.1  # rad, as `motion.extent`: a place so near is replaced by the newer one,
     # which shows it as it is now. Half a step between keyframes: on a round memory stops growing
-    recent: int = 16  # last places, which are all kept: new keyframes are measured against them
+    recent: int = 16  # last places, which are not replaced: new keyframes are measured against them
 
     def __post_init__(self) -> None:
         if self.count < 3 or self.features < 1:
