@@ -155,8 +155,8 @@ def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
 def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:tour", "--rate", "6")
-        service.wait_for_poses(20)
+        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s, for seven
+        service.wait_for_poses(10)
         for actor in EVERY_ACTOR:
             old = service.update_health()[actor]
             os.kill(old.pid, signal.SIGKILL)
@@ -167,8 +167,8 @@ def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> No
             )
             service.poses()
             steps = service.health["optimizer"].steps
-            poses = service.wait_for_poses(20)
-            assert sum(pose.status == "OK" for pose in poses) >= 18, f"after {actor}"
+            poses = service.wait_for_poses(10)
+            assert sum(pose.status == "OK" for pose in poses) >= 8, f"after {actor}"
             assert f"{actor}: its process was killed by signal 9" in service.log
             wait_until(
                 lambda s=steps: service.update_health()["optimizer"].steps != s, 10, "keyframes"

@@ -36,20 +36,21 @@ def test_a_recorded_service_replays(tmp_path: Path) -> None:
     assert_replays(recording)
 
 
+@pytest.mark.timeout(400)
 def test_actors_that_are_killed_replay_with_both_their_lives(tmp_path: Path) -> None:
     recording = tmp_path / "recording"
     with live_service(tmp_path, "--record", str(recording), *APART) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:tour", "--rate", "10", "--max-frames", "300")
+        publisher = service.publisher("synthetic:tour", "--rate", "4")  # 90 s, for seven
         for actor in EVERY_ACTOR:
-            service.wait_for_poses(25)
+            service.wait_for_poses(10)
             pid = service.update_health()[actor].pid
             os.kill(pid, signal.SIGKILL)
             wait_until(
                 lambda a=actor, pid=pid: service.update_health()[a].pid != pid, 15, "it comes back"
             )
             service.poses()
-        service.wait_for_poses(25)
+        service.wait_for_poses(10)
         publisher.kill()
         publisher.wait()
         assert service.stop() == 0
