@@ -132,7 +132,8 @@ async def test_a_child_that_is_drained_while_it_starts_ends() -> None:
 
 
 async def test_a_process_leaves_when_its_parent_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(PARENT_VARIABLE, str(os.getppid()))
+    monkeypatch.setenv(PARENT_VARIABLE, "12345")
+    monkeypatch.setattr(os, "getppid", lambda: 12345)
     waiting = asyncio.create_task(leave_with_parent(0.001))
     await asyncio.sleep(0.02)
     assert not waiting.done()
