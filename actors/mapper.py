@@ -220,11 +220,13 @@ class Mapper(Actor):
 
     def _iterations(self) -> int:
         """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
-        the neighbour of the next."""
+        the neighbour of the next. Those that are mended with it have their share."""
         waiting = self.situation.waiting.get(KEYFRAME_NEW, 0)
         config = self.config
+        mending = config.mending_iterations * min(config.mended_keyframes, len(self._to_mend))
         return max(
-            config.iterations // (1 + waiting), min(config.least_iterations, config.iterations)
+            config.iterations // (1 + waiting) - mending,
+            min(config.least_iterations, config.iterations),
         )
 
     def _refine(self, message: MapRefine) -> Iterator[Output]:
