@@ -36,8 +36,8 @@ from ldo_service.schemas.topics import (
     LOOP_CANDIDATE,
     LOOP_CLOSURE,
 )
+from ldo_service.semantics.movable import MovableConfig, movable_pixels
 from ldo_service.semantics.vocabulary import Vocabulary
-from ldo_service.tracking.movable import MovableConfig, movable_pixels
 from ldo_service.tracking.places import Place, place_of
 from ldo_service.wire import (
     boxes_in,

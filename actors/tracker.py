@@ -42,8 +42,8 @@ from ldo_service.schemas.topics import (
     ODOMETRY_PRIOR,
     POSE_TRACKED,
 )
+from ldo_service.semantics.movable import Box
 from ldo_service.tracking.judgement import Status
-from ldo_service.tracking.movable import Box
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.prior import Prior, Reading, Verdict
 from ldo_service.tracking.tracked import Tracked

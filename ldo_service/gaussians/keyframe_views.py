@@ -1,6 +1,7 @@
 """The keyframes that a map was made from, as views to optimise against."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,14 @@ class KeyframeViews:
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
         self.horizons[view.keyframe] = Horizon.of(view.depth_m)
+
+    def leave_out(self, keyframe: int, pixels: np.ndarray) -> None:
+        """Those pixels [H, W] bool of its images count no more. Raises KeyError as a view does."""
+        images = self.store.get(keyframe)
+        if images is None:
+            raise KeyError(keyframe)
+        counts = ~pixels if images.mask is None else ~pixels & (images.mask > 0)
+        self.store.put(replace(images, mask=counts.astype(np.uint8)))
 
     def placed(self, keyframe: int) -> PlacedCamera:
         """Its camera where it stands, and how far it saw."""

@@ -25,7 +25,7 @@ from .pruning import PruningConfig, superfluous
 from .render import Contributions, Rendering, RenderMemory, render
 from .sleep import SleepingGaussians, whole_map
 from .sleep_choice import SleepConfig, choose_sleepers
-from .views import View, sampled_surface, schedule, shared_surface
+from .views import View, sampled_surface, schedule, shared_surface, shown_within
 
 MOST_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
 
@@ -181,6 +181,23 @@ class MapBuilder:
             threads=self._threads,
         )
         self._log.grown(self.gaussians)
+
+    def leave_out(self, keyframe: int, pixels: np.ndarray) -> int:
+        """What a keyframe shows there, [H, W] bool, turned out not to belong to the map: it is
+        fitted no more, and the Gaussians that the keyframe put there go. How many did.
+
+        Raises KeyError for a keyframe without images.
+        """
+        self._wake(self.views.placed(keyframe))
+        self._shown = None
+        self.views.leave_out(keyframe, pixels)
+        theirs = np.flatnonzero(self.gaussians.anchors == keyframe)
+        camera, T_map_camera = self.views.cameras[keyframe], self.views.poses[keyframe]
+        is_there = shown_within(pixels, self.gaussians.means[theirs], camera, T_map_camera)
+        mask = np.zeros(len(self.gaussians), bool)
+        mask[theirs[is_there]] = True
+        self._remove(mask)
+        return int(np.count_nonzero(mask))
 
     # --- fitting ----------------------------------------------------------------------------------
     def _plan(self, newest: View, iterations: int) -> list[int]:

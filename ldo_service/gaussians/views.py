@@ -54,6 +54,20 @@ def shared_surface(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) 
     return float(np.count_nonzero(inside)) / max(len(p_map), 1)
 
 
+def shown_within(
+    pixels: np.ndarray, p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray
+) -> np.ndarray:
+    """Mask [M] of the points [M, 3] that a camera shows in `pixels`, [H, W] bool, or that something
+    before them hides there."""
+    p_camera = se3.transform(se3.inverse(T_map_camera), p_map)
+    out = p_camera[:, 2] > 0
+    u, v = np.rint(camera.project(p_camera[out])).T
+    inside = (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    inside[inside] = pixels[v[inside].astype(int), u[inside].astype(int)]
+    out[out] = inside
+    return out
+
+
 def schedule(
     newest: int,
     covisible: Sequence[int],

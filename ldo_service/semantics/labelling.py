@@ -52,6 +52,18 @@ class Claims:
     ) -> "Claims":
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
+    def where(self, mask: np.ndarray) -> "Claims":
+        """Those of a mask [M]."""
+        parts = tuple(part for part, is_in in zip(self.parts, mask, strict=False) if is_in)
+        return Claims(
+            self.boxes[mask],
+            self.labels[mask],
+            self.confidences[mask],
+            self.open_labels[mask],
+            self.open_confidences[mask],
+            parts,
+        )
+
     def scores(self) -> np.ndarray:
         """[M], by which regions compete where they overlap."""
         return np.maximum(self.confidences, self.open_confidences)

@@ -1,7 +1,7 @@
 """What is known of a map beside its shape: the labels of its Gaussians, and its objects."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from .consistency import Disagreement
 from .label_images import reliable_image
 from .labelling import Claims, Labelled, LabellingConfig, label_keyframe
 from .labels import BACKGROUND, MOST_LABELS, top_labels
+from .movable import Box, MovableConfig, movable_pixels
 from .naming import Naming, NamingConfig
 from .objects import Objects, ObjectsConfig, Observed
 from .regions_to_name import Region
@@ -26,6 +27,9 @@ class SemanticMapConfig:
     labelling: LabellingConfig = field(default_factory=LabellingConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     naming: NamingConfig = field(default_factory=NamingConfig)
+    movable: MovableConfig = field(default_factory=MovableConfig)
+    movable_confidence: float = 0.5  # of the detector, so that what may walk away is left out: a
+    # hole where a picture was taken for a cat would be worse
     most_names: int = MOST_LABELS  # of the vocabulary; a later name is `other`
     most_waiting: int = 8  # keyframes whose boxes came before they were mapped: as many as may be
     # on their way to the mapper
@@ -75,7 +79,7 @@ class SemanticMap:
         self._waiting: dict[int, Claims | None] = {}  # by keyframe, the first to come first
         self._disagreement = Disagreement(0.0, 0.0)
         self._boxes = self._repeated = self._too_early = self._without_images = 0
-        self._answers_without_images = 0
+        self._answers_without_images = self._movable = 0
 
     @property
     def is_used(self) -> bool:
@@ -116,7 +120,9 @@ class SemanticMap:
         if not self._map.views.is_readable(keyframe):
             self._without_images += 1
             return None
-        view = self._map.views[keyframe]
+        # who may walk away
+        found = found and self._without_movable(keyframe, found)
+        view = _of_map(self._map.views[keyframe])
         # who makes its image
         made_by = self._map.made_by(keyframe)
         # what is said of it, and what is to be asked
@@ -128,6 +134,18 @@ class SemanticMap:
         # which objects they are
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims.boxes)
         return Learnt(keyframe, self.objects.observe(seen, self._spared()), asked)
+
+    def _without_movable(self, keyframe: int, found: Claims) -> Claims:
+        """What may walk away belongs to no map: neither its surface nor its name."""
+        names, sure = self.config.movable.classes, self.config.movable_confidence
+        said = [self.vocabulary.name(int(label)) for label in found.labels]
+        is_movable = np.isin(said, names) & (found.confidences >= sure)
+        if is_movable.any():
+            boxes = [Box(said[i], *(found.boxes[i] + 0.5)) for i in np.flatnonzero(is_movable)]
+            depth_m = self._map.views[keyframe].depth_m
+            pixels = movable_pixels(boxes, depth_m, self.config.movable)
+            self._movable += self._map.leave_out(keyframe, pixels)
+        return found.where(~is_movable)
 
     def _with_names(
         self, view: View, top: np.ndarray, claims: Claims
@@ -195,7 +213,7 @@ class SemanticMap:
             self._answers_without_images += 1
             return False
         self._by_labeller.update(claims.open_labels.tolist())
-        view, indices = self._map.views[keyframe], self._map.made_by(keyframe).indices
+        view, indices = _of_map(self._map.views[keyframe]), self._map.made_by(keyframe).indices
         self._label(view, indices, claims, is_late=True)
         self.refresh(view)
         return True
@@ -243,6 +261,7 @@ class SemanticMap:
             "boxes_repeated": self._repeated,  # messages, said again after a restart
             "boxes_too_early": self._too_early,  # messages, of keyframes that never came in time
             "boxes_without_images": self._without_images,  # messages, of keyframes forgotten
+            "gaussians_movable": self._movable,  # left out again: of what may walk away
             "label_disagreement_literal": self._disagreement.literal,
             "label_disagreement_expected": self._disagreement.expected,
             "label_names": len(self.names),
@@ -251,6 +270,13 @@ class SemanticMap:
             **(self.naming.statistics() if self.naming else {}),
             "answers_without_images": self._answers_without_images,  # of keyframes forgotten
         }
+
+
+def _of_map(view: View) -> View:
+    """Without the depth of what was left out of the map."""
+    if view.mask is None:
+        return view
+    return replace(view, depth_m=view.depth_m * (view.mask > 0))
 
 
 def _packed(claims: Claims | None) -> list[np.ndarray]:

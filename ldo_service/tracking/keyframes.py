@@ -1,5 +1,6 @@
 """When a frame becomes a keyframe, and what is kept of it. Conventions: `ldo_service.geometry`."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from math import radians
@@ -9,6 +10,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
+from ldo_service.semantics.movable import Box, MovableConfig, movable_pixels
 
 from .features import FeatureConfig, Features, detect
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
@@ -139,3 +141,11 @@ def is_worth_mapping(
             or rotation_rad > config.supporting * config.max_rotation_rad
         )
     )
+
+
+def movable_in(view: Pyramid, boxes: Sequence[Box], config: MovableConfig) -> np.ndarray:
+    """`movable_pixels` [H, W] bool at working resolution, of boxes in pixels of the whole image."""
+    finest = view.levels[0]
+    times = view.camera.width / finest.camera.width
+    smaller = [box.in_smaller(times) for box in boxes]
+    return movable_pixels(smaller, finest.depth_m, config)

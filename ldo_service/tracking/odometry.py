@@ -24,6 +24,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.semantics.movable import Box, MovableConfig
 
 from .align import AlignConfig, Alignment
 from .candidates import Candidate, CandidateConfig
@@ -31,9 +32,8 @@ from .equations import Appearance
 from .features import FeatureConfig
 from .guesses import Guesses
 from .judgement import History, JudgementConfig, Status, judge
-from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
+from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping, movable_in
 from .motion import Motion
-from .movable import Box, MovableConfig, movable_in
 from .moving import MovingConfig, spread, watch
 from .places import Places, PlacesConfig, place_of, thumbnail_of
 from .prior import Anchor, PriorConfig, Reading

@@ -8,8 +8,6 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 
-from .pyramid import Pyramid
-
 CORE = 0.5  # of a box's width and height, in its middle: mostly the thing itself
 
 
@@ -40,14 +38,6 @@ class Box:
         """In an image that is so many times smaller."""
         edges = (self.left, self.top, self.right, self.bottom)
         return Box(self.label, *(edge / times for edge in edges))
-
-
-def movable_in(view: Pyramid, boxes: Sequence[Box], config: MovableConfig) -> np.ndarray:
-    """`movable_pixels` [H, W] bool at working resolution, of boxes in pixels of the whole image."""
-    finest = view.levels[0]
-    times = view.camera.width / finest.camera.width
-    smaller = [box.in_smaller(times) for box in boxes]
-    return movable_pixels(smaller, finest.depth_m, config)
 
 
 def movable_pixels(boxes: Sequence[Box], depth_m: np.ndarray, config: MovableConfig) -> np.ndarray:
