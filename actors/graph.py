@@ -4,7 +4,7 @@ The drawing and the table of topics in README are printed from here (`ldo topics
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
@@ -16,98 +16,76 @@ from ldo_service.actors.tracker import Tracker
 from ldo_service.actors.vlm_labeller import VlmLabeller
 from ldo_service.config import Config
 from ldo_service.errors import ConfigError
-from ldo_service.runtime import Actor, In, Latest, Lossless, Out
+from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import topics as t
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """An actor of the design, with all its ports.
-
-    Without `make` it is drawn and left out of every run. An actor that runs may not have all of
-    its ports yet: `built` is the class that says which.
-    """
+    """An actor of the design, with its ports."""
 
     name: str
     does: str
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
-    make: Callable[[Config], Actor] | None = None
-    built: type[Actor] | None = None
+    make: Callable[[Config], Actor]
 
 
-def _built(
-    actor: type[Actor],
-    does: str,
-    make: Callable[[Config], Actor],
-    later: tuple[In | Out, ...] = (),
-) -> Box:
-    """An actor that runs; `later` are ports of the design that come with their use."""
-    inputs = tuple(port for port in later if isinstance(port, In))
-    outputs = tuple(port for port in later if isinstance(port, Out))
-    ports = actor.inputs + inputs, actor.outputs + outputs
-    return Box(actor.name, does, *ports, make, built=actor)
+def _box(actor: type[Actor], does: str, make: Callable[[Config], Actor]) -> Box:
+    return Box(actor.name, does, actor.inputs, actor.outputs, make)
 
 
 GRAPH: tuple[Box, ...] = (
-    _built(
+    _box(
         FrameSource,
         "checks and rectifies camera frames",
         lambda config: FrameSource(config.frame_source),
     ),
-    _built(
+    _box(
         Tracker,
         "finds the camera's pose",
         lambda config: (LocalisingTracker if config.tracker.localise else Tracker)(config.tracker),
     ),
-    _built(
+    _box(
         Detector,
         "finds objects of known classes",
         lambda config: Detector(config.detector),
     ),
-    _built(
+    _box(
         VlmLabeller,
         "names what the detector does not know",
         lambda config: VlmLabeller(config.vlm_labeller),
     ),
-    _built(
+    _box(
         Mapper,
         "keeps the map of Gaussians, and what stands in it",
         lambda config: Mapper(config.mapper, has_labeller=config.vlm_labeller.is_chosen),
     ),
-    _built(
+    _box(
         LoopCloser,
         "recognises places",
         lambda config: LoopCloser(config.loop_closer),
-        later=(In(t.MAP_OBJECTS, Latest(1)),),
     ),
-    _built(
+    _box(
         Optimizer,
         "makes keyframe poses agree",
         lambda config: Optimizer(config.optimizer),
     ),
 )
 
-# The actors of a run, with the ports that they have today.
-RUNNING: tuple[Box, ...] = tuple(
-    replace(box, inputs=box.built.inputs, outputs=box.built.outputs) for box in GRAPH if box.built
-)
-
 
 def box_named(name: str) -> Box:
-    """Raises ConfigError for a name that is not in the graph, or not in runs yet."""
+    """Raises ConfigError for a name that is not in the graph."""
     for box in GRAPH:
-        if box.name == name and box.make is not None:
-            return box
         if box.name == name:
-            raise ConfigError(f"actor {name} is declared and not part of this version.")
-    names = ", ".join(box.name for box in RUNNING)
+            return box
+    names = ", ".join(box.name for box in GRAPH)
     raise ConfigError(f"there is no actor {name!r}. The actors are {names}.")
 
 
 def make_actors(config: Config) -> list[Actor]:
-    """All running actors, producers first."""
-    return [box.make(config) for box in RUNNING if box.make is not None]
+    """All of them, producers first."""
+    return [box.make(config) for box in GRAPH]
 
 
 def producer_of(topic: t.Topic) -> str:
@@ -119,7 +97,7 @@ def producer_of(topic: t.Topic) -> str:
     if topic is t.CONTROL:
         return "outside"
     outside = (*t.FROM_OUTSIDE, *t.FROM_ODOMETRY, *t.FROM_OPERATORS)
-    return "outside" if topic in outside else "nobody yet"
+    return "outside" if topic in outside else "nobody"
 
 
 def consumers_of(topic: t.Topic) -> list[tuple[str, str]]:
@@ -137,11 +115,8 @@ def topics_table() -> str:
     for topic in t.TOPICS:
         name = "health/<actor>" if topic is t.HEALTH else topic.name
         state = " *" if topic.is_state else ""
-        planned = "" if topic.message else " (declared)"
         takers = ", ".join(f"{who} {policy}" for who, policy in consumers_of(topic)) or "outside"
-        lines.append(
-            f"| `{name}`{state}{planned} | {topic.says} | {producer_of(topic)} | {takers} |"
-        )
+        lines.append(f"| `{name}`{state} | {topic.says} | {producer_of(topic)} | {takers} |")
     return "\n".join(lines)
 
 
@@ -150,13 +125,12 @@ def drawing(boxes: Iterable[Box] = GRAPH) -> str:
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
     for box in boxes:
-        lines.append(f"    {box.name}{'' if box.make else ':::declared'}")
+        lines.append(f"    {box.name}")
     for box in boxes:
         for port in box.inputs:
             arrow = "-->" if isinstance(port.policy, Lossless) else "-.->"
             for maker in _makers(port.topic, boxes):
                 lines.append(f"    {maker} {arrow}|{port.topic.name}| {box.name}")
-    lines.append("    classDef declared stroke-dasharray: 4 4")
     return "\n".join(lines)
 
 

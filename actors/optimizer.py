@@ -190,12 +190,13 @@ class Optimizer(Actor):
         self._graph.add(self._graph.missed_odometry(known, keyframe, T_known_keyframe))
 
     def _join(self, pose: MeasuredPose) -> None:
-        """One keyframe in another, of the same segment or not."""
+        """A keyframe in one of another segment; where loops joined these by now, it is judged as a
+        closure is."""
         if pose.reference not in self._graph:
             log.warning("keyframe %d joins %d, which is missing", pose.keyframe, pose.reference)
             return
         before = self._joined()
-        self._graph.connect(measured_of(pose))
+        self._graph.close(measured_of(pose))
         self._tell_joined(before)
 
     def _tell_joined(self, before: dict[int, int]) -> None:

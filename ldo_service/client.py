@@ -169,7 +169,7 @@ class Client:
         """Header and message of each sample on a topic, for ever."""
         with self._subscriber(topic.name, keep) as subscriber:
             for sample in subscriber:
-                yield _header(sample), _message(sample, _type_of(topic))
+                yield _header(sample), _message(sample, topic.message)
 
     @contextmanager
     def listen(self, name: str, of: type[M], keep: int = 256) -> Iterator[Callable[[], list[M]]]:
@@ -192,7 +192,7 @@ class Client:
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
         )
-        return [_message(r.ok, _type_of(topic)) for r in replies if r.ok is not None]
+        return [_message(r.ok, topic.message) for r in replies if r.ok is not None]
 
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
         """The objects of the map as of now. Raises ConfigError when nobody answers: a map without
@@ -305,12 +305,6 @@ def _stamp(stamp_ns: int | None) -> int:
 
 def _raw_depth(depth: np.ndarray) -> Image:
     return Image.raw("z16" if depth.dtype == np.uint16 else "f32", depth)
-
-
-def _type_of(topic: Topic) -> type[Message]:
-    if topic.message is None:
-        raise ConfigError(f"{topic.name} is declared and has no messages in this version.")
-    return topic.message
 
 
 def _header(sample: Any) -> Header:

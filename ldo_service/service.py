@@ -18,7 +18,7 @@ from pathlib import Path
 
 import zenoh
 
-from ldo_service.actors.graph import RUNNING, Box, box_named
+from ldo_service.actors.graph import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.control import Control
 from ldo_service.errors import ConfigError, StageStalled
@@ -64,7 +64,7 @@ class Service:
 
         Raises ConfigError when the port cannot be had, StageError when an actor was given up.
         """
-        check_graph(RUNNING)
+        check_graph(GRAPH)
         self._require_known(self.only)
         self._require_known(self.config.service.spawned)
         health = HealthCollector()
@@ -110,8 +110,8 @@ class Service:
     def _open_control(self, transport: ZenohTransport) -> Control:
         control = Control(
             transport,
-            actors=[box.name for box in RUNNING],
-            sources=[box.name for box in RUNNING if _is_fed_from_outside(box)],
+            actors=[box.name for box in GRAPH],
+            sources=[box.name for box in GRAPH if _is_fed_from_outside(box)],
             saved_where=self._saved_where(),
             timeout_s=self.config.service.control_timeout_s,
         )
@@ -128,7 +128,7 @@ class Service:
         """Stages and child processes, producers first."""
         children: dict[str, ChildProcess] = {}
         runners: list[Runner] = []
-        for box in RUNNING:
+        for box in GRAPH:
             if self.only and box.name not in self.only:
                 continue
             if not self.only and box.name in self.config.service.spawned:
@@ -155,8 +155,7 @@ class Service:
                 config=self.config.stage,
                 store=FolderStore(self.state / "state"),
                 expected={
-                    out.topic.name: lossless_consumers(RUNNING, out.topic.name)
-                    for out in box.outputs
+                    out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
                 },
                 on_evicted=evicted,
                 journal=self._journal(box.name),

@@ -22,11 +22,7 @@ def json_schema() -> dict[str, object]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "LDO-SLAM messages",
         "$defs": definitions,
-        "topics": {
-            topic.name: {"$ref": f"#/$defs/{topic.message.__name__}"}
-            for topic in TOPICS
-            if topic.message is not None
-        },
+        "topics": {topic.name: {"$ref": f"#/$defs/{topic.message.__name__}"} for topic in TOPICS},
         "answers": {
             topic.name: {"$ref": f"#/$defs/{topic.answer.__name__}"}
             for topic in TOPICS

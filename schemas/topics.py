@@ -26,7 +26,7 @@ ROBOT_PREFIX = "ldo"
 @dataclass(frozen=True, slots=True)
 class Topic:
     name: str
-    message: type[Message] | None
+    message: type[Message]
     says: str
     is_state: bool = False
     key: str | None = None  # field by which `Latest(per_key=True)` tells messages apart

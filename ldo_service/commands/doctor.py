@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from ldo_service import __version__, kernels
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.client import connect
 from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.errors import ConfigError, LdoError, ModelError
@@ -162,7 +162,7 @@ def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[Seen]:
                 heard[health.actor] = (time.monotonic(), health)
             time.sleep(0.05)
         alive, now_s = client.alive(), time.monotonic()
-    names = [box.name for box in RUNNING]
+    names = [box.name for box in GRAPH]
     names += sorted((set(heard) | alive) - set(names))  # of a later version
     return [_seen(name, name in alive, heard.get(name), now_s) for name in names]
 

@@ -42,8 +42,9 @@ def _table(robot: str) -> Table:
     table = Table("topic", "message", "made by", "taken by")
     for topic in TOPICS:
         expression = topic.expression(robot) + ("/<actor>" if topic is HEALTH else "")
-        message = topic.message.__name__ if topic.message else "declared only"
         takers = "\n".join(f"{who} {policy}" for who, policy in consumers_of(topic))
         state = " *" if topic.is_state else ""
-        table.add_row(expression + state, message, producer_of(topic), takers or "outside")
+        table.add_row(
+            expression + state, topic.message.__name__, producer_of(topic), takers or "outside"
+        )
     return table

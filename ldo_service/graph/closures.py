@@ -1,6 +1,6 @@
 """Which loop closures are believed: false ones are worse than missed ones."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -98,25 +98,24 @@ class Closures:
         return best
 
     def after(self, closure: RelativePose, verdict: Verdict) -> "Closures":
-        accepted = {pair: c for pair, c in self.accepted.items() if pair not in verdict.dropped}
+        """A pair is in one of the three, where it was put last."""
+        pair = pair_of(closure)
+        accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
         if verdict.is_accepted:
-            return replace(
-                self,
-                accepted=accepted | {pair_of(closure): closure},
-                left=self._remembered(*self.left, *verdict.dropped),
-            )
+            accepted |= {pair: closure}
+        refused = (*self.refused, pair) if pair not in accepted else self.refused
         return replace(
             self,
             accepted=accepted,
-            refused=self._remembered(*self.refused, pair_of(closure)),
-            left=self._remembered(*self.left, *verdict.dropped),
+            refused=self._remembered(p for p in refused if p not in accepted),
+            left=self._remembered(p for p in (*self.left, *verdict.dropped) if p not in accepted),
         )
 
     def without(self, pairs: Collection[Pair]) -> "Closures":
         """When other measurements hold what these say."""
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
-    def _remembered(self, *pairs: Pair) -> tuple[Pair, ...]:
+    def _remembered(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
         """The newest of them."""
         return tuple(dict.fromkeys(pairs))[-self.config.remembered :]
 

@@ -128,33 +128,14 @@ class KeyframeGraph:
                 raise KeyError(keyframe)
 
     # --- components and loops ---------------------------------------------------------------------
-    def connect(self, measured: RelativePose) -> None:
-        """A measurement between two known keyframes. Raises KeyError when one is not known.
-
-        When it joins two components, the younger one moves as a whole into the older one's frame,
-        T_new_old = T_map_a T_a_b T_map_b^-1 (or its inverse), before everything is solved again.
-        """
-        first_a, first_b = self.first_of(measured.a), self.first_of(measured.b)
-        if first_a == first_b:
-            self.replace([measured])
-            return
-        T_new_old = self.pose(measured.a) @ measured.T_a_b @ se3.inverse(self.pose(measured.b))
-        if first_a > first_b:
-            T_new_old = se3.inverse(T_new_old)
-        T_new_old = se3.orthonormalised(T_new_old)
-        younger, older = max(first_a, first_b), min(first_a, first_b)
-        moved = self._known.move_component(younger, older, T_new_old, self._solver.variables())
-        self._known.joins[measured.a, measured.b] = measured
-        self._rebase(moved)
-
     def close(self, closure: RelativePose) -> Verdict:
-        """A loop closure between known keyframes: is it believed, and what left for it.
+        """What somebody recognised, between known keyframes: is it believed, and what left for it.
 
         See `closures`; a refused one leaves no trace in any pose. Between two components there is
         nothing to judge it by, and it joins them. Raises KeyError when a keyframe is not known.
         """
         if self.first_of(closure.a) != self.first_of(closure.b):
-            self.connect(closure)
+            self._join(closure)
             return Verdict(True)
         start, known = self._solver.variables(), self._known
         if known.in_head(closure.a)[0] == known.in_head(closure.b)[0]:
@@ -171,6 +152,19 @@ class KeyframeGraph:
         else:
             self._note("refuse", measured=pack_relative([closure]))
         return verdict
+
+    def _join(self, measured: RelativePose) -> None:
+        """Two components become one: the younger moves as a whole into the older one's frame,
+        T_new_old = T_map_a T_a_b T_map_b^-1 (or its inverse), before everything is solved again."""
+        first_a, first_b = self.first_of(measured.a), self.first_of(measured.b)
+        T_new_old = self.pose(measured.a) @ measured.T_a_b @ se3.inverse(self.pose(measured.b))
+        if first_a > first_b:
+            T_new_old = se3.inverse(T_new_old)
+        T_new_old = se3.orthonormalised(T_new_old)
+        younger, older = max(first_a, first_b), min(first_a, first_b)
+        moved = self._known.move_component(younger, older, T_new_old, self._solver.variables())
+        self._known.joins[measured.a, measured.b] = measured
+        self._rebase(moved)
 
     def _refuse(self, closure: RelativePose) -> Verdict:
         verdict = Verdict(False)

@@ -129,7 +129,6 @@ class RunFolder:
         self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.loops = LoopRecord()
-        self.corrections = 0
         self.boxes = 0  # that a detector found
         self.labeller_calls = 0  # regions that a labeller looked at
         self.newest_stamp_ns = 0
@@ -147,7 +146,7 @@ class RunFolder:
             case Keyframe():
                 self._observe_keyframe(message)
             case Correction():
-                self.corrections += 1
+                self.loops.observe(message, step_ms)
                 self._poses.correct(message.graph_version, keyframe_poses_of(message))
                 self._joined = dict(message.joined)
             case DetectionBoxes():

@@ -5,7 +5,8 @@ candidates   as the message `loop/candidate`: keyframe, reference, keyframes, re
              refused, which is "" where it became a closure; ms is the time of its comparison, null
              where it was not measured
 closures     as `loop/closure`: keyframe, reference, T_reference_keyframe [4, 4], information
-             [6, 6], overlap, rmse_m, entropy
+             [6, 6], overlap, rmse_m, entropy; and is_believed, whether the graph took it, and
+             still did at the end
 """
 
 import json
@@ -18,7 +19,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.evaluation.loops import FoundLoops, LoopClosed, PairCompared
-from ldo_service.schemas import LoopCandidate, LoopClosure
+from ldo_service.schemas import Correction, LoopCandidate, LoopClosure
 from ldo_service.wire import transform
 
 LOOPS = "loops.json"
@@ -30,20 +31,30 @@ class LoopRecord:
     def __init__(self) -> None:
         self._candidates: list[tuple[LoopCandidate, float]] = []  # with ms of their whole step
         self._closures: list[LoopClosure] = []
+        self._not_believed: set[tuple[int, int]] = set()  # reference and keyframe
 
-    def observe(self, message: LoopCandidate | LoopClosure, step_ms: float) -> None:
-        if isinstance(message, LoopClosure):
-            self._closures.append(message)
-        else:
-            self._candidates.append((message, step_ms))
+    def observe(self, message: LoopCandidate | LoopClosure | Correction, step_ms: float) -> None:
+        match message:
+            case Correction():
+                self._not_believed = set(message.not_believed)
+            case LoopClosure():
+                self._closures.append(message)
+            case LoopCandidate():
+                self._candidates.append((message, step_ms))
 
     @property
     def accepted(self) -> int:
-        return len(self._closures)
+        """By the graph."""
+        return sum(map(self._is_believed, self._closures))
 
     @property
     def rejected(self) -> int:
-        return sum(bool(candidate.refused) for candidate, _ in self._candidates)
+        """By the loop closer, or by the graph."""
+        refused = sum(bool(candidate.refused) for candidate, _ in self._candidates)
+        return refused + len(self._closures) - self.accepted
+
+    def _is_believed(self, closure: LoopClosure) -> bool:
+        return (closure.pose.reference, closure.pose.keyframe) not in self._not_believed
 
     def save(self, folder: Path) -> None:
         at_once = Counter(candidate.keyframe for candidate, _ in self._candidates)
@@ -52,7 +63,10 @@ class LoopRecord:
                 _candidate(candidate, step_ms / at_once[candidate.keyframe])
                 for candidate, step_ms in self._candidates
             ],
-            "closures": [_closure(closure) for closure in self._closures],
+            "closures": [
+                _closure(closure) | {"is_believed": self._is_believed(closure)}
+                for closure in self._closures
+            ],
         }
         (folder / LOOPS).write_text(json.dumps(value, indent=1) + "\n")
 

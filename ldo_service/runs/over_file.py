@@ -50,7 +50,10 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
             stage_ms = {
                 name: percentiles(steps) for name, steps in clock.step_ms().items() if steps
             }
-            summary = summarise(record, used, len(indices), rejected, stage_ms, drops={})
+            solving = actors["optimizer"].facts()
+            summary = summarise(
+                record, used, len(indices), rejected, stage_ms, drops={}, solving=solving
+            )
             record.close({**summary, "interrupted": not is_finished})
         require_usable(record, config.run.max_rejected)
         if job.refine:

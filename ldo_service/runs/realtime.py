@@ -6,7 +6,7 @@ from collections.abc import Sequence as Ordered
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ldo_service.actors.graph import RUNNING, Box
+from ldo_service.actors.graph import GRAPH, Box
 from ldo_service.config import config_yaml
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.graph import lossless_consumers
@@ -50,7 +50,7 @@ class _RealTimeRun:
 
     async def go(self) -> RunFolder:
         transport = MemoryTransport()
-        stages = [self._stage(box, transport) for box in RUNNING]
+        stages = [self._stage(box, transport) for box in GRAPH]
         for topic in _made_topics():
             self._observe(topic, transport)
         stop = Stop()
@@ -73,13 +73,12 @@ class _RealTimeRun:
             transport,
             config=self._config.stage,
             expected={
-                out.topic.name: lossless_consumers(RUNNING, out.topic.name) for out in box.outputs
+                out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
             },
         )
 
     def _observe(self, topic: Topic, transport: MemoryTransport) -> None:
         kind = topic.message
-        assert kind is not None
         transport.subscribe(
             data_key(topic.name),
             lambda _header, body: self._record.observe(decode(body, kind), 0.0),
@@ -113,10 +112,13 @@ class _RealTimeRun:
         stage_ms = {h.actor: {"p50": h.step_ms_p50, "p95": h.step_ms_p95} for h in healths}
         drops = {f"{h.actor} {i.topic}": i.dropped for h in healths for i in h.inputs if i.dropped}
         frames = len(self._indices)
-        self._record.close(summarise(self._record, used, frames, rejected, stage_ms, drops))
+        solving = next((h.facts for h in healths if h.actor == "optimizer"), {})
+        self._record.close(
+            summarise(self._record, used, frames, rejected, stage_ms, drops, solving)
+        )
         require_usable(self._record, self._config.run.max_rejected)
         return self._record
 
 
 def _made_topics() -> list[Topic]:
-    return [out.topic for box in RUNNING for out in box.outputs if out.topic.message is not None]
+    return [out.topic for box in GRAPH for out in box.outputs]

@@ -3,6 +3,7 @@
 import os
 import resource
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -38,8 +39,9 @@ def summarise(
     rejected: int,
     stage_ms: dict[str, Percentiles],
     drops: dict[str, int],
+    solving: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The summary of a finished run; `drops` by "actor topic".
+    """The summary of a finished run; `drops` by "actor topic", `solving` the optimizer's facts.
 
     FPS counts everything from the first read to the last step; nothing is excluded as warm-up.
     """
@@ -63,7 +65,8 @@ def summarise(
         "loops_accepted": record.loops.accepted,
         "loops_rejected": record.loops.rejected,
         "vlm_calls": record.labeller_calls,
-        "optimizations": record.corrections,
+        "optimizations": int(solving.get("optimizations", 0)),
+        "optimizations_saved": int(solving.get("optimizations_saved", 0)),  # left for later
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
         "versions": versions(),

@@ -92,8 +92,7 @@ class LogicalClock:
         self._takers: dict[type[Message], list[ActorThread]] = {}
         for thread in self._threads:
             for port in thread.actor.inputs:
-                if port.topic.message is not None:
-                    self._takers.setdefault(port.topic.message, []).append(thread)
+                self._takers.setdefault(port.topic.message, []).append(thread)
         self._observe = observe
         self._due: list[Due] = []
         self._started = 0

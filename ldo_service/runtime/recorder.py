@@ -149,7 +149,6 @@ class Recorder(Journal):
 
     def _write_message(self, taken: Taken) -> None:
         topic, body = taken.delivery.port.topic, taken.delivery.body
-        assert topic.message is not None
         self._file.add(topic.name, topic.message, body, taken.number, taken.stamp_ns)
 
     def _write_step(self, step: Step, taken: Taken | None, produced: tuple[Produced, ...]) -> None:

@@ -124,8 +124,6 @@ class Stage:
 
     def _open_ports(self) -> Mailbox:
         for port in self._actor.outputs:
-            if port.topic.message is None:
-                continue  # declared for a later version: nothing can be sent on it
             self._outlets[port.topic.message] = Outlet(
                 port,
                 self.name,
@@ -181,7 +179,6 @@ class Stage:
 
     def _decode(self, delivery: Delivery) -> Message | None:
         topic, header = delivery.port.topic, delivery.header
-        assert topic.message is not None
         try:
             message = decode(delivery.body, topic.message)
         except msgspec.DecodeError as error:

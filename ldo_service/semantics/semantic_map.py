@@ -28,8 +28,8 @@ class SemanticMapConfig:
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     naming: NamingConfig = field(default_factory=NamingConfig)
     movable: MovableConfig = field(default_factory=MovableConfig)
-    movable_confidence: float = 0.6  # of the detector: below it is not relied on elsewhere either, and
-    # a hole where a picture was taken for a person would be worse than the person
+    movable_confidence: float = 0.6  # of the detector: below, it is not relied on elsewhere, and a
+    # hole where a picture was taken for a person would be worse than the person
     most_names: int = MOST_LABELS  # of the vocabulary; a later name is `other`
     most_waiting: int = 8  # keyframes whose boxes came before they were mapped: as many as may be
     # on their way to the mapper

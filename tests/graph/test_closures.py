@@ -77,6 +77,32 @@ def test_a_false_closure_that_seemed_possible_leaves_when_true_ones_refute_it() 
     assert ate_m(graph, truth) < 0.3 * bent_m
 
 
+def test_a_pair_that_is_judged_again_is_told_once() -> None:
+    truth = round_trips(120, 100)
+    graph = walked(truth[0], odometry(truth, 2, window=3))
+    true, false = off_by(truth, 8, 108, *[0] * 6), off_by(truth, 8, 108, 0, 0, 0, 3.0, 0, 0)
+    assert not graph.close(false).is_accepted
+    assert graph.closures.refused == ((8, 108),)
+    assert graph.close(true).is_accepted
+    assert graph.closures.refused == ()
+    assert not graph.close(false).is_accepted
+    assert graph.closures.refused == ()
+    assert [*graph.closures.accepted] == [(8, 108)]
+
+
+def test_a_second_join_of_two_components_is_judged() -> None:
+    truth = kitchen(40)
+    graph = walked(truth[0], odometry(truth[:20], 1, window=3))
+    graph.add_first(20, np.eye(4))
+    for b in range(21, 40):
+        graph.add(RelativePose(b - 1, b, se3.inverse(truth[b - 1]) @ truth[b], REFINED))
+    assert graph.close(off_by(truth, 18, 21, *[0] * 6)).is_accepted
+    before = graph.placed()[1]
+    assert not graph.close(off_by(truth, 17, 22, 0, 0, 0, 2.0, 0, 0)).is_accepted
+    np.testing.assert_array_equal(graph.placed()[1], before)
+    assert graph.close(off_by(truth, 17, 22, *[0] * 6)).is_accepted
+
+
 def test_a_closure_between_components_joins_them() -> None:
     truth = kitchen(20)
     graph = KeyframeGraph()

@@ -197,7 +197,7 @@ def test_components_keep_their_frames_until_they_are_joined() -> None:
 def test_a_measurement_joins_the_younger_component_to_the_older(pair: tuple[int, int]) -> None:
     truth = circle(12)
     graph = two_components(truth, T_APART)
-    graph.connect(*measured(truth, [pair], 0.0))
+    graph.close(*measured(truth, [pair], 0.0))
     assert {graph.first_of(k) for k in range(12)} == {0}
     for keyframe, T in graph.poses().items():
         np.testing.assert_allclose(T, truth[keyframe], atol=1e-5)
@@ -206,11 +206,11 @@ def test_a_measurement_joins_the_younger_component_to_the_older(pair: tuple[int,
 def test_a_joined_graph_grows_on_and_survives_a_restart() -> None:
     truth = circle(12)
     graph, successor = two_components(truth[:11], T_APART), KeyframeGraph()
-    graph.connect(*measured(truth, [(2, 9)], 0.0))
+    graph.close(*measured(truth, [(2, 9)], 0.0))
     successor.restore(graph.snapshot())
     for one in (graph, successor):
         one.add(*measured(truth, [(10, 11)], 0.0))
-        one.connect(*measured(truth, [(0, 11)], 0.0))
+        one.close(*measured(truth, [(0, 11)], 0.0))
         np.testing.assert_allclose(one.pose(11), truth[11], atol=1e-5)
         assert one.first_of(11) == 0
 

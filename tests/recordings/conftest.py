@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.config import Config, load_config
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import Trajectory
@@ -31,14 +31,14 @@ CONFIG = load_config(settings=(ROUGH, *REFINING))
 
 def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Stage]:
     made: list[Stage] = []
-    for box in RUNNING:
+    for box in GRAPH:
         assert box.make is not None
         make, topics = box.make, [out.topic.name for out in box.outputs]
         made.append(
             Stage(
                 lambda make=make: make(config),
                 transport,
-                expected={name: lossless_consumers(RUNNING, name) for name in topics},
+                expected={name: lossless_consumers(GRAPH, name) for name in topics},
                 journal=open_recorder(folder, box.name, "robot", config),
             )
         )

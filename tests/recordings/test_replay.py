@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ldo_service import kernels
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
 from ldo_service.recordings.replay import open_recording
@@ -29,7 +29,7 @@ EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "replay_test.py"
 
 def test_every_actor_replays(recording: Path) -> None:
     replayed = replay_recording(recording)
-    assert set(replayed) == {box.name for box in RUNNING}
+    assert set(replayed) == {box.name for box in GRAPH}
     assert replayed["frame_source"].steps == FRAMES + 1
     assert replayed["tracker"].made["pose/tracked"] >= FRAMES - 1
     keyframes = replayed["tracker"].made["keyframe/new"]
@@ -172,7 +172,7 @@ def pytest_on(example: Path, recording: Path) -> subprocess.CompletedProcess[str
 def test_the_example_makes_a_case_of_each_actor(spoilt: Path) -> None:
     rewrite(spoilt / "frame_source.mcap", flip_a_pixel_of=7)
     done = pytest_on(EXAMPLE, spoilt)
-    assert f"1 failed, {len(RUNNING) - 1} passed" in done.stdout
+    assert f"1 failed, {len(GRAPH) - 1} passed" in done.stdout
     assert "ReplayDiverged: frame_source diverged at step 7" in done.stdout
 
 

@@ -3,11 +3,12 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from ldo_service.actors import graph
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
@@ -55,6 +56,19 @@ def test_what_the_loop_closer_says_is_read_back(tmp_path: Path) -> None:
     assert (record.accepted, record.rejected) == (1, bool(refused.refused))
 
 
+def test_a_closure_that_the_graph_does_not_believe_is_no_accepted_one(tmp_path: Path) -> None:
+    record, closure = LoopRecord(), EXAMPLES["loop_closure"]
+    record.observe(closure, 60.0)
+    pair = closure.pose.reference, closure.pose.keyframe
+    for not_believed, accepted in (((pair,), 0), ((), 1), ((pair,), 0)):
+        correction = msgspec.structs.replace(EXAMPLES["correction"], not_believed=not_believed)
+        record.observe(correction, 1.0)
+        assert (record.accepted, record.rejected) == (accepted, 1 - accepted)
+    record.save(tmp_path)
+    (written,) = json.loads((tmp_path / "loops.json").read_text())["closures"]
+    assert written["is_believed"] is False
+
+
 def test_a_run_writes_its_loops_and_counts_them(finished: Path) -> None:
     found, summary = read_loops(finished), json.loads((finished / "summary.json").read_text())
     assert found is not None
@@ -88,6 +102,6 @@ def test_a_run_that_meets_nothing_again_is_what_it_is_without_a_loop_closer(
 
     whole = simulated()
     assert whole.pop("loop_closer").messages == 0
-    others = [box for box in RUNNING if box.name != "loop_closer"]
-    monkeypatch.setattr(graph, "RUNNING", tuple(others))
+    others = [box for box in GRAPH if box.name != "loop_closer"]
+    monkeypatch.setattr(graph, "GRAPH", tuple(others))
     assert simulated() == whole

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence
@@ -37,7 +37,7 @@ def made(room: Sequence) -> dict[str, Made]:
 
 
 def test_every_actor_has_a_digest(made: dict[str, Made]) -> None:
-    assert list(made) == [box.name for box in RUNNING]
+    assert list(made) == [box.name for box in GRAPH]
     assert made["frame_source"].messages == FRAMES
     talking = [entry.digest for entry in made.values() if entry.messages]
     assert len(talking) >= 5

@@ -4,9 +4,10 @@ from ldo_service.errors import ConfigError, LosslessCycle
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out, check_graph
 from ldo_service.runtime.graph import lossless_consumers, producers
 from ldo_service.runtime.ports import Policy
+from ldo_service.schemas.message import Message
 from ldo_service.schemas.topics import Topic
 
-A, B, C = (Topic(name, None, "") for name in "abc")
+A, B, C = (Topic(name, Message, "") for name in "abc")
 
 
 def actor(kind: str, inputs: list[tuple[Topic, Policy]], outputs: list[Topic]) -> type[Actor]:

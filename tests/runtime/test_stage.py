@@ -16,7 +16,6 @@ from ldo_service.runtime.stage import Stage, StageConfig
 from ldo_service.runtime.state_store import FolderStore, MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Health, Message, decode
-from ldo_service.schemas.topics import Topic
 
 from .cast import (
     DOUBLES,
@@ -361,15 +360,6 @@ async def test_a_state_topic_of_one_part_answers_with_the_newest() -> None:
         await send(latest, number(value))
     ((_header, body),) = transport.query(LATEST_NUMBER.name)
     assert decode(body, Number).value == 2
-
-
-async def test_a_declared_topic_without_a_format_is_left_out() -> None:
-    class Later(Doubler):
-        outputs = (Out(DOUBLES), Out(Topic("test/later", None, "")))
-
-    stage = Stage(Later, MemoryTransport(), config=QUICK)
-    async with running(stage):
-        assert [output.topic for output in stage.health().outputs] == [DOUBLES.name]
 
 
 @pytest.mark.parametrize(

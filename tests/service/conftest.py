@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.client import Client, connect
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, TrackedPose
@@ -81,7 +81,7 @@ class LiveService:
         self.health.update({health.actor: health for health in self._health()})
         return self.health
 
-    def wait_for_actors(self, count: int = len(RUNNING)) -> None:
+    def wait_for_actors(self, count: int = len(GRAPH)) -> None:
         wait_until(lambda: len(self.update_health()) == count, 20, "all actors report")
 
     def poses(self) -> list[TrackedPose]:

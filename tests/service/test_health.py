@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from tests.runtime.conftest import free_port
 from tests.service.conftest import LDO, live_service, wait_until
 
@@ -50,7 +50,7 @@ def test_prometheus_sees_every_actor_count(tmp_path: Path) -> None:
                 return reply.read().decode()
 
         wait_until(lambda: _value(text(), 'ldo_steps_total{actor="mapper"}') > 0, 10, "steps")
-        for actor in (box.name for box in RUNNING):
+        for actor in (box.name for box in GRAPH):
             assert _value(text(), f'ldo_resident_bytes{{actor="{actor}"}}') > 1e6
         assert publisher.wait(20) == 0
         second = subprocess.run(

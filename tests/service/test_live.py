@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
 from tests.service.conftest import LDO, free_endpoint, is_running, live_service, wait_until
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
-EVERY_ACTOR = tuple(box.name for box in RUNNING)
+EVERY_ACTOR = tuple(box.name for box in GRAPH)
 # A light map: what is watched here is the runtime, and a process that starts anew needs its core.
 APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]", "--set", "mapper.iterations=2")
 

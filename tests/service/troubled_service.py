@@ -42,6 +42,6 @@ def troubled(box: graph.Box) -> graph.Box:
 
 
 if __name__ == "__main__":
-    service.RUNNING = tuple(map(troubled, service.RUNNING))
+    service.GRAPH = tuple(map(troubled, service.GRAPH))
     service.python_command = lambda *arguments: [sys.executable, __file__, *arguments]
     cli.main(sys.argv[1:])
