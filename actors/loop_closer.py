@@ -50,7 +50,7 @@ from ldo_service.wire import (
 
 log = logging.getLogger(__name__)
 
-MOST_WAITING = 16  # keyframes, or boxes: two windows of their inputs; what waits longer was lost
+MOST_WAITING = 16  # keyframes: two windows of boxes; if these wait longer, they were lost
 RECENT_KEYFRAMES = 32  # that the optimizer may not have placed yet, as the tracker keeps
 
 
@@ -71,12 +71,9 @@ class Waiting:
     width_px: int  # of the image that the boxes are in
 
     @property
-    def packed(self) -> dict[str, Any]:
-        """`place` is one and the same object each time."""
-        return {
-            "place": self.place.packed,
-            "facts": (self.frame, self.stamp_ns, self.width_px),
-        }
+    def facts(self) -> tuple[int, int, int]:
+        """All but the place, which is a part of the state by itself."""
+        return self.frame, self.stamp_ns, self.width_px
 
 
 class LoopCloser(Actor):
@@ -214,7 +211,7 @@ class LoopCloser(Actor):
         waiting = {f"waiting_{k}": w.place.packed for k, w in self._waiting.items()}
         now = {
             **state,
-            "waiting": {k: w.packed["facts"] for k, w in self._waiting.items()},
+            "waiting": {k: w.facts for k, w in self._waiting.items()},
             "boxes": [encode(boxes) for boxes in self._boxes.values()],
             "newest": self._newest,
             "joined": list(self._joined.items()),

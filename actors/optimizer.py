@@ -94,7 +94,7 @@ class Optimizer(Actor):
         self._early_observations: list[ObjectObservation] = []
         self._waiting_number = 0  # of the last refinement that came
         self._refinements = 0  # number of the last one that all poses agree with
-        self._repeated = self._bridged = self._refined = self._too_early = 0
+        self._repeated = self._bridged = self._refined = self._too_early = self._too_late = 0
 
     def handle(
         self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
@@ -236,6 +236,8 @@ class Optimizer(Actor):
                 self._landmarks.observe(self._observation(seen, camera))
             elif seen.keyframe not in self._graph:
                 later.append(seen)
+            else:
+                self._too_late += 1
         self._early_observations = self._bounded(later)
 
     def _observation(self, seen: ObjectObservation, camera: Camera) -> Observation:
@@ -327,5 +329,6 @@ class Optimizer(Actor):
             "keyframes_bridged": self._bridged,
             "keyframes_refined": self._refined,
             "waited_in_vain": self._too_early,
+            "observations_too_late": self._too_late,  # in keyframes whose camera was forgotten
             "segments_apart": len(self._first) - len(self._joined()),
         }

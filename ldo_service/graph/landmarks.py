@@ -67,6 +67,20 @@ class Observation:
         right, below = width - 1 - BORDER_PX, height - 1 - BORDER_PX
         return bool(min(x0, y0) > BORDER_PX and x1 < right and y1 < below)
 
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Of its distribution only what is not zero: a few of 256."""
+        values = {name: getattr(self, name) for name in self.__slots__}
+        labels = np.flatnonzero(self.distribution)
+        return values | {"distribution": (labels, self.distribution[labels])}
+
+    @staticmethod
+    def unpacked(packed: Mapping[str, Any]) -> "Observation":
+        labels, weights = packed["distribution"]
+        distribution = np.zeros(CLASSES)
+        distribution[labels] = weights
+        return Observation(**{**packed, "distribution": distribution})
+
 
 @dataclass(frozen=True, slots=True)
 class Landmark:
@@ -251,9 +265,7 @@ class Landmarks:
     def snapshot(self) -> dict[str, Any]:
         """`known` is the same object until the next `settle`."""
         self._saved = self._saved or self._packed()
-        waiting = [
-            [getattr(seen, name) for name in Observation.__slots__] for seen in self._waiting
-        ]
+        waiting = [seen.packed for seen in self._waiting]
         return {"known": self._saved, "waiting": waiting, "skipped": self.skipped}
 
     def _packed(self) -> dict[str, Any]:
@@ -279,5 +291,5 @@ class Landmarks:
             for k, weight, log_sum, p, misses in zip(*columns, strict=True)
         }
         self._pairs = {(i, j) for i, j in packed["pairs"]}
-        self._waiting = [Observation(*columns) for columns in state["waiting"]]
+        self._waiting = [Observation.unpacked(values) for values in state["waiting"]]
         self.skipped = state["skipped"]
