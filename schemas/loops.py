@@ -5,7 +5,7 @@ from typing import Literal
 from ldo_service.schemas.keyframe import MeasuredPose
 from ldo_service.schemas.message import Message, require_count, require_finite
 
-Evidence = Literal["", "landmarks", "features"]
+Evidence = Literal["", "landmarks", "features", "map"]
 LONGEST_REASON = 100  # characters
 
 

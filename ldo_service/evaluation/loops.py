@@ -14,15 +14,15 @@ APART_FRAMES = 100
 LEAST_OVERLAP = 0.3
 KEPT_ACROSS, ASKED_ACROSS = 160, 40  # pixels in a row of depth, and those asked for a partner
 SAME_M, SAME_SHARE = 0.05, 0.03  # of depth: nearer to each other two depths are one surface
-LEFTOVER = 5  # keyframes of a subgraph that loops.json does not name
+LEFTOVER, LEAST = 5, 3  # keyframes of a subgraph that loops.json does not name
 
 PROTOCOL = """\
 Loops: a pair of subgraphs is true when a keyframe of one and a keyframe of the other each see more
 than 30 % of the other's measured pixels, by the source's depth (within 5 cm + 3 %) and true poses,
 and are more than 100 frames apart. Precision: closures between true pairs, of all closures. Recall:
 newer subgraphs that closed a true pair, of those that have one; keyframes that loops.json puts into
-no subgraph are taken five at a time. Errors: of the pose of each closure against the true one.
-Time: of the whole search over its candidates, per candidate."""
+no subgraph are taken five at a time, fewer than three are none. Errors: of the pose of each closure
+against the true one. Time: of the whole search over its candidates, per candidate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def _subgraphs(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> list
         if not groups or keyframe != groups[-1][-1] + 1 or len(groups[-1]) == LEFTOVER:
             groups.append([])
         groups[-1].append(keyframe)
-    return sorted([*named, *map(tuple, groups)])
+    return sorted([*named, *(tuple(group) for group in groups if len(group) >= LEAST)])
 
 
 def _true_pairs(

@@ -108,6 +108,12 @@ class Plausibility:
         T_map_newodom = self._poses[proposal.old.keyframe] @ proposal.T_old_new @ T_new_odom
         return T_map_newodom @ new.place.T_odom_keyframe
 
+    def T_old_new(self, old: View, new: View) -> np.ndarray | None:
+        """[4, 4] as the map has them; None where it does not say."""
+        if not self._is_known(old, new):
+            return None
+        return se3.inverse(self._poses[old.keyframe]) @ self._poses[new.keyframe]
+
     def _is_known(self, old: View, new: View) -> bool:
         """Whether the map says where both are to each other."""
         if old.keyframe not in self._poses or new.keyframe not in self._poses:

@@ -149,7 +149,7 @@ class Recogniser:
         known = Plausibility(poses, joined, self._config.plausibility)
         is_possible = known.may_meet([old.views[0] for old in self.subgraphs], new.views[-1])
         likely = self._memory.alike(new, is_possible)
-        proposals = [known.judged(self._proposal(like.subgraph, new)) for like in likely]
+        proposals = [known.judged(self._proposal(like.subgraph, new, known)) for like in likely]
         proposals = known.without_twins(proposals)
         checks: dict[int, Check] = {}
         is_closed = False
@@ -158,15 +158,18 @@ class Recogniser:
             is_closed = is_closed or checks[index].closure is not None
         return [Finding(new, like, checks[index]) for index, like in enumerate(likely)]
 
-    def _proposal(self, old: Subgraph, new: Subgraph) -> Proposal:
-        """Features first: they place a camera to centimetres, landmarks to decimetres."""
-        if self._config.stages == "semantic":
-            return self._verifier.by_landmarks(old, new)
-        proposal = self._verifier.by_features(old, new)
-        if not proposal.refused or self._config.stages == "geometric":
-            return proposal
-        other = self._verifier.by_landmarks(old, new)
-        return proposal if other.refused else other
+    def _proposal(self, old: Subgraph, new: Subgraph, known: Plausibility) -> Proposal:
+        """Features first: they place a camera to centimetres, landmarks to decimetres. The map
+        last: what it says is judged by itself."""
+        verifier, stages = self._verifier, self._config.stages
+        if stages == "semantic":
+            return verifier.by_landmarks(old, new)
+        proposal = verifier.by_features(old, new)
+        if proposal.refused and stages == "two_stage":
+            proposal = _unless_refused(verifier.by_landmarks(old, new), proposal)
+        if proposal.refused:
+            proposal = _unless_refused(verifier.by_map(old, new, known.T_old_new), proposal)
+        return proposal
 
     def _check(self, proposal: Proposal, is_closed: bool) -> Check:
         if proposal.refused:
@@ -195,3 +198,7 @@ class Recogniser:
         self._words = VisualWords(self._config.words, state["words"])
         self._path_m, last = state["path"]
         self._last = None if last is None else (last[0], last[1])
+
+
+def _unless_refused(proposal: Proposal, other: Proposal) -> Proposal:
+    return other if proposal.refused else proposal

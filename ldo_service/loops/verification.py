@@ -1,11 +1,11 @@
 """Whether two subgraphs show one place, and the pose between two of their keyframes (fine stage).
 
-A pose comes from ORB features or from landmarks, is refined on the images, and is believed when all
-of this agrees: features of two keyframes of the new subgraph, the refined pose, the surfaces, and
-what the detector named. Conventions: `ldo_service.geometry`.
+A pose comes from ORB features, from landmarks or from the map, is refined on the images, and is
+believed when all of this agrees: two keyframes of the new subgraph, the refined pose, the surfaces,
+and what the detector named. Conventions: `ldo_service.geometry`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import islice, product
@@ -28,7 +28,8 @@ from .subgraph import Subgraph, View
 from .surface_fit import SurfaceFit, SurfaceFitConfig, surface_fit
 
 NOTHING = Matched(0, 0, 0.0, 0.0)
-Evidence = Literal["", "landmarks", "features"]
+Evidence = Literal["", "landmarks", "features", "map"]
+MapPose = Callable[[View, View], np.ndarray | None]  # T_old_new [4, 4]; None: it is not known
 OPENED = 12  # keyframes kept ready for alignment, 3 MB each: a query and some candidates
 FIT_LEVEL = 1  # of the pyramid, 160 pixels wide: 19,200 points say what overlaps
 
@@ -42,7 +43,10 @@ class VerificationConfig:
     witness_landmarks: int = 3  # or landmarks of one kind that it brings together
     witness_rad: float = 0.08  # rotation plus parallax between what the two say
     pairs: int = 15  # of keyframes whose features are matched, at 3 ms each
-    refined_rad: float = 0.1  # how far the images may move the pose of the features,
+    map_pairs: int = 3  # of keyframes that are aligned where the map has them, at 15 ms each
+    map_overlap: float = 0.35  # of either's surface, more than where features vouch
+    map_witness_rad: float = 0.02  # between what two of these say: half a centimetre in a room
+    refined_rad: float = 0.1  # how far the images may move the pose of the features, or of the map,
     refined_landmarks_rad: float = 0.4  # and that of landmarks, whose centres are vague
     max_condition: float = 1e5  # of the information in median depths, as the tracker's
     max_gain: float = 3.0  # of brightness, either way
@@ -51,8 +55,9 @@ class VerificationConfig:
     def __post_init__(self) -> None:
         if min(self.min_inliers, self.witness_inliers) < 6 or self.pairs < 1:
             raise ConfigError(f"{self}: inliers must be at least 6, pairs at least 1.")
-        if min(self.witness_rad, self.refined_rad, self.refined_landmarks_rad) <= 0:
-            raise ConfigError(f"{self}: angles must be positive.")
+        angles = (self.witness_rad, self.refined_rad, self.refined_landmarks_rad)
+        if min(*angles, self.map_witness_rad) <= 0 or self.map_pairs < 0:
+            raise ConfigError(f"{self}: angles must be positive, map_pairs not negative.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -103,7 +108,8 @@ class Verifier:
                 T_old_new = se3.inverse(pose.T_camera_reference)
                 found.append(Proposal(a, b, T_old_new, "features", pose.inliers))
                 best = max(found, key=lambda proposal: proposal.inliers)
-                if best.inliers >= self._config.min_inliers and self._has_witness(best, found):
+                is_enough = best.inliers >= self._config.min_inliers
+                if is_enough and self._has_witness(best, found, self._config.witness_rad):
                     return self._with_semantics(best, old, new)
         return self._alone(found, old, new)
 
@@ -127,11 +133,11 @@ class Verifier:
         check = self.confirm(replace(best, new=view, T_old_new=T_old_view))
         return check.closure is not None
 
-    def _has_witness(self, best: Proposal, found: list[Proposal]) -> bool:
+    def _has_witness(self, best: Proposal, found: list[Proposal], within_rad: float) -> bool:
         """Whether another new keyframe says the same."""
         return any(
             extent(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
-            < self._config.witness_rad
+            < within_rad
             for other in found
             if other.new is not best.new
         )
@@ -151,6 +157,32 @@ class Verifier:
         a, b = _nearest_pair(old, new, motion.T_a_b)
         T_old_new = _between(a, b, motion.T_a_b)
         return Proposal(a, b, T_old_new, "landmarks", count, semantics)
+
+    def by_map(self, old: Subgraph, new: Subgraph, T_old_new: MapPose) -> Proposal:
+        """Where the map has them, if that brings them together, and the images of two new keyframes
+        refine it to one and the same pose: what sees a place from elsewhere shares few features.
+
+        It finds no loop that drift tore open; it ties what was seen twice before it drifts apart.
+        """
+        found: list[Proposal] = []
+        for a, b, T in islice(_pairs_in_map(old, new, T_old_new), self._config.map_pairs):
+            check = self._met(Proposal(a, b, T, "map"))
+            if check is not None and check.closure is not None:
+                found.append(replace(check.proposal, T_old_new=check.closure.T_a_b))
+                if self._has_witness(found[0], found[1:], self._config.map_witness_rad):
+                    return self._with_semantics(found[0], old, new)
+        refused = "the map alone says so" if found else "the map has them elsewhere"
+        return Proposal(old.views[0], new.views[0], np.eye(4), refused=refused)
+
+    def _met(self, proposal: Proposal) -> Check | None:
+        """None, without an alignment, where either sees too little of what the other does."""
+        old, new = self._opened(proposal.old), self._opened(proposal.new)
+        T_old_new, least = proposal.T_old_new, self._config.map_overlap
+        if self._fit(old, new, T_old_new).overlap < least:
+            return None
+        if self._fit(new, old, se3.inverse(T_old_new)).overlap < least:
+            return None
+        return self.confirm(proposal)
 
     def _with_semantics(self, proposal: Proposal, old: Subgraph, new: Subgraph) -> Proposal:
         """What the landmarks say of a pose: those in one place should be of one kind."""
@@ -189,9 +221,9 @@ class Verifier:
 
     def _objection(self, proposal: Proposal, alignment: Alignment, fit: SurfaceFit) -> str:
         """What speaks against a pose; nothing: ""."""
-        config, by_features = self._config, proposal.evidence == "features"
+        config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
-        limit = config.refined_rad if by_features else config.refined_landmarks_rad
+        limit = config.refined_landmarks_rad if by_landmarks else config.refined_rad
         if extent(moved, _depth(proposal)) > limit:
             return "images and " + proposal.evidence + " disagree"
         if alignment.condition > config.max_condition:
@@ -215,6 +247,22 @@ def _likely_pairs(old: Subgraph, new: Subgraph) -> Iterator[tuple[View, View]]:
     pairs = list(product(old.views, new.views))
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
+
+
+def _pairs_in_map(
+    old: Subgraph, new: Subgraph, T_old_new: MapPose
+) -> Iterator[tuple[View, View, np.ndarray]]:
+    """Each new keyframe with the old one that the map has nearest to it, the nearest first; with
+    T_old_new [4, 4]."""
+    nearest = []
+    for b in new.views:
+        known = [(a, b, T) for a in old.views if (T := T_old_new(a, b)) is not None]
+        apart = [extent(T, a.place.median_depth_m) for a, _, T in known]
+        if known:
+            index = int(np.argmin(apart))
+            nearest.append((apart[index], known[index]))
+    for index in np.argsort([apart for apart, _ in nearest], kind="stable"):
+        yield nearest[index][1]
 
 
 def _nearest_pair(old: Subgraph, new: Subgraph, T_oldodom_newodom: np.ndarray) -> tuple[View, View]:

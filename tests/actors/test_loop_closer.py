@@ -11,7 +11,7 @@ from ldo_service.geometry import se3
 from ldo_service.loops import LoopsConfig
 from ldo_service.loops.memory import RetrievalConfig
 from ldo_service.loops.plausibility import PlausibilityConfig
-from ldo_service.loops.verification import Proposal, Verifier
+from ldo_service.loops.verification import Proposal, VerificationConfig, Verifier
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Array,
@@ -124,6 +124,41 @@ def test_the_return_is_closed_with_the_true_pose_whatever_odometry_says(said, ro
         assert closure.overlap > 0.2
         assert closure.rmse_m < 0.03
         assert np.linalg.eigvalsh(np.reshape(closure.pose.information, (6, 6))).min() > 0
+
+
+def without_features(map_pairs: int = 3) -> LoopCloser:
+    """For whom no number of features is enough."""
+    verification = VerificationConfig(
+        min_inliers=10_000, witness_inliers=10_000, map_pairs=map_pairs
+    )
+    return LoopCloser(LoopCloserConfig(loops=LoopsConfig(verification=verification)))
+
+
+def drifted_by(room, shift_m: float) -> list[Keyframe]:
+    T_drift = se3.exp(np.array([0, 0, 0, shift_m, 0, 0]))
+    return keyframes_of(room, SECOND_WALK, len(FIRST_WALK), LONG_AFTER, T_drift)
+
+
+def test_where_features_do_not_match_the_map_says_where_to_look(there, room) -> None:
+    said = handled(without_features(), told([*there, *drifted_by(room, 0.04)]))
+    found = closures(said)
+    assert len(found) >= 2
+    assert {c.evidence for c in candidates(said) if not c.refused} == {"map"}
+    for closure in found:
+        old, new = closure.pose.reference, closure.pose.keyframe - len(FIRST_WALK)
+        T_true = se3.inverse(true_pose(room, FIRST_WALK[old])) @ true_pose(room, SECOND_WALK[new])
+        T = transform(closure.pose.T_reference_keyframe)
+        assert np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]) < 0.01
+
+
+@pytest.mark.parametrize(("shift_m", "map_pairs"), [(0.04, 0), (0.04, 1), (0.8, 3)])
+def test_the_map_is_not_believed_without_two_images_near_to_where_it_says(
+    there, room, shift_m: float, map_pairs: int
+) -> None:
+    actor = without_features(map_pairs)
+    found = handled(actor, told([*there, *drifted_by(room, shift_m)]))
+    assert candidates(found)
+    assert closures(found) == []
 
 
 def test_every_candidate_is_told_with_its_scores_and_a_reason(said) -> None:
