@@ -1,7 +1,7 @@
 """ldo query"""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -10,32 +10,18 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ldo_service.answers import Answer, answer
 from ldo_service.client import connect
-from ldo_service.errors import DataError
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.objects_file import read_objects
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
-from ldo_service.schemas import MapObjects, Pose, TrackedPose
+from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
-from ldo_service.semantics.search import Encode, nearest_names, search
 from ldo_service.wire import transform
 
 from .options import Endpoint, Json, KeysFolder, Robot
 
 LIVE = "live"
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """An object, in the map frame; lengths in metres."""
-
-    id: int
-    name: str
-    score: float  # 0..1, see `semantics.search`
-    center: tuple[float, float, float]  # of its box
-    size: tuple[float, float, float]  # along the axes of the box
-    T_map_object: Pose  # these axes
-    distance: float | None  # from where the camera is, or was at the end of the run
 
 
 def query(
@@ -65,34 +51,6 @@ def query(
         print(json.dumps([_plain(one) for one in answers]))
     else:
         Console(highlight=False, markup=False).print(_table(answers))
-
-
-def answer(
-    text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
-) -> list[Answer]:
-    """Objects that answer to `text`, the best and of equals the nearest to `eye` [3] first.
-
-    Raises DataError when there is none.
-    """
-    objects = found.objects
-    hits = search(text, [dict(one.distribution) for one in objects], encode)
-    if not hits:
-        raise DataError(_nothing(text, [one.name for one in objects]))
-    answers = []
-    for hit in hits:
-        one = objects[hit.index]
-        center = one.T_map_object.translation
-        distance = None if eye is None else float(np.linalg.norm(eye - center))
-        about = (one.id, one.name, hit.score, center, one.size, one.T_map_object)
-        answers.append(Answer(*about, distance))
-    return sorted(answers, key=lambda one: (-one.score, one.distance or 0, one.id))
-
-
-def _nothing(text: str, names: list[str]) -> str:
-    if not names:
-        return "the map has no objects yet: a detector has to find one in three keyframes."
-    near = ", ".join(nearest_names(text, names))
-    return f"none of {len(names)} objects answers to {text!r}. There is {near}."
 
 
 def _of_run(folder: Path) -> tuple[MapObjects, np.ndarray | None]:
