@@ -93,6 +93,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         simulate,
         suite,
         topics,
+        view,
     )
 
     return {
@@ -101,6 +102,7 @@ def verbs() -> dict[str, Callable[..., None]]:
         "eval": evaluate.evaluate,
         "suite": suite.suite,
         "query": query.query,
+        "view": view.view,
         "export": export.export,
         "serve": serve.serve,
         "publish": publish.publish,

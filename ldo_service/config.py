@@ -38,6 +38,7 @@ from ldo_service.metrics import LOOPBACK
 from ldo_service.runtime.network import MAX_MESSAGE_MB
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.stage import StageConfig
+from ldo_service.viewer.config import ViewerConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +122,7 @@ class Config:
     service: ServiceConfig = field(default_factory=ServiceConfig)
     record: RecordConfig = field(default_factory=RecordConfig)
     stage: StageConfig = field(default_factory=StageConfig)
+    viewer: ViewerConfig = field(default_factory=ViewerConfig)
 
     def with_map_folder(self, folder: Path) -> "Config":
         """The mapper keeps images and sleeping Gaussians there, if nowhere else: its successor

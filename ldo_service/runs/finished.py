@@ -103,13 +103,11 @@ class MapFolder:
 
     def viewpoints(self) -> list[Viewpoint]:
         """Where the keyframes were taken that are in the map's frame."""
-        with self._keyframes() as (path, keyframes):
-            mapped = [k for k in keyframes if "segment" not in k or k["segment"] == 0]
-            return [_viewpoint(path, keyframe) for keyframe in mapped]
+        return list(read_viewpoints(self.folder).values())
 
     def exposures(self) -> Exposures:
         """Of keyframes that have one; older versions wrote none."""
-        with self._keyframes() as (_, keyframes):
+        with _keyframes(self.folder) as (_, keyframes):
             exposed = [keyframe for keyframe in keyframes if "exposure" in keyframe]
             stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
             matrices = np.array([keyframe["exposure"] for keyframe in exposed], float)
@@ -117,7 +115,7 @@ class MapFolder:
 
     def keyframes(self) -> dict[int, int]:
         """Index of the frame of each, by id."""
-        with self._keyframes() as (_, keyframes):
+        with _keyframes(self.folder) as (_, keyframes):
             return {int(k["keyframe"]): int(k["frame_index"]) for k in keyframes}
 
     def posed(self, name: str) -> PosedMap:
@@ -125,16 +123,25 @@ class MapFolder:
         labels = self._semantics(len(rows))
         return PosedMap(name, rows, self.trajectory(), self.exposures(), labels)
 
-    @contextmanager
-    def _keyframes(self) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
-        """Where keyframes.json is and what it holds; what makes no sense is the file's fault."""
-        path = written(self.folder, "keyframes.json")
-        try:
-            yield path, json.loads(path.read_text())
-        except OSError as error:
-            raise DataError(f"{path} cannot be read: {error.strerror}.") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
+
+def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
+    """Where the keyframes were taken that are in the map's frame, by id; needs keyframes.json
+    alone."""
+    with _keyframes(folder) as (path, keyframes):
+        mapped = [k for k in keyframes if "segment" not in k or k["segment"] == 0]
+        return {int(k["keyframe"]): _viewpoint(path, k) for k in mapped}
+
+
+@contextmanager
+def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
+    """Where keyframes.json is and what it holds; what makes no sense is the file's fault."""
+    path = written(folder, "keyframes.json")
+    try:
+        yield path, json.loads(path.read_text())
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
 
 
 def _viewpoint(path: Path, keyframe: dict[str, Any]) -> Viewpoint:

@@ -1,0 +1,79 @@
+"""ldo view"""
+
+import importlib.util
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from ldo_service.client import connect
+from ldo_service.config import load_config
+from ldo_service.errors import ConfigError
+from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
+from ldo_service.viewer.config import ViewerConfig
+from ldo_service.viewer.live import live
+from ldo_service.viewer.run_folder import RunFolder
+from ldo_service.viewer.scene import Source
+
+from .options import ConfigFile, Endpoint, KeysFolder, Robot, Settings
+from .query import LIVE
+
+
+def view(
+    where: Annotated[
+        str,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="DIR|live", help="folder of a run, or the running service"),
+    ],
+    robot: Robot = "robot",
+    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    keys: KeysFolder = None,
+    config: ConfigFile = None,
+    set: Settings = (),
+) -> None:
+    """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a box to ask in.
+
+    Of a run that is under way it shows what there is, and the rest when it comes. The window is for
+    this machine alone; it has no keys, see docs/viewer.md. Ctrl-C ends it.
+
+      ldo view runs/desk
+      ldo view live --endpoint tls/mule.local:7447 --keys keys/desk
+    """
+    require_viser()
+    chosen = load_config(config, set).viewer
+    with suppress(KeyboardInterrupt), source_of(where, robot, endpoint, keys, chosen) as source:
+        title = robot if where == LIVE else Path(where).resolve().name
+        serve_window(source, chosen, f"ldo view {title}")
+
+
+def require_viser() -> None:
+    """Raises ConfigError where it is not installed."""
+    if importlib.util.find_spec("viser") is None:
+        raise ConfigError("the window needs viser: `pip install 'ldo-slam[viewer]'` brings it.")
+
+
+@contextmanager
+def source_of(
+    where: str, robot: str, endpoint: str, keys: Path | None, config: ViewerConfig
+) -> Iterator[Source]:
+    """Raises DataError for a folder that no run wrote, ConfigError when no service answers."""
+    if where != LIVE:
+        yield RunFolder(Path(where).expanduser(), config)
+        return
+    with connect(robot, endpoint, keys) as service, live(service, config) as source:
+        yield source
+
+
+def serve_window(source: Source, config: ViewerConfig, title: str) -> None:
+    """For ever."""
+    from ldo_service.viewer.window import open_window  # viser is an extra
+
+    with open_window(source, config, title) as window:
+        Console(stderr=True, highlight=False).print(f"{title} on {window.url}")
+        while True:
+            window.show(source.update())
+            time.sleep(config.update_s)

@@ -1,0 +1,136 @@
+"""What is drawn of a scene beside its Gaussians: paths, keyframes, boxes, loops."""
+
+import colorsys
+import itertools
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ldo_service.geometry import Camera, se3
+from ldo_service.schemas import MapObject
+from ldo_service.wire import transform
+
+from .scene import Sight
+
+Color = tuple[int, int, int]  # RGB, 0..255
+
+JUMP_M = 1.0  # between two poses of a path: a camera that was lost, not one that moved
+FRUSTUM_M = 0.12  # from a keyframe to its drawn image
+MOST_SIGHTS = 20  # of a keyframe, the first
+UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # how a keyframe looks until it is
+
+ONLINE, FINAL = (220, 90, 0), (0, 150, 30)
+KEYFRAME, LOOP, FOUND = (20, 70, 220), (220, 0, 110), (255, 255, 255)
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """points [S, 2, 3] float32: both ends, metres; colors [S, 2, 3] uint8 RGB."""
+
+    points: np.ndarray
+    colors: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, color: Color) -> "Lines":
+        points = np.asarray(points, np.float32).reshape(-1, 2, 3)
+        return cls(points, np.broadcast_to(np.array(color, np.uint8), points.shape))
+
+    @classmethod
+    def together(cls, many: Iterable["Lines"]) -> "Lines":
+        lines = [cls.of(np.zeros((0, 2, 3)), FOUND), *many]
+        return cls(
+            np.concatenate([one.points for one in lines]),
+            np.concatenate([one.colors for one in lines]),
+        )
+
+
+def path_lines(positions: np.ndarray, color: Color) -> Lines:
+    """From each position [K, 3] to the next, but across jumps."""
+    segments = np.stack([positions[:-1], positions[1:]], axis=1)
+    is_step = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) < JUMP_M
+    return Lines.of(segments[is_step], color)
+
+
+def keyframe_lines(
+    keyframes: Iterable[np.ndarray], camera: Camera | None, color: Color = KEYFRAME
+) -> Lines:
+    """Of each T_map_camera [4, 4] the rays to the corners of its image, and the outline of it."""
+    camera = camera or UNKNOWN_CAMERA
+    whole = np.array([[-0.5, -0.5, camera.width - 0.5, camera.height - 0.5]])
+    (outline,) = _outlines(camera, whole)
+    rays = np.stack([np.zeros((4, 3)), outline[:, 0]], axis=1)
+    shape = np.concatenate([rays, outline])
+    return Lines.of(np.array([se3.transform(T, shape) for T in keyframes]), color)
+
+
+def sight_lines(
+    keyframes: Mapping[int, np.ndarray],
+    camera: Camera | None,
+    sights: Mapping[int, Iterable[Sight]],
+) -> Lines:
+    """What keyframes show, as boxes in their drawn images; nothing without their camera."""
+    shown = [
+        (T, sight)
+        for keyframe, T in keyframes.items()
+        for sight in itertools.islice(sights.get(keyframe, ()), MOST_SIGHTS)
+    ]
+    if camera is None or not shown:
+        return Lines.together(())
+    T_map_camera = np.array([T for T, _ in shown])[:, None, None]  # [M, 1, 1, 4, 4]
+    outlines = _outlines(camera, np.array([sight.box_px for _, sight in shown]))
+    points = (T_map_camera[..., :3, :3] @ outlines[..., None])[..., 0] + T_map_camera[..., :3, 3]
+    colors = np.array([color_of(sight.name) for _, sight in shown], np.uint8)
+    return Lines(
+        points.reshape(-1, 2, 3).astype(np.float32),
+        np.broadcast_to(colors[:, None, None], outlines.shape).reshape(-1, 2, 3),
+    )
+
+
+def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines:
+    """The edges of each object's box; without a colour in that of its name."""
+    return Lines.together(
+        Lines.of(
+            se3.transform(transform(one.T_map_object), EDGES * one.size),
+            color or color_of(one.name),
+        )
+        for one in objects
+    )
+
+
+def loop_lines(loops: Iterable[tuple[int, int]], keyframes: Mapping[int, np.ndarray]) -> Lines:
+    """Between keyframes of which one closed a loop with the other, where both are known."""
+    ends = [
+        [keyframes[a][:3, 3], keyframes[b][:3, 3]]
+        for a, b in loops
+        if a in keyframes and b in keyframes
+    ]
+    return Lines.of(np.array(ends), LOOP)
+
+
+@lru_cache(maxsize=1024)
+def color_of(name: str) -> Color:
+    """The same for the same name, and strong: browsers draw lines paler."""
+    hue = zlib.crc32(name.encode()) % 360 / 360
+    red, green, blue = (round(255 * value) for value in colorsys.hls_to_rgb(hue, 0.45, 1.0))
+    return red, green, blue
+
+
+def _outlines(camera: Camera, boxes_px: np.ndarray) -> np.ndarray:
+    """The sides [M, 4, 2, 3] of boxes [M, 4] in the image, FRUSTUM_M in front of the camera."""
+    corners_px = boxes_px[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]  # [M, 4, 2]
+    rays = (corners_px - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+    points = FRUSTUM_M * np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+    return np.stack([points, np.roll(points, -1, axis=1)], axis=2)
+
+
+def _edges() -> np.ndarray:
+    """The edges [12, 2, 3] of a box of side 1 about the origin."""
+    corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+    pairs = itertools.combinations(corners, 2)
+    return np.array([pair for pair in pairs if np.abs(np.subtract(*pair)).sum() == 1])
+
+
+EDGES = _edges()

@@ -1,0 +1,84 @@
+"""Where the camera and its keyframes were, as far as a service has said."""
+
+import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.schemas import Correction, TrackedPose
+from ldo_service.wire import keyframe_poses_of, transform
+
+NOWHERE = np.full(3, np.nan)
+
+
+class LiveKeyframes:
+    """T_map_keyframe [4, 4] by id. A correction names every keyframe, and says it all; those that
+    are newer stay where the tracker saw them from their references."""
+
+    def __init__(self) -> None:
+        self.T_map: dict[int, np.ndarray] = {}
+        self._newer: dict[int, tuple[int | None, np.ndarray]] = {}  # than the last correction
+
+    def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
+        """The frame became a keyframe."""
+        assert pose.keyframe is not None
+        self.T_map = {**self.T_map, pose.keyframe: T_map_camera}
+        self._newer[pose.keyframe] = pose.reference, transform(pose.T_reference_camera)
+
+    def correct(self, correction: Correction) -> None:
+        T_map = keyframe_poses_of(correction)
+        newest = max(T_map, default=-1)
+        self._newer = {k: link for k, link in self._newer.items() if k > newest}
+        for keyframe, (reference, T_reference_keyframe) in sorted(self._newer.items()):
+            if reference in T_map:
+                T_map[keyframe] = T_map[reference] @ T_reference_keyframe
+            else:
+                T_map[keyframe] = self.T_map[keyframe]
+        self.T_map = T_map
+
+
+class LivePath:
+    """The positions of the camera: as they were published, and from where the keyframes that it
+    was tracked against are now. Of more than `most` every second is forgotten, then every second of
+    those that come."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._every = 1
+        self._heard = 0
+        self._online: list[np.ndarray] = []
+        self._references: list[int] = []  # -1: none
+        self._p_reference: list[np.ndarray] = []  # the camera in its reference
+
+    def __len__(self) -> int:
+        return len(self._online)
+
+    def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
+        """Not a LOST one. The online position is that of the map's own segment alone."""
+        self._heard += 1
+        if self._heard % self._every:
+            return
+        self._online.append(NOWHERE if pose.segment else T_map_camera[:3, 3])
+        self._references.append(-1 if pose.reference is None else pose.reference)
+        self._p_reference.append(np.array(pose.T_reference_camera.translation))
+        if len(self) > self._most:
+            for values in (self._online, self._references, self._p_reference):
+                del values[::2]
+            self._every *= 2
+
+    def online(self) -> np.ndarray:
+        """[K, 3], NaN where nobody could tell."""
+        return np.array(self._online).reshape(-1, 3)
+
+    def final(self, T_map_keyframe: dict[int, np.ndarray]) -> np.ndarray:
+        """[K, 3]: T_map_reference p_reference of those whose reference is known, in order."""
+        ids = np.array(sorted(T_map_keyframe), np.int64)
+        references = np.array(self._references, np.int64)
+        known = np.isin(references, ids)
+        T_map = np.array([T_map_keyframe[k] for k in ids]).reshape(-1, 4, 4)
+        T = T_map[np.searchsorted(ids, references[known])]
+        p = np.array(self._p_reference).reshape(-1, 3)[known]
+        return (T[:, :3, :3] @ p[..., None])[..., 0] + T[:, :3, 3]
+
+
+def T_map_camera_of(pose: TrackedPose) -> np.ndarray:
+    """[4, 4], as the tracker published it."""
+    return se3.orthonormalised(transform(pose.T_map_odom) @ transform(pose.T_odom_camera))

@@ -1,0 +1,171 @@
+"""What a service says, as a scene: bounded, whatever it says. Knows no network."""
+
+from collections.abc import Callable
+from itertools import islice
+
+from ldo_service.schemas import (
+    Correction,
+    DetectionBoxes,
+    Health,
+    Keyframe,
+    LoopClosure,
+    MapDelta,
+    MapObjects,
+    MapSnapshot,
+    Message,
+    TrackedPose,
+)
+from ldo_service.wire import camera_of
+
+from . import panel
+from .config import ViewerConfig
+from .known_gaussians import KnownGaussians
+from .lines import MOST_SIGHTS
+from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
+from .scene import Layer, Scene, Sight
+
+MOST_ACTORS = 64  # whose health is told; a name is what a message says
+MOST_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with
+FACTS_EVERY_S = 1.0  # words that change faster cannot be read
+
+
+class LiveScene:
+    """`take` every message, then `update`: `scene` is what they say together."""
+
+    def __init__(self, config: ViewerConfig, clock: Callable[[], float]) -> None:
+        self._config, self._clock = config, clock
+        self._heard: dict[str, panel.Heard] = {}
+        self._pose_rate, self._poses = panel.Rate(), 0
+        self._told_s = -FACTS_EVERY_S
+        self._gaussians = KnownGaussians(config.most_gaussians)
+        self.scene = Scene()
+        self._begin()
+
+    def _begin(self) -> None:
+        """The map is empty."""
+        self.scene = Scene(camera=self.scene.camera)
+        self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
+        self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
+        self._correction: Correction | None = None
+        self._pose: TrackedPose | None = None
+        self._changed: set[Layer] = {
+            "gaussians",
+            "online",
+            "final",
+            "keyframes",
+            "objects",
+            "loops",
+        }
+
+    @property
+    def has_camera(self) -> bool:
+        return self.scene.camera is not None
+
+    def take(self, message: Message) -> None:
+        match message:
+            case TrackedPose():
+                self._take_pose(message)
+            case Correction():
+                self._take_correction(message)
+            case Keyframe():
+                self.scene.camera = camera_of(message.camera)
+                self._changed.add("keyframes")
+            case DetectionBoxes():
+                self._take_boxes(message)
+            case MapDelta() | MapSnapshot():
+                self._take_map(message)
+            case MapObjects():
+                self.scene.objects = message
+                self._changed.add("objects")
+            case LoopClosure():
+                self._loops[message.pose.reference, message.pose.keyframe] = None
+                self._changed.add("loops")
+            case Health():
+                self._take_health(message)
+
+    def _take_pose(self, pose: TrackedPose) -> None:
+        self._poses += 1
+        self._pose_rate.add(self._clock(), self._poses)
+        self._pose = pose
+        if pose.status == "LOST":
+            return
+        self.scene.T_map_camera = T_map_camera_of(pose)
+        self._path.add(pose, self.scene.T_map_camera)
+        self._changed |= {"online", "final"}
+        if pose.keyframe is not None:
+            self._keyframes.add(pose, self.scene.T_map_camera)
+            self._changed.add("keyframes")
+
+    def _take_correction(self, correction: Correction) -> None:
+        if self._correction and correction.graph_version <= self._correction.graph_version:
+            return
+        self._correction = correction
+        self._keyframes.correct(correction)
+        self._changed |= {"keyframes", "final", "loops"}
+
+    def _take_boxes(self, boxes: DetectionBoxes) -> None:
+        found = (Sight(one.label, one.box_px) for one in islice(boxes.detections, MOST_SIGHTS))
+        sights = self.scene.sights
+        sights[boxes.keyframe] = tuple(found)
+        while len(sights) > self._config.most_keyframes:
+            del sights[next(iter(sights))]
+        self._changed.add("keyframes")
+
+    def _take_map(self, message: MapDelta | MapSnapshot) -> None:
+        if isinstance(message, MapDelta) and message.since == 0 and self._gaussians.version:
+            self._begin()  # on request, see `ldo control reset`
+        if self._gaussians.take(message):
+            self._changed.add("gaussians")
+
+    def _take_health(self, health: Health) -> None:
+        if health.actor not in self._heard and len(self._heard) >= MOST_ACTORS:
+            return
+        heard = self._heard.get(health.actor)
+        rate = heard.rate if heard else panel.Rate()
+        rate.add(self._clock(), health.steps)
+        self._heard[health.actor] = panel.Heard(health, self._clock(), rate)
+
+    # --- together ---------------------------------------------------------------------------------
+    def update(self) -> set[Layer]:
+        """Bring the scene up to date; what changed since the last call."""
+        changed, self._changed = self._changed, set()
+        scene = self.scene
+        if "keyframes" in changed:
+            scene.keyframes = self._keyframes.T_map
+        if "online" in changed:
+            scene.online = self._path.online()
+        if "final" in changed:
+            scene.final = self._path.final(self._keyframes.T_map)
+        if "loops" in changed:
+            scene.loops = self._agreed_loops()
+        if "gaussians" in changed:
+            scene.rows = self._gaussians.rows
+        if self._clock() - self._told_s >= FACTS_EVERY_S:
+            scene.facts, self._told_s = self._facts(), self._clock()
+            changed.add("facts")
+        return changed
+
+    def _agreed_loops(self) -> tuple[tuple[int, int], ...]:
+        """Heard of or in the newest correction, but for those that it does not believe."""
+        while len(self._loops) > MOST_LOOPS:
+            del self._loops[next(iter(self._loops))]
+        if self._correction is None:
+            return tuple(self._loops)
+        named = dict.fromkeys((*self._loops, *self._correction.closures))
+        return tuple(loop for loop in named if loop not in set(self._correction.not_believed))
+
+    def _facts(self) -> str:
+        scene, behind = self.scene, ", behind until the next snapshot"
+        counts = (
+            f"{len(self._keyframes.T_map):,} keyframes, {len(scene.rows):,} Gaussians drawn, "
+            f"{len(scene.objects.objects) if scene.objects else 0} objects, "
+            f"{len(scene.loops)} loops; map version {self._gaussians.version}"
+            f"{behind if self._gaussians.is_behind else ''}"
+        )
+        return "\n\n".join(
+            (
+                panel.of_pose(self._pose, self._pose_rate),
+                counts,
+                panel.of_health(self._heard.values(), self._clock()),
+            )
+        )

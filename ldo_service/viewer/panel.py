@@ -1,0 +1,104 @@
+"""What the window tells in words, as Markdown."""
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ldo_service.schemas import Health, TrackedPose
+
+RATE_OVER_S = 5.0  # ten heartbeats
+SILENT_AFTER_S = 1.5  # three heartbeats
+MOST_NAME = 40  # characters; a panel is narrow
+
+
+# --- of a run -------------------------------------------------------------------------------------
+def of_summary(summary: Mapping[str, Any]) -> str:
+    """summary.json of a run, whatever of it is there."""
+    counts = [
+        f"{summary[name]:,} {says}"
+        for name, says in (
+            ("frames", "frames"),
+            ("keyframes", "keyframes"),
+            ("gaussians", "Gaussians"),
+            ("objects", "objects"),
+            ("loops_accepted", "loops closed"),
+        )
+        if isinstance(summary.get(name), int)
+    ]
+    fps = summary.get("fps")
+    speed = [f"{fps:.1f} frames/s"] if isinstance(fps, int | float) else []
+    stages = summary.get("stage_ms")
+    rows = [
+        f"| {actor} | {ms['p50']:.0f} | {ms['p95']:.0f} |"
+        for actor, ms in (stages if isinstance(stages, dict) else {}).items()
+        if isinstance(ms, dict) and {"p50", "p95"} <= ms.keys()
+    ]
+    table = ["| actor | ms p50 | p95 |\n|---|---|---|", *rows] if rows else []
+    return "\n\n".join(filter(None, (", ".join([*counts, *speed]), "\n".join(table))))
+
+
+def under_way(frames: int) -> str:
+    return f"**under way**: {frames:,} frames so far. A run writes its map when it ends."
+
+
+def share_shown(shown: int, there: int) -> str:
+    """Nothing where all are."""
+    return f"{shown:,} of {there:,} Gaussians are drawn" if shown < there else ""
+
+
+# --- of a service ---------------------------------------------------------------------------------
+@dataclass(slots=True)
+class Rate:
+    """Of something that is counted, over the last seconds."""
+
+    _counts: deque[tuple[float, int]] = field(default_factory=deque)  # at what time, how many
+
+    def add(self, now_s: float, count: int) -> None:
+        if self._counts and count < self._counts[-1][1]:
+            self._counts.clear()  # it began anew
+        self._counts.append((now_s, count))
+        while now_s - self._counts[0][0] > RATE_OVER_S:
+            self._counts.popleft()
+
+    @property
+    def hz(self) -> float:
+        """0 until there are two counts."""
+        (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
+        return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
+
+
+@dataclass(slots=True)
+class Heard:
+    """The last heartbeat of an actor."""
+
+    health: Health
+    at_s: float
+    rate: Rate
+
+
+def of_pose(pose: TrackedPose | None, poses: Rate) -> str:
+    if pose is None:
+        return "no pose yet"
+    where = f", segment {pose.segment} not joined" if pose.segment else ""
+    return f"**{pose.status}** at frame {pose.frame:,}, {poses.hz:.1f} poses/s{where}"
+
+
+def of_health(heard: Iterable[Heard], now_s: float) -> str:
+    rows = [_row(one, now_s) for one in sorted(heard, key=lambda one: one.health.actor)]
+    if not rows:
+        return "No actor reports: is this the name of the robot? `ldo doctor` tells."
+    return "\n".join(
+        ("| actor | | /s | ms | p95 | drops | MB |\n|---|---|---|---|---|---|---|", *rows)
+    )
+
+
+def _row(one: Heard, now_s: float) -> str:
+    health, silent_s = one.health, now_s - one.at_s
+    state = "held" if health.held else health.state
+    state = f"**silent {silent_s:.0f} s**" if silent_s > SILENT_AFTER_S else state
+    drops = sum(count.dropped for count in health.inputs)
+    return (
+        f"| {health.actor[:MOST_NAME]} | {state} | {one.rate.hz:.1f} | {health.step_ms_p50:.0f} "
+        f"| {health.step_ms_p95:.0f} | {drops} | {health.rss_mb:.0f} |"
+    )

@@ -1,0 +1,154 @@
+"""What a run left in its folder, or has left so far: files are read as they come and change."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import DataError
+from ldo_service.gaussians.ply import read_ply
+from ldo_service.geometry import Trajectory
+from ldo_service.runs.finished import has_refined, read_viewpoints
+from ldo_service.runs.folder import REFINED
+from ldo_service.runs.loops_file import LOOPS, read_loops
+from ldo_service.runs.objects_file import OBJECTS, read_objects
+
+from . import panel
+from .config import ViewerConfig
+from .scene import Layer, Scene, Sight, thinned
+from .splats import weightiest
+
+Signature = tuple[int, int]  # time of the last change, ns, and size, bytes
+
+
+class RunFolder:
+    """Looks at the folder on every `update`; what cannot be read is told in words, once more when
+    it changes."""
+
+    def __init__(self, folder: Path, config: ViewerConfig) -> None:
+        """Raises DataError for a folder that is none, or that no run wrote to."""
+        if not folder.is_dir():
+            raise DataError(f"{folder} is not a folder: name that of an `ldo run`, or `live`.")
+        self.scene = Scene()
+        self._folder, self._config = folder, config
+        self._seen: dict[str, tuple[Path, Signature]] = {}
+        self._problems: dict[str, str] = {}  # by file
+        self._summary: dict[str, Any] | None = None
+        self._frames = self._gaussians = 0
+        if not any(_signature(folder / name) for name in ("config.yaml", *PARTS)):
+            raise DataError(
+                f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt: "
+                "name the folder that was its --out."
+            )
+
+    def update(self) -> set[Layer]:
+        changed: set[Layer] = set()
+        for name, (layer, read) in PARTS.items():
+            if self._is_news(name):
+                self._read(name, read)
+                changed |= {layer, "facts"}
+        if changed:
+            self.scene.facts = self._facts()
+        return changed
+
+    def _is_news(self, name: str) -> bool:
+        path = self._path(name)
+        signature = _signature(path)
+        if signature is None or self._seen.get(name) == (path, signature):
+            return False
+        self._seen[name] = path, signature
+        return True
+
+    def _path(self, name: str) -> Path:
+        """The refined one where there is one."""
+        refined = self._folder / REFINED / name
+        return refined if has_refined(self._folder) and refined.is_file() else self._folder / name
+
+    def _read(self, name: str, read: Callable[["RunFolder", Path], None]) -> None:
+        try:
+            read(self, self._path(name))
+            self._problems.pop(name, None)
+        except DataError as error:
+            self._problems[name] = str(error)
+
+    def _facts(self) -> str:
+        told = panel.of_summary(self._summary) if self._summary else panel.under_way(self._frames)
+        shown = panel.share_shown(len(self.scene.rows), self._gaussians)
+        return "\n\n".join(filter(None, (told, shown, *self._problems.values())))
+
+    # --- one for each file ------------------------------------------------------------------------
+    def read_summary(self, path: Path) -> None:
+        try:
+            value = json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise DataError(f"{path} cannot be read: {error}.") from error
+        if not isinstance(value, dict):
+            raise DataError(f"{path} is not what `ldo run` writes.")
+        self._summary = value
+
+    def read_frames(self, path: Path) -> None:
+        """How many: there is a line for each, and the names of the columns."""
+        try:
+            self._frames = max(0, path.read_bytes().count(b"\n") - 1)
+        except OSError as error:
+            raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+
+    def read_online(self, path: Path) -> None:
+        self.scene.online = self._positions(path)
+
+    def read_final(self, path: Path) -> None:
+        self.scene.final = self._positions(path)
+
+    def _positions(self, path: Path) -> np.ndarray:
+        T_map_camera = Trajectory.load(path).T_world_camera
+        if len(T_map_camera):
+            self.scene.T_map_camera = T_map_camera[-1]
+        return thinned(T_map_camera[:, :3, 3], self._config.most_poses)
+
+    def read_keyframes(self, path: Path) -> None:
+        viewpoints = read_viewpoints(path.parent)
+        self.scene.keyframes = {k: one.T_map_camera for k, one in viewpoints.items()}
+        self.scene.camera = next((one.camera for one in viewpoints.values()), None)
+
+    def read_map(self, path: Path) -> None:
+        rows = read_ply(path)
+        self._gaussians = len(rows)
+        self.scene.rows = rows[weightiest(rows, self._config.most_gaussians)]
+
+    def read_objects(self, path: Path) -> None:
+        """Their views are the detections that a run keeps."""
+        self.scene.objects = read_objects(path.parent)
+        sights: dict[int, tuple[Sight, ...]] = {}
+        for one in self.scene.objects.objects:
+            for view in one.views:
+                others = sights.get(view.keyframe, ())
+                sights[view.keyframe] = (*others, Sight(one.name, view.box_px))
+        self.scene.sights = sights
+
+    def read_loops(self, path: Path) -> None:
+        found = read_loops(path.parent)
+        closures = found.closures if found else ()
+        self.scene.loops = tuple((loop.reference, loop.keyframe) for loop in closures)
+
+
+PARTS: dict[str, tuple[Layer, Callable[[RunFolder, Path], None]]] = {
+    "frames.csv": ("facts", RunFolder.read_frames),
+    "summary.json": ("facts", RunFolder.read_summary),
+    "trajectory_online.txt": ("online", RunFolder.read_online),
+    "trajectory.txt": ("final", RunFolder.read_final),
+    "keyframes.json": ("keyframes", RunFolder.read_keyframes),
+    OBJECTS: ("objects", RunFolder.read_objects),
+    LOOPS: ("loops", RunFolder.read_loops),
+    "map.ply": ("gaussians", RunFolder.read_map),
+}
+
+
+def _signature(path: Path) -> Signature | None:
+    """None where there is no such file."""
+    try:
+        stat = path.stat()
+    except OSError:
+        return None
+    return stat.st_mtime_ns, stat.st_size

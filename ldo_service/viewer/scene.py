@@ -1,0 +1,56 @@
+"""What is known of a map, and of the camera in it. Conventions: `ldo_service.geometry`."""
+
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+
+from ldo_service.gaussians.model import ROW
+from ldo_service.geometry import Camera
+from ldo_service.schemas import MapObjects
+from ldo_service.schemas.objects import Box
+
+Layer = Literal["gaussians", "online", "final", "keyframes", "objects", "loops", "facts"]
+NOTHING = np.zeros((0, 3))
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What a keyframe shows: a name, and its box in the image in pixels."""
+
+    name: str
+    box_px: Box
+
+
+@dataclass(slots=True)
+class Scene:
+    """All in the map frame, metres. What other threads read, `keyframes` and `objects`, is replaced
+    and never written to."""
+
+    # [N, 16], see `gaussians.model`; valid until the next update
+    rows: np.ndarray = field(default_factory=lambda: np.zeros((0, ROW), np.float32))
+    online: np.ndarray = field(default_factory=NOTHING.copy)  # [K, 3] camera, as it was published
+    final: np.ndarray = field(default_factory=NOTHING.copy)  # [K, 3] after the last correction
+    keyframes: dict[int, np.ndarray] = field(default_factory=dict)  # T_map_camera [4, 4] by id
+    camera: Camera | None = None  # of the keyframes, rectified; None where it is not known yet
+    sights: dict[int, tuple[Sight, ...]] = field(default_factory=dict)  # by keyframe
+    objects: MapObjects | None = None
+    loops: tuple[tuple[int, int], ...] = ()  # pairs of keyframes
+    T_map_camera: np.ndarray | None = None  # [4, 4] where the camera is, or was at the end
+    facts: str = ""  # Markdown
+
+
+class Source(Protocol):
+    """Where a scene comes from."""
+
+    @property
+    def scene(self) -> Scene: ...
+
+    def update(self) -> set[Layer]:
+        """Take what is new; says what changed."""
+        ...
+
+
+def thinned(values: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of `values` [K, ...], evenly chosen, the first among them."""
+    return values[:: max(1, -(-len(values) // most))]

@@ -1,0 +1,255 @@
+"""The browser's side of a scene. The one file that knows viser."""
+
+import io
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from typing import Any
+
+import numpy as np
+import viser
+
+from ldo_service.answers import Answer, answer
+from ldo_service.errors import LdoError
+from ldo_service.schemas import MapObject
+
+from .config import ViewerConfig
+from .flight import View, flight, overview, up_of, view_of
+from .lines import (
+    FINAL,
+    FOUND,
+    ONLINE,
+    Lines,
+    box_lines,
+    keyframe_lines,
+    loop_lines,
+    path_lines,
+    sight_lines,
+)
+from .scene import Layer, Scene, Source
+from .splats import splats_of
+
+FLIGHT_STEPS, FLIGHT_STEP_S = 30, 1 / 30
+THICK_PX, VERY_THICK_PX = 1.5, 4.0
+MOST_ANSWERS = 10  # that are told of
+LEGEND: dict[str, tuple[str, bool]] = {  # what can be hidden, and whether it is shown at first
+    "gaussians": ("Gaussians", True),
+    "online": ("path, online", True),
+    "final": ("path, corrected", True),
+    "keyframes": ("keyframes", True),
+    "sights": ("detections", True),
+    "objects": ("objects", True),
+    "labels": ("names", True),
+    "loops": ("loops", True),
+}
+
+
+class Server(viser.ViserServer):
+    """The map stays on this machine: a browser may ask for a public address, and gets none."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
+        return None
+
+
+class Window:
+    """Feed it with `show`; made by `open_window`."""
+
+    def __init__(self, server: Server, source: Source, config: ViewerConfig, title: str) -> None:
+        self._server, self._source, self._config = server, source, config
+        self._due: set[Layer] = set()  # changed, and not shown yet
+        self._sent_s = -config.gaussians_s  # when the Gaussians were
+        self._has_view = False
+        self._nodes: dict[str, Any] = {}  # of viser, by name
+        self._names: dict[int, Any] = {}  # labels, by object
+        server.scene.set_up_direction(up_of({}))
+        server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
+        self._build_panel(title)
+
+    @property
+    def url(self) -> str:
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    @property
+    def _scene(self) -> Scene:
+        return self._source.scene
+
+    # --- panel ------------------------------------------------------------------------------------
+    def _build_panel(self, title: str) -> None:
+        gui = self._server.gui
+        gui.set_panel_label(title)
+        self._facts = gui.add_markdown("")
+        with gui.add_form("Where is ...") as form:
+            self._text = gui.add_text("name", "", hint="Enter flies to it")
+            form.on_submit(self._fly_to_answer)
+        self._answers = gui.add_markdown("")
+        with gui.add_folder("Show"):
+            self._boxes = {name: self._checkbox(name) for name in LEGEND}
+
+    def _checkbox(self, name: str) -> Any:
+        says, is_shown = LEGEND[name]
+        box = self._server.gui.add_checkbox(says, is_shown)
+        box.on_update(lambda _: self._set_visible(name, box.value))
+        return box
+
+    def _set_visible(self, name: str, is_visible: bool) -> None:
+        nodes = list(self._names.values()) if name == "labels" else [self._nodes.get(name)]
+        for node in nodes:
+            if node is not None:
+                node.visible = is_visible
+
+    # --- what is new ------------------------------------------------------------------------------
+    def show(self, changed: set[Layer]) -> None:
+        """Draw what changed. While no browser is there nothing is drawn, and it is due."""
+        self._due |= changed
+        if not self._server.get_clients():
+            return
+        with self._server.atomic():
+            for layer in sorted(self._due - {"gaussians"}):
+                self._draw[layer](self)
+        self._due &= {"gaussians"}
+        if self._due and time.monotonic() - self._sent_s >= self._config.gaussians_s:
+            self._draw_gaussians()
+            self._due.clear()
+            self._sent_s = time.monotonic()
+        self._server.flush()
+
+    def _draw_gaussians(self) -> None:
+        splats = splats_of(self._scene.rows)
+        arrays = (splats.centers, splats.covariances, splats.colors, splats.opacities)
+        if "gaussians" in self._nodes:
+            self._nodes["gaussians"].set_gaussians(*arrays)
+        elif len(splats.centers):
+            is_visible = self._boxes["gaussians"].value
+            add = self._server.scene.add_gaussian_splats
+            self._nodes["gaussians"] = add("/gaussians", *arrays, visible=is_visible)
+
+    def _draw_online(self) -> None:
+        path, here = path_lines(self._scene.online, ONLINE), self._scene.T_map_camera
+        now = () if here is None else (keyframe_lines([here], self._scene.camera, ONLINE),)
+        self._draw_lines("online", Lines.together((path, *now)))
+        self._look_from_the_camera()
+
+    def _draw_final(self) -> None:
+        self._draw_lines("final", path_lines(self._scene.final, FINAL))
+        self._look_from_the_camera()
+
+    def _draw_keyframes(self) -> None:
+        scene, most = self._scene, self._config.most_keyframes
+        chosen = sorted(scene.keyframes)[:: max(1, -(-len(scene.keyframes) // most))]
+        keyframes = {k: scene.keyframes[k] for k in chosen}
+        self._draw_lines("keyframes", keyframe_lines(keyframes.values(), scene.camera))
+        self._draw_lines("sights", sight_lines(keyframes, scene.camera, scene.sights))
+        self._draw_loops()
+
+    def _draw_loops(self) -> None:
+        lines = loop_lines(self._scene.loops, self._scene.keyframes)
+        self._draw_lines("loops", lines, VERY_THICK_PX)
+
+    def _draw_objects(self) -> None:
+        objects = self._shown_objects()
+        self._draw_lines("objects", box_lines(objects))
+        for gone in self._names.keys() - {one.id for one in objects}:
+            self._names.pop(gone).remove()
+        for one in objects:
+            self._draw_name(one)
+
+    def _shown_objects(self) -> list[MapObject]:
+        found = self._scene.objects
+        by_sights = sorted(found.objects if found else (), key=lambda one: (-one.seen, one.id))
+        return by_sights[: self._config.most_objects]
+
+    def _draw_name(self, one: MapObject) -> None:
+        text, position = f"{one.name} {one.confidence:.0%}", one.T_map_object.translation
+        if one.id in self._names:
+            label = self._names[one.id]
+            label.text, label.position = text, np.array(position)
+        else:
+            is_visible, name = self._boxes["labels"].value, f"/names/{one.id}"
+            add = self._server.scene.add_label
+            self._names[one.id] = add(
+                name, text, position=position, visible=is_visible, anchor="center-center"
+            )
+
+    def _draw_facts(self) -> None:
+        self._facts.content = self._scene.facts
+
+    _draw: dict[Layer, Callable[["Window"], None]] = {
+        "online": _draw_online,
+        "final": _draw_final,
+        "keyframes": _draw_keyframes,
+        "objects": _draw_objects,
+        "loops": _draw_loops,
+        "facts": _draw_facts,
+    }
+
+    def _draw_lines(self, name: str, lines: Lines, thickness_px: float = THICK_PX) -> None:
+        if name in self._nodes:
+            self._nodes[name].points, self._nodes[name].colors = lines.points, lines.colors
+        elif len(lines.points):
+            is_visible = self._boxes[name].value if name in self._boxes else True
+            self._nodes[name] = self._server.scene.add_line_segments(
+                f"/{name}",
+                lines.points,
+                lines.colors,
+                thickness=thickness_px,
+                thickness_units="screen",
+                visible=is_visible,
+            )
+
+    # --- camera of the browser --------------------------------------------------------------------
+    def _look_from_the_camera(self) -> None:
+        """Once, as soon as it is known where the camera is; the view is the user's from then on."""
+        if self._has_view or self._scene.T_map_camera is None:
+            return
+        self._has_view, view = True, overview(self._scene.T_map_camera)
+        self._server.scene.set_up_direction(up_of(self._scene.keyframes))
+        initial = self._server.initial_camera
+        initial.position, initial.look_at = view.position, view.look_at
+        for client in self._server.get_clients().values():
+            _set_view(client, view)
+
+    def _fly_to_answer(self, event: viser.GuiEvent[Any]) -> None:
+        """In a thread of viser's."""
+        client, text = event.client, self._text.value.strip()
+        found, keyframes = self._scene.objects, self._scene.keyframes
+        if client is None or not text:
+            return
+        if found is None:
+            self._answers.content = "The map has no objects: a detector has to find them."
+            return
+        start = View(client.camera.position, client.camera.look_at)
+        try:
+            answers = answer(text, found, start.position)
+        except LdoError as error:
+            self._answers.content = str(error)
+            return
+        self._answers.content = "\n".join(map(_line, answers[:MOST_ANSWERS]))
+        (best,) = (one for one in found.objects if one.id == answers[0].id)
+        self._draw_lines("found", box_lines([best], FOUND), VERY_THICK_PX)
+        for view in flight(start, view_of(best, keyframes, start.position), FLIGHT_STEPS):
+            _set_view(client, view)
+            time.sleep(FLIGHT_STEP_S)
+
+
+def _set_view(client: viser.ClientHandle, view: View) -> None:
+    with client.atomic():
+        client.camera.position, client.camera.look_at = view.position, view.look_at
+    client.flush()
+
+
+def _line(one: Answer) -> str:
+    away = "" if one.distance is None else f", {one.distance:.1f} m away"
+    return f"- **{one.name}** {one.id}: {one.score:.2f}{away}"
+
+
+@contextmanager
+def open_window(source: Source, config: ViewerConfig, title: str) -> Iterator[Window]:
+    """Serve a window on `config.address`, on the first free port from `config.port` on."""
+    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # else a line per browser
+    with redirect_stdout(io.StringIO()):  # viser introduces itself
+        server = Server(host=config.address, port=config.port, label=title, verbose=False)
+    try:
+        yield Window(server, source, config, title)
+    finally:
+        server.stop()

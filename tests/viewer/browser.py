@@ -1,0 +1,117 @@
+"""A headless Chromium, driven by its DevTools protocol: a page, keys, screenshots."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",  # tests may run as root
+    "--no-first-run",
+    "--disable-dev-shm-usage",
+    "--use-gl=angle",  # WebGL on the CPU
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--remote-debugging-port=0",
+    "--window-size=960,600",
+)
+STARTS_WITHIN_S = 60
+LARGEST_ANSWER_BYTES = 64_000_000  # a screenshot
+
+
+class Page:
+    def __init__(self, socket: ClientConnection) -> None:
+        self._socket, self._asked = socket, 0
+
+    def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+        self._asked += 1
+        message = {"id": self._asked, "method": method, "params": parameters}
+        self._socket.send(json.dumps(message))
+        while True:  # events come between
+            answer = json.loads(self._socket.recv(timeout=STARTS_WITHIN_S))
+            if answer.get("id") == self._asked:
+                return answer["result"]
+
+    def open(self, url: str) -> None:
+        self.ask("Page.navigate", url=url)
+
+    def evaluate(self, script: str) -> Any:
+        return self.ask("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
+            "value"
+        )
+
+    def text(self) -> str:
+        """What the page says in words."""
+        return self.evaluate("document.body ? document.body.innerText : ''") or ""
+
+    def type_into(self, selector: str, text: str) -> None:
+        """Text, then Enter."""
+        self.evaluate(f"document.querySelector({selector!r}).focus()")
+        self.ask("Input.insertText", text=text)
+        for kind in ("keyDown", "keyUp"):
+            self.ask(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key="Enter",
+                code="Enter",
+                text="\r",
+                windowsVirtualKeyCode=13,
+            )
+
+    def screenshot(self) -> np.ndarray:
+        """[H, W, 3] uint8 RGB."""
+        png = base64.b64decode(self.ask("Page.captureScreenshot", format="png")["data"])
+        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        return image[..., ::-1]
+
+    def wait_for(self, true: Callable[[], bool], what: str, timeout_s: float = 60) -> None:
+        until_s = time.monotonic() + timeout_s
+        while not true():
+            assert time.monotonic() < until_s, f"not {what} within {timeout_s} s: {self.text()}"
+            time.sleep(0.2)
+
+
+@contextmanager
+def browser(folder: Path) -> Iterator[Page]:
+    """A page of a fresh browser. Skips the test where there is none."""
+    path = next(filter(None, map(shutil.which, NAMES)), None)
+    if path is None:
+        pytest.skip("needs a headless Chromium: `apt-get install chromium`")
+    log_path = folder / "chromium.log"
+    with log_path.open("w") as log:
+        command = [path, *FLAGS, f"--user-data-dir={folder / 'profile'}", "about:blank"]
+        process = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            with connect(_address(process, log_path), max_size=LARGEST_ANSWER_BYTES) as socket:
+                yield Page(socket)
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _address(process: subprocess.Popen[bytes], log: Path) -> str:
+    """Of the first page's socket."""
+    until_s = time.monotonic() + STARTS_WITHIN_S
+    while time.monotonic() < until_s and process.poll() is None:
+        if found := re.search(r"ws://(127\.0\.0\.1:\d+)/", log.read_text()):
+            with urllib.request.urlopen(f"http://{found[1]}/json/list") as answer:
+                pages = [one for one in json.load(answer) if one["type"] == "page"]
+            if pages:
+                return pages[0]["webSocketDebuggerUrl"]
+        time.sleep(0.1)
+    pytest.fail(f"Chromium did not start: {log.read_text()}")
