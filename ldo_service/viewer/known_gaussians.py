@@ -29,6 +29,7 @@ class KnownGaussians:
         self._map = GaussianMap()
         self.version = 0
         self.is_behind = False  # something was missed
+        self._is_choice = False  # some were left out, and may have become weightier since
         self._next_id = 0  # above all ids that ever came
         self._parts: dict[int, int] = {}  # of a snapshot under way: the last id of each
         self._of_version = 0
@@ -46,6 +47,7 @@ class KnownGaussians:
             changed = self._take_delta(message)
         if len(self._map) > ROOM * self._most:
             self._map.remove(~weightiest(self.rows, self._most))
+            self._is_choice = True
         return changed
 
     def _take_delta(self, delta: MapDelta) -> bool:
@@ -79,7 +81,8 @@ class KnownGaussians:
 
     # --- the whole --------------------------------------------------------------------------------
     def _take_part(self, part: MapSnapshot) -> bool:
-        if part.version < self.version or (part.version == self.version and not self.is_behind):
+        is_news = self.is_behind or self._is_choice or part.version > self.version
+        if part.version < self.version or not is_news:
             return False
         if part.version != self._of_version:
             self._parts.clear()

@@ -1,0 +1,103 @@
+"""From where an object is looked at."""
+
+import itertools
+
+import msgspec
+import numpy as np
+import pytest
+
+from ldo_service.datasets import open_sequence
+from ldo_service.geometry import se3
+from ldo_service.schemas import MapObject, MapObjects, ObjectView, Pose
+from ldo_service.viewer.flight import NEAREST_M, View, flight, overview, up_of, view_of
+from tests.schemas.examples import EXAMPLES
+
+FOUND = EXAMPLES["map_objects"]
+assert isinstance(FOUND, MapObjects)
+HALF_VIEW_RAD = np.deg2rad(75) / 2  # of the browser, as viser has it
+
+
+def thing(size: tuple[float, float, float], *keyframes: int) -> MapObject:
+    views = tuple(ObjectView(keyframe=k, box_px=(0.0, 0.0, 1.0, 1.0)) for k in keyframes)
+    return msgspec.structs.replace(
+        FOUND.objects[0],
+        T_map_object=Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0)),
+        size=size,
+        views=views,
+    )
+
+
+def at(*position: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = position
+    return T
+
+
+@pytest.mark.parametrize("size", [(0.1, 0.1, 0.1), (0.5, 2.0, 1.0), (3.0, 1.0, 0.1)])
+def test_all_of_the_object_is_in_the_picture(size: tuple[float, float, float]) -> None:
+    one = thing(size)
+    view = view_of(one, {}, np.array([5.0, 2.0, -3.0]))
+    corners = view.look_at + 0.5 * np.array(list(itertools.product((-1, 1), repeat=3))) * size
+    rays, axis = corners - view.position, view.look_at - view.position
+    cosines = rays @ axis / np.linalg.norm(rays, axis=1) / np.linalg.norm(axis)
+    assert np.arccos(cosines.min()) < HALF_VIEW_RAD
+    assert np.linalg.norm(axis) >= NEAREST_M - 1e-9
+
+
+def test_it_is_seen_from_the_first_known_keyframe_that_shows_it() -> None:
+    keyframes = {4: at(1, 2, 13), 5: at(11, 2, 3)}
+    view = view_of(thing((0.2, 0.2, 0.2), 9, 5, 4), keyframes, np.zeros(3))
+    np.testing.assert_allclose(view.look_at, [1, 2, 3])
+    assert view.position[0] > 1
+    np.testing.assert_allclose(view.position[1:], [2, 3])
+
+
+def test_it_is_not_seen_from_behind_the_keyframe() -> None:
+    """What is behind it nobody saw: there may be a wall."""
+    keyframe = at(1, 2, 4)
+    view = view_of(thing((2.0, 2.0, 2.0), 5), {5: keyframe}, np.zeros(3))
+    np.testing.assert_allclose(view.position, keyframe[:3, 3])
+
+
+def test_who_stands_in_the_object_steps_back() -> None:
+    view = view_of(thing((0.2, 0.2, 0.2)), {}, np.array([1.0, 2.0, 3.0]))
+    assert np.linalg.norm(view.position - view.look_at) >= NEAREST_M - 1e-9
+
+
+def test_a_flight_begins_and_ends_slowly_and_arrives() -> None:
+    start, end = View(np.zeros(3), np.ones(3)), View(np.array([4.0, 0, 0]), np.zeros(3))
+    views = list(flight(start, end, 20))
+    x = np.array([0.0, *(view.position[0] for view in views)])
+    steps = np.diff(x)
+    assert len(views) == 20
+    assert (steps > 0).all()
+    assert steps[0] < 0.5 * steps[10]
+    assert steps[-1] < 0.5 * steps[10]
+    np.testing.assert_array_equal(views[-1].position, end.position)
+    np.testing.assert_array_equal(views[-1].look_at, end.look_at)
+
+
+def test_the_overview_has_the_camera_in_front_of_it() -> None:
+    T = se3.exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0]))
+    view = overview(T)
+    behind, ahead = (
+        se3.transform(se3.inverse(T), point) for point in (view.position, view.look_at)
+    )
+    assert behind[2] < 0 < ahead[2]
+    np.testing.assert_allclose([*behind[:2], *ahead[:2]], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["flat", "tour", "room"])
+def test_up_is_up(name: str) -> None:
+    """The synthetic world's z, whatever way the first camera was held."""
+    truth = open_sequence(f"synthetic:{name}").truth()
+    assert truth is not None
+    T_first = truth.T_world_camera[0]
+    T_map_camera = se3.inverse(T_first) @ truth.T_world_camera
+    up = up_of(dict(enumerate(T_map_camera)))
+    true_up = T_first[2, :3]  # z of the world in the axes of the first camera
+    assert np.rad2deg(np.arccos(up @ true_up)) < 5
+
+
+def test_without_keyframes_up_is_that_of_a_level_camera() -> None:
+    np.testing.assert_array_equal(up_of({}), [0, -1, 0])

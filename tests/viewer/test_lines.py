@@ -1,0 +1,119 @@
+"""What is drawn beside the Gaussians, where it ought to be."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from ldo_service.geometry import Camera, se3
+from ldo_service.schemas import MapObjects
+from ldo_service.viewer.lines import (
+    FRUSTUM_M,
+    JUMP_M,
+    MOST_SIGHTS,
+    box_lines,
+    color_of,
+    keyframe_lines,
+    loop_lines,
+    path_lines,
+    sight_lines,
+)
+from ldo_service.viewer.scene import Sight, thinned
+from ldo_service.wire import pose_message
+from tests.schemas.examples import EXAMPLES
+
+CAMERA = Camera(64, 48, 60.0, 50.0, 30.0, 25.0)
+T_MAP_CAMERA = se3.exp(np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0]))
+WHITE = (255, 255, 255)
+
+
+def seen_in_the_camera(points: np.ndarray) -> np.ndarray:
+    """Pixels of points of the map."""
+    return CAMERA.project(se3.transform(se3.inverse(T_MAP_CAMERA), points))
+
+
+def test_a_keyframe_is_drawn_as_its_camera_sees() -> None:
+    lines = keyframe_lines([T_MAP_CAMERA], CAMERA)
+    assert lines.points.shape == lines.colors.shape == (8, 2, 3)
+    rays, outline = lines.points[:4], lines.points[4:]
+    np.testing.assert_allclose(rays[:, 0], np.tile(T_MAP_CAMERA[:3, 3], (4, 1)), atol=1e-6)
+    corners = [(-0.5, -0.5), (63.5, -0.5), (63.5, 47.5), (-0.5, 47.5)]
+    for drawn in (rays[:, 1], outline[:, 0]):
+        np.testing.assert_allclose(seen_in_the_camera(drawn), corners, atol=1e-3)
+    z_m = se3.transform(se3.inverse(T_MAP_CAMERA), outline)[..., 2]
+    np.testing.assert_allclose(z_m, FRUSTUM_M, atol=1e-6)
+
+
+def test_a_detection_is_drawn_around_what_was_detected() -> None:
+    sights = {7: (Sight("cup", (10.0, 5.0, 20.0, 15.0)), Sight("sofa", (0.0, 0.0, 60.0, 40.0)))}
+    lines = sight_lines({7: T_MAP_CAMERA, 8: np.eye(4)}, CAMERA, sights)
+    assert lines.points.shape == (8, 2, 3)
+    corners = [(10, 5), (20, 5), (20, 15), (10, 15)]
+    np.testing.assert_allclose(seen_in_the_camera(lines.points[:4, 0]), corners, atol=1e-3)
+    np.testing.assert_allclose(lines.points[:4, 1], np.roll(lines.points[:4, 0], -1, axis=0))
+    assert tuple(lines.colors[0, 0]) == color_of("cup")
+    assert tuple(lines.colors[7, 1]) == color_of("sofa")
+
+
+def test_detections_wait_for_the_camera_and_are_not_too_many() -> None:
+    sights = {7: tuple(Sight("cup", (i, 0.0, i + 1.0, 1.0)) for i in range(2 * MOST_SIGHTS))}
+    assert len(sight_lines({7: T_MAP_CAMERA}, None, sights).points) == 0
+    assert len(sight_lines({7: T_MAP_CAMERA}, CAMERA, sights).points) == 4 * MOST_SIGHTS
+    assert len(sight_lines({}, CAMERA, sights).points) == 0
+
+
+def test_a_box_has_the_edges_of_its_object() -> None:
+    found = EXAMPLES["map_objects"]
+    assert isinstance(found, MapObjects)
+    one = msgspec.structs.replace(
+        found.objects[0], T_map_object=pose_message(T_MAP_CAMERA), size=(0.5, 0.25, 1.0)
+    )
+    lines = box_lines([one])
+    lengths = np.linalg.norm(lines.points[:, 1] - lines.points[:, 0], axis=1)
+    np.testing.assert_allclose(np.sort(lengths), [0.25] * 4 + [0.5] * 4 + [1.0] * 4, atol=1e-6)
+    inside = se3.transform(se3.inverse(T_MAP_CAMERA), lines.points)
+    corners = np.broadcast_to([0.25, 0.125, 0.5], (12, 2, 3))
+    np.testing.assert_allclose(np.abs(inside), corners, atol=1e-6)
+    assert tuple(lines.colors[0, 0]) == color_of(one.name)
+    assert tuple(box_lines([one], WHITE).colors[0, 0]) == WHITE
+    assert len(box_lines([]).points) == 0
+
+
+def test_a_path_is_not_drawn_across_a_jump_or_where_nobody_knows() -> None:
+    x = [0.0, 0.1, 0.2, 0.2 + 2 * JUMP_M, 0.3 + 2 * JUMP_M, np.nan, 0.5 + 2 * JUMP_M]
+    path = np.stack([x, np.zeros(7), np.zeros(7)], axis=1)
+    lines = path_lines(path, WHITE)
+    np.testing.assert_allclose(
+        lines.points[:, :, 0], [(0, 0.1), (0.1, 0.2), (x[3], x[4])], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("poses", [0, 1])
+def test_a_path_of_a_pose_or_none_has_no_lines(poses: int) -> None:
+    assert path_lines(np.zeros((poses, 3)), WHITE).points.shape == (0, 2, 3)
+
+
+def test_a_loop_is_drawn_where_both_ends_are_known() -> None:
+    keyframes = {3: np.eye(4), 9: T_MAP_CAMERA}
+    lines = loop_lines([(3, 9), (3, 10), (2, 9)], keyframes)
+    np.testing.assert_allclose(lines.points, [[np.zeros(3), T_MAP_CAMERA[:3, 3]]], atol=1e-6)
+
+
+def test_names_have_colours_of_their_own() -> None:
+    names = ("chair", "couch", "cup", "oven", "bed", "clock")
+    assert len({color_of(name) for name in names}) == len(names)
+    assert color_of("chair") == color_of("chair")
+
+
+@pytest.mark.parametrize(("count", "expected"), [(0, 0), (5, 5), (10, 10), (11, 6), (25, 9)])
+def test_too_many_are_thinned_evenly(count: int, expected: int) -> None:
+    values = thinned(np.arange(count), 10)
+    assert len(values) == expected
+    assert len(set(np.diff(values))) <= 1
+
+
+def test_another_lens_draws_another_image() -> None:
+    wide = replace(CAMERA, fx=30.0)
+    narrow, wider = (keyframe_lines([np.eye(4)], camera).points for camera in (CAMERA, wide))
+    assert np.ptp(wider[4:, 0, 0]) == pytest.approx(2 * np.ptp(narrow[4:, 0, 0]), rel=1e-5)

@@ -1,0 +1,39 @@
+"""What the window tells in words."""
+
+import pytest
+
+from ldo_service.viewer import panel
+
+
+def test_a_rate_is_of_the_last_seconds() -> None:
+    rate = panel.Rate()
+    for second in range(100):
+        rate.add(float(second), 10 * second if second < 50 else 500 + 2 * (second - 50))
+    assert rate.hz == pytest.approx(2.0)
+
+
+def test_a_rate_survives_a_count_that_begins_anew() -> None:
+    rate = panel.Rate()
+    for now_s, count in ((0.0, 1000), (1.0, 1010), (2.0, 0), (3.0, 5)):
+        rate.add(now_s, count)
+    assert rate.hz == pytest.approx(5.0)
+
+
+def test_a_rate_of_one_count_is_none() -> None:
+    rate = panel.Rate()
+    rate.add(1.0, 7)
+    assert rate.hz == 0
+
+
+def test_a_summary_is_told_as_far_as_it_goes() -> None:
+    stages = {"tracker": {"p50": 12.4, "p95": 30.0}, "odd": 3}
+    told = panel.of_summary({"frames": 1234, "fps": 9.87, "stage_ms": stages})
+    assert "1,234 frames, 9.9 frames/s" in told
+    assert "| tracker | 12 | 30 |" in told
+    assert "odd" not in told
+    assert panel.of_summary({"frames": "many"}) == ""
+
+
+def test_it_is_told_when_not_all_is_drawn() -> None:
+    assert panel.share_shown(10, 10) == ""
+    assert panel.share_shown(300_000, 1_200_000) == "300,000 of 1,200,000 Gaussians are drawn"
