@@ -2,6 +2,7 @@
 
 import io
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -55,10 +56,18 @@ class Server(viser.ViserServer):
 class Window:
     """Feed it with `show`; made by `open_window`."""
 
-    def __init__(self, server: Server, source: Source, config: ViewerConfig, title: str) -> None:
+    def __init__(
+        self,
+        server: Server,
+        source: Source,
+        config: ViewerConfig,
+        title: str,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._server, self._source, self._config = server, source, config
+        self._clock = clock
         self._due: set[Layer] = set()  # changed, and not shown yet
-        self._sent_s = -config.gaussians_s  # when the Gaussians were
+        self._sent_s = -math.inf  # when the Gaussians were
         self._has_view = False
         self._nodes: dict[str, Any] = {}  # of viser, by name
         self._names: dict[int, Any] = {}  # labels, by object
@@ -108,10 +117,10 @@ class Window:
             for layer in sorted(self._due - {"gaussians"}):
                 self._draw[layer](self)
         self._due &= {"gaussians"}
-        if self._due and time.monotonic() - self._sent_s >= self._config.gaussians_s:
+        if self._due and self._clock() - self._sent_s >= self._config.gaussians_s:
             self._draw_gaussians()
             self._due.clear()
-            self._sent_s = time.monotonic()
+            self._sent_s = self._clock()
         self._server.flush()
 
     def _draw_gaussians(self) -> None:
@@ -208,6 +217,11 @@ class Window:
         initial.position, initial.look_at = view.position, view.look_at
         for client in self._server.get_clients().values():
             _set_view(client, view)
+
+    def eyes(self) -> list[View]:
+        """From where each browser looks."""
+        cameras = (client.camera for client in self._server.get_clients().values())
+        return [View(camera.position, camera.look_at) for camera in cameras]
 
     def _fly_to_answer(self, event: viser.GuiEvent[Any]) -> None:
         """In a thread of viser's."""

@@ -58,9 +58,22 @@ class Page:
         """What the page says in words."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
 
+    def click_checkbox(self, label: str) -> None:
+        """Of the panel, beside this text."""
+        clicked = self.evaluate(
+            f"""(() => {{
+                const labels = [...document.querySelectorAll('label')];
+                const box = document.getElementById(
+                    labels.find(one => one.innerText.trim() === {label!r})?.htmlFor);
+                box?.click();
+                return Boolean(box);
+            }})()"""
+        )
+        assert clicked, f"no checkbox {label!r} in {self.text()}"
+
     def type_into(self, selector: str, text: str) -> None:
-        """Text, then Enter."""
-        self.evaluate(f"document.querySelector({selector!r}).focus()")
+        """Text in place of what is there, then Enter."""
+        self.evaluate(f"document.querySelector({selector!r}).select()")
         self.ask("Input.insertText", text=text)
         for kind in ("keyDown", "keyUp"):
             self.ask(

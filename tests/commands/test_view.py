@@ -1,0 +1,42 @@
+"""ldo view"""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.service.conftest import free_endpoint
+
+
+def test_without_the_extra_one_line_says_how_to_get_it(
+    capsys, monkeypatch: pytest.MonkeyPatch, run: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, _, err = ldo(capsys, "view", run)
+    assert code == 2
+    assert_one_paragraph(err)
+    assert "pip install 'ldo-slam[viewer]'" in err
+
+
+@pytest.mark.parametrize("name", ["absent", "."])
+def test_a_folder_that_no_run_wrote_is_bad_data(capsys, tmp_path: Path, name: str) -> None:
+    code, _, err = ldo(capsys, "view", tmp_path / name)
+    assert code == 3
+    assert_one_paragraph(err)
+
+
+def test_nobody_to_look_at_is_a_configuration_error(capsys) -> None:
+    code, _, err = ldo(capsys, "view", "live", "--endpoint", free_endpoint())
+    assert code == 2
+    assert_one_paragraph(err)
+
+
+@pytest.mark.parametrize(
+    "setting", ["viewer.most_gaussians=0", "viewer.update_s=0", "viewer.port=70000"]
+)
+def test_limits_that_make_no_sense_are_refused(capsys, run: Path, setting: str) -> None:
+    code, _, err = ldo(capsys, "view", run, "--set", setting)
+    assert code == 2
+    assert_one_paragraph(err)
+    assert setting.partition("=")[0].split(".")[1] in err

@@ -1,0 +1,76 @@
+"""A scene that a test sets."""
+
+import msgspec
+import numpy as np
+
+from ldo_service.gaussians.model import aligned_rows
+from ldo_service.geometry import Camera
+from ldo_service.schemas import MapObject, MapObjects, ObjectView, Pose
+from ldo_service.viewer.scene import Layer, Scene, Sight
+from tests.schemas.examples import EXAMPLES
+
+RED, GREEN = (0.9, 0.05, 0.05), (0.05, 0.9, 0.05)
+EVERY_LAYER: set[Layer] = {
+    *("gaussians", "online", "final", "keyframes", "objects", "loops", "facts")
+}
+
+
+class Staged:
+    """What is changed by hand is shown when it is told."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.changed: set[Layer] = set(EVERY_LAYER)
+
+    def update(self) -> set[Layer]:
+        changed, self.changed = self.changed, set()
+        return changed
+
+
+def wall(color: tuple[float, float, float], half_m: float = 3.0, z_m: float = 3.0) -> np.ndarray:
+    """Rows [N, 16] of an opaque wall in front of the first camera."""
+    x, y = np.meshgrid(*2 * [np.arange(-half_m, half_m, 0.1)])
+    rows = aligned_rows(x.size)
+    rows[:, 0], rows[:, 1], rows[:, 2] = x.ravel(), y.ravel(), z_m
+    rows[:, 3:6] = np.log([0.1, 0.1, 0.01])
+    rows[:, 6] = 1
+    rows[:, 10] = 6
+    rows[:, 11:14] = color
+    return rows
+
+
+def chair(x_m: float) -> MapObject:
+    """Seen from keyframe 1."""
+    found = EXAMPLES["map_objects"]
+    assert isinstance(found, MapObjects)
+    return msgspec.structs.replace(
+        found.objects[0],
+        id=7,
+        name="chair",
+        distribution=(("chair", 0.9),),
+        T_map_object=Pose((x_m, 0.0, 3.0), (1.0, 0.0, 0.0, 0.0)),
+        size=(0.5, 0.5, 0.5),
+        views=(ObjectView(keyframe=1, box_px=(10.0, 10.0, 30.0, 30.0)),),
+    )
+
+
+def scene_of(rows: np.ndarray, *objects: MapObject) -> Scene:
+    """The camera went a metre to the right, with three keyframes."""
+    path = np.linspace([0, 0, 0], [1, 0, 0], 11)
+    keyframes = {k: np.eye(4) for k in range(3)}
+    for k, T in keyframes.items():
+        T[0, 3] = 0.5 * k
+    found = EXAMPLES["map_objects"]
+    assert isinstance(found, MapObjects)
+    return Scene(
+        rows=rows,
+        online=path,
+        final=path + np.array([0, 0.1, 0]),
+        keyframes=keyframes,
+        camera=Camera(64, 48, 60.0, 60.0, 31.5, 23.5),
+        sights={1: (Sight("chair", (10.0, 10.0, 30.0, 30.0)),)},
+        objects=msgspec.structs.replace(found, objects=objects),
+        loops=((0, 2),),
+        T_map_camera=keyframes[0],
+        facts="**all is well**",
+    )
