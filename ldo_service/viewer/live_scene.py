@@ -85,7 +85,6 @@ class LiveScene:
 
     def _take_pose(self, pose: TrackedPose) -> None:
         self._poses += 1
-        self._pose_rate.add(self._clock(), self._poses)
         self._pose = pose
         if pose.status == "LOST":
             return
@@ -141,7 +140,9 @@ class LiveScene:
         if "gaussians" in changed:
             scene.rows = self._gaussians.rows
         if self._clock() - self._told_s >= FACTS_EVERY_S:
-            scene.facts, self._told_s = self._facts(), self._clock()
+            self._told_s = self._clock()
+            self._pose_rate.add(self._told_s, self._poses)
+            scene.facts = self._facts()
             changed.add("facts")
         return changed
 
@@ -152,7 +153,8 @@ class LiveScene:
         if self._correction is None:
             return tuple(self._loops)
         named = dict.fromkeys((*self._loops, *self._correction.closures))
-        return tuple(loop for loop in named if loop not in set(self._correction.not_believed))
+        refused = set(self._correction.not_believed)
+        return tuple(loop for loop in named if loop not in refused)
 
     def _facts(self) -> str:
         scene, behind = self.scene, ", behind until the next snapshot"

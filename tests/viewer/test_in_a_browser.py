@@ -129,7 +129,7 @@ def test_a_service_is_watched_while_its_map_grows(tmp_path: Path) -> None:
                 page.wait_for(lambda: "no pose yet" in page.text(), "a service without frames")
                 assert share_lit(page) < 0.05
                 publisher = service.publisher("synthetic:room", "--rate", "3", "--max-frames", "40")
-                wait_for_share(page, lambda: share_lit(page), 0.6, "a picture")
+                wait_for_share(page, lambda: share_lit(page), 0.4, "a picture")
                 page.wait_for(lambda: "tracker" in page.text(), "told how the actors are")
                 publisher.kill()
                 publisher.wait()
