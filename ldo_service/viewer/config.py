@@ -18,11 +18,12 @@ class ViewerConfig:
     most_keyframes: int = 2_000  # of more every second, third, ... is drawn
     most_objects: int = 200  # those seen most: more labels than that hide each other
     update_s: float = 0.2  # between looks at what is new; poses move at 5 Hz
+    lines_s: float = 1.0  # between sends of a path, all keyframes or boxes: 0.6 MB each at most
     gaussians_s: float = 2.0  # between sends of the Gaussians: 5 MB a second at most
 
     def __post_init__(self) -> None:
         counts = (self.most_gaussians, self.most_poses, self.most_keyframes, self.most_objects)
-        if min(counts) < 1 or min(self.update_s, self.gaussians_s) <= 0:
+        if min(counts) < 1 or min(self.update_s, self.lines_s, self.gaussians_s) <= 0:
             raise ConfigError(f"{self}: counts must be at least 1, and times positive.")
         if not 0 <= self.port <= 65535:
             raise ConfigError(f"viewer.port={self.port} must be in 0..65535; 0 takes any free one.")

@@ -50,6 +50,7 @@ class LiveScene:
         self._pose: TrackedPose | None = None
         self._changed: set[Layer] = {
             "gaussians",
+            "camera",
             "online",
             "final",
             "keyframes",
@@ -90,7 +91,7 @@ class LiveScene:
             return
         self.scene.T_map_camera = T_map_camera_of(pose)
         self._path.add(pose, self.scene.T_map_camera)
-        self._changed |= {"online", "final"}
+        self._changed |= {"camera", "online", "final"}
         if pose.keyframe is not None:
             self._keyframes.add(pose, self.scene.T_map_camera)
             self._changed.add("keyframes")

@@ -1,5 +1,6 @@
 """What the window tells in words, as Markdown."""
 
+import re
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -10,6 +11,11 @@ from ldo_service.schemas import Health, TrackedPose
 RATE_OVER_S = 5.0  # ten heartbeats
 SILENT_AFTER_S = 1.5  # three heartbeats
 MOST_NAME = 40  # characters; a panel is narrow
+
+
+def escaped(text: str) -> str:
+    """Plain text in Markdown: names are what a message says, and must not become markup."""
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
 
 
 # --- of a run -------------------------------------------------------------------------------------
@@ -30,7 +36,7 @@ def of_summary(summary: Mapping[str, Any]) -> str:
     speed = [f"{fps:.1f} frames/s"] if isinstance(fps, int | float) else []
     stages = summary.get("stage_ms")
     rows = [
-        f"| {actor} | {ms['p50']:.0f} | {ms['p95']:.0f} |"
+        f"| {escaped(actor)} | {ms['p50']:.0f} | {ms['p95']:.0f} |"
         for actor, ms in (stages if isinstance(stages, dict) else {}).items()
         if isinstance(ms, dict) and {"p50", "p95"} <= ms.keys()
     ]
@@ -97,8 +103,13 @@ def _row(one: Heard, now_s: float) -> str:
     health, silent_s = one.health, now_s - one.at_s
     state = "held" if health.held else health.state
     state = f"**silent {silent_s:.0f} s**" if silent_s > SILENT_AFTER_S else state
-    drops = sum(count.dropped for count in health.inputs)
-    return (
-        f"| {health.actor[:MOST_NAME]} | {state} | {one.rate.hz:.1f} | {health.step_ms_p50:.0f} "
-        f"| {health.step_ms_p95:.0f} | {drops} | {health.rss_mb:.0f} |"
+    cells = (
+        escaped(health.actor[:MOST_NAME]),
+        state,
+        f"{one.rate.hz:.1f}",
+        f"{health.step_ms_p50:.0f}",
+        f"{health.step_ms_p95:.0f}",
+        sum(count.dropped for count in health.inputs),
+        f"{health.rss_mb:.0f}",
     )
+    return f"| {' | '.join(map(str, cells))} |"

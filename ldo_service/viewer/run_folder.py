@@ -45,10 +45,10 @@ class RunFolder:
 
     def update(self) -> set[Layer]:
         changed: set[Layer] = set()
-        for name, (layer, read) in PARTS.items():
+        for name, (layers, read) in PARTS.items():
             if self._is_news(name):
                 self._read(name, read)
-                changed |= {layer, "facts"}
+                changed |= {*layers, "facts"}
         if changed:
             self.scene.facts = self._facts()
         return changed
@@ -76,7 +76,9 @@ class RunFolder:
     def _facts(self) -> str:
         told = panel.of_summary(self._summary) if self._summary else panel.under_way(self._frames)
         shown = panel.share_shown(len(self.scene.rows), self._gaussians)
-        return "\n\n".join(filter(None, (told, shown, *self._problems.values())))
+        return "\n\n".join(
+            filter(None, (told, shown, *map(panel.escaped, self._problems.values())))
+        )
 
     # --- one for each file ------------------------------------------------------------------------
     def read_summary(self, path: Path) -> None:
@@ -133,15 +135,15 @@ class RunFolder:
         self.scene.loops = tuple((loop.reference, loop.keyframe) for loop in closures)
 
 
-PARTS: dict[str, tuple[Layer, Callable[[RunFolder, Path], None]]] = {
-    "frames.csv": ("facts", RunFolder.read_frames),
-    "summary.json": ("facts", RunFolder.read_summary),
-    "trajectory_online.txt": ("online", RunFolder.read_online),
-    "trajectory.txt": ("final", RunFolder.read_final),
-    "keyframes.json": ("keyframes", RunFolder.read_keyframes),
-    OBJECTS: ("objects", RunFolder.read_objects),
-    LOOPS: ("loops", RunFolder.read_loops),
-    "map.ply": ("gaussians", RunFolder.read_map),
+PARTS: dict[str, tuple[tuple[Layer, ...], Callable[[RunFolder, Path], None]]] = {
+    "frames.csv": (("facts",), RunFolder.read_frames),
+    "summary.json": (("facts",), RunFolder.read_summary),
+    "trajectory_online.txt": (("online", "camera"), RunFolder.read_online),
+    "trajectory.txt": (("final", "camera"), RunFolder.read_final),
+    "keyframes.json": (("keyframes",), RunFolder.read_keyframes),
+    OBJECTS: (("objects", "keyframes"), RunFolder.read_objects),
+    LOOPS: (("loops",), RunFolder.read_loops),
+    "map.ply": (("gaussians",), RunFolder.read_map),
 }
 
 

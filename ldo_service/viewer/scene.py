@@ -10,7 +10,7 @@ from ldo_service.geometry import Camera
 from ldo_service.schemas import MapObjects
 from ldo_service.schemas.objects import Box
 
-Layer = Literal["gaussians", "online", "final", "keyframes", "objects", "loops", "facts"]
+Layer = Literal["gaussians", "camera", "online", "final", "keyframes", "objects", "loops", "facts"]
 NOTHING = np.zeros((0, 3))
 
 

@@ -28,21 +28,22 @@ from .lines import (
     path_lines,
     sight_lines,
 )
+from .panel import escaped
 from .scene import Layer, Scene, Source
 from .splats import splats_of
 
 FLIGHT_STEPS, FLIGHT_STEP_S = 30, 1 / 30
 THICK_PX, VERY_THICK_PX = 1.5, 4.0
 MOST_ANSWERS = 10  # that are told of
-LEGEND: dict[str, tuple[str, bool]] = {  # what can be hidden, and whether it is shown at first
-    "gaussians": ("Gaussians", True),
-    "online": ("path, online", True),
-    "final": ("path, corrected", True),
-    "keyframes": ("keyframes", True),
-    "sights": ("detections", True),
-    "objects": ("objects", True),
-    "labels": ("names", True),
-    "loops": ("loops", True),
+LEGEND = {  # what can be hidden
+    "gaussians": "Gaussians",
+    "online": "path, online",
+    "final": "path, corrected",
+    "keyframes": "keyframes",
+    "sights": "detections",
+    "objects": "objects",
+    "labels": "names",
+    "loops": "loops",
 }
 
 
@@ -67,7 +68,7 @@ class Window:
         self._server, self._source, self._config = server, source, config
         self._clock = clock
         self._due: set[Layer] = set()  # changed, and not shown yet
-        self._sent_s = -math.inf  # when the Gaussians were
+        self._drawn_s: dict[Layer, float] = {}
         self._has_view = False
         self._nodes: dict[str, Any] = {}  # of viser, by name
         self._names: dict[int, Any] = {}  # labels, by object
@@ -96,8 +97,7 @@ class Window:
             self._boxes = {name: self._checkbox(name) for name in LEGEND}
 
     def _checkbox(self, name: str) -> Any:
-        says, is_shown = LEGEND[name]
-        box = self._server.gui.add_checkbox(says, is_shown)
+        box = self._server.gui.add_checkbox(LEGEND[name], initial_value=True)
         box.on_update(lambda _: self._set_visible(name, box.value))
         return box
 
@@ -109,19 +109,29 @@ class Window:
 
     # --- what is new ------------------------------------------------------------------------------
     def show(self, changed: set[Layer]) -> None:
-        """Draw what changed. While no browser is there nothing is drawn, and it is due."""
+        """Draw what changed, but no layer more often than it may be. While no browser is there
+        nothing is drawn, and all of it is due."""
         self._due |= changed
         if not self._server.get_clients():
             return
+        now_s = self._clock()
         with self._server.atomic():
-            for layer in sorted(self._due - {"gaussians"}):
-                self._draw[layer](self)
-        self._due &= {"gaussians"}
-        if self._due and self._clock() - self._sent_s >= self._config.gaussians_s:
-            self._draw_gaussians()
-            self._due.clear()
-            self._sent_s = self._clock()
+            for layer in sorted(self._due):
+                if now_s - self._drawn_s.get(layer, -math.inf) >= self._every_s(layer):
+                    self._draw[layer](self)
+                    self._due.discard(layer)
+                    self._drawn_s[layer] = now_s
         self._server.flush()
+
+    def _every_s(self, layer: Layer) -> float:
+        """The least time from one drawing to the next."""
+        match layer:
+            case "camera":
+                return 0.0
+            case "gaussians":
+                return self._config.gaussians_s
+            case _:
+                return self._config.lines_s
 
     def _draw_gaussians(self) -> None:
         splats = splats_of(self._scene.rows)
@@ -133,15 +143,19 @@ class Window:
             add = self._server.scene.add_gaussian_splats
             self._nodes["gaussians"] = add("/gaussians", *arrays, visible=is_visible)
 
+    def _draw_camera(self) -> None:
+        T_map_camera = self._scene.T_map_camera
+        here = () if T_map_camera is None else (T_map_camera,)
+        self._draw_lines("camera", keyframe_lines(here, self._scene.camera, ONLINE))
+        if T_map_camera is not None and not self._has_view:
+            self._has_view = True
+            self._look_along(T_map_camera)
+
     def _draw_online(self) -> None:
-        path, here = path_lines(self._scene.online, ONLINE), self._scene.T_map_camera
-        now = () if here is None else (keyframe_lines([here], self._scene.camera, ONLINE),)
-        self._draw_lines("online", Lines.together((path, *now)))
-        self._look_from_the_camera()
+        self._draw_lines("online", path_lines(self._scene.online, ONLINE))
 
     def _draw_final(self) -> None:
         self._draw_lines("final", path_lines(self._scene.final, FINAL))
-        self._look_from_the_camera()
 
     def _draw_keyframes(self) -> None:
         scene, most = self._scene, self._config.most_keyframes
@@ -184,6 +198,8 @@ class Window:
         self._facts.content = self._scene.facts
 
     _draw: dict[Layer, Callable[["Window"], None]] = {
+        "gaussians": _draw_gaussians,
+        "camera": _draw_camera,
         "online": _draw_online,
         "final": _draw_final,
         "keyframes": _draw_keyframes,
@@ -207,11 +223,9 @@ class Window:
             )
 
     # --- camera of the browser --------------------------------------------------------------------
-    def _look_from_the_camera(self) -> None:
-        """Once, as soon as it is known where the camera is; the view is the user's from then on."""
-        if self._has_view or self._scene.T_map_camera is None:
-            return
-        self._has_view, view = True, overview(self._scene.T_map_camera)
+    def _look_along(self, T_map_camera: np.ndarray) -> None:
+        """For all browsers that are there and will be; from then on the view is theirs."""
+        view = overview(T_map_camera)
         self._server.scene.set_up_direction(up_of(self._scene.keyframes))
         initial = self._server.initial_camera
         initial.position, initial.look_at = view.position, view.look_at
@@ -236,7 +250,7 @@ class Window:
         try:
             answers = answer(text, found, start.position)
         except LdoError as error:
-            self._answers.content = str(error)
+            self._answers.content = escaped(str(error))
             return
         self._answers.content = "\n".join(map(_line, answers[:MOST_ANSWERS]))
         (best,) = (one for one in found.objects if one.id == answers[0].id)
@@ -254,7 +268,7 @@ def _set_view(client: viser.ClientHandle, view: View) -> None:
 
 def _line(one: Answer) -> str:
     away = "" if one.distance is None else f", {one.distance:.1f} m away"
-    return f"- **{one.name}** {one.id}: {one.score:.2f}{away}"
+    return f"- **{escaped(one.name)}** {one.id}: {one.score:.2f}{away}"
 
 
 @contextmanager

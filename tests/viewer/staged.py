@@ -11,7 +11,7 @@ from tests.schemas.examples import EXAMPLES
 
 RED, GREEN = (0.9, 0.05, 0.05), (0.05, 0.9, 0.05)
 EVERY_LAYER: set[Layer] = {
-    *("gaussians", "online", "final", "keyframes", "objects", "loops", "facts")
+    *("gaussians", "camera", "online", "final", "keyframes", "objects", "loops", "facts")
 }
 
 

@@ -1,5 +1,7 @@
 """What the window tells in words."""
 
+import re
+
 import pytest
 
 from ldo_service.viewer import panel
@@ -37,3 +39,10 @@ def test_a_summary_is_told_as_far_as_it_goes() -> None:
 def test_it_is_told_when_not_all_is_drawn() -> None:
     assert panel.share_shown(10, 10) == ""
     assert panel.share_shown(300_000, 1_200_000) == "300,000 of 1,200,000 Gaussians are drawn"
+
+
+@pytest.mark.parametrize("text", ["{1 + 1}", "<b>x</b>", "[x](http://y)", "a|b_c*d`e", "\\"])
+def test_names_are_no_markup(text: str) -> None:
+    told = panel.escaped(text)
+    assert re.sub(r"\\(.)", r"\1", told) == text
+    assert not re.search(r"(?<!\\)[{<\[|*_`]", told.replace("\\\\", ""))

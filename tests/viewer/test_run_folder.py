@@ -14,6 +14,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.runs.objects_file import write_objects
 from ldo_service.schemas import MapObjects, ObjectView
 from ldo_service.viewer.config import ViewerConfig
+from ldo_service.viewer.panel import escaped
 from ldo_service.viewer.run_folder import PARTS, RunFolder
 from ldo_service.viewer.splats import weights
 from tests.schemas.examples import EXAMPLES
@@ -76,9 +77,9 @@ def test_what_is_not_there_is_left_out(run: Path, name: str) -> None:
     (run / name).unlink(missing_ok=True)
     folder = RunFolder(run, CONFIG)
     shown = folder.update()
-    others = {layer for other, (layer, _) in PARTS.items() if (run / other).is_file()}
-    assert shown == others | {"facts"}
-    assert str(run) not in folder.scene.facts  # no complaint
+    others = [layers for other, (layers, _) in PARTS.items() if (run / other).is_file()]
+    assert shown == {"facts"}.union(*others)
+    assert escaped(str(run)) not in folder.scene.facts  # no complaint
 
 
 def test_a_run_under_way_is_shown_as_it_comes(run: Path, tmp_path: Path) -> None:
@@ -91,7 +92,7 @@ def test_a_run_under_way_is_shown_as_it_comes(run: Path, tmp_path: Path) -> None
     assert "under way**: 16 frames" in folder.scene.facts
     for name in ("trajectory.txt", "map.ply"):
         shutil.copy(run / name, young)
-    assert folder.update() == {"facts", "final", "gaussians"}
+    assert folder.update() == {"facts", "camera", "final", "gaussians"}
     assert len(folder.scene.rows)
 
 
@@ -111,7 +112,7 @@ def test_what_was_refined_is_shown_in_place_of_the_runs_own(run: Path) -> None:
     rows = read_ply(run / "map.ply")[:20]
     shutil.copy(run / "trajectory.txt", run / "refined")
     write_ply(run / "refined" / "map.ply", rows)
-    assert folder.update() == {"final", "gaussians", "facts"}
+    assert folder.update() == {"camera", "final", "gaussians", "facts"}
     np.testing.assert_array_equal(folder.scene.rows[:, 0:6], rows[:, 0:6])
 
 
@@ -122,12 +123,12 @@ def test_a_broken_file_is_told_of_until_it_is_mended(run: Path, name: str) -> No
     path.write_bytes(b"\xffbroken")
     folder = RunFolder(run, CONFIG)
     shown = folder.update()
-    assert str(path) in folder.scene.facts
+    assert escaped(str(path)) in folder.scene.facts
     assert len(shown) > 3  # the others are there
     if good is not None:
         path.write_bytes(good)
         folder.update()
-        assert str(path) not in folder.scene.facts
+        assert escaped(str(path)) not in folder.scene.facts
 
 
 def test_limits_hold_for_a_run_too(run: Path) -> None:
