@@ -18,7 +18,7 @@ class ViewerConfig:
     most_keyframes: int = 2_000  # of more every second, third, ... is drawn
     most_objects: int = 200  # those seen most: more labels than that hide each other
     update_s: float = 0.2  # between looks at what is new; poses move at 5 Hz
-    lines_s: float = 1.0  # between sends of a path, all keyframes or boxes: 0.6 MB each at most
+    lines_s: float = 1.0  # between sends of paths, keyframes and boxes: 4 MB at most
     gaussians_s: float = 2.0  # between sends of the Gaussians: 5 MB a second at most
 
     def __post_init__(self) -> None:

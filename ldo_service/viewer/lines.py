@@ -19,7 +19,7 @@ Color = tuple[int, int, int]  # RGB, 0..255
 
 JUMP_M = 1.0  # between two poses of a path: a camera that was lost, not one that moved
 FRUSTUM_M = 0.12  # from a keyframe to its drawn image
-MOST_SIGHTS = 20  # of a keyframe, the first
+MOST_SIGHTS = 8  # of a keyframe, the first: more are a tangle
 UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # how a keyframe looks until it is
 
 ONLINE, FINAL = (220, 90, 0), (0, 150, 30)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from itertools import islice
+from typing import get_args
 
 from ldo_service.schemas import (
     Correction,
@@ -48,15 +49,7 @@ class LiveScene:
         self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
         self._correction: Correction | None = None
         self._pose: TrackedPose | None = None
-        self._changed: set[Layer] = {
-            "gaussians",
-            "camera",
-            "online",
-            "final",
-            "keyframes",
-            "objects",
-            "loops",
-        }
+        self._changed: set[Layer] = set(get_args(Layer)) - {"facts"}
 
     @property
     def has_camera(self) -> bool:

@@ -1,5 +1,7 @@
 """A scene that a test sets."""
 
+from typing import get_args
+
 import msgspec
 import numpy as np
 
@@ -10,9 +12,7 @@ from ldo_service.viewer.scene import Layer, Scene, Sight
 from tests.schemas.examples import EXAMPLES
 
 RED, GREEN = (0.9, 0.05, 0.05), (0.05, 0.9, 0.05)
-EVERY_LAYER: set[Layer] = {
-    *("gaussians", "camera", "online", "final", "keyframes", "objects", "loops", "facts")
-}
+EVERY_LAYER: set[Layer] = set(get_args(Layer))
 
 
 class Staged:
