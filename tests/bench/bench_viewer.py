@@ -1,12 +1,13 @@
 """What a window that nobody looks at costs a service that has more frames than it can handle.
 
-    python tests/bench/bench_viewer.py [SOURCE] [--pairs N] [--rate HZ]
+    python tests/bench/bench_viewer.py [SOURCE] [--pairs N] [--rate HZ] [--frames N]
 
 SOURCE: default tum/kitchen in LDO_DATA, else synthetic:room. A service, a camera and a viewer, in
-processes of their own. Each round begins with an empty map and is sent the same frames, faster
-than they can be handled; a pair is a round with the viewer connected, its window open and no
+processes of their own. Each round begins with an empty map and is sent the same frames, by default
+faster than they can be handled; a pair is a round with the viewer connected, its window open and no
 browser, and one without, in turn the one or the other first. CPU time is that of the service's
-processes, per frame that it handled, and that of the viewer's.
+processes, per frame that it handled, and that of the viewer's. On a machine that does other things
+`--rate 2 --frames 60` says more: the same frames are handled in every round, and CPU time counts.
 """
 
 import argparse
@@ -34,7 +35,6 @@ from ldo_service.wire import camera_rgbd_message
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.service.conftest import LiveService, live_service
 
-FRAMES = 300
 TICKS = os.sysconf("SC_CLK_TCK")
 DETAILS = 8192  # poses that are kept until they are counted
 CONFIG = ViewerConfig(port=0)
@@ -62,16 +62,23 @@ def look(endpoint: str, wanted: Event, is_ready: Event) -> None:
         is_ready.clear()
 
 
-def send(endpoint: str, source: str, rate_hz: float, wanted: Event) -> None:
+@dataclass(frozen=True)
+class Frames:
+    source: str
+    count: int
+    rate_hz: float
+
+
+def send(endpoint: str, frames: Frames, wanted: Event) -> None:
     """The camera's process: the frames once, whenever it is wanted."""
-    sequence = open_sequence(source)
-    frames = [camera_rgbd_message(sequence.read(index)) for index in range(FRAMES)]
+    sequence = open_sequence(frames.source)
+    messages = [camera_rgbd_message(sequence.read(index)) for index in range(frames.count)]
     with connect("robot", endpoint) as service:
         while wanted.wait():
             started_s = time.monotonic()
-            for number, frame in enumerate(frames):
-                time.sleep(max(0.0, started_s + number / rate_hz - time.monotonic()))
-                service.send(frame)
+            for number, message in enumerate(messages):
+                time.sleep(max(0.0, started_s + number / frames.rate_hz - time.monotonic()))
+                service.send(message)
             wanted.clear()
 
 
@@ -103,7 +110,7 @@ def cpu_s(pids: list[int]) -> float:
     return sum(int(stat[11]) + int(stat[12]) for stat in stats) / TICKS
 
 
-def pairs_of(count: int, source: str, rate_hz: float) -> list[tuple[Round, Round]]:
+def pairs_of(count: int, frames: Frames) -> list[tuple[Round, Round]]:
     """(with, without)"""
     context, pairs = multiprocessing.get_context("spawn"), []
     wanted, is_ready, sending = context.Event(), context.Event(), context.Event()
@@ -111,8 +118,7 @@ def pairs_of(count: int, source: str, rate_hz: float) -> list[tuple[Round, Round
         service = stack.enter_context(live_service(Path(folder)))
         service.wait_for_actors()
         viewer = context.Process(target=look, args=(service.endpoint, wanted, is_ready))
-        arguments = (service.endpoint, source, rate_hz, sending)
-        camera = context.Process(target=send, args=arguments)
+        camera = context.Process(target=send, args=(service.endpoint, frames, sending))
         for process in (viewer, camera):
             process.start()
             stack.callback(process.kill)
@@ -145,8 +151,10 @@ def main() -> None:
     parser.add_argument("source", nargs="?", default=default_source())
     parser.add_argument("--pairs", type=int, default=16)
     parser.add_argument("--rate", type=float, default=30.0)
+    parser.add_argument("--frames", type=int, default=300)
     arguments = parser.parse_args()
-    pairs = pairs_of(arguments.pairs, arguments.source, arguments.rate)
+    frames = Frames(arguments.source, arguments.frames, arguments.rate)
+    pairs = pairs_of(arguments.pairs, frames)
     with_, without = ([pair[side] for pair in pairs] for side in (0, 1))
     print("| median (quartiles) | without | with | with / without, by pairs |\n|---|---|---|---|")
     for name, of in (
