@@ -45,8 +45,8 @@ def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0
 
 
 def up_of(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Up [3] in the map, for a horizon that is level: who carries a camera rolls it less than he
-    tilts it. With x and y the axes of the cameras, to the right and down, it is the unit vector u
+    """Up [3] in the map, for a horizon that is level: a camera in a hand is tilted more than it is
+    rolled. With x and y the axes of the cameras, to the right and down, it is the unit vector u
     with the least
 
         mean (x . u)^2 + TILT (1 - mean (y . u)^2)

@@ -17,7 +17,9 @@ from .scene import Sight
 
 Color = tuple[int, int, int]  # RGB, 0..255
 
-JUMP_M = 1.0  # between two poses of a path: a camera that was lost, not one that moved
+# Between two poses of a path: a camera that was lost, not one that moved.
+JUMP_M = 1.0  # at least
+JUMPS = 10.0  # times the median step
 FRUSTUM_M = 0.12  # from a keyframe to its drawn image
 MOST_SIGHTS = 8  # of a keyframe, the first: more are a tangle
 UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # how a keyframe looks until it is
@@ -48,9 +50,13 @@ class Lines:
 
 
 def path_lines(positions: np.ndarray, color: Color) -> Lines:
-    """From each position [K, 3] to the next, but across jumps."""
+    """From each position [K, 3] to the next, but across jumps: steps that are much longer than
+    most, for of a long path not every pose is here."""
     segments = np.stack([positions[:-1], positions[1:]], axis=1)
-    is_step = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1) < JUMP_M
+    steps_m = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
+    known_m = steps_m[np.isfinite(steps_m)]
+    usual_m = float(np.median(known_m)) if len(known_m) else 0.0
+    is_step = steps_m < max(JUMP_M, JUMPS * usual_m)
     return Lines.of(segments[is_step], color)
 
 

@@ -89,6 +89,13 @@ def test_a_path_is_not_drawn_across_a_jump_or_where_nobody_knows() -> None:
     )
 
 
+def test_of_a_long_journey_every_hundredth_pose_is_still_a_path() -> None:
+    x = 2 * JUMP_M * np.arange(50.0)
+    x[25:] += 100 * JUMP_M
+    lines = path_lines(np.stack([x, 0 * x, 0 * x], axis=1), WHITE)
+    assert len(lines.points) == 48
+
+
 @pytest.mark.parametrize("poses", [0, 1])
 def test_a_path_of_a_pose_or_none_has_no_lines(poses: int) -> None:
     assert path_lines(np.zeros((poses, 3)), WHITE).points.shape == (0, 2, 3)
