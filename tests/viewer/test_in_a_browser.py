@@ -19,12 +19,7 @@ from tests.service.conftest import LDO, live_service
 from tests.viewer.browser import Page, browser
 from tests.viewer.staged import GREEN, RED, Staged, chair, scene_of, wall
 
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.timeout(600),
-    # viser leaves its sockets to the garbage collector when a browser is killed
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),
-]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 CONFIG = ViewerConfig(port=0, gaussians_s=0.5)
 LIT = 40  # of 255: the background is darker
 
