@@ -133,6 +133,8 @@ def pairs_of(count: int, frames: Frames) -> list[tuple[Round, Round]]:
                 rounds[has_viewer] = measured(service, client, sending, viewer.pid)
             if number >= 0:
                 pairs.append((rounds[True], rounds[False]))
+                print(*pairs[-1], file=sys.stderr, flush=True)
+        service.stop()
     return pairs
 
 
