@@ -1,11 +1,13 @@
 """Image files, read so that a damaged one is an error and never a half-grey picture."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ldo_service.errors import FrameError
+from ldo_service.geometry.image_header import PNG, announced_size
 
 # The last bytes of a complete file. OpenCV decodes what is there of a cut one without complaint.
 _ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
@@ -64,10 +66,10 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         ) from error
     if not _is_complete(data):
         raise FrameError(f"{path} is cut short at {len(data)} bytes: copy or download it again.")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
+    image = None
+    if not data.startswith(PNG) or announced_size(memoryview(data)):
+        with suppress(cv2.error):
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if image is None:
         raise FrameError(f"{path} is not a readable image: copy or download it again.")
     return image

@@ -45,6 +45,14 @@ def test_the_size_is_that_of_the_decoded_image(data: bytes) -> None:
     assert announced_size(memoryview(data)) == (53, 37)
 
 
+def test_a_png_with_a_chunk_beyond_its_end_has_no_size() -> None:
+    """OpenCV would allocate all of it."""
+    data = bytearray(png(COLOR))
+    data[33:37] = struct.pack(">I", 4_000_000_000)
+    assert data[37:41] == b"IDAT"
+    assert announced_size(memoryview(bytes(data))) is None
+
+
 def test_every_prefix_of_a_header_is_taken_without_an_error() -> None:
     for data in (png(COLOR), jpeg()):
         for length in range(700):
