@@ -35,6 +35,7 @@ from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
 from ldo_service.metrics import LOOPBACK
+from ldo_service.plain_yaml import plain_values
 from ldo_service.runtime.network import MAX_MESSAGE_MB
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.stage import StageConfig
@@ -165,7 +166,7 @@ def explained_yaml(config: Config) -> str:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        tree = yaml.safe_load(path.read_text())
+        tree = plain_values(path.read_text())
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
@@ -187,7 +188,7 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
         if not isinstance(tree, dict):
             raise ConfigError(f"--set {setting}: {section} is no section.")
     try:
-        tree[last] = yaml.safe_load(value)
+        tree[last] = plain_values(value)
     except yaml.YAMLError as error:
         raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
 

@@ -133,7 +133,7 @@ class Models:
         folder = self.folder / name
         try:
             about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=About)
-        except (OSError, msgspec.DecodeError) as error:
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ModelError(
                 f"{folder / ABOUT} cannot be read ({error}): `ldo models remove {name}` and add it "
                 "again."

@@ -29,7 +29,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file. Raises DataError."""
     try:
         content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} cannot be read as JSON: {error}.") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} holds a {type(content).__name__}, expected a JSON object.")

@@ -75,7 +75,10 @@ def _calibration(folder: Path) -> Calibration:
 
 def _poses(path: Path) -> np.ndarray:
     """T_world_camera [K, 4, 4] of the lines. Raises DataError with the line at fault."""
-    lines = [line for line in path.read_text().splitlines() if line.strip()]
+    try:
+        lines = [line for line in path.read_text().splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as poses: {error}.") from error
     return np.array([_pose(path, k, line) for k, line in enumerate(lines, 1)]).reshape(-1, 4, 4)
 
 

@@ -27,6 +27,7 @@ CAMERA_JSON = (
     '"distortion": [k1, k2, p1, p2, k3], "depth_scale": 5000}, the last two optional'
 )
 ASSOCIATION_TOLERANCE_NS = 20_000_000  # as TUM's associate.py
+LAST_STAMP_NS = 2**63 - 1  # what an int64 holds, in the year 2262
 DEPTH_SCALE = 5000.0  # units per metre in every recording of the benchmark
 
 # The calibration of the colour cameras published with the benchmark. fr3 is rectified already.
@@ -107,6 +108,8 @@ def _row(path: Path, line_number: int, line: str) -> tuple[int, str]:
     try:
         stamp_ns = int(Decimal(words[0]) * 10**9)  # a float has no room for nanoseconds since 1970
         name = words[1].strip()
+        if abs(stamp_ns) > LAST_STAMP_NS or "\0" in name:
+            raise ValueError(line)
     except (InvalidOperation, ValueError, OverflowError, IndexError):
         raise DataError(
             f"{path}, line {line_number}: expected `stamp file`, found {line[:80]!r}."

@@ -114,7 +114,7 @@ def unpacked(body: bytes | memoryview) -> KeyframeImages:
         color = _color_of(_expanded(stored.color, np.uint8, (3, *size)))
         depth_m = _depth_of(stored.depth, stored.is_depth_differences, size)
         mask = None if stored.mask is None else _expanded(stored.mask, np.uint8, size)
-    except (msgspec.DecodeError, zstandard.ZstdError, ValueError) as error:
+    except (zstandard.ZstdError, ValueError, RecursionError) as error:
         raise DataError(f"{len(body)} bytes hold no images of a keyframe: {error}.") from error
     for image in (color, depth_m, mask):
         if image is not None:

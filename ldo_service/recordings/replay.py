@@ -1,18 +1,19 @@
 """A recording lived again, one fresh actor after the other."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
 import yaml
 
 from ldo_service import kernels
 from ldo_service.actors.graph import box_named
-from ldo_service.config import config_of
+from ldo_service.config import Config, config_of
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.plain_yaml import plain_values
 from ldo_service.runtime import Actor
 from ldo_service.runtime.recording import JournalFile, recorded_actors
 from ldo_service.runtime.replay import Replayed, replay
@@ -45,12 +46,28 @@ class RecordedActor:
         """One that keeps on disk what outlives it, as it did then, and not where it did."""
         make = box_named(self.name).make
         assert make is not None
-        config = config_of(yaml.safe_load(about.get("config", "")) or {})
+        config = _config_of(about)
         return make(replace(config, mapper=replace(config.mapper, folder=str(folder))))
 
     def caveats(self) -> list[str]:
         """Why the bits may differ here although nothing is wrong."""
         return [line for file in self.files[:1] for line in _caveats(file.about)]
+
+
+def _config_of(about: Mapping[str, str]) -> Config:
+    """What the actor was configured with. Raises DataError."""
+    try:
+        return config_of(plain_values(about.get("config", "")) or {})
+    except yaml.YAMLError as error:
+        raise DataError(f"the configuration in the recording cannot be read: {error}.") from error
+
+
+def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
+    """Of libraries, by name. Raises DataError."""
+    try:
+        return msgspec.json.decode(about.get("versions", "{}"), type=dict[str, str])
+    except msgspec.DecodeError as error:
+        raise DataError(f"the versions in the recording cannot be read: {error}.") from error
 
 
 def _caveats(about: Mapping[str, str]) -> list[str]:
@@ -62,7 +79,7 @@ def _caveats(about: Mapping[str, str]) -> list[str]:
             f"Force it with LDO_ISA={isa}, on a machine that has it."
         )
     now = versions()
-    for name, version in json.loads(about.get("versions", "{}")).items():
+    for name, version in _versions_of(about).items():
         if now.get(name) != version:
             lines.append(f"recorded with {name} {version}, this is {now.get(name)}.")
     return lines

@@ -47,7 +47,7 @@ def vlm_calls(folder: Path) -> int | None:
     path = folder / "summary.json"
     try:
         found = json.loads(path.read_text())["vlm_calls"] if path.is_file() else None
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return found if isinstance(found, int) else None
 
@@ -140,7 +140,7 @@ def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
         yield path, json.loads(path.read_text())
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
 
 
@@ -160,7 +160,7 @@ def _frames(path: Path) -> tuple[RunFrame, ...]:
     try:
         with path.open(newline="") as file:
             return tuple(_frame(row) for row in csv.DictReader(file))
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except (OSError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise DataError(f"{path} cannot be read: {error!r}.") from error
 
 

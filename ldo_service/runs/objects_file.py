@@ -41,5 +41,5 @@ def read_objects(folder: Path) -> MapObjects:
         return msgspec.json.decode(path.read_bytes(), type=MapObjects)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise DataError(f"{path} is not what `ldo run` writes: {error}.") from error

@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import yaml
 
 from ldo_service.errors import ConfigError
+from ldo_service.plain_yaml import plain_values
 from ldo_service.schemas.topics import (
     CONTROL,
     FROM_ODOMETRY,
@@ -62,12 +64,12 @@ Access = Mapping[str, Grantee]  # by common name of the certificate
 def read_access(path: Path) -> dict[str, Grantee]:
     """Raises ConfigError for a file that cannot be read or says something else."""
     try:
-        return msgspec.yaml.decode(path.read_bytes(), type=dict[str, Grantee])
+        return msgspec.convert(plain_values(path.read_bytes()), dict[str, Grantee])
     except OSError as error:
         raise ConfigError(
             f"{path} cannot be read: {error.strerror}. `ldo keys` writes it for each service."
         ) from error
-    except msgspec.DecodeError as error:
+    except (msgspec.ValidationError, yaml.YAMLError) as error:
         raise ConfigError(
             f"{path} does not say who may do what: {error}. `ldo keys` writes such a file."
         ) from error

@@ -87,7 +87,7 @@ class FolderStore:
             parts = {
                 part: decode_state((folder / file).read_bytes()) for part, file in files.items()
             }
-        except (OSError, msgspec.DecodeError, ValueError) as error:
+        except (OSError, ValueError) as error:  # a name may hold a null byte
             log.error("%s: its saved state cannot be read and is left out: %s", actor, error)
             return None
         return parts or None
@@ -125,7 +125,11 @@ def encode_state(value: object) -> bytes:
 
 
 def decode_state(body: bytes) -> Any:
-    return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
+    """The inverse. Raises msgspec.DecodeError, whatever the bytes are."""
+    try:
+        return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise msgspec.DecodeError(f"cannot be decoded: {error}") from error
 
 
 def _array_to_ext(value: object) -> msgspec.msgpack.Ext:

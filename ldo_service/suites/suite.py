@@ -10,6 +10,7 @@ import yaml
 from msgspec import field
 
 from ldo_service.errors import ConfigError
+from ldo_service.plain_yaml import plain_values
 
 from .figures import FIGURES
 
@@ -95,6 +96,6 @@ def load_suite(name: str) -> Suite:
             f"there is no suite {name}: neither a file nor one of {', '.join(known_suites())}."
         )
     try:
-        return msgspec.convert(yaml.safe_load(path.read_text()), Suite)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, msgspec.ValidationError) as error:
+        return msgspec.convert(plain_values(path.read_text()), Suite)
+    except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} is not a suite: {error}") from error

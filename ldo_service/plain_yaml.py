@@ -1,0 +1,18 @@
+"""Plain values out of YAML that somebody wrote."""
+
+from typing import Any
+
+import yaml
+
+
+def plain_values(text: str | bytes) -> Any:
+    """Numbers, text, dates, lists and dictionaries. Raises yaml.YAMLError, whatever the text is.
+
+    Parsed in Python: libyaml, in C, overflows its stack where brackets are nested deeply.
+    """
+    try:
+        return yaml.safe_load(text)
+    except RecursionError:
+        raise yaml.YAMLError("it is nested too deeply") from None
+    except ValueError as error:  # a date such as 2027-13-01
+        raise yaml.YAMLError(str(error)) from error
