@@ -1,0 +1,91 @@
+"""Data sets: each kind of file in each layout, beside files that are good."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ldo_service.datasets import open_sequence
+
+from .target import Target, in_folder
+
+WIDTH, HEIGHT = 40, 32
+COLOR = np.random.default_rng(7).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+DEPTH = np.full((HEIGHT, WIDTH), 1500, np.uint16)
+POSE = b"1 0 0 0.5\n0 1 0 0\n0 0 1 -2e-1\n0 0 0 1\n"
+INTRINSICS = b"40 0 19.5\n0 41 15.5\n0 0 1\n"
+INTRINSICS_4 = b"40 0 19.5 0\n0 41 15.5 0\n0 0 1 0\n0 0 0 1\n"
+PINHOLE = {"fx": 40.0, "fy": 41.0, "cx": 19.5, "cy": 15.5}
+LISTED = b"# stamp file\n0.1 rgb/a.png\n0.2 rgb/a.png\n"
+TRAJECTORY = b"# stamp tx ty tz qx qy qz qw\n0.1 0 0 0 0 0 0 1\n0.2 1 -2e0 3.5 0 0.6 0 0.8\n"
+
+
+def png(pixels: np.ndarray) -> bytes:
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+def jpeg(pixels: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", pixels)[1].tobytes()
+
+
+TUM = {
+    "rgb.txt": LISTED,
+    "depth.txt": LISTED.replace(b"rgb/", b"depth/"),
+    "camera.json": json.dumps(
+        {
+            **PINHOLE,
+            "width": WIDTH,
+            "height": HEIGHT,
+            "distortion": [0.1, 0, 0, 0],
+            "depth_scale": 9,
+        }
+    ).encode(),
+    "groundtruth.txt": TRAJECTORY,
+    "rgb/a.png": png(COLOR),
+    "depth/a.png": png(DEPTH),
+}
+REPLICA = {
+    "cam_params.json": json.dumps(
+        {"camera": {**PINHOLE, "w": WIDTH, "h": HEIGHT, "scale": 1000.0}}
+    ).encode(),
+    "traj.txt": b"1 0 0 0.5 0 1 0 0 0 0 1 0 0 0 0 1\n" * 2,
+    "labels.json": b'{"classes": {"0": "undefined", "1": "sofa"}}',
+    "results/frame000000.jpg": jpeg(COLOR),
+    "results/depth000000.png": png(DEPTH),
+    "semantic_class/000000.png": png(DEPTH.astype(np.uint8)),
+    "instance/000000.png": png(DEPTH),
+}
+SCANNET = {
+    "intrinsic/intrinsic_color.txt": INTRINSICS_4,
+    "intrinsic/intrinsic_depth.txt": INTRINSICS_4,
+    "intrinsic/extrinsic_depth.txt": POSE,
+    "color/0.jpg": jpeg(COLOR),
+    "depth/0.png": png(DEPTH),
+    "pose/0.txt": POSE,
+}
+SEVEN_SCENES = {
+    "camera-intrinsics.txt": INTRINSICS,
+    "frame-000000.color.png": png(COLOR),
+    "frame-000000.depth.png": png(DEPTH),
+    "frame-000000.pose.txt": POSE,
+}
+LAYOUTS = {"TUM": TUM, "Replica": REPLICA, "ScanNet": SCANNET, "7-Scenes": SEVEN_SCENES}
+
+
+def frames_of(folder: Path) -> None:
+    """All that a run asks of a data set."""
+    sequence = open_sequence(str(folder))
+    sequence.truth()
+    labels = sequence.true_labels()
+    for index in range(min(len(sequence), 2)):
+        if labels is not None:
+            labels.frame(index)
+        assert sequence[index].depth_m.shape == (sequence.camera.height, sequence.camera.width)
+
+
+TARGETS = [
+    Target(f"{layout}: {name}", in_folder(name, frames_of, files), [body])
+    for layout, files in LAYOUTS.items()
+    for name, body in files.items()
+]

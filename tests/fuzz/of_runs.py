@@ -1,0 +1,230 @@
+"""What the service and its runs leave on the disk, and read again."""
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from ldo_service.actors.localiser import PLACES, places_of
+from ldo_service.errors import DataError
+from ldo_service.gaussians import chunk, keyframe_images
+from ldo_service.gaussians.model import new_labels
+from ldo_service.gaussians.ply import read_ply, write_ply
+from ldo_service.geometry import Camera, codecs
+from ldo_service.recordings.replay import open_recording
+from ldo_service.recordings.sequence import RecordingSequence
+from ldo_service.runs.finished import MapFolder, read_run, vlm_calls
+from ldo_service.runs.loops_file import read_loops
+from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
+from ldo_service.runtime.journal import Started, Step, checksum
+from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
+from ldo_service.runtime.state_store import FolderStore, decode_state, encode_state
+from ldo_service.schemas import CameraRgbd, MapObjects
+from ldo_service.semantics.saved import read_semantics, write_semantics
+from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.tracking.places import Place
+from tests.schemas.examples import EXAMPLES
+
+from .of_data_sets import DEPTH, TRAJECTORY, png
+from .target import Target, as_file, in_folder
+
+ROWS = np.random.default_rng(7).normal(size=(3, 16)).astype(np.float32)
+CAMERA = {"width": 40, "height": 32, "fx": 40.0, "fy": 41.0, "cx": 19.5, "cy": 15.5}
+KEYFRAME = {
+    "keyframe": 0,
+    "frame_index": 0,
+    "stamp_ns": 0,
+    "camera": CAMERA,
+    "T_map_camera": np.eye(4).tolist(),
+    "exposure": [[1, 1, 1], [0, 0, 0]],
+    "segment": 0,
+}
+LOOPS = {
+    "candidates": [{"keyframes": [4], "references": [1], "refused": "", "ms": 1.5}],
+    "closures": [{"keyframe": 4, "reference": 1, "T_reference_keyframe": np.eye(4).tolist()}],
+}
+FRAMES = b"frame,stamp_ns,status,held_out\n0,0,OK,0\n1,33333333,LOST,1\n"
+
+
+def bytes_of(write: Callable[[Path], object]) -> bytes:
+    """What it writes to a file."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "file")
+        return (Path(folder) / "file").read_bytes()
+
+
+# --- maps -----------------------------------------------------------------------------------------
+def as_text(body: bytes) -> bytes:
+    """The same Gaussians as a PLY file in text."""
+    header, _, _ = body.partition(b"end_header\n")
+    header = header.replace(b"binary_little_endian", b"ascii")
+    return header + b"end_header\n" + b"\n".join(b"1 " * header.count(b"property") for _ in ROWS)
+
+
+def objects_bytes() -> bytes:
+    objects = EXAMPLES["map_objects"]
+    assert isinstance(objects, MapObjects)
+    with tempfile.TemporaryDirectory() as folder:
+        write_objects(Path(folder), objects)
+        return (Path(folder) / OBJECTS).read_bytes()
+
+
+def keyframes_file(folder: Path) -> None:
+    run = MapFolder(folder)
+    run.viewpoints()
+    run.exposures()
+    run.keyframes()
+
+
+def images_of_a_keyframe() -> bytes:
+    color = np.arange(3 * 48, dtype=np.uint8).reshape(3, 6, 8)
+    depth_m = np.linspace(0.5, 3, 48, dtype=np.float32).reshape(6, 8)
+    camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
+    return keyframe_images.packed(keyframe_images.KeyframeImages(3, camera, color, depth_m, None))
+
+
+def gaussians_of_a_chunk() -> bytes:
+    ids = np.arange(3, dtype=np.int64)
+    return chunk.packed(chunk.Chunk(2, ids, ROWS, new_labels(3)))
+
+
+def places_bytes() -> bytes:
+    """Of a place with two features."""
+    place = Place(
+        id=0,
+        segment=0,
+        T_odom_keyframe=np.eye(4),
+        median_depth_m=1.5,
+        intensity_sigma=2.0,
+        depth_noise_scale=1.0,
+        thumbnail=np.zeros(300, np.int8),
+        points_camera=np.ones((2, 3), np.float32),
+        descriptors=np.zeros((2, 32), np.uint8),
+        camera=Camera(*CAMERA.values()),
+        gray=png(DEPTH.astype(np.uint8)),
+        depth=codecs.encode_depth(DEPTH)[1],
+    )
+    return encode_state({"places": [place.packed]})
+
+
+MAP = bytes_of(lambda path: write_ply(path, ROWS))
+SEMANTICS = bytes_of(lambda path: write_semantics(path, new_labels(3), ("background", "other")))
+RUN = {
+    "map.ply": MAP,
+    "frames.csv": FRAMES,
+    "trajectory.txt": TRAJECTORY,
+    "trajectory_online.txt": TRAJECTORY,
+    "keyframes.json": json.dumps([KEYFRAME]).encode(),
+    "loops.json": json.dumps(LOOPS).encode(),
+    "summary.json": b'{"vlm_calls": 3}',
+    "semantics.npz": SEMANTICS,
+}
+
+
+# --- recordings and states ------------------------------------------------------------------------
+def record(path: Path) -> None:
+    """A camera's frame, and the step that took it."""
+    body = msgspec.msgpack.encode(EXAMPLES["camera_rgbd"])
+    file = RecordingFile(path, {"config": "tracker: {hold_out: 5}"}, RecordConfig())
+    file.add_entry(Started(step=0, state={"last_stamp_ns": encode_state(1)}))
+    file.add("camera/rgbd", CameraRgbd, body, 0, 2)
+    step = Step(step=0, kind="done", taken=0, topic="camera/rgbd", checksum=checksum(body))
+    file.add_entry(step)
+    file.close()
+
+
+def chunked(body: bytes) -> bytes:
+    """The same recording as other tools write it."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    out = BytesIO()
+    writer = Writer(out)
+    writer.start()
+    ids: dict[str, int] = {}
+    for _, channel, message in make_reader(BytesIO(body)).iter_messages():
+        topic = channel.topic
+        ids[topic] = ids.get(topic) or writer.register_channel(topic, channel.message_encoding, 0)
+        writer.add_message(ids[topic], message.log_time, message.data, message.publish_time)
+    writer.finish()
+    return out.getvalue()
+
+
+def live_again(folder: Path) -> None:
+    """What `ldo replay` does: a difference is an answer, too."""
+    for actor in open_recording(folder):
+        actor.caveats()
+        actor.verify()
+
+
+def frames_of(folder: Path) -> None:
+    sequence = RecordingSequence(folder)
+    for index in range(min(2, len(sequence))):
+        sequence[index]
+
+
+def state_of(folder: Path) -> None:
+    """None where it cannot be read, which is said in the log."""
+    FolderStore(folder).load("actor")
+
+
+def states() -> Iterator[bytes]:
+    yield encode_state({"sum": 3, "text": "a", "none": None, "list": [1, 2.5]})
+    yield encode_state({"array": np.arange(6, dtype=np.float32).reshape(2, 3)})
+    yield encode_state(np.float64(2.5))
+
+
+CONTENTS = msgspec.msgpack.encode({"sum": "sum.a"})
+STATE = {"actor/contents.msgpack": CONTENTS, "actor/sum.a": next(states())}
+RECORDING = bytes_of(record)
+
+of_packed: tuple[type[Exception], ...] = (DataError,)
+of_vocabulary = (msgspec.DecodeError, ValueError, KeyError, TypeError)  # as the mapper catches
+
+
+def vocabulary(body: bytes, _folder: Path) -> Any:
+    return Vocabulary.unpacked(decode_state(body))
+
+
+TARGETS = [
+    Target("PLY", as_file("map.ply", read_ply), [MAP, as_text(MAP)]),
+    Target("labels of a map", as_file("s.npz", read_semantics), [SEMANTICS]),
+    Target("objects.json", in_folder(OBJECTS, read_objects, {}), [objects_bytes()]),
+    Target("places", in_folder(PLACES, places_of, {}), [places_bytes()]),
+    Target("summary.json", in_folder("summary.json", vlm_calls, {}), [RUN["summary.json"]]),
+    Target("loops.json", in_folder("loops.json", read_loops, {}), [RUN["loops.json"]]),
+    Target(
+        "keyframes.json", in_folder("keyframes.json", keyframes_file, RUN), [RUN["keyframes.json"]]
+    ),
+    *(
+        Target(f"run: {name}", in_folder(name, read_run, RUN), [body])
+        for name, body in RUN.items()
+        if name not in ("summary.json", "trajectory_online.txt")
+    ),
+    Target(
+        "images of a keyframe",
+        lambda body, _: keyframe_images.unpacked(body),
+        [images_of_a_keyframe()],
+    ),
+    Target("chunk of Gaussians", lambda body, _: chunk.unpacked(body), [gaussians_of_a_chunk()]),
+    Target(
+        "recording",
+        in_folder("frame_source.mcap", live_again, {}),
+        [RECORDING, chunked(RECORDING)],
+    ),
+    Target(
+        "recording as a data set",
+        in_folder("frame_source.mcap", frames_of, {}),
+        [RECORDING, chunked(RECORDING)],
+    ),
+    Target("state", in_folder("actor/sum.a", state_of, STATE), list(states()), ()),
+    Target(
+        "contents of a state", in_folder("actor/contents.msgpack", state_of, STATE), [CONTENTS], ()
+    ),
+    Target("vocabulary", vocabulary, [msgspec.msgpack.encode(Vocabulary().packed)], of_vocabulary),
+]

@@ -1,0 +1,105 @@
+"""What comes over the network."""
+
+from functools import partial
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
+from ldo_service.geometry import codecs
+from ldo_service.runtime.links import Grant, Header, Join, Welcome, decode_request, encode
+from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, decode
+from ldo_service.semantics.labellers.answers import read_answer
+from tests.schemas.examples import EXAMPLES
+
+from .target import Target, chosen, numbered
+
+KINDS = tuple(type(message) for message in EXAMPLES.values())
+BODIES = [msgspec.msgpack.encode(message) for message in EXAMPLES.values()]
+CAMERAS = (CameraRgbd, CameraColor, CameraDepth)
+GRAY = np.arange(35, dtype=np.uint8).reshape(5, 7) * 7
+COLOR = np.stack([GRAY, GRAY + 1, GRAY + 2], axis=2)
+DEPTH = GRAY.astype(np.uint16) * 20
+
+
+def messages(body: bytes, _folder: Path) -> None:
+    """What decodes is valid, so it encodes and decodes again."""
+    if body:
+        kind = KINDS[body[0] % len(KINDS)]
+        decode(msgspec.msgpack.encode(decode(body[1:], kind)), kind)
+
+
+def frames(body: bytes, _folder: Path) -> None:
+    """The actor rejects and counts frames that it cannot use; none may make it fail."""
+    source = FrameSource(FrameSourceConfig(min_side_px=1))
+    for kind in CAMERAS:
+        try:
+            message = decode(body, kind)
+        except msgspec.DecodeError:
+            continue
+        list(source.handle(message))
+
+
+def images(body: bytes, _folder: Path) -> None:
+    """The first bytes are the size and the encoding."""
+    if len(body) < 3:
+        return
+    width, height, which, data = *body[:3], memoryview(body[3:])
+    decoders = [partial(codecs.decode_color, name) for name in ("rgb8", "bgr8", "jpeg", "png")]
+    decoders += [
+        partial(codecs.decode_depth, name) for name in ("png", "z16", "z16+zstd", "f32+zstd")
+    ]
+    decoders[which % len(decoders)](width, height, data)
+
+
+def of_cameras() -> list[bytes]:
+    examples = [EXAMPLES[name] for name in ("camera_rgbd", "camera_color", "camera_depth")]
+    return [msgspec.msgpack.encode(example) for example in examples]
+
+
+def of_images() -> list[bytes]:
+    def encoded(suffix: str, pixels: np.ndarray) -> bytes:
+        return cv2.imencode(suffix, pixels)[1].tobytes()
+
+    bodies = (
+        COLOR.tobytes(),
+        COLOR.tobytes(),
+        encoded(".jpg", COLOR),
+        encoded(".png", COLOR),
+        encoded(".png", DEPTH),
+        DEPTH.tobytes(),
+        codecs.encode_depth(DEPTH)[1],
+        codecs.encode_depth(DEPTH.astype(np.float32))[1],
+    )
+    return [bytes([7, 5, number]) + body for number, body in enumerate(bodies)]
+
+
+ANSWER = (
+    b'{"choices": [{"message": {"content": "A sofa."}, "logprobs": {"content": '
+    b'[{"token": "sofa", "logprob": -0.25}]}}]}'
+)
+LINKS = (
+    decode_request,
+    partial(decode, kind=Header),
+    partial(decode, kind=Welcome),
+)
+LINK_BODIES = [
+    encode(Grant("mapper", 1, 3, 4, 12)),
+    encode(Header("camera", 1, 2, 3)),
+    encode(Welcome(1, {"mapper": 3})),
+]
+
+TARGETS = [
+    Target("messages", messages, numbered(BODIES), (msgspec.DecodeError,)),
+    Target("camera frames", frames, of_cameras(), ()),
+    Target("images", images, of_images()),
+    Target(
+        "links",
+        chosen(*LINKS),
+        [*numbered(LINK_BODIES), b"\0" + encode(Join("mapper"))],
+        (msgspec.DecodeError,),
+    ),
+    Target("answers of a server", lambda body, _: read_answer(body), [ANSWER]),
+]

@@ -1,0 +1,121 @@
+"""What users write and bring: settings, suites, names, keys and networks."""
+
+import gzip
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import yaml
+from safetensors.numpy import save
+
+from ldo_service.authority import Authority
+from ldo_service.config import config_of, config_yaml, load_config
+from ldo_service.models import Models
+from ldo_service.runtime.access import access_control, read_access
+from ldo_service.runtime.keys import CA, CERTIFICATE, KEY, Keys
+from ldo_service.runtime.network import Network
+from ldo_service.semantics.class_names import class_names, read_names
+from ldo_service.semantics.detectors import OnnxDetector
+from ldo_service.semantics.labellers.byte_pairs import BytePairs
+from ldo_service.semantics.labellers.text_space import CachedEmbeddings
+from ldo_service.suites import load_suite
+from tests.semantics.networks import SQUARES
+
+from .of_runs import bytes_of
+from .target import Read, Target, as_file, in_folder
+
+CONFIG = b"tracker:\n  hold_out: 5\nservice: {spawned: [optimizer], max_message_mb: 60}\n"
+SUITE = b"""title: Desks
+sequences: {fr1: desk, room: "synthetic:room"}
+variants: {as it is: [], fewer: [tracker.hold_out=2]}
+figures: [ate_cm, fps]
+seeds: [0, 1]
+published: {other: {fr1: {ate_cm: 1.5}}}
+"""
+ACCESS = b"front-3f9a1c02: {role: camera, robot: mule, until: 2027-11-22}\n"
+ABOUT = json.dumps(
+    {"sha256": hashlib.sha256(b"x").hexdigest(), "layout": "yolox", "classes": ["a"], "parts": {}}
+).encode()
+MERGES = b"#version: 0.2\ni n\nt h\nth e</w>\n"
+NAMES = np.array(["a", "b"])
+EMBEDDINGS = np.eye(2, dtype=np.float32)
+
+
+def config(path: Path) -> None:
+    """What is taken is written and read again as the same."""
+    taken = load_config(path)
+    assert config_of(yaml.safe_load(config_yaml(taken))) == taken
+
+
+def setting(body: bytes, _folder: Path) -> None:
+    load_config(settings=(body.decode("utf-8", "replace"),))
+
+
+def of_names(take: Callable[[str], object]) -> Read:
+    return lambda body, _: take(body.decode("utf-8", "replace"))
+
+
+def npz() -> bytes:
+    out = BytesIO()
+    np.savez(out, names=NAMES, embeddings=EMBEDDINGS, logit_scale=np.float32(4))
+    return out.getvalue()
+
+
+def rules(path: Path) -> None:
+    access_control(read_access(path))
+
+
+def registered(folder: Path) -> None:
+    Models(folder).get("net").verify()
+
+
+def keys(folder: Path) -> None:
+    (folder / KEY).chmod(0o600)
+    Keys(folder).context()
+
+
+def of_an_authority() -> dict[str, bytes]:
+    with tempfile.TemporaryDirectory() as name:
+        authority = Authority.new(Path(name) / "keys", 9)
+        made = authority.add("desk", "viewer", "*", 9)
+        return {file: (made / file).read_bytes() for file in (CA, CERTIFICATE, KEY)}
+
+
+NET = {"net/model.onnx": b"x"}
+KEYS = of_an_authority()
+NETWORK = bytes_of(SQUARES["yolox"].write)
+
+TARGETS = [
+    Target("config.yaml", as_file("config.yaml", config), [CONFIG]),
+    Target("--set", setting, [b"tracker.hold_out=5", b"data.T_color_depth=[1, 0]"]),
+    Target("suite", as_file("suite.yaml", lambda path: load_suite(str(path))), [SUITE]),
+    Target("names of robots", of_names(Network), [b"mule", b"../up"]),
+    Target("endpoints", of_names(lambda text: Network("r", text).address), [b"tcp/[::1]:7447"]),
+    Target(
+        "access.yaml",
+        as_file("access.yaml", lambda path: access_control(read_access(path))),
+        [ACCESS],
+    ),
+    *(Target(f"keys: {name}", in_folder(name, keys, KEYS), [body]) for name, body in KEYS.items()),
+    Target(
+        "about.json", in_folder("net/about.json", registered, {"net/model.onnx": b"x"}), [ABOUT]
+    ),
+    Target("ONNX", as_file("net.onnx", OnnxDetector), [NETWORK]),
+    Target("names of classes", as_file("names.txt", read_names), [b"chair\nsofa\n"]),
+    Target(
+        "names that a network carries",
+        of_names(lambda text: class_names(2, metadata=text)),
+        [b"{0: 'chair', 1: 'sofa'}", b"['a', 'b']"],
+    ),
+    Target("byte pairs", as_file("bpe", BytePairs.read), [MERGES, gzip.compress(MERGES, mtime=0)]),
+    Target("embeddings", as_file("e.npz", CachedEmbeddings), [npz()]),
+    Target(
+        "embeddings in safetensors",
+        as_file("e.safetensors", CachedEmbeddings),
+        [save({"embeddings": EMBEDDINGS}, {"names": "a\nb"})],
+    ),
+]

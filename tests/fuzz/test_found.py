@@ -1,0 +1,52 @@
+"""What fuzzing found, tried again: each of these once raised what nobody expected."""
+
+import logging
+import struct
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from .of_data_sets import COLOR as IMAGE
+from .of_data_sets import png
+from .targets import TARGETS
+
+DEEP_JSON, DEEP_YAML, DEEP_MSGPACK = b'{"a": ' * 100_000, b"{a: " * 3000, b"\x91" * 100_000
+NO_TEXT = b"\xff\xfe\x80"
+LONG_CHUNK = png(IMAGE)[:8] + struct.pack(">I4s", 4_000_000_000, b"IDAT") + bytes(300)
+
+FOUND = [
+    ("Replica: traj.txt", NO_TEXT),
+    ("Replica: cam_params.json", DEEP_JSON),
+    ("TUM: rgb.txt", b"0.1 rgb/\0.png\n"),
+    ("TUM: rgb.txt", b"99999999999999999999 rgb/a.png\n"),
+    ("TUM: rgb/a.png", LONG_CHUNK + b"IEND\xaeB`\x82"),
+    ("images", bytes([40, 32, 3]) + LONG_CHUNK),
+    ("about.json", b'{"sha256": "' + NO_TEXT + b'"}'),
+    ("objects.json", DEEP_JSON),
+    ("loops.json", DEEP_JSON),
+    ("keyframes.json", DEEP_JSON),
+    ("summary.json", DEEP_JSON),
+    ("run: frames.csv", b"a" * 200_000),
+    ("images of a keyframe", b"\x81\xa1a" * 100_000),
+    ("places", DEEP_MSGPACK),
+    ("state", DEEP_MSGPACK),
+    ("state", msgspec.msgpack.encode(msgspec.msgpack.Ext(1, b"\x93\xa3<q9\x91\x01\xc4\x01\0"))),
+    ("contents of a state", msgspec.msgpack.encode({"sum": "\0"})),
+    ("config.yaml", DEEP_YAML),
+    ("config.yaml", b"tracker: 2027-13-45\n"),
+    ("--set", b"tracker.hold_out=" + b"[" * 3000),
+    ("suite", DEEP_YAML),
+    ("access.yaml", b"[" * 100_000),  # this one ended the process
+    ("access.yaml", b"a: {role: camera, robot: mule, until: 2027-13-01}"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "body"), FOUND, ids=[f"{name} {number}" for number, (name, _) in enumerate(FOUND)]
+)
+def test_it_is_refused_now(
+    name: str, body: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.CRITICAL + 1):
+        TARGETS[name].attempt(body, tmp_path)
