@@ -1,16 +1,16 @@
 """Image files, read so that a damaged one is an error and never a half-grey picture."""
 
-from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ldo_service.errors import FrameError
-from ldo_service.geometry.image_header import PNG, announced_size
+from ldo_service.geometry.image_header import announced_size
 
 # The last bytes of a complete file. OpenCV decodes what is there of a cut one without complaint.
 _ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
+MOST_PIXELS = 1 << 25  # as of images in messages
 _TRAILING_BYTES = 64  # some writers pad their files
 
 
@@ -66,17 +66,27 @@ def _decode(path: Path, flags: int) -> np.ndarray:
         ) from error
     if not _is_complete(data):
         raise FrameError(f"{path} is cut short at {len(data)} bytes: copy or download it again.")
-    image = None
-    if not data.startswith(PNG) or announced_size(memoryview(data)):
-        with suppress(cv2.error):
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    _require_size(path, data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error:
+        image = None
     if image is None:
         raise FrameError(f"{path} is not a readable image: copy or download it again.")
     return image
 
 
+def _require_size(path: Path, data: bytes) -> None:
+    """Before memory is taken for it."""
+    size = announced_size(memoryview(data))
+    if size is None:
+        raise FrameError(f"{path} is not a readable image, PNG or JPEG: copy or download it again.")
+    if size[0] * size[1] > MOST_PIXELS:
+        raise FrameError(f"{path} says that it has {size[0]}x{size[1]} pixels: no camera has that.")
+
+
 def _is_complete(data: bytes) -> bool:
-    """Whether a PNG or JPEG has its end; other formats are left to their decoder."""
+    """Whether a PNG or JPEG has its end."""
     if len(data) < 16:
         return False
     for start, end in _ENDS.items():

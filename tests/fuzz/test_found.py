@@ -8,12 +8,13 @@ import msgspec
 import pytest
 
 from .of_data_sets import COLOR as IMAGE
-from .of_data_sets import png
+from .of_data_sets import jpeg, png
 from .targets import TARGETS
 
 DEEP_JSON, DEEP_YAML, DEEP_MSGPACK = b'{"a": ' * 100_000, b"{a: " * 3000, b"\x91" * 100_000
 NO_TEXT = b"\xff\xfe\x80"
 LONG_CHUNK = png(IMAGE)[:8] + struct.pack(">I4s", 4_000_000_000, b"IDAT") + bytes(300)
+LARGE_JPEG = jpeg(IMAGE).replace(struct.pack(">HH", *IMAGE.shape[:2]), b"\x7f\xff" * 2)
 
 FOUND = [
     ("Replica: traj.txt", NO_TEXT),
@@ -21,6 +22,7 @@ FOUND = [
     ("TUM: rgb.txt", b"0.1 rgb/\0.png\n"),
     ("TUM: rgb.txt", b"99999999999999999999 rgb/a.png\n"),
     ("TUM: rgb/a.png", LONG_CHUNK + b"IEND\xaeB`\x82"),
+    ("Replica: results/frame000000.jpg", LARGE_JPEG),
     ("images", bytes([40, 32, 3]) + LONG_CHUNK),
     ("about.json", b'{"sha256": "' + NO_TEXT + b'"}'),
     ("objects.json", DEEP_JSON),
