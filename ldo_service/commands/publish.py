@@ -2,29 +2,46 @@
 
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from typing import Annotated
 
 import msgspec
 import tyro
 from rich.console import Console
 
+from ldo_service.cameras import realsense
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.source import Selection
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
+from ldo_service.runtime.keys import Keys
+from ldo_service.runtime.network import DEFAULT_ENDPOINT, Network
 from ldo_service.wire import camera_rgbd_message
 
-from .options import ConfigFile, Endpoint, KeysFolder, MaxFrames, Robot, Settings, Source, Stride
+from .live_camera import (
+    REALSENSE,
+    ROS2,
+    RealSenseOptions,
+    RosOptions,
+    frames_of_ros,
+    relay,
+    require_no_sequence,
+)
+from .options import ConfigFile, Endpoint, KeysFolder, MaxFrames, Robot, Settings, Stride
 from .progress import progress
 
+FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
 MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad
 
 
 def publish(
-    source: Source,
+    source: Annotated[
+        str,
+        tyro.conf.Positional,
+        tyro.conf.arg(metavar="SOURCE", help="a data set, as of `ldo run`; `realsense`; or `ros2`"),
+    ],
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
@@ -39,19 +56,36 @@ def publish(
     ] = False,
     config: ConfigFile = None,
     set: Settings = (),
+    usb: RealSenseOptions = FIRST_REALSENSE,
+    ros: RosOptions = NO_TOPICS,
 ) -> None:
-    """Be a camera: publish a sequence's frames on camera/rgbd.
+    """Be a camera: publish on camera/rgbd what a sequence or a camera has.
 
-    Stamps are those of the sequence unless --restamp is given: then a subscriber can subtract the
+    `realsense` is a camera on USB. `ros2` are topics of ROS that a Zenoh bridge forwards.
+
+    Stamps are those of the source unless --restamp is given: then a subscriber can subtract the
     stamp of a pose from its clock and has the pose's age.
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
+      ldo publish realsense --size 848x480
+      ldo publish ros2 --color /camera/color/image_raw --depth /camera/aligned_depth/image_raw
     """
+    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    if source in (REALSENSE, ROS2):
+        require_no_sequence(source, rate=rate, config=config, set=set)
+        network, chosen = Network(robot, endpoint, Keys.of(keys)), Selection(stride, max_frames)
+        live = (
+            realsense.frames(usb.stream())
+            if source == REALSENSE
+            else frames_of_ros(ros, network, console.print)
+        )
+        with connect(robot, endpoint, keys) as service, closing(live):
+            relay(service, live, chosen, restamp, console.print)
+        return
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
     sequence = open_source(source, load_config(config, set).data.options())
     indices = Selection(stride, max_frames).indices(sequence)
-    console = Console(stderr=True)
     with (
         connect(robot, endpoint, keys) as service,
         progress("publish", len(indices), console) as advance,

@@ -8,10 +8,14 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
+from ldo_service.cameras.ros2 import RosCamera, RosTopics
 from ldo_service.geometry import codecs
+from ldo_service.geometry.codecs import encode_jpeg
 from ldo_service.runtime.links import Grant, Header, Join, Welcome, decode_request, encode
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, decode
 from ldo_service.semantics.labellers.answers import read_answer
+from tests.cameras import ros
+from tests.cameras.ros import camera_info, cdr, compressed, image
 from tests.schemas.examples import EXAMPLES
 
 from .target import Target, chosen, numbered
@@ -22,6 +26,8 @@ CAMERAS = (CameraRgbd, CameraColor, CameraDepth)
 GRAY = np.arange(35, dtype=np.uint8).reshape(5, 7) * 7
 COLOR = np.stack([GRAY, GRAY + 1, GRAY + 2], axis=2)
 DEPTH = GRAY.astype(np.uint16) * 20
+INFO = cdr(camera_info())
+PNG_DEPTH = compressed("16UC1; png", bytes(12) + cv2.imencode(".png", ros.DEPTH_MM)[1].tobytes())
 
 
 def messages(body: bytes, _folder: Path) -> None:
@@ -76,6 +82,26 @@ def of_images() -> list[bytes]:
     return [bytes([7, 5, number]) + body for number, body in enumerate(bodies)]
 
 
+PLAIN = RosTopics("/c/image_raw", "/d/image_raw")
+COMPRESSED = RosTopics("/c/image_raw/compressed", "/d/image_raw/compressedDepth")
+ROS = [  # topics, which of them the bytes come on, and good bytes for all of them
+    (topics, topic, {topics.camera_info: INFO, topics.color: color, topics.depth: depth})
+    for topics, color, depth in (
+        (PLAIN, cdr(image("rgb8", ros.COLOR)), cdr(image("16UC1", ros.DEPTH_MM))),
+        (COMPRESSED, cdr(compressed("jpeg", encode_jpeg(ros.COLOR))), cdr(PNG_DEPTH)),
+    )
+    for topic in (topics.camera_info, topics.color, topics.depth)
+]
+
+
+def of_ros(body: bytes, _folder: Path) -> None:
+    """A camera takes whatever comes on its topics; the first byte says on which."""
+    topics, changed, good = ROS[body[0] % len(ROS) if body else 0]
+    camera = RosCamera(topics, lambda _: None)
+    for topic, sample in good.items():
+        list(camera.take(topic, body[1:] if topic == changed else sample))
+
+
 ANSWER = (
     b'{"choices": [{"message": {"content": "A sofa."}, "logprobs": {"content": '
     b'[{"token": "sofa", "logprob": -0.25}]}}]}'
@@ -101,5 +127,6 @@ TARGETS = [
         [*numbered(LINK_BODIES), b"\0" + encode(Join("mapper"))],
         (msgspec.DecodeError,),
     ),
+    Target("ROS 2", of_ros, numbered(good[topic] for _, topic, good in ROS), ()),
     Target("answers of a server", lambda body, _: read_answer(body), [ANSWER]),
 ]

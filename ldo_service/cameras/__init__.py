@@ -1,0 +1,1 @@
+"""Cameras that somebody else's software speaks to, as frames of `camera/rgbd`."""

@@ -1,0 +1,186 @@
+"""An RGB-D camera of ROS 2, as topics that a Zenoh bridge forwards.
+
+zenoh-bridge-ros2dds puts the CDR of the topic `/a/b` on the key `a/b`, once somebody subscribes.
+"""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from functools import partial
+from threading import Condition
+
+import zenoh
+
+from ldo_service.errors import ConfigError, FrameError
+from ldo_service.geometry.pairing import Pairing
+from ldo_service.schemas import CameraModel, CameraRgbd
+
+from .ros_messages import (
+    RosImage,
+    is_compressed,
+    joined,
+    read_camera,
+    read_color,
+    read_depth,
+    typestore,
+)
+
+KEEP = 4  # samples of a topic that wait: a burst, as the service's own input keeps
+PAIR_BUFFER = 8  # halves that wait for the other: 0.27 s at 30 Hz
+RESTARTED_AFTER_NS = 1_000_000_000  # a stamp so much earlier is no jitter
+SILENT_AFTER_S = 5.0  # what does not come is said so often
+MOST_REASONS = 20  # that are said; a stream of garbage has a new one each time
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class RosTopics:
+    """Names as ROS has them. `info` of colour; empty: `camera_info` beside it.
+
+    max_skew_s     between the stamps of colour and depth: under half a period at 30 Hz
+    is_rectified   images without distortion: the camera is the info's P
+    is_registered  depth lies on the pixels of colour, though its frame_id is another
+    """
+
+    color: str
+    depth: str
+    info: str = ""
+    max_skew_s: float = 0.015
+    is_rectified: bool = False
+    is_registered: bool = False
+
+    def __post_init__(self) -> None:
+        for topic in (self.color, self.depth, self.camera_info):
+            key_of(topic)
+        if not 0 <= self.max_skew_s < 10:
+            raise ConfigError(f"--max-skew-s {self.max_skew_s:g}: must be within 0..10.")
+
+    @property
+    def camera_info(self) -> str:
+        base = self.color.rsplit("/", 1)[0] if is_compressed(self.color) else self.color
+        return self.info or base.rpartition("/")[0] + "/camera_info"
+
+
+def key_of(topic: str) -> str:
+    """Where the bridge puts a topic. Raises ConfigError for what is no name of one."""
+    parts = topic.strip("/").split("/")
+    if not all(part.isidentifier() and part.isascii() for part in parts):
+        raise ConfigError(f"{topic!r} is no topic of ROS: write it like /camera/color/image_raw.")
+    return "/".join(parts)
+
+
+@dataclass
+class Inbox:
+    """Samples in the order in which they came; of each topic the newest `KEEP`."""
+
+    dropped: int = 0
+    _waiting: deque[tuple[str, bytes]] = field(default_factory=deque)
+    _changed: Condition = field(default_factory=Condition)
+
+    def put(self, topic: str, sample: zenoh.Sample) -> None:
+        """On Zenoh's thread."""
+        body = sample.payload.to_bytes()
+        with self._changed:
+            of_topic = [entry for entry in self._waiting if entry[0] == topic]
+            if len(of_topic) >= KEEP:
+                self._waiting.remove(of_topic[0])
+                self.dropped += 1
+            self._waiting.append((topic, body))
+            self._changed.notify()
+
+    def take(self, timeout_s: float) -> tuple[str, bytes] | None:
+        with self._changed:
+            self._changed.wait_for(lambda: bool(self._waiting), timeout_s)
+            return self._waiting.popleft() if self._waiting else None
+
+
+class RosCamera:
+    """Frames of three topics. What cannot be used is counted, and each reason is said once."""
+
+    def __init__(self, topics: RosTopics, say: Say) -> None:
+        typestore()
+        self._topics, self._say = topics, say
+        self._inbox = Inbox()
+        self._pairing = self._new_pairing()
+        self._newest_ns = 0
+        self._camera: CameraModel | None = None
+        self._reasons: set[str] = set()
+        self._last_s = dict.fromkeys((topics.color, topics.depth, topics.camera_info), 0.0)
+        self._said_s = time.monotonic()
+        self.frames_made = self.rejected = 0
+
+    @property
+    def statistics(self) -> str:
+        return (
+            f"{self.frames_made} frames, {self.rejected} images refused, {self._pairing.lost_a} of "
+            f"colour and {self._pairing.lost_b} of depth without a partner, {self._inbox.dropped} "
+            "dropped"
+        )
+
+    def frames(self, session: zenoh.Session) -> Iterator[CameraRgbd]:
+        """For ever."""
+        with ExitStack() as stack:
+            for topic in self._last_s:
+                handler = zenoh.handlers.Callback(partial(self._inbox.put, topic), indirect=False)
+                stack.enter_context(session.declare_subscriber(key_of(topic), handler))
+            while True:
+                taken = self._inbox.take(SILENT_AFTER_S)
+                if taken is not None:
+                    yield from self.take(*taken)
+                self._notice_silence()
+
+    def take(self, topic: str, body: bytes) -> Iterator[CameraRgbd]:
+        """The frames that a sample completes."""
+        self._last_s[topic] = time.monotonic()
+        try:
+            for color, depth in self._pairs(topic, body):
+                yield self._frame(color, depth)
+        except FrameError as error:
+            self.rejected += 1
+            reason = f"{topic}: {str(error)[:30]}"
+            if reason not in self._reasons and len(self._reasons) < MOST_REASONS:
+                self._say(f"{topic}: {error} Further ones are only counted.")
+                self._reasons.add(reason)
+
+    def _pairs(self, topic: str, body: bytes) -> Iterator[tuple[RosImage, RosImage]]:
+        if topic == self._topics.camera_info:
+            self._camera = read_camera(body, self._topics.is_rectified)
+        elif topic == self._topics.color:
+            color = read_color(body, topic)
+            yield from self._pairing_at(color.stamp_ns).add_a(color)
+        else:
+            depth = read_depth(body, topic)
+            yield from self._pairing_at(depth.stamp_ns).add_b(depth)
+
+    def _pairing_at(self, stamp_ns: int) -> Pairing[RosImage, RosImage]:
+        """A new one where a driver that started again, or a bag, counts from an earlier time."""
+        if stamp_ns < self._newest_ns - RESTARTED_AFTER_NS:
+            self._say("stamps went back: the camera has started again.")
+            self._pairing, self._newest_ns = self._new_pairing(), 0
+        self._newest_ns = max(self._newest_ns, stamp_ns)
+        return self._pairing
+
+    def _new_pairing(self) -> Pairing[RosImage, RosImage]:
+        return Pairing(round(self._topics.max_skew_s * 1e9), PAIR_BUFFER)
+
+    def _frame(self, color: RosImage, depth: RosImage) -> CameraRgbd:
+        if self._camera is None:
+            raise FrameError(f"nothing has come on {self._topics.camera_info} yet.")
+        frame = joined(color, depth, self._camera, self.frames_made, self._topics.is_registered)
+        self.frames_made += 1
+        return frame
+
+    def _notice_silence(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._said_s < SILENT_AFTER_S:
+            return
+        self._said_s = now_s
+        since_s = now_s - SILENT_AFTER_S
+        silent = [topic for topic, last_s in self._last_s.items() if last_s < since_s]
+        if silent:
+            self._say(
+                f"nothing comes on {', '.join(silent)}: does `ros2 topic hz` show it, and is the "
+                "bridge connected here?"
+            )
