@@ -63,6 +63,6 @@ def unpacked(data: bytes | memoryview) -> Chunk:
         planes = planes.reshape(4 * ROW + LABEL_BYTES, count).T
         rows = np.ascontiguousarray(planes[:, : 4 * ROW]).view("<f4")
         labels = np.ascontiguousarray(planes[:, 4 * ROW :])
-    except (zstandard.ZstdError, struct.error, ValueError) as error:
+    except (zstandard.ZstdError, struct.error, ValueError, MemoryError) as error:
         raise DataError(f"{len(data)} bytes hold no Gaussians: {error}") from error
     return Chunk(anchor, np.cumsum(steps), rows, labels)

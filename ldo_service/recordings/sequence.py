@@ -12,6 +12,7 @@ from ldo_service.geometry import RawFrame, Trajectory
 from ldo_service.runtime.mcap_index import Place
 from ldo_service.runtime.recording import JournalFile, recorded_actors
 from ldo_service.schemas import CameraRgbd, decode
+from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.schemas.topics import CAMERA_RGBD
 from ldo_service.wire import camera_of, raw_frame_of
 
@@ -31,7 +32,8 @@ class RecordingSequence(Sequence):
         self._frames: list[tuple[JournalFile, Place]] = []
         for file in map(JournalFile, paths):
             for place in file.messages:
-                is_later = not self._frames or place.stamp_ns > self._frames[-1][1].stamp_ns
+                last_ns = self._frames[-1][1].stamp_ns if self._frames else -1
+                is_later = last_ns < place.stamp_ns <= LAST_INTEGER
                 if place.topic == CAMERA_RGBD.name and is_later:
                     self._frames.append((file, place))
         if not self._frames:

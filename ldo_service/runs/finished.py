@@ -140,7 +140,7 @@ def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
         yield path, json.loads(path.read_text())
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
 
 

@@ -104,7 +104,7 @@ def read_loops(folder: Path) -> FoundLoops | None:
         )
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
 
 

@@ -17,6 +17,10 @@ from .actor import State
 log = logging.getLogger(__name__)
 ARRAY_CODE = 1  # MessagePack extension type of a NumPy array
 CONTENTS = "contents.msgpack"
+UNREADABLE = (
+    *(ValueError, RecursionError),
+    *(TypeError, SyntaxError, OverflowError, MemoryError),  # what NumPy thinks of a dtype and shape
+)
 
 
 class StateStore(Protocol):
@@ -128,7 +132,7 @@ def decode_state(body: bytes) -> Any:
     """The inverse. Raises msgspec.DecodeError, whatever the bytes are."""
     try:
         return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
-    except (ValueError, TypeError, RecursionError) as error:
+    except UNREADABLE as error:
         raise msgspec.DecodeError(f"cannot be decoded: {error}") from error
 
 

@@ -11,6 +11,7 @@ from numpy.lib import format as npy
 UNREADABLE = (
     *(OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile, zlib.error),
     *(MemoryError, OverflowError, NotImplementedError),  # sizes and methods that a header makes up
+    *(RuntimeError, SyntaxError),  # it says that it is encrypted; its header is no literal
 )
 
 

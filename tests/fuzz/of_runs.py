@@ -127,12 +127,12 @@ RUN = {
 
 
 # --- recordings and states ------------------------------------------------------------------------
-def record(path: Path) -> None:
+def record(path: Path, stamp_ns: int = 2) -> None:
     """A camera's frame, and the step that took it."""
     body = msgspec.msgpack.encode(EXAMPLES["camera_rgbd"])
     file = RecordingFile(path, {"config": "tracker: {hold_out: 5}"}, RecordConfig())
     file.add_entry(Started(step=0, state={"last_stamp_ns": encode_state(1)}))
-    file.add("camera/rgbd", CameraRgbd, body, 0, 2)
+    file.add("camera/rgbd", CameraRgbd, body, 0, stamp_ns)
     step = Step(step=0, kind="done", taken=0, topic="camera/rgbd", checksum=checksum(body))
     file.add_entry(step)
     file.close()

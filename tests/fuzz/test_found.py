@@ -1,6 +1,7 @@
 """What fuzzing found, tried again: each of these once raised what nobody expected."""
 
 import logging
+import re
 import struct
 from pathlib import Path
 
@@ -9,12 +10,17 @@ import pytest
 
 from .of_data_sets import COLOR as IMAGE
 from .of_data_sets import jpeg, png
+from .of_runs import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, record
 from .targets import TARGETS
 
 DEEP_JSON, DEEP_YAML, DEEP_MSGPACK = b'{"a": ' * 100_000, b"{a: " * 3000, b"\x91" * 100_000
 NO_TEXT = b"\xff\xfe\x80"
 LONG_CHUNK = png(IMAGE)[:8] + struct.pack(">I4s", 4_000_000_000, b"IDAT") + bytes(300)
 LARGE_JPEG = jpeg(IMAGE).replace(struct.pack(">HH", *IMAGE.shape[:2]), b"\x7f\xff" * 2)
+LOOPS = RUN["loops.json"]
+ENCRYPTED = re.sub(rb"(PK\x01\x02.{4})..", b"\\g<1>\x01\x00", SEMANTICS, flags=re.DOTALL)
+CHUNK = gaussians_of_a_chunk()
+LARGE_CHUNK = CHUNK[:4] + b"\xe0" + b"\xff" * 7 + b"\x0f" + CHUNK[6:]  # says that it is 10^18 bytes
 
 FOUND = [
     ("Replica: traj.txt", NO_TEXT),
@@ -35,6 +41,12 @@ FOUND = [
     ("state", DEEP_MSGPACK),
     ("state", msgspec.msgpack.encode(msgspec.msgpack.Ext(1, b"\x93\xa3<q9\x91\x01\xc4\x01\0"))),
     ("contents of a state", msgspec.msgpack.encode({"sum": "\0"})),
+    ("state", bytes.fromhex("d80193a32c666390c4080000008000009a0440")),  # the type is ",fc"
+    ("labels of a map", ENCRYPTED),
+    ("loops.json", LOOPS.replace(b'"reference": 1', b'"reference": 1e999')),
+    ("keyframes.json", RUN["keyframes.json"].replace(b'"keyframe": 0', b'"keyframe": 1e999')),
+    ("chunk of Gaussians", LARGE_CHUNK),
+    ("recording as a data set", bytes_of(lambda path: record(path, stamp_ns=2**63))),
     ("config.yaml", DEEP_YAML),
     ("config.yaml", b"tracker: 2027-13-45\n"),
     ("--set", b"tracker.hold_out=" + b"[" * 3000),
