@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.localiser import PLACES, places_of
-from ldo_service.errors import DataError
+from ldo_service.errors import DataError, LdoError
 from ldo_service.gaussians import chunk, keyframe_images
 from ldo_service.gaussians.model import new_labels
 from ldo_service.gaussians.ply import read_ply, write_ply
@@ -184,7 +184,7 @@ STATE = {"actor/contents.msgpack": CONTENTS, "actor/sum.a": next(states())}
 RECORDING = bytes_of(record)
 
 of_packed: tuple[type[Exception], ...] = (DataError,)
-of_vocabulary = (msgspec.DecodeError, ValueError, KeyError, TypeError)  # as the mapper catches
+of_vocabulary = (LdoError, msgspec.DecodeError, ValueError, KeyError, TypeError)
 
 
 def vocabulary(body: bytes, _folder: Path) -> Any:

@@ -1,0 +1,48 @@
+"""Tell ROS 2 where the camera is: /tf, through zenoh-bridge-ros2dds.
+
+Needs `pip install 'ldo-slam[ros2]'`. Start `ldo serve`, a camera, and the bridge as a client:
+`zenoh-bridge-ros2dds -m client -e tcp/127.0.0.1:7447`. It takes CDR from the key `tf` and writes it
+to the topic `/tf` when somebody listens. Frames have the axes of the camera where it started.
+
+    python examples/5_pose_for_ros.py [POSES]
+"""
+
+import json
+import sys
+
+import zenoh
+from rosbags.typesys import Stores, get_typestore
+
+from ldo_service.client import connect
+from ldo_service.schemas import Pose
+
+count = int(sys.argv[1]) if len(sys.argv) > 1 else sys.maxsize
+ros = get_typestore(Stores.ROS2_HUMBLE)
+types = ros.types
+config = zenoh.Config()
+config.insert_json5("mode", json.dumps("client"))
+config.insert_json5("connect/endpoints", json.dumps(["tcp/127.0.0.1:7447"]))
+
+
+def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Pose):
+    w, x, y, z = T_parent_child.quaternion
+    stamp = types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
+    return types["geometry_msgs/msg/TransformStamped"](
+        types["std_msgs/msg/Header"](stamp, parent),
+        child,
+        types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](*T_parent_child.translation),
+            types["geometry_msgs/msg/Quaternion"](x, y, z, w),
+        ),
+    )
+
+
+with connect("robot") as service, zenoh.open(config) as session:
+    for number, pose in enumerate(service.poses(), 1):
+        if pose.status != "LOST":
+            odom = transform(pose.stamp_ns, "ldo_map", "ldo_odom", pose.T_map_odom)
+            camera = transform(pose.stamp_ns, "ldo_odom", "ldo_camera", pose.T_odom_camera)
+            message = types["tf2_msgs/msg/TFMessage"]([odom, camera])
+            session.put("tf", bytes(ros.serialize_cdr(message, message.__msgtype__)))
+        if number == count:
+            break

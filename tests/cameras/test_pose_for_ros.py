@@ -1,0 +1,46 @@
+"""The example that tells ROS where the camera is: read by rosbags, as a node of ROS would."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from ldo_service.runtime.links import Header
+from ldo_service.runtime.links import encode as encode_header
+from ldo_service.runtime.network import Network
+from ldo_service.runtime.zenoh_transport import open_session
+from ldo_service.schemas import encode
+from tests.schemas.examples import EXAMPLES
+from tests.service.conftest import free_endpoint
+
+from .ros import STORE
+
+EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "5_pose_for_ros.py"
+
+
+@pytest.mark.timeout(120)
+def test_poses_become_transforms() -> None:
+    endpoint, pose = free_endpoint(), EXAMPLES["tracked_pose"]
+    program = EXAMPLE.read_text().replace("tcp/127.0.0.1:7447", endpoint)
+    program = program.replace('connect("robot")', f'connect("robot", "{endpoint}")')
+    with open_session(Network("robot", endpoint), router=True) as session:
+        heard = session.declare_subscriber("tf", zenoh.handlers.FifoChannel(9))
+        with subprocess.Popen([sys.executable, "-c", program, "1"]) as process:
+            while process.poll() is None:
+                header = encode_header(Header("tracker", 1, 0, pose.stamp_ns))
+                session.put("ldo/robot/pose/tracked", encode(pose), attachment=header)
+                time.sleep(0.05)
+        sample = heard.try_recv()
+    assert process.returncode == 0
+    assert sample is not None
+    message = STORE.deserialize_cdr(sample.payload.to_bytes(), "tf2_msgs/msg/TFMessage")
+    odom, camera = message.transforms
+    assert (odom.header.frame_id, odom.child_frame_id) == ("ldo_map", "ldo_odom")
+    assert (camera.header.frame_id, camera.child_frame_id) == ("ldo_odom", "ldo_camera")
+    assert camera.header.stamp.nanosec == pose.stamp_ns
+    t, q = camera.transform.translation, camera.transform.rotation
+    assert [t.x, t.y, t.z] == [1.0, -2.0, 0.5]
+    assert [q.w, q.x, q.y, q.z] == [0.5, -0.5, 0.5, 0.5], "ROS has w last, and by name"
