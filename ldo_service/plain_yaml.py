@@ -6,7 +6,8 @@ import yaml
 
 
 def plain_values(text: str | bytes) -> Any:
-    """Numbers, text, dates, lists and dictionaries. Raises yaml.YAMLError, whatever the text is.
+    """Numbers, text, dates, lists and dictionaries. Raises yaml.YAMLError in one line, whatever the
+    text is.
 
     Parsed in Python: libyaml, in C, overflows its stack where brackets are nested deeply.
     """
@@ -14,5 +15,5 @@ def plain_values(text: str | bytes) -> Any:
         return yaml.safe_load(text)
     except RecursionError:
         raise yaml.YAMLError("it is nested too deeply") from None
-    except ValueError as error:  # a date such as 2027-13-01
-        raise yaml.YAMLError(str(error)) from error
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2027-13-01
+        raise yaml.YAMLError(" ".join(str(error).split())) from error

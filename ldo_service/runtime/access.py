@@ -69,7 +69,7 @@ def read_access(path: Path) -> dict[str, Grantee]:
         raise ConfigError(
             f"{path} cannot be read: {error.strerror}. `ldo keys` writes it for each service."
         ) from error
-    except (msgspec.ValidationError, yaml.YAMLError) as error:
+    except (ValueError, yaml.YAMLError) as error:
         raise ConfigError(
             f"{path} does not say who may do what: {error}. `ldo keys` writes such a file."
         ) from error

@@ -81,7 +81,7 @@ def _fitting(names: tuple[str, ...], count: int, who: str) -> tuple[str, ...]:
 def _of_metadata(text: str) -> tuple[str, ...]:
     try:
         entry = ast.literal_eval(text)
-    except (ValueError, SyntaxError, RecursionError, MemoryError):
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError):
         entry = None
     if isinstance(entry, dict) and set(entry) == set(range(len(entry))):
         entry = [entry[number] for number in range(len(entry))]

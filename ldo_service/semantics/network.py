@@ -53,8 +53,11 @@ class Network:
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What its exporter wrote beside it."""
-        return dict(self._session.get_modelmeta().custom_metadata_map)
+        """What its exporter wrote beside it. Raises ModelError for what is no text."""
+        try:
+            return dict(self._session.get_modelmeta().custom_metadata_map)
+        except UnicodeDecodeError as error:
+            raise ModelError(f"its metadata is no text: {error}.") from error
 
     def run(self, **inputs: np.ndarray) -> list[np.ndarray]:
         """All outputs. Raises ModelError when the inference fails or yields NaN or infinity."""

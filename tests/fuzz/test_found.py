@@ -52,6 +52,8 @@ FOUND = [
     ("--set", b"tracker.hold_out=" + b"[" * 3000),
     ("suite", DEEP_YAML),
     ("access.yaml", b"[" * 100_000),  # this one ended the process
+    ("access.yaml", b'"\\ud800": {role: camera, robot: mule}'),
+    ("names that a network carries", b"{['a', 0]: ''}"),
     ("access.yaml", b"a: {role: camera, robot: mule, until: 2027-13-01}"),
 ]
 
