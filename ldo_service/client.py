@@ -159,6 +159,13 @@ class Client:
         """Whether anybody subscribes to this client's camera/rgbd."""
         return self._publisher(CameraRgbd).matching_status.matching
 
+    def wait_until_heard(self, timeout_s: float = 3.0) -> bool:
+        """Who has just connected hears of subscribers a moment later. False: of none in time."""
+        until_s = time.monotonic() + timeout_s
+        while not self.is_heard and time.monotonic() < until_s:
+            time.sleep(0.02)
+        return self.is_heard
+
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
         """Every tracked pose as it comes, for ever; of those not taken in time the newest stay."""
         for _, message in self.messages(POSE_TRACKED, keep):

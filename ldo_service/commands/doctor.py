@@ -41,6 +41,8 @@ EXTRAS = {
     "viewer": ("viser", "gsply"),
     "keys": ("cryptography",),
     "cuda": ("torch", "gsplat"),
+    "realsense": ("pyrealsense2",),
+    "ros2": ("rosbags",),
 }
 LISTEN_S = 1.5  # three heartbeats
 MARKS = {

@@ -119,6 +119,8 @@ def relay(
     service: Client, frames: Iterable[CameraRgbd], chosen: Selection, restamp: bool, say: Say
 ) -> None:
     """Send every n-th frame, until there are `chosen.max_frames`, or Ctrl-C."""
+    if not service.wait_until_heard():
+        say("nobody listens to camera/rgbd yet: is the service of this robot running?")
     sent = 0
     try:
         for frame in islice(frames, 0, None, chosen.stride):

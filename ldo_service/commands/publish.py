@@ -90,6 +90,7 @@ def publish(
         connect(robot, endpoint, keys) as service,
         progress("publish", len(indices), console) as advance,
     ):
+        service.wait_until_heard()
         camera = Camera(service, sequence, restamp, console.print)
         for done, index in enumerate(paced(sequence, indices, rate), 1):
             camera.send(index)
