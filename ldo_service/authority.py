@@ -59,15 +59,19 @@ class Authority:
             self._certificate = read_certificate((folder / CA).read_bytes())
             self._key = read_key((folder / CA_KEY).read_bytes())
         except (OSError, ValueError) as error:
+            why = error.strerror if isinstance(error, OSError) else error
             raise ConfigError(
-                f"{folder} holds no authority ({error}): `ldo keys new {folder}` makes one."
+                f"{folder} holds no authority ({why}): `ldo keys new` makes one, in a new folder."
             ) from error
         self._access = read_access(folder / ACCESS)
 
     @classmethod
     def new(cls, folder: Path, days: int) -> "Authority":
         """Raises ConfigError when something is there already, which is left as it is."""
-        _require_absent(folder)
+        if folder.exists():
+            raise ConfigError(
+                f"{folder} is there already, and keys are never overwritten: name a new folder."
+            )
         key = new_key()
         certificate = of_authority(key, days, datetime.now(UTC))
         try:

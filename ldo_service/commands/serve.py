@@ -23,6 +23,18 @@ from .options import (
     localising,
 )
 
+WithoutKeys = Annotated[
+    bool, tyro.conf.arg(help="listen on a network where everybody may do everything")
+]
+Join = Annotated[bool, tyro.conf.arg(help="be a client of the router at ADDRESS, and open none")]
+Metrics = Annotated[
+    int | None,
+    tyro.conf.arg(
+        metavar="PORT",
+        help="export every actor's health for Prometheus on PORT of service.metrics_address",
+    ),
+]
+
 
 def serve(
     robot: Robot = "robot",
@@ -37,19 +49,9 @@ def serve(
         tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
     ] = None,
     keys: KeysFolder = None,
-    without_keys: Annotated[
-        bool, tyro.conf.arg(help="listen on a network where everybody may do everything")
-    ] = False,
-    join: Annotated[
-        bool, tyro.conf.arg(help="be a client of the router at ADDRESS, and open none")
-    ] = False,
-    metrics: Annotated[
-        int | None,
-        tyro.conf.arg(
-            metavar="PORT",
-            help="export every actor's health for Prometheus on PORT of service.metrics_address",
-        ),
-    ] = None,
+    without_keys: WithoutKeys = False,
+    join: Join = False,
+    metrics: Metrics = None,
 ) -> None:
     """Run the service: camera frames in on camera/rgbd; poses, map and health out.
 
@@ -90,9 +92,16 @@ def record(
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
+    localise: Localise = None,
     keys: KeysFolder = None,
+    without_keys: WithoutKeys = False,
+    join: Join = False,
+    metrics: Metrics = None,
 ) -> None:
     """Run the service as `ldo serve` does, and record what every actor takes.
+
+    A service that runs already cannot begin to: what its actors hold would be missing. Stop it and
+    record in its --state, and it goes on with its map.
 
     640x480 at 30 Hz makes 100 MB a second; record.max_gb bounds it. `ldo replay DIR --verify` lives
     it again, and DIR is a data set for every verb that takes a SOURCE.
@@ -100,4 +109,11 @@ def record(
       ldo record recordings/desk
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
-    serve(robot, endpoint, only, config, set, state, record=out, keys=keys)
+    serve(
+        *(robot, endpoint, only, config, set, state, localise),
+        record=out,
+        keys=keys,
+        without_keys=without_keys,
+        join=join,
+        metrics=metrics,
+    )

@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.suites import Entry, Work, load_suite, markdown
 
 from .options import Overwrite, Settings
@@ -41,6 +41,7 @@ def suite(
     """
     chosen = load_suite(name)
     work = Work(chosen, data.expanduser(), out.expanduser(), set, overwrite)
+    _require_folder(work.out)
     console, total = Console(stderr=True), len(work.entries())
     done: list[Entry] = []
 
@@ -49,12 +50,23 @@ def suite(
         console.print(f"{len(done)} of {total}: {entry.folder}", highlight=False)
 
     outcomes = list(work.outcomes(begun))
+    if all(outcome.missing == "no data" for outcome in outcomes):
+        raise DataError(
+            f"{work.data} has none of the sequences of {name}: --data says where they are."
+        )
     table = markdown(chosen, outcomes)
     try:
-        work.out.mkdir(parents=True, exist_ok=True)
         (work.out / TABLE).write_text(table)
     except OSError as error:
         raise ConfigError(f"{work.out / TABLE} cannot be written: {error.strerror}.") from error
     print(table, end="")
     if any(outcome.missing == "failed" for outcome in outcomes):
         sys.exit(1)
+
+
+def _require_folder(folder: Path) -> None:
+    """Before hours of runs. Raises ConfigError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error

@@ -1,0 +1,78 @@
+"""What a stranger gets wrong: each verb says it in one paragraph, with the right exit code."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.commands.test_cli import assert_one_paragraph, ldo
+
+SUITE = "title: x\nsequences: {a: nowhere}\nfigures: [ate_cm]\n"
+ROS = "publish", "ros2", "--color", "/c/image_raw"
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with an empty folder, a full one, and files that are nothing."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("empty", "full", "junk"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("years of work")
+    (tmp_path / "junk" / "tracker.mcap").write_bytes(b"no recording")
+    (tmp_path / "suite.yaml").write_text(SUITE)
+    (tmp_path / "broken.yaml").write_text("title: [\n\n  x: {")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ("suite nosuch --out s", 2, "no suite nosuch"),
+        ("suite broken.yaml --out s", 2, "is not a suite"),
+        ("suite suite.yaml --out s", 3, "none of the sequences of suite.yaml: --data"),
+        ("suite suite.yaml --out /proc/x", 2, "/proc/x cannot be written"),
+        ("keys new full", 2, "full is there already"),
+        ("keys list empty", 2, "empty holds no authority (No such file or directory)"),
+        ("keys router empty", 2, "access.yaml cannot be read"),
+        ("eval empty synthetic:room", 3, "is it what `ldo run` wrote"),
+        ("query nowhere chair", 3, "nowhere is not a folder"),
+        ("query empty chair", 3, "empty has no objects.json"),
+        ("publish nowhere", 3, "nowhere does not exist"),
+        ("publish junk", 3, "junk holds no camera/rgbd"),
+        ("publish realsense --size 3", 2, "--size 3"),
+        ("publish realsense --rate 3", 2, "--rate is for sequences"),
+        ("publish ros2", 2, "needs --color TOPIC and --depth TOPIC"),
+        ("publish ros2 --color /c/image_raw --depth /d/*", 2, "no topic of ROS"),
+        ("publish ros2 --color /c --depth /d --stride 0", 2, "stride of 0"),
+        ("publish ros2 --color /c --depth /d --max-skew-s -1", 2, "--max-skew-s -1"),
+        ("record full", 2, "full is not empty"),
+        ("record r --only nobody", 2, "no actor 'nobody'"),
+        ("record r --endpoint tcp/0.0.0.0:7447", 2, "--without-keys"),
+        ("record r --config broken.yaml", 2, "broken.yaml is not valid YAML"),
+        ("record r --localise empty", 3, "no places.msgpack"),
+        ("simulate empty", 3, "in no known layout"),
+        ("simulate junk", 3, "junk holds no camera/rgbd"),
+        ("simulate synthetic:room --max-frames 0", 2, "at most 0 frames"),
+        ("serve --localise nowhere", 3, "no places.msgpack"),
+        ("serve --state suite.yaml", 2, "cannot be used for state"),
+        ("serve --set tracker.nothing=1", 2, "no setting tracker.nothing"),
+        ("serve --keys empty --endpoint tls/127.0.0.1:1", 2, "ca.crt cannot be read"),
+        ("replay junk --verify", 3, "no MCAP file"),
+    ],
+)
+def test_it_is_said_in_one_paragraph(capsys, here: Path, words: str, code: int, says: str) -> None:
+    left, _, err = ldo(capsys, *words.split())
+    told = err.splitlines()[-1]
+    assert_one_paragraph(told)
+    assert says in told
+    assert left == code
+    assert (here / "full" / "thesis.tex").read_text() == "years of work"
+
+
+@pytest.mark.usefixtures("here")
+def test_a_router_with_keys_needs_a_bridge_of_its_own(capsys) -> None:
+    assert ldo(capsys, "keys", "new", "keys")[0] == 0
+    assert ldo(capsys, "keys", "add", "keys", "camera", "front")[0] == 0
+    with_keys = "--keys", "keys/front", "--endpoint", "tls/127.0.0.1:1"
+    code, _, err = ldo(capsys, *ROS, "--depth", "/d", *with_keys)
+    assert code == 2
+    assert "name its address with --bridge" in err
