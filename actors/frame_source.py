@@ -76,7 +76,7 @@ class FrameSource(Actor):
             yield from self._frame(message, partial(raw_frame_of, message, message.frame))
         else:
             for color, depth in self._paired(message):
-                yield from self._frame(color, partial(_joined, color, depth))
+                yield from self._frame(color, partial(joined, color, depth))
 
     # --- pairs ------------------------------------------------------------------------------------
     def _paired(self, half: CameraColor | CameraDepth) -> list[tuple[CameraColor, CameraDepth]]:
@@ -170,7 +170,7 @@ class FrameSource(Actor):
         }
 
 
-def _joined(color: CameraColor, depth: CameraDepth) -> RawFrame:
+def joined(color: CameraColor, depth: CameraDepth) -> RawFrame:
     """The depth in the colour image, with the colour's stamp, number and camera."""
     image, scale = depth.image, depth.depth_scale
     values = codecs.decode_depth(image.encoding, image.width, image.height, image.data)

@@ -3,12 +3,16 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.recordings.sequence import RecordingSequence, open_source
+from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
+from ldo_service.schemas import CameraColor, CameraDepth
+from ldo_service.wire import camera_rgbd_message
 from tests.commands.test_cli import ldo
 
 from .conftest import FRAMES, ROUGH
@@ -71,3 +75,31 @@ def test_other_sources_are_opened_as_before(tmp_path: Path) -> None:
     assert open_source("synthetic:room").truth() is not None
     with pytest.raises(DataError, match="no known layout"):
         open_source(str(tmp_path))
+
+
+def test_halves_are_frames_too(room: Sequence, tmp_path: Path) -> None:
+    """Of a camera that sends colour and depth apart, 4 ms off, and one colour without depth."""
+    file = RecordingFile(tmp_path / "frame_source.mcap", {}, RecordConfig())
+    for index in range(4):
+        frame = camera_rgbd_message(room.read(index))
+        color = CameraColor(
+            stamp_ns=frame.stamp_ns, frame=index, camera=frame.camera, image=frame.color
+        )
+        depth = CameraDepth(
+            stamp_ns=frame.stamp_ns + 4_000_000,
+            frame=index,
+            camera=frame.camera,
+            image=frame.depth,
+            depth_scale=frame.depth_scale,
+        )
+        for topic, half in (("camera/color", color), ("camera/depth", depth)):
+            if (topic, index) != ("camera/depth", 2):
+                body = msgspec.msgpack.encode(half)
+                file.add(topic, type(half), body, 2 * index, half.stamp_ns)
+    file.close()
+    sequence = open_source(str(tmp_path))
+    np.testing.assert_array_equal(sequence.stamps_ns, room.stamps_ns[[0, 1, 3]])
+    ours, theirs = sequence.read(2), room.read(3)
+    assert ours.index == 2
+    np.testing.assert_array_equal(ours.color, theirs.color)
+    np.testing.assert_array_equal(ours.depth, theirs.depth)
