@@ -209,8 +209,9 @@ class Client:
             return message
         if "mapper" in self.alive():
             raise ConfigError(
-                "the map has no objects yet, which takes a keyframe, and a detector that looked at "
-                "it: `ldo serve --set detector.model=...`; `ldo models` tells how."
+                "the map has no objects yet, which takes a keyframe, also after a restart, and a "
+                "detector that looked at it: `ldo serve --set detector.model=...`; `ldo models` "
+                "tells how."
             )
         raise self._nobody("answers", MAP_OBJECTS)
 
