@@ -1,11 +1,20 @@
 """What rosbags writes as CDR is read as it was meant, and nothing else is."""
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
 
-from ldo_service.cameras.ros_messages import RosImage, joined, read_camera, read_color, read_depth
-from ldo_service.errors import FrameError
+from ldo_service.cameras.ros_messages import (
+    RosImage,
+    joined,
+    read_camera,
+    read_color,
+    read_depth,
+    typestore,
+)
+from ldo_service.errors import ConfigError, FrameError
 from ldo_service.geometry import codecs
 from ldo_service.schemas import CameraModel
 
@@ -194,3 +203,9 @@ def test_a_stamp_before_the_epoch_is_refused() -> None:
     color = read_color(cdr(image("rgb8", COLOR, header(-(10**9)))), "/image_raw")
     with pytest.raises(FrameError, match="stamp_ns"):
         joined(color, depth_of(), CAMERA, 0, False)
+
+
+def test_without_the_library_one_line_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.typesys", None)
+    with pytest.raises(ConfigError, match=r"ldo-slam\[ros2\]"):
+        typestore.__wrapped__()
