@@ -101,7 +101,7 @@ class MapperConfig:
     # the others long
     changed_keyframes: int = 5  # between telling how old Gaussians changed: the optimiser touches
     # all that is in view at every keyframe
-    checkpoint_keyframes: int = 5  # between saved states; a crash costs at most so many of the map
+    checkpoint_keyframes: int = 5  # between saved maps: after a crash so many are mapped again
     motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
     motion_min_rad: float = 2e-4  # As builder.refined_m: what is not told must not be taken back
     mending_min_m: float = 0.01  # a keyframe that a correction moves farther is mended: it may lie
@@ -139,6 +139,7 @@ class Mapper(Actor):
     """Maps a keyframe at once; corrections move each Gaussian with the keyframe that made it."""
 
     name = "mapper"
+    lags = True  # it writes the whole map every few keyframes
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
@@ -328,6 +329,12 @@ class Mapper(Actor):
             depth_m=Array.of(rendering.median_depth_m),
             opacity=Array.of(to_bytes(rendering.opacity)),
         )
+
+    def resumed(self) -> Iterator[Output]:
+        """The whole map: followers may have missed deltas, and late joiners find nothing else."""
+        if self._map.size():
+            yield from self._teller.snapshot(self._now())
+            yield from self._objects()
 
     def finish(self) -> Iterator[Output]:
         """The whole map, so that whoever listens ends with it."""

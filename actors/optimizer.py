@@ -87,6 +87,7 @@ class Optimizer(Actor):
         self._classes: list[str] = ["other"]  # as they were first named
         self._cameras: dict[int, Camera] = {}  # of the newest keyframes
         self._version = 0
+        self._stamp_ns = 0  # of the newest message
         self._newest: dict[int, tuple[int, np.ndarray]] = {}  # by segment: id and T_odom_keyframe
         self._first: dict[int, int] = {}  # keyframe of each segment
         self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
@@ -99,6 +100,7 @@ class Optimizer(Actor):
     def handle(
         self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
     ) -> Iterator[Correction]:
+        self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         match message:
             case ObjectObservation() if not self.config.uses_objects:
                 return
@@ -119,6 +121,11 @@ class Optimizer(Actor):
             case Keyframe():
                 self._take(message)
         yield self._correction(message.stamp_ns)
+
+    def resumed(self) -> Iterator[Correction]:
+        """The last one may not have been sent."""
+        if len(self._graph):
+            yield self._correction(self._stamp_ns)
 
     def _correction(self, stamp_ns: int) -> Correction:
         self._version += 1
@@ -284,6 +291,7 @@ class Optimizer(Actor):
         graph = self._graph.snapshot()
         rest = {
             "version": self._version,
+            "stamp_ns": self._stamp_ns,
             "segments": [
                 (segment, self._first[segment], *newest) for segment, newest in self._newest.items()
             ],
@@ -301,7 +309,7 @@ class Optimizer(Actor):
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["rest"]
-        self._version = saved["version"] + 1  # one more may have been sent and not saved
+        self._version, self._stamp_ns = saved["version"], saved["stamp_ns"]
         self._first = {segment: first for segment, first, *_ in saved["segments"]}
         self._newest = {segment: (newest, T) for segment, _, newest, T in saved["segments"]}
         self._waiting_number, self._refinements = saved["refinements"]

@@ -330,7 +330,6 @@ class Tracker(Actor):
         kept = {"places": sorted(places, key=itemgetter("id")), "keyframe": state["keyframe"]}
         self._odometry.restore({**now["odometry"], **kept})
         self._prior, self._parts = Prior.unpacked(state["prior"]), None
-        self._odometry.skip_keyframe_id()  # one more may have been sent and not saved
         self._poses.restore(now["poses"])
         self._saved_correction = state["correction"]
         body = self._saved_correction

@@ -138,8 +138,16 @@ class MapTeller:
 
     # --- state ------------------------------------------------------------------------------------
     def state(self) -> dict[str, int]:
-        return {"version": self.version, "since_changed": self._since_changed}
+        return {
+            "version": self.version,
+            "since_changed": self._since_changed,
+            "since_snapshot": self._since_snapshot,
+            "in_snapshot": self._in_snapshot,
+            "names_told": self._names_told,
+        }
 
     def restore(self, state: dict[str, int]) -> None:
         self.version = state["version"] + VERSIONS_IN_A_CHECKPOINT
         self._since_changed = state["since_changed"]
+        self._since_snapshot, self._in_snapshot = state["since_snapshot"], state["in_snapshot"]
+        self._names_told = state["names_told"]

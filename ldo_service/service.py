@@ -27,6 +27,7 @@ from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.graph import lossless_consumers
 from ldo_service.runtime.journal import Journal
+from ldo_service.runtime.ledger import Past
 from ldo_service.runtime.process import (
     ChildProcess,
     leave_with_parent,
@@ -42,8 +43,7 @@ from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 
 log = logging.getLogger(__name__)
 
-MAPPED = ("mapper", "optimizer")  # have state from the first keyframe on
-ENTANGLED = ("tracker", *MAPPED)
+ENTANGLED = ("tracker", "mapper", "optimizer")  # have state before the first keyframe is made
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,9 +230,9 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
             f"another service keeps its state in {folder}: choose another with --state."
         ) from error
     store = FolderStore(folder / "state")
-    missing = [name for name in ENTANGLED if store.load(name) is None]
-    has_keyframes = not set(MAPPED) <= set(missing)
-    if missing and has_keyframes:
+    pasts = {name: Past.of(store.load(name)) for name in ENTANGLED}
+    missing = [name for name, past in pasts.items() if past.is_none]
+    if missing and any(past.has_passed for past in pasts.values()):
         raise ConfigError(
             f"{folder} has no readable state of {', '.join(missing)} beside that of the others. "
             "Choose another folder with --state, or delete this one to start anew."

@@ -34,6 +34,7 @@ class Actor:
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
+    lags = False  # its snapshots may be of an earlier step: what it took since is kept beside them
     talks_outside = (
         False  # asks what no journal records: a replay leaves it out, and who takes what
     )
@@ -48,6 +49,10 @@ class Actor:
     def handle(self, message: Any) -> Iterator[Message]:
         """What the actor makes of one message of its inputs."""
         raise NotImplementedError
+
+    def resumed(self) -> Iterator[Message]:
+        """First words of a successor: what a predecessor may have left unsaid to those outside."""
+        return iter(())
 
     def finish(self) -> Iterator[Message]:
         """Last words before a soft stop."""

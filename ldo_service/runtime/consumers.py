@@ -25,8 +25,9 @@ class Consumers:
     no room. Others count while they live. `seq` is always that of the next message.
     """
 
-    def __init__(self, expected: Iterable[str]) -> None:
-        self._known = {name: Consumer() for name in expected}
+    def __init__(self, expected: Iterable[str], handled: int = 0) -> None:
+        """Each of those expected has handled all before `handled`."""
+        self._known = {name: Consumer(handled=handled) for name in expected}
         self.expected = frozenset(self._known)
         self._evicted: dict[str, int] = {}  # what each had handled when patience was over
 

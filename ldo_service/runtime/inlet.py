@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from ldo_service.schemas import InputCount
 
-from .links import Grant, Header, Join
+from .links import Grant, Header, InletPast, Join
 from .ports import In, Latest, Lossless
 
 
@@ -92,6 +92,7 @@ class LosslessInlet(Inlet):
     handled: int = 0
     arrived: int = 0
     gap: bool = False
+    is_welcome: bool = False  # by the producer that is there now
 
     @property
     def window(self) -> int:
@@ -100,8 +101,10 @@ class LosslessInlet(Inlet):
 
     def welcome(self, epoch: int, start: int) -> int:
         """Numbering begins here, unless we know already; how many messages are lost by it."""
-        known = epoch == self.epoch
+        known, joins = epoch == self.epoch, not self.is_welcome
+        self.is_welcome = True
         if known and start <= self.arrived:
+            self.gap = self.gap or joins
             return 0
         lost = start - self.arrived if known else 0
         self.epoch, self.handled, self.arrived = epoch, start, start
@@ -126,7 +129,7 @@ class LosslessInlet(Inlet):
         """Forget what waits and who sent it: whoever sends has to welcome us again."""
         super().renew()
         self.epoch = self.handled = self.arrived = 0
-        self.gap = False
+        self.gap = self.is_welcome = False
 
     def _overflow(self, newest: Delivery) -> list[Delivery]:  # noqa: ARG002
         return []  # `accept` keeps to the window
@@ -136,8 +139,19 @@ class LosslessInlet(Inlet):
         if delivery.header.epoch == self.epoch:
             self.handled = max(self.handled, delivery.header.seq + 1)
 
+    def go_on(self, past: InletPast) -> None:
+        """Where a predecessor stopped."""
+        self.epoch, self.handled, self.arrived = past.epoch, past.handled, past.handled
+
+    def past(self, being_handled: Delivery | None) -> InletPast:
+        """For a successor, as if that delivery had been handled."""
+        handled = self.handled
+        if being_handled is not None and being_handled.header.epoch == self.epoch:
+            handled = max(handled, being_handled.header.seq + 1)
+        return InletPast(self.epoch, handled)
+
     def grant(self, consumer: str) -> Join | Grant:
-        if self.epoch == 0:
+        if not self.is_welcome:
             return Join(consumer)
         limit = self.handled + self.window
         return Grant(consumer, self.epoch, self.handled, self.arrived, limit, self.gap)

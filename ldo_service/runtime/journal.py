@@ -24,7 +24,8 @@ Kind: TypeAlias = Literal[
     "done",
     "failed",  # the handler raised: its outputs are dropped, and a successor started
     "set_aside",  # after failing twice
-    "finished",  # last words: no message was taken
+    "resumed",  # first words of a successor: no message was taken
+    "finished",  # last words: none either
 ]
 
 

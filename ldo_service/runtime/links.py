@@ -9,10 +9,12 @@
 All three state what is, not what changed: they may be lost, repeated or replaced by newer ones.
 
 The producer keeps what was not handled, at most one window, and sends it again from `arrived` when
-a grant shows a gap. A consumer that died and joined again is welcomed at what it had not handled:
-between crashes each message is handled once, and after a crash the one under way once more. What a
-producer had not delivered when its process was killed is gone with it.
+a grant shows a gap. A consumer that died and joined again gets what it had not handled. Both ends
+keep their place beside the actor's state (`ledger`), in one write with it: so each message takes
+effect once, whoever is killed, and when.
 """
+
+from typing import NamedTuple
 
 import msgspec
 
@@ -59,6 +61,34 @@ class Grant(msgspec.Struct, frozen=True, tag="grant", array_like=True):
 class Welcome(msgspec.Struct, frozen=True, array_like=True):
     epoch: int
     starts: dict[str, int]  # by consumer: the first seq to come
+
+
+class Sent(NamedTuple):
+    """A message that was numbered."""
+
+    seq: int
+    header: bytes
+    body: bytes
+
+
+class OutletPast(NamedTuple):
+    """Where a producer stood, and what some consumer had not handled."""
+
+    epoch: int
+    seq: int  # of the next message
+    unhandled: tuple[Sent, ...] = ()
+
+    @property
+    def handled(self) -> int:
+        """Every message before has been handled."""
+        return self.unhandled[0].seq if self.unhandled else self.seq
+
+
+class InletPast(NamedTuple):
+    """Where a consumer stood."""
+
+    epoch: int  # of its producer; 0: none was known
+    handled: int
 
 
 encode = msgspec.msgpack.Encoder().encode

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 from collections import deque
+from collections.abc import Mapping
 from threading import Lock
 
 import msgspec
@@ -14,6 +15,7 @@ from .inlet import Delivery, Inlet, LosslessInlet
 from .links import (
     OUTSIDE,
     Header,
+    InletPast,
     Welcome,
     again_key,
     data_key,
@@ -40,6 +42,7 @@ class Mailbox:
         ports: tuple[In, ...],
         transport: Transport,
         max_bytes: int = 64_000_000,  # of a Latest input: lossless ones come from our own actors
+        past: Mapping[str, InletPast] | None = None,  # by lossless topic: where a predecessor was
     ) -> None:
         self._consumer, self._max_bytes = consumer, max_bytes
         self._loop = asyncio.get_running_loop()
@@ -52,10 +55,10 @@ class Mailbox:
         self._grants: dict[str, Publisher] = {}
         self._inlets: dict[str, Inlet] = {}
         for port in ports:
-            self._connect(port, transport)
+            self._connect(port, transport, (past or {}).get(port.topic.name))
         self.send_grants()
 
-    def _connect(self, port: In, transport: Transport) -> None:
+    def _connect(self, port: In, transport: Transport, past: InletPast | None) -> None:
         topic = port.topic.name
         inlet = LosslessInlet(port) if isinstance(port.policy, Lossless) else Inlet(port)
         self._inlets[topic] = inlet
@@ -65,6 +68,8 @@ class Mailbox:
 
         if isinstance(inlet, LosslessInlet):
             link = inlet
+            if past is not None:
+                link.go_on(past)
             self._grants[topic] = transport.publisher(grant_key(topic))
             transport.subscribe(welcome_key(topic), lambda _, body: self._welcomed(link, body))
             transport.subscribe(again_key(topic), arrived)
@@ -146,6 +151,17 @@ class Mailbox:
             inlet.done(delivery, rejected)
         if isinstance(inlet, LosslessInlet):
             self._send_grant(inlet)
+
+    def past(self, being_handled: Delivery | None = None) -> dict[str, InletPast]:
+        """Where a successor goes on, by lossless topic, once that delivery was handled."""
+        with self._lock:
+            return {
+                topic: inlet.past(
+                    being_handled if being_handled and being_handled.port is inlet.port else None
+                )
+                for topic, inlet in self._inlets.items()
+                if isinstance(inlet, LosslessInlet)
+            }
 
     def tell(self, order: Order) -> None:
         """It is taken before any delivery."""

@@ -4,7 +4,6 @@ import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 
 import msgspec
 
@@ -15,6 +14,8 @@ from .links import (
     Grant,
     Header,
     Join,
+    OutletPast,
+    Sent,
     Welcome,
     again_key,
     data_key,
@@ -29,19 +30,15 @@ from .transport import Transport, call_soon
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Sent:
-    seq: int
-    header: bytes
-    body: bytes
-
-
 class Outlet:
     """Numbers messages, waits for room at every lossless consumer, sends again what got lost.
 
     `expected` names consumers that must not miss a message: until each has joined, and again after
     one died, there is no room. Others hold the producer back only while they live. A port that
     never waits sends at once: its actor has looked at `room` before.
+
+    With a `past` it goes on with a predecessor's numbers, and what some expected consumer has not
+    handled is sent again.
     """
 
     REPEAT_AFTER_S = 0.25  # half a grant period: sooner would repeat what is still on its way
@@ -55,15 +52,18 @@ class Outlet:
         expected: Iterable[str] = (),
         evict_after_s: float = 30.0,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
+        past: OutletPast | None = None,
     ) -> None:
         self.port, self.topic = port, port.topic
-        self._source, self._epoch = source, epoch
+        past = past or OutletPast(epoch, 0)
+        self._source, self._epoch = source, past.epoch
         self._evict_after_s, self._on_evicted = evict_after_s, on_evicted
         self._loop = asyncio.get_running_loop()
-        self._seq = 0
+        self._seq = past.seq
         self._sent_at_s = self._loop.time()
-        self._consumers = Consumers(expected)
-        self._unhandled: deque[Sent] = deque()
+        self._consumers = Consumers(expected, past.handled)
+        self._unhandled = deque(past.unhandled)
+        self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # something about a consumer
         self._repeating: asyncio.Task[None] | None = None
         self._closed = False
@@ -85,23 +85,48 @@ class Outlet:
 
     # --- sending ----------------------------------------------------------------------------
     def room(self) -> int:
-        """How many messages may be sent now without waiting."""
-        return self._consumers.room(self._seq)
+        """How many messages may be sent now without waiting; none while one is held."""
+        return 0 if self._unsent else self._consumers.room(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
-        if not self.port.never_wait:
-            await self._wait_for_room()
+        self.hold(message, body)
+        await self.release()
+
+    def hold(self, message: Message, body: bytes) -> None:
+        """Number a message, to be sent with the next `release`."""
         key = str(getattr(message, self.topic.key)) if self.topic.key else ""
         header = encode(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
-        self._keep(message, header, body)
+        held = Sent(self._seq, header, body)
+        self._unsent.append(held)
+        if self._consumers:
+            self._unhandled.append(held)
+        self._note_state(message, header, body)
         self._seq += 1
-        self.sent += 1
-        self._sent_at_s = self._loop.time()
-        await self._publisher.send(header, body)
+
+    async def release(self) -> None:
+        """Send what is held."""
+        while self._unsent:
+            if not self.port.never_wait:
+                await self._wait_for_room()
+            held = self._unsent.popleft()
+            self.sent += 1
+            self._sent_at_s = self._loop.time()
+            await self._publisher.send(held.header, held.body)
+
+    def take_back(self) -> None:
+        """What is held was never made: its numbers are given again."""
+        self._seq = self._next
+        self._unhandled = deque(sent for sent in self._unhandled if sent.seq < self._seq)
+        self._unsent.clear()
+
+    @property
+    def _next(self) -> int:
+        """Number of the first message that was not sent."""
+        return self._unsent[0].seq if self._unsent else self._seq
 
     async def _wait_for_room(self) -> None:
-        self.waited += self.room() == 0
-        while self.room() == 0:
+        self.waited += self._consumers.room(self._next) == 0
+        while self._consumers.room(self._next) == 0:
             await self._change()
 
     async def flush(self) -> None:
@@ -114,15 +139,19 @@ class Outlet:
         self._changed.clear()
         await self._changed.wait()
 
-    def _keep(self, message: Message, header: bytes, body: bytes) -> None:
-        if self._consumers:
-            self._unhandled.append(Sent(self._seq, header, body))
+    def _note_state(self, message: Message, header: bytes, body: bytes) -> None:
         if self.topic.is_state:
             if getattr(message, "part", 0) == 0:
                 self._parts.clear()
             self._parts.append((header, body))
             if len(self._parts) == getattr(message, "parts", 1):
                 self._last_value = tuple(self._parts)
+
+    def past(self) -> OutletPast | None:
+        """What a successor needs to go on; None where nobody is expected."""
+        if not self._consumers.expected:
+            return None
+        return OutletPast(self._epoch, self._seq, tuple(self._unhandled))
 
     # --- consumers --------------------------------------------------------------------------
     def _requested(self, _header: bytes, body: memoryview) -> None:
@@ -154,6 +183,7 @@ class Outlet:
         self._epoch, self._seq = epoch, 0
         self._consumers = Consumers(self._consumers.expected)
         self._unhandled.clear()
+        self._unsent.clear()
         self._parts.clear()
         self._last_value = ()
         self._post_welcomes()
@@ -166,7 +196,7 @@ class Outlet:
             return  # of messages that were never sent
         consumer = self._consumers.grant(grant)
         self._forget_handled()
-        if consumer.arrived < self._seq:
+        if consumer.arrived < self._next:
             self._repeat(consumer, grant.gap)
         self._changed.set()
 
@@ -186,7 +216,7 @@ class Outlet:
         if is_on_its_way or self._repeating is not None:
             return
         consumer.repeated_from, consumer.repeated_at_s = consumer.arrived, now
-        lost = [sent for sent in self._unhandled if sent.seq >= consumer.arrived]
+        lost = [sent for sent in self._unhandled if consumer.arrived <= sent.seq < self._next]
         self.repeated += len(lost)
         self._repeating = self._loop.create_task(self._send_again(lost))
 
@@ -206,7 +236,7 @@ class Outlet:
 
     def check_windows(self) -> None:
         """Evict consumers that live and yet take nothing; called with every heartbeat."""
-        overdue = self._consumers.overdue(self._loop.time(), self._evict_after_s, self._seq)
+        overdue = self._consumers.overdue(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
             log.error("%s: consumer %s took nothing for %.0f s and is evicted",
                       self.topic.name, name, self._evict_after_s)  # fmt: skip

@@ -81,8 +81,9 @@ class Recorder(Journal):
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
-        taken = None if kind == "finished" else self._taken
-        if taken is None and (kind != "finished" or self._lost):
+        takes_none = kind in ("resumed", "finished")
+        taken = None if takes_none else self._taken
+        if taken is None and (not takes_none or self._lost):
             return  # its message is not recorded
         made = tuple(produced)
         step = Step(

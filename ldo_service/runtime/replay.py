@@ -12,10 +12,10 @@ import msgspec
 
 from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.schemas import Message, decode
-from ldo_service.schemas.topics import Topic
 
 from .actor import Actor, Situation
 from .journal import Gap, Output, Started, Step, checksum, digest_of, outputs_of
+from .ledger import Past, counts_by_topic, successor
 from .recording import JournalFile
 from .state_store import decode_state
 from .step import Produced, produce
@@ -99,15 +99,18 @@ class Life:
         return f" while it handled {taken[-1].topic} of stamp {taken[-1].stamp_ns}"
 
     def _start(self, start: Started) -> None:
-        self._actor = self._make(self._file.about)
         self._replayed.starts += 1
-        if start.state is not None:
+        if start.state is None:
+            self._actor = self._make(self._file.about)
+        else:
             self._replayed.restored += 1
-            self._restore(self._actor, start, start.state)
+            self._actor = self._successor(start, start.state)
 
-    def _restore(self, actor: Actor, start: Started, state: Mapping[str, bytes]) -> None:
+    def _successor(self, start: Started, state: Mapping[str, bytes]) -> Actor:
         try:
-            actor.restore({part: decode_state(body) for part, body in state.items()})
+            past = Past.of({part: decode_state(body) for part, body in state.items()})
+            about = self._file.about
+            return successor(self._make(about), past, lambda: self._make(about))
         except Exception as error:
             where = f"the start before step {start.step} ({self._file.path.name})"
             what = "the state it began from"
@@ -134,8 +137,8 @@ class Life:
         if actor.talks_outside:
             return
         actor.situation = Situation(
-            room=_by_topic(step.room, (out.topic for out in actor.outputs)),
-            waiting=_by_topic(step.waiting, (port.topic for port in actor.inputs)),
+            room=counts_by_topic(step.room, (out.topic for out in actor.outputs)),
+            waiting=counts_by_topic(step.waiting, (port.topic for port in actor.inputs)),
         )
         match step.kind:
             case "done":
@@ -147,6 +150,10 @@ class Life:
                 self._fail(step, actor, self._message(actor, step))
             case "set_aside":
                 self._replayed.set_aside += 1
+            case "resumed":
+                self._compare(step, self._produce(step, actor, actor.resumed()))
+                actor.checkpoint()
+                actor.saved()
             case "finished":
                 self._compare(step, self._produce(step, actor, actor.finish()))
 
@@ -201,7 +208,3 @@ def first_difference(recorded: tuple[Output, ...], replayed: tuple[Output, ...])
             topics = old.topic if old.topic == new.topic else f"{old.topic}, now {new.topic}"
             return f"output {place} of {len(recorded)} differs: {topics}"
     return f"{len(recorded)} outputs, now {len(replayed)}"
-
-
-def _by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[Topic, int]:
-    return {topic: counts[topic.name] for topic in topics if topic.name in counts}

@@ -1,9 +1,9 @@
-"""Runs one actor: take, handle in its own thread, send in order, acknowledge."""
+"""Runs one actor: take, handle in its own thread, save, send in order, acknowledge."""
 
 import asyncio
 import logging
 import secrets
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import msgspec
@@ -13,12 +13,14 @@ from ldo_service.schemas import Health, Message, decode, encode
 from ldo_service.schemas.topics import HEALTH, Topic
 
 from . import links
-from .actor import Actor, Situation
+from .actor import Actor, Situation, State
 from .inlet import Delivery
-from .journal import Journal
+from .journal import Journal, Kind
+from .ledger import Ledger, Past, Taken, successor
 from .mailbox import Mailbox
 from .orders import Order, OrderTaker
 from .outlet import Outlet
+from .ports import Lossless
 from .restart import RestartBudget
 from .state_store import MemoryStore, StateStore
 from .step import Produced, produce
@@ -57,9 +59,15 @@ class Stage:
     A failed step is tried once more by a successor that starts from the last state; a message that
     fails twice is set aside and counted. `expected` names, for each output topic, the consumers
     that must not miss a message. Everything that a step depends on is told to the `journal`.
+
+    A step counts when it is saved: only then is what it made for such consumers sent, and what it
+    took acknowledged. While the disk takes nothing the stage tries again and does no more steps.
+    One whose outputs never wait goes on, makes nothing for them, and sends what it made once it is
+    saved; one without such neighbours goes on too.
     """
 
     JOURNAL_WITHIN_S = 5.0  # a stage that ends waits so long for its journal to be written
+    SAVE_AGAIN_S = 0.5  # after a failed save: soon enough for who frees a disk, and no load
 
     def __init__(
         self,
@@ -77,9 +85,12 @@ class Stage:
         self._expected = expected or {}
         self._on_evicted = on_evicted
         self._journal = journal or Journal()
+        self._ledger = Ledger()
         self._actor = self._successor()
         self.name = self._actor.name
-        self._epoch = _new_epoch()
+        self._epoch = new_epoch()
+        self._is_unsaved = False  # the last step
+        self._saves_failed = 0
         self._vitals = Vitals()
         self._budget = RestartBudget(
             self.name,
@@ -97,7 +108,10 @@ class Stage:
     async def run(self) -> None:
         """Once. Raises RestartsExhausted or StageStalled when it gives up."""
         self._worker = Worker(self.name)
-        self._mailbox = self._open_ports()
+        self._open_outlets()
+        if self._past.is_none and not self._begin():
+            await self._keep()
+        self._mailbox = self._open_mailbox()
         self._transport.announce(self.name)
         tasks = {
             asyncio.create_task(self._beat(self._mailbox), name=f"{self.name} heartbeat"),
@@ -122,7 +136,7 @@ class Stage:
         if self._mailbox:
             self._mailbox.close()
 
-    def _open_ports(self) -> Mailbox:
+    def _open_outlets(self) -> None:
         for port in self._actor.outputs:
             self._outlets[port.topic.message] = Outlet(
                 port,
@@ -132,13 +146,17 @@ class Stage:
                 self._expected.get(port.topic.name, ()),
                 self._config.evict_after_s,
                 self._on_evicted,
+                self._past.outputs.get(port.topic.name),
             )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
+
+    def _open_mailbox(self) -> Mailbox:
         mailbox = Mailbox(
             self.name,
             self._actor.inputs,
             self._transport,
             max_bytes=round(self._config.max_message_mb * 1e6),
+            past=self._past.inputs,
         )
         self._orders = OrderTaker(self.name, self._transport, mailbox.tell)
         if self._drain_requested:
@@ -164,6 +182,9 @@ class Stage:
 
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
+        for outlet in self._outlets.values():
+            await outlet.release()  # what a predecessor made
+        await self._say_first_words()
         while delivery := await mailbox.take():
             if isinstance(delivery, Order):
                 await self._obey(delivery, mailbox)
@@ -171,7 +192,7 @@ class Stage:
             message = self._decode(delivery)
             if message is not None:
                 self._journal.took(delivery, message.stamp_ns)
-                await self._step(message)
+                await self._step(message, delivery)
             mailbox.done(delivery, rejected=message is None)
         await self._say_last_words()
         for outlet in self._outlets.values():
@@ -192,19 +213,20 @@ class Stage:
         self._rejecting.discard(topic)
         return message
 
-    async def _step(self, message: Message) -> None:
+    async def _step(self, message: Message, delivery: Delivery) -> None:
         for _attempt in range(2):
-            if await self._try(message):
+            if await self._try(message, delivery):
                 return
         self._vitals.set_aside += 1
         self._journal.stepped("set_aside", Situation())
+        await self._keep(delivery)
         log.error(
             "%s: %s of stamp %d failed twice and is set aside",
             self.name, type(message).__name__, message.stamp_ns,
         )  # fmt: skip
 
-    async def _try(self, message: Message) -> bool:
-        """Handle, send, save; False when the handler failed and a successor is in place."""
+    async def _try(self, message: Message, delivery: Delivery) -> bool:
+        """Handle, save, send; False when the handler failed and a successor is in place."""
         self._look_around()
         try:
             with self._vitals.step():
@@ -215,14 +237,25 @@ class Stage:
             await self._restart()
             return False
         self._journal.stepped("done", self._actor.situation, produced)
-        for out in produced:
-            await self._send(out)
-        await self._worker.run(self._save)
+        lags, situation = self._actor.lags, self._actor.situation
+        taken = Taken.of(delivery.port.topic.name, delivery.body, situation) if lags else None
+        await self._tell(produced, delivery, taken)
         self._vitals.finished(message, is_timed=bool(produced) or not self._actor.outputs)
         return True
 
-    async def _send(self, out: Produced) -> None:
-        await self._outlets[type(out.message)].send(out.message, out.body)
+    async def _tell(
+        self,
+        produced: list[Produced],
+        delivery: Delivery | None = None,
+        taken: Taken | None = None,
+        whole: bool = False,
+    ) -> None:
+        for out in produced:
+            self._outlets[type(out.message)].hold(out.message, out.body)
+        is_saved = await self._keep(delivery, taken, whole)
+        for outlet in self._outlets.values():
+            if is_saved or outlet.past() is None:
+                await outlet.release()
 
     def _look_around(self) -> None:
         never_wait = [outlet for outlet in self._outlets.values() if outlet.port.never_wait]
@@ -231,18 +264,73 @@ class Stage:
             waiting=self._mailbox.waiting() if self._mailbox else {},
         )
 
+    async def _say_first_words(self) -> None:
+        if self._past.of_actor:
+            await self._say("resumed", lambda: self._actor.resumed())
+
     async def _say_last_words(self) -> None:
+        await self._say("finished", lambda: self._actor.finish())
+
+    async def _say(self, kind: Kind, words: Callable[[], Iterator[Message]]) -> None:
         self._look_around()
         try:
-            last_words = await self._worker.run(self._finish)
+            produced = await self._worker.run(lambda: produce(self._actor, words()))
         except Exception:
             self._vitals.failures += 1
-            log.exception("%s failed on its last words", self.name)
+            log.exception("%s: what it says when it has %s failed", self.name, kind)
             return
-        self._journal.stepped("finished", self._actor.situation, last_words)
-        for out in last_words:
-            await self._send(out)
-        await self._worker.run(self._save, True)
+        if produced or kind == "finished":
+            self._journal.stepped(kind, self._actor.situation, produced)
+        await self._tell(produced, whole=True)
+
+    # --- keeping --------------------------------------------------------------------------------
+    async def _keep(
+        self, delivery: Delivery | None = None, taken: Taken | None = None, whole: bool = False
+    ) -> bool:
+        """Save all as of now, that delivery handled. False: it could not, and nobody waits for it."""
+        links, state = self._links(delivery), None
+        while True:
+            try:
+                state = state or await self._worker.run(self._compose, links, taken, whole)
+                await self._worker.run(self._write, state)
+            except Exception as error:
+                self._note_unsaved(error)
+            else:
+                return True
+            if not self._waits_for_disk:
+                return False
+            await asyncio.sleep(self.SAVE_AGAIN_S)
+
+    @property
+    def _waits_for_disk(self) -> bool:
+        if any(outlet.port.never_wait for outlet in self._outlets.values()):
+            return False
+        takes = any(isinstance(port.policy, Lossless) for port in self._actor.inputs)
+        return takes or any(outlet.past() for outlet in self._outlets.values())
+
+    def _begin(self) -> bool:
+        """Save what there is before anyone counts on this stage: at once, as it is little."""
+        try:
+            self._write(self._compose(self._links(), None, False))
+        except Exception as error:
+            self._note_unsaved(error)
+        return not self._is_unsaved
+
+    def _links(self, delivery: Delivery | None = None) -> State:
+        inputs = self._mailbox.past(delivery) if self._mailbox else self._past.inputs
+        pasts = {out.topic.name: out.past() for out in self._outlets.values()}
+        return self._ledger.links(inputs, {name: past for name, past in pasts.items() if past})
+
+    def _note_unsaved(self, error: Exception) -> None:
+        self._saves_failed += 1
+        if not self._is_unsaved:
+            self._is_unsaved = True
+            self._vitals.failures += 1
+            log.error(
+                "%s: its last step cannot be saved: %r. It tries again, and nothing is mapped that "
+                "a kill would lose: free some disk space, or choose another folder with --state.",
+                self.name, error,
+            )  # fmt: skip
 
     # --- orders ---------------------------------------------------------------------------------
     async def _obey(self, order: Order, mailbox: Mailbox) -> None:
@@ -255,7 +343,8 @@ class Stage:
                 case "renew":
                     await self._renew(mailbox)
                 case "save":
-                    await self._worker.run(self._checkpoint)
+                    whole = await self._worker.run(self._compose, self._links(), None, True)
+                    await self._worker.run(self._write, whole)
         except Exception as error:
             log.exception("%s could not %s", self.name, order.what)
             self._orders.report(order, f"{type(error).__name__}: {error}")
@@ -265,42 +354,43 @@ class Stage:
     async def _renew(self, mailbox: Mailbox) -> None:
         """Begin anew; to everyone else it looks like a process that was started again."""
         self._store.forget(self.name)
+        self._ledger = Ledger()
         self._actor = await self._worker.run(self._successor)
-        self._epoch = _new_epoch()
+        self._epoch = new_epoch()
         self._vitals.facts = {}
         mailbox.renew()
         for outlet in self._outlets.values():
             outlet.renew(self._epoch)
-
-    def _checkpoint(self) -> None:
-        self._store.save(self.name, self._actor.checkpoint())
-        self._actor.saved()
+        await self._keep()
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _handle(self, message: Message) -> list[Produced]:
         return produce(self._actor, self._actor.handle(message))
 
-    def _finish(self) -> list[Produced]:
-        return produce(self._actor, self._actor.finish())
+    def _compose(self, links: State, taken: Taken | None, whole: bool) -> State:
+        self._vitals.facts = {
+            **self._actor.facts(),
+            **self._journal.statistics(),
+            **({"saves_failed": self._saves_failed} if self._saves_failed else {}),
+        }
+        is_whole = whole or self._ledger.is_long
+        own = self._actor.checkpoint() if is_whole else self._actor.snapshot()
+        return {**self._ledger.own(own, None if is_whole else taken), **links}
 
-    def _save(self, everything: bool = False) -> None:
-        """A full disk must not stop the robot: it goes on, and a restart would lose a few steps."""
-        self._vitals.facts = {**self._actor.facts(), **self._journal.statistics()}
-        try:
-            state = self._actor.checkpoint() if everything else self._actor.snapshot()
-            self._store.save(self.name, state)
-            self._actor.saved()
-        except Exception:
-            self._vitals.failures += 1
-            log.exception("%s: its state could not be saved", self.name)
+    def _write(self, state: State) -> None:
+        self._store.save(self.name, state)
+        self._actor.saved()
+        if self._is_unsaved:
+            self._is_unsaved = False
+            log.info("%s is saved again", self.name)
 
     def _successor(self) -> Actor:
-        actor = self._make()
-        state = self._store.load(actor.name)
-        if state is not None:
-            actor.restore(state)
+        fresh = self._make()
+        self._past = Past.of(self._store.load(fresh.name))
+        actor = successor(fresh, self._past, self._make)
+        if self._past.of_actor:
             log.info("%s goes on from its last state", actor.name)
-        self._journal.started(state)
+        self._journal.started(self._past.of_actor or None)
         return actor
 
     async def _restart(self) -> None:
@@ -314,6 +404,9 @@ class Stage:
                 log.exception("%s cannot go on from its last state", self.name)
                 continue
             self._vitals.restarts += 1
+            for outlet in self._outlets.values():
+                outlet.take_back()
+            await self._say_first_words()
             return
 
     # --- health ---------------------------------------------------------------------------------
@@ -339,6 +432,6 @@ class Stage:
         )
 
 
-def _new_epoch() -> int:
+def new_epoch() -> int:
     """A number no earlier run of this stage had."""
     return 1 + secrets.randbits(62)

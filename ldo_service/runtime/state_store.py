@@ -70,7 +70,10 @@ class FolderStore:
         folder = self._folder / actor
         folder.mkdir(parents=True, exist_ok=True)
         saved = self._saved.get(actor, {})
-        old = self._files[actor] if actor in self._files else _read_contents_or_nothing(folder)
+        if actor not in self._files:
+            self._files[actor] = _read_contents_or_nothing(folder)
+            _sweep(folder, self._files[actor])
+        old = self._files[actor]
         new = dict(old)
         for part, value in state.items():
             if part not in saved or saved[part] is not value:
@@ -103,6 +106,13 @@ class FolderStore:
             file.unlink()
         self._saved.pop(actor, None)
         self._files.pop(actor, None)
+
+
+def _sweep(folder: Path, files: Mapping[str, str]) -> None:
+    """Remove what a killed process wrote and did not name, or no longer named."""
+    for file in folder.glob("*"):
+        if file.name not in (CONTENTS, *files.values()):
+            file.unlink()
 
 
 def _read_contents(folder: Path) -> dict[str, str]:

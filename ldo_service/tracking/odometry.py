@@ -200,10 +200,6 @@ class Odometry:
         self._state = replace(self._state, next_id=number + 1, T_odom_mapped=tracked.T_odom_camera)
         return number
 
-    def skip_keyframe_id(self) -> None:
-        """Leave an id unused, for one that may have been given and forgotten."""
-        self._state = replace(self._state, next_id=self._state.next_id + 1)
-
     @property
     def keyframe(self) -> int | None:
         """Id of the keyframe that the next frame is aligned to."""

@@ -86,6 +86,7 @@ async def live(
     """
     recording = folder / "recording"
     recording.mkdir(exist_ok=True)
+    epoch = 1 + len(list(recording.iterdir()))  # the source begins anew with each life
     recorder = Recorder(
         new_path(recording, make().name), {"robot": "test"}, config or RecordConfig()
     )
@@ -98,7 +99,7 @@ async def live(
         expected=expected,
         journal=recorder,
     )
-    numbers = Outlet(Out(NUMBERS), "source", 1, transport, (stage.name,))
+    numbers = Outlet(Out(NUMBERS), "source", epoch, transport, (stage.name,))
     async with running(stage) as (task,):
         for done, value in enumerate(values, 1):
             meanwhile(recorder, value)

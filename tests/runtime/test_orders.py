@@ -11,6 +11,7 @@ from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime import orders as orders_module
 from ldo_service.runtime.actor import State
 from ldo_service.runtime.links import OUTSIDE, encode
+from ldo_service.runtime.ledger import Past
 from ldo_service.runtime.orders import ORDER_KEY, Commander, Order
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
@@ -144,7 +145,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
         for what in ("hold", "renew", "release"):
             assert await commander.order(what, "counter", 5) == ""
         assert counter.health().epoch != epoch
-        assert store.load("counter") is None
+        assert Past.of(store.load("counter")).own == {}
         feed(transport, 12)
         await eventually(lambda: seen == [1, 2, 1])
         feed(transport, 13)

@@ -12,7 +12,7 @@ from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.actor import State
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.stage import Stage, StageConfig
+from ldo_service.runtime.stage import Stage, StageConfig, new_epoch
 from ldo_service.runtime.state_store import FolderStore, MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Health, Message, decode
@@ -37,7 +37,7 @@ from .cast import (
 
 
 def source(transport: MemoryTransport, *expected: str) -> Outlet:
-    return Outlet(Out(NUMBERS), "source", 1, transport, expected)
+    return Outlet(Out(NUMBERS), "source", new_epoch(), transport, expected)
 
 
 class Adder(Actor):
@@ -151,7 +151,7 @@ async def test_a_state_that_cannot_be_saved_is_a_failure_that_stops_nothing(
 async def test_an_actor_is_told_when_its_state_is_saved() -> None:
     peace = Trouble(value=-1, times=0)
     await run_adder(peace, [1, 2, 3])
-    assert peace.saved[:3] == [1, 3, 6]
+    assert peace.saved[:4] == [0, 1, 3, 6]
 
 
 async def test_the_next_process_goes_on_from_the_folder(tmp_path: Path) -> None:
