@@ -10,8 +10,8 @@ import pytest
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime import orders as orders_module
 from ldo_service.runtime.actor import State
-from ldo_service.runtime.links import OUTSIDE, encode
 from ldo_service.runtime.ledger import Past
+from ldo_service.runtime.links import OUTSIDE, encode
 from ldo_service.runtime.orders import ORDER_KEY, Commander, Order
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage

@@ -137,17 +137,6 @@ async def test_whatever_a_handler_raises_is_a_failed_step(error: BaseException) 
     assert stage.health().failures == 1
 
 
-async def test_a_state_that_cannot_be_saved_is_a_failure_that_stops_nothing(
-    tmp_path: Path,
-) -> None:
-    (tmp_path / "adder").write_text("a file where the folder should be")
-    peace = Trouble(value=-1, times=0)
-    sums, stage = await run_adder(peace, [1, 2, 3], store=FolderStore(tmp_path))
-    assert sums == [1, 3, 6]
-    assert stage.health().failures == 3
-    assert peace.saved == []
-
-
 async def test_an_actor_is_told_when_its_state_is_saved() -> None:
     peace = Trouble(value=-1, times=0)
     await run_adder(peace, [1, 2, 3])

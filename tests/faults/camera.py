@@ -1,0 +1,62 @@
+"""A camera that goes to and fro in the synthetic room, at a quarter of its pixels."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from threading import Event, Thread
+
+import msgspec
+
+from ldo_service.client import Client
+from ldo_service.datasets import open_sequence
+from ldo_service.geometry import Camera
+from ldo_service.geometry.rectify import RawFrame
+from ldo_service.schemas import CameraRgbd
+from ldo_service.wire import camera_rgbd_message
+
+STRIDE, PERIOD_NS = 2, 100_000_000
+
+
+def frames() -> list[CameraRgbd]:
+    """There and back, without a jump where it begins again."""
+    room = open_sequence("synthetic:room")
+    there = [camera_rgbd_message(_smaller(room.read(i))) for i in range(0, len(room), STRIDE)]
+    return there + there[-2:0:-1]
+
+
+def _smaller(raw: RawFrame) -> RawFrame:
+    big = raw.camera
+    camera = Camera(big.width // 2, big.height // 2, big.fx / 2, big.fy / 2, big.cx / 2, big.cy / 2)
+    return replace(raw, camera=camera, color=raw.color[::2, ::2], depth=raw.depth[::2, ::2])
+
+
+class Streaming:
+    """Sends frames in a thread, `rate_hz` of them, with stamps that go on."""
+
+    def __init__(self, scene: list[CameraRgbd], rate_hz: float) -> None:
+        self._scene, self._period_s = scene, 1 / rate_hz
+        self._stop, self._thread = Event(), Thread()
+        self.sent = 0
+
+    def start(self, client: Client) -> None:
+        self._stop.clear()
+        self._thread = Thread(target=self._stream, args=(client.send,), daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def skip(self, frames: int) -> None:
+        """The camera moves on and nobody sees it."""
+        self.sent += frames
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the next frame."""
+        return 1_000_000_000 + self.sent * PERIOD_NS
+
+    def _stream(self, send: Callable[[CameraRgbd], None]) -> None:
+        while not self._stop.wait(self._period_s):
+            frame = self._scene[self.sent % len(self._scene)]
+            send(msgspec.structs.replace(frame, frame=self.sent, stamp_ns=self.stamp_ns))
+            self.sent += 1

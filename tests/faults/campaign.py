@@ -1,0 +1,350 @@
+"""Seeded faults on the real service, and what must hold after each.
+
+    python -m tests.faults.campaign OUT.jsonl [--batches 10] [--faults 20] [--seed 0]
+
+A batch is a service on a fresh state folder that meets a number of faults, one after the other,
+while a camera goes to and fro. OUT gets a line per fault; batches that are in it whole are skipped,
+so a campaign goes on where it was interrupted. Ends with 1 when an invariant was broken.
+"""
+
+import argparse
+import json
+import os
+import resource
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from random import Random
+from typing import Any, TextIO
+
+import numpy as np
+
+from ldo_service.map_follower import MapFollower
+from ldo_service.schemas import CameraRgbd
+from ldo_service.schemas.topics import MAP_SNAPSHOT
+
+from .camera import Streaming, frames
+from .life import ACTORS, ALL_APART, Life, NotRecovered, arrays_of, difference, followed
+from .witness import TAKERS, Witness
+
+RATE_HZ = 5.0
+KEPT = ("tracker", *TAKERS)  # have something to lose
+
+# by placement: kinds, and how often each comes
+APART = {"kill": 10, "stop": 1, "hang": 2, "disk": 3, "network": 3, "service": 1}
+TOGETHER = {"service": 10, "optimizer": 2, "disk": 3, "network": 3, "hang in main": 1}
+
+
+@dataclass
+class Outcome:
+    batch: int
+    number: int
+    kind: str
+    what: str = ""
+    pose_s: float = 0.0  # from the fault until a pose is OK
+    recovered_s: float = 0.0  # and until everybody reports and has handled a new keyframe
+    keyframes: int = 0
+    violations: list[str] = field(default_factory=list)
+
+
+class Batch:
+    def __init__(self, number: int, seed: int, folder: Path, scene: list[CameraRgbd]) -> None:
+        self.number, self.rng = number, Random(f"{seed}-{number}")
+        self.kinds = APART if number % 2 == 0 else TOGETHER
+        self.witness = Witness()
+        settings = (ALL_APART,) if self.kinds is APART else ()
+        self.life = Life(folder, self.witness, settings)
+        self.camera = Streaming(scene, RATE_HZ)
+        self.compared = 0  # maps of followers with the mapper's
+        self._killed: set[int] = set()  # processes
+        self._now()
+
+    def run(self, faults: int, tell: Callable[[Outcome], None]) -> None:
+        self.life.start()
+        self.camera.start(self.life.client)
+        try:
+            self._recovered()
+            for number in range(faults):
+                tell(self._meet(number))
+        finally:
+            self.camera.stop()
+            if self.life.process.poll() is None:
+                self.life.kill()
+
+    def _meet(self, number: int) -> Outcome:
+        self._killed.clear()
+        (kind,) = self.rng.choices(list(self.kinds), list(self.kinds.values()))
+        outcome = Outcome(self.number, number, kind)
+        time.sleep(self.rng.uniform(0.0, 1.5))
+        try:
+            self._faults[kind](self, outcome)
+            outcome.recovered_s = round(self._recovered(), 2)
+            outcome.pose_s = round(self._pose_s, 2)
+            self._judge()
+        except NotRecovered as error:
+            self.witness.violations.append(f"{error}\n{self.life.tail()}")
+            self._begin_again()
+        outcome.keyframes = len(self.witness.made)
+        outcome.violations, self.witness.violations = self.witness.violations, []
+        return outcome
+
+    def _begin_again(self) -> None:
+        """After one that did not recover, so that the next faults say something."""
+        self.camera.stop()
+        self.life.kill()
+        self.life.start()
+        self.camera.start(self.life.client)
+        with suppress(NotRecovered):
+            self._recovered()
+
+    # --- faults -----------------------------------------------------------------------------------
+    def _pid(self, actor: str) -> int:
+        self.witness.update()
+        return self.witness.health[actor][1].pid
+
+    def _kill(self, outcome: Outcome) -> None:
+        outcome.what = self.rng.choice(ACTORS)
+        self._end(outcome.what, signal.SIGKILL)
+        self._now()
+
+    def _kill_optimizer(self, outcome: Outcome) -> None:
+        outcome.what = "optimizer"
+        self._end("optimizer", signal.SIGKILL)
+        self._now()
+
+    def _end(self, actor: str, how: signal.Signals) -> None:
+        self._killed.add(self._pid(actor))
+        os.kill(self._pid(actor), how)
+
+    def _stop(self, outcome: Outcome) -> None:
+        """A process that lives and does nothing: it is silent, and killed."""
+        outcome.what = self.rng.choice(KEPT)
+        self._end(outcome.what, signal.SIGSTOP)
+        self._now()
+
+    def _hang(self, outcome: Outcome) -> None:
+        outcome.what = self.rng.choice(KEPT)
+        self._hang_one(outcome.what)
+
+    def _hang_in_main(self, outcome: Outcome) -> None:
+        """A stall in the main process ends the service, and systemd starts it again."""
+        outcome.what = "mapper"
+        old = self._hang_one("mapper")
+        while self.life.process.poll() is None and self._pid("mapper") == old:
+            time.sleep(0.1)
+        self._restart()
+
+    def _hang_one(self, actor: str) -> int:
+        old, flag = self._pid(actor), self.life.folder / f"hang-{actor}"
+        flag.touch()
+        self._killed.add(old)
+        self.life.wait(f"{actor} hangs", lambda: not flag.exists())
+        self._now()
+        return old
+
+    def _disk(self, outcome: Outcome) -> None:
+        """No file may grow beyond a limit: short ones may, or none. Sometimes a kill comes with it."""
+        limit = self.rng.choice([0, 20_000])
+        actor = self.rng.choice(KEPT)
+        pids = {self._pid(actor)} if self.rng.random() < 0.5 else set(map(self._pid, ACTORS))
+        is_killed = self.kinds is APART and self.rng.random() < 0.5
+        outcome.what = f"{len(pids)} at {limit} bytes" + is_killed * f", {actor} killed"
+        self._limit_files(pids, limit)
+        time.sleep(self.rng.uniform(1.0, 3.0))
+        if is_killed:
+            self._end(actor, signal.SIGKILL)
+            time.sleep(0.5)
+        self._limit_files(pids, resource.RLIM_INFINITY)
+        self._now()
+
+    def _limit_files(self, pids: set[int], limit: int) -> None:
+        for pid in pids:
+            with suppress(ProcessLookupError):
+                hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)[1]
+                resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, hard))
+
+    def _network(self, outcome: Outcome) -> None:
+        """Messages are lost, late and out of order, for a while; perhaps a kill in between."""
+        flag = self.life.folder / "bad_network"
+        flag.touch()
+        time.sleep(self.rng.uniform(2.0, 4.0))
+        if self.kinds is APART and self.rng.random() < 0.3:
+            self._kill(outcome)
+            time.sleep(1.0)
+        flag.unlink()
+        self._now()
+
+    def _service(self, outcome: Outcome) -> None:
+        self.life.kill()
+        self._now()
+        self._restart()
+
+    def _restart(self) -> None:
+        """Go on from the state on the disk, with the very map that it holds; meanwhile the camera
+        moved on."""
+        self.camera.stop()
+        if self.life.process.poll() is None:
+            self.life.kill()
+        self.life.close()
+        expected = self.life.expected_map()
+        self.camera.skip(self.rng.randrange(8))
+        self.life.start()
+        if expected is not None:
+            self._must_show(expected)
+        self.camera.start(self.life.client)
+
+    _faults = {
+        "kill": _kill,
+        "optimizer": _kill_optimizer,
+        "stop": _stop,
+        "hang": _hang,
+        "hang in main": _hang_in_main,
+        "disk": _disk,
+        "network": _network,
+        "service": _service,
+    }
+
+    # --- after each -------------------------------------------------------------------------------
+    def _now(self) -> None:
+        self._met_s = time.monotonic()
+        self.witness.update()
+        self._stamp_ns = self.camera.stamp_ns
+        self._made_before = max(self.witness.made, default=-1)
+        self._pose_s = 0.0
+
+    def _recovered(self) -> float:
+        """Seconds since the fault: everybody reports, and has handled a keyframe made since."""
+        witness = self.witness
+        self.life.wait("a pose is OK", self._is_tracked)
+        self._pose_s = time.monotonic() - self._met_s
+        self.life.wait("a new keyframe", lambda: max(witness.made, default=-1) > self._made_before)
+        self.life.wait("everybody reports", self._all_report)
+        return time.monotonic() - self._met_s
+
+    def _is_tracked(self) -> bool:
+        pose = self.witness.pose
+        return pose is not None and pose.stamp_ns >= self._stamp_ns and pose.status == "OK"
+
+    def _all_report(self) -> bool:
+        heard = self.witness.health
+        is_new = [at > self._met_s and h.pid not in self._killed for at, h in heard.values()]
+        return len(is_new) == len(ACTORS) and all(is_new)
+
+    def _judge(self) -> None:
+        """With the camera still: nothing is lost or doubled, and who comes late has the map."""
+        witness, life = self.witness, self.life
+        self.camera.stop()
+        life.wait("all keyframes are handled by all", witness.is_caught_up)
+        life.wait("the graph has them all", lambda: set(witness.made) <= witness.placed)
+        witness.violations += witness.repeated()
+        saved = self._saved_and_told()
+        self._same_keyframes("the mapper", saved["map"]["views"]["keyframes"])
+        self._same_map("a follower", saved, witness.follower)
+        self._same_map("who joined late", saved, witness.late)
+        witness.join_late(life.client.last(MAP_SNAPSHOT, 10))
+        self.camera.start(life.client)
+
+    def _saved_and_told(self) -> dict[str, Any]:
+        """The mapper's map, on the disk and as followers have been told all that changed."""
+        life, before = self.life, self._refined()
+        life.client.refine(0, timeout_s=60)
+        life.wait("followers are told", lambda: self._refined() > before)
+        answer = life.client.control("save")
+        if not answer.ok:
+            self.witness.violations.append(answer.text)
+        saved = life.saved_map()
+        version = saved["told"]["version"]
+        life.wait("the last delta", lambda: self.witness.map_version >= version)
+        return saved
+
+    def _refined(self) -> int:
+        inputs = self.witness.health["mapper"][1].inputs
+        return sum(i.delivered for i in inputs if i.topic == "map/refine")
+
+    def _same_map(self, whose: str, saved: dict[str, Any], follower: MapFollower) -> None:
+        """One that missed something knows that, and waits for the next snapshot."""
+        if follower.is_behind or not follower.version:
+            return
+        self.compared += 1
+        if what := difference(saved["map"]["map"], arrays_of(follower)):
+            self.witness.violations.append(f"the map of {whose} has other {what}")
+
+    def _must_show(self, expected: MapFollower) -> None:
+        self.life.wait("the map is shown", self._shown)
+        if what := difference(arrays_of(expected), arrays_of(followed(self._shown()))):
+            self.witness.violations.append(f"the map after the restart has other {what}")
+
+    def _shown(self) -> list[Any]:
+        return self.life.client.last(MAP_SNAPSHOT, 10)
+
+    def _same_keyframes(self, whose: str, keyframes: list[int]) -> None:
+        if lost := set(self.witness.made) - set(keyframes):
+            self.witness.violations.append(f"{whose} lost keyframes {sorted(lost)}")
+        if len(set(keyframes)) < len(keyframes):
+            self.witness.violations.append(f"{whose} has a keyframe twice")
+
+
+# --- the campaign ---------------------------------------------------------------------------------
+def main() -> int:
+    arguments = read_arguments()
+    out: Path = arguments.out
+    lines = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+    done = [line["batch"] for line in lines]
+    scene = frames()
+    for number in range(arguments.first, arguments.first + arguments.batches):
+        if done.count(number) >= arguments.faults:
+            continue
+        with tempfile.TemporaryDirectory(prefix="faults-") as folder, out.open("a") as file:
+
+            def tell(outcome: Outcome, file: TextIO = file) -> None:
+                print(summary_of(outcome), flush=True)
+                file.write(json.dumps(asdict(outcome)) + "\n")
+                file.flush()
+
+            Batch(number, arguments.seed, Path(folder), scene).run(arguments.faults, tell)
+    outcomes = [Outcome(**json.loads(line)) for line in out.read_text().splitlines()]
+    print(table(outcomes))
+    return int(any(outcome.violations for outcome in outcomes))
+
+
+def read_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--first", type=int, default=0, help="batch to begin with")
+    parser.add_argument("--batches", type=int, default=10)
+    parser.add_argument("--faults", type=int, default=20, help="in each batch")
+    parser.add_argument("--seed", type=int, default=0)
+    return parser.parse_args()
+
+
+def summary_of(outcome: Outcome) -> str:
+    said = "; ".join(outcome.violations) or "held"
+    return (
+        f"batch {outcome.batch} fault {outcome.number:2d}  {outcome.kind:13s} {outcome.what:28s} "
+        f"pose {outcome.pose_s:5.1f} s, all {outcome.recovered_s:5.1f} s, "
+        f"{outcome.keyframes} keyframes  {said}"
+    )
+
+
+def table(outcomes: list[Outcome]) -> str:
+    lines = ["| fault | times | pose again p50 / p95 s | all again p50 / p95 s | broken |"]
+    lines.append("|---|---|---|---|---|")
+    for kind in (*sorted({o.kind for o in outcomes}), "all"):
+        of = [o for o in outcomes if kind in (o.kind, "all")]
+        pose = np.percentile([o.pose_s for o in of], (50, 95))
+        whole = np.percentile([o.recovered_s for o in of], (50, 95))
+        broken = sum(bool(o.violations) for o in of)
+        lines.append(
+            f"| {kind} | {len(of)} | {pose[0]:.1f} / {pose[1]:.1f} | "
+            f"{whole[0]:.1f} / {whole[1]:.1f} | {broken} |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

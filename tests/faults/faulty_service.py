@@ -1,0 +1,67 @@
+"""`ldo` on bad ground: arguments of `ldo`, and in the environment
+
+FAULT_FOLDER   a file `hang-ACTOR` there makes that actor's next step hang, once, and is removed; while
+               `bad_network` is there, messages to this process are lost, late and out of order
+"""
+
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+from threading import Timer
+
+from ldo_service import cli, service
+from ldo_service.actors import graph
+from ldo_service.runtime import Actor
+from ldo_service.runtime.transport import OnMessage
+from ldo_service.runtime.zenoh_transport import ZenohTransport
+
+FOLDER = Path(os.environ["FAULT_FOLDER"])
+BAD_NETWORK = FOLDER / "bad_network"
+LOST, LATE, LATEST_S = 0.15, 0.4, 0.3  # shares of the messages; and so late at most
+
+
+def hanging(actor: Actor) -> Actor:
+    flag, handle = FOLDER / f"hang-{actor.name}", actor.handle
+
+    def hang_or_handle(message: object):
+        if flag.exists():
+            flag.unlink()
+            time.sleep(1e6)
+        return handle(message)
+
+    actor.handle = hang_or_handle
+    return actor
+
+
+def faulty(box: graph.Box) -> graph.Box:
+    make = box.make
+    return box if make is None else replace(box, make=lambda config: hanging(make(config)))
+
+
+class BadTransport(ZenohTransport):
+    def subscribe(self, key: str, on_message: OnMessage) -> None:
+        rng = Random(key)
+
+        def maybe(header: bytes, body: memoryview) -> None:
+            if not BAD_NETWORK.exists():
+                on_message(header, body)
+                return
+            fate = rng.random()
+            if fate >= LOST + LATE:
+                on_message(header, body)
+            elif fate >= LOST:
+                late = Timer(LATEST_S * rng.random(), on_message, (header, body))
+                late.daemon = True
+                late.start()
+
+        super().subscribe(key, maybe)
+
+
+if __name__ == "__main__":
+    service.RUNNING = tuple(map(faulty, service.RUNNING))
+    service.ZenohTransport = BadTransport
+    service.python_command = lambda *arguments: [sys.executable, __file__, *arguments]
+    cli.main(sys.argv[1:])

@@ -1,0 +1,190 @@
+"""The service under test: its lives on one state folder, and what its state says from outside."""
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+
+from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.mapper import Mapper
+from ldo_service.client import Client, connect
+from ldo_service.config import load_config
+from ldo_service.errors import ConfigError
+from ldo_service.map_follower import MapFollower
+from ldo_service.runtime.ledger import Past, successor
+from ldo_service.runtime.network import Network
+from ldo_service.runtime.state_store import FolderStore
+from ldo_service.runtime.zenoh_transport import open_session
+from ldo_service.schemas import MapSnapshot
+
+from .witness import Witness
+
+PROGRAM = Path(__file__).with_name("faulty_service.py")
+PATIENCE_S = 120.0  # on a machine with much else to do
+ACTORS = tuple(box.name for box in RUNNING)
+ALL_APART = f"service.spawned=[{','.join(ACTORS)}]"
+LIGHT = (  # what is tested is the runtime: little work for each keyframe, and little patience
+    *("mapper.iterations=2", "mapper.threads=1", "stage.stall_after_s=4", "stage.heartbeat_s=0.25"),
+    *("service.silent_after_s=5", "stage.max_restarts=1000", "service.drain_s=60"),
+)
+
+
+class NotRecovered(Exception):
+    pass
+
+
+class Life:
+    """`start`, and after a `kill` again."""
+
+    def __init__(self, folder: Path, witness: Witness, settings: tuple[str, ...]) -> None:
+        self.folder, self.witness = folder, witness
+        self.settings = (*LIGHT, *settings)
+        self.log: deque[str] = deque(maxlen=400)
+        self._stack = ExitStack()
+
+    @property
+    def state(self) -> Path:
+        return self.folder / "s"
+
+    # --- life and death ---------------------------------------------------------------------------
+    def start(self) -> None:
+        network = Network("robot", free_endpoint())
+        settings = [word for setting in self.settings for word in ("--set", setting)]
+        self.process = subprocess.Popen(
+            [
+                *(sys.executable, str(PROGRAM), "serve", "--endpoint", network.endpoint),
+                *("--state", str(self.state), *settings),
+            ],
+            env={**os.environ, "FAULT_FOLDER": str(self.folder), "OMP_NUM_THREADS": "1"},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        Thread(target=self._read_log, args=(self.process,), daemon=True).start()
+        self.witness.health.clear()
+        self.witness.pose = None
+        self.client = self._connect(network)
+        session = self._stack.enter_context(open_session(network))
+        self.witness.listen(session, network)
+
+    def _read_log(self, process: subprocess.Popen[str]) -> None:
+        assert process.stderr
+        self.log.extend(iter(process.stderr.readline, ""))
+
+    def _connect(self, network: Network) -> Client:
+        until_s = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until_s and self.process.poll() is None:
+            try:
+                return self._stack.enter_context(connect("robot", network.endpoint))
+            except ConfigError:
+                time.sleep(0.2)
+        raise NotRecovered(f"the service does not answer:\n{self.tail()}")
+
+    def kill(self) -> None:
+        """-9, to all its processes at once."""
+        self.witness.update()
+        pids = {self.process.pid, *(health.pid for _, health in self.witness.health.values())}
+        for pid in pids | children_of(self.process.pid):
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+        self.process.wait()
+        self.close()
+
+    def close(self) -> None:
+        self._stack.close()
+        self._stack = ExitStack()
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        try:
+            return self.process.wait(PATIENCE_S)
+        finally:
+            self.close()
+
+    def tail(self, lines: int = 40) -> str:
+        return "".join(list(self.log)[-lines:])
+
+    def wait(self, what: str, true: Callable[[], object], timeout_s: float = PATIENCE_S) -> float:
+        """Seconds that it took. Raises NotRecovered."""
+        started_s = time.monotonic()
+        while True:
+            self.witness.update()
+            if true():
+                return time.monotonic() - started_s
+            if self.process.poll() is not None:
+                raise NotRecovered(f"the service ended with {self.process.returncode} ({what})")
+            if time.monotonic() - started_s > timeout_s:
+                raise NotRecovered(f"not within {timeout_s:g} s: {what}")
+            time.sleep(0.02)
+
+    # --- what is in the map -----------------------------------------------------------------------
+    def saved_map(self) -> dict[str, np.ndarray]:
+        """Of the checkpoint that is on the disk now."""
+        state = FolderStore(self.state / "state").load("mapper")
+        assert state is not None
+        return state["map"]
+
+    def expected_map(self) -> MapFollower | None:
+        """What a service must show that goes on from the state on the disk: its checkpoint, with
+        what was taken since handled again in this process. None before the first keyframe."""
+        past = Past.of(FolderStore(self.state / "state").load("mapper"))
+        if not past.of_actor:
+            return None
+        copy = self.folder / "copy"
+        shutil.rmtree(copy, ignore_errors=True)
+        shutil.copytree(self.state / "map", copy)
+        config = load_config(settings=self.settings).with_map_folder(copy)
+
+        def make() -> Mapper:
+            return Mapper(config.mapper)
+
+        mapper = successor(make(), past, make)
+        snapshot = [m for m in mapper.resumed() if isinstance(m, MapSnapshot)]
+        return followed(snapshot) if snapshot else None
+
+
+def followed(parts: Iterable[Any]) -> MapFollower:
+    follower = MapFollower()
+    for part in parts:
+        follower.take(part)
+    return follower
+
+
+def arrays_of(follower: MapFollower) -> dict[str, np.ndarray]:
+    return follower.map.snapshot()
+
+
+def difference(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> str:
+    """Of the Gaussians, in a word; empty where there is none, to the bit."""
+    for name in ("ids", "anchors", "rows", "labels"):
+        a, b = one[name], other[name]
+        if a.shape != b.shape:
+            return f"{name} {a.shape} and {b.shape}"
+        if a.tobytes() != b.tobytes():
+            return name
+    return ""
+
+
+def children_of(pid: int) -> set[int]:
+    try:
+        return set(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
+    except OSError:
+        return set()
+
+
+def free_endpoint() -> str:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
