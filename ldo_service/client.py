@@ -11,6 +11,7 @@ does not take in time is dropped on its side.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -65,6 +66,7 @@ class Client:
     def __init__(self, session: zenoh.Session, network: Network) -> None:
         self._session, self._network = session, network
         self._sent = self._asked = self._priors = 0
+        self._numbers: Counter[type[Message]] = Counter()  # of frames and halves sent
         self._epoch = time.time_ns()
         self._publishers: dict[type[Message], Any] = {}  # by message
 
@@ -140,9 +142,11 @@ class Client:
     def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
         """Send a frame or half of one, which may be compressed. May block for some milliseconds,
         and is dropped when the network is congested."""
-        header = Header("camera", self._epoch, self._sent, frame.stamp_ns)
-        self._publisher(type(frame)).put(msgspec.msgpack.encode(frame), attachment=encode(header))
+        kind = type(frame)
+        header = Header("camera", self._epoch, self._numbers[kind], frame.stamp_ns)
+        self._publisher(kind).put(msgspec.msgpack.encode(frame), attachment=encode(header))
         self._sent += 1
+        self._numbers[kind] += 1
 
     def _publisher(self, kind: type[Message]) -> Any:
         if kind not in self._publishers:

@@ -52,6 +52,7 @@ def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
             )
         yield from _of_steps(seen.health)
         yield from _of_failures(seen.health)
+        yield from _of_disk(seen.health)
         yield from _of_models(seen.health)
 
 
@@ -83,6 +84,14 @@ def _of_failures(health: Health) -> Iterator[Trouble]:
             f"failed {health.failures} times, was restarted {health.restarts} times and set "
             f"{health.set_aside} messages aside",
             "the log of `ldo serve` has each failure",
+        )
+
+
+def _of_disk(health: Health) -> Iterator[Trouble]:
+    if health.facts.get("is_unsaved"):
+        yield Trouble(
+            "cannot save its last step, and takes no more keyframes until it can",
+            "free some disk space, or start the service with another folder for --state",
         )
 
 

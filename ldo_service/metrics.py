@@ -36,6 +36,7 @@ OF_INPUT: dict[Row, Callable[[InputCount], float]] = {
     (CounterMetricFamily, "input_dropped", "displaced by newer ones"): lambda i: i.dropped,
     (CounterMetricFamily, "input_rejected", "no valid message"): lambda i: i.rejected,
     (CounterMetricFamily, "input_paused", "left out while paused"): lambda i: i.paused,
+    (CounterMetricFamily, "input_lost", "never came, by number"): lambda i: i.lost,
     (CounterMetricFamily, "input_gaps", "came out of order"): lambda i: i.gaps,
     (GaugeMetricFamily, "input_waiting", "in the mailbox now"): lambda i: i.waiting,
 }

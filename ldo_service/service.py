@@ -21,7 +21,7 @@ import zenoh
 from ldo_service.actors.graph import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.control import Control
-from ldo_service.errors import ConfigError, StageStalled
+from ldo_service.errors import ConfigError, StageError
 from ldo_service.metrics import HealthCollector, exported
 from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import check_graph
@@ -38,11 +38,13 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.supervision import Runner, Stop, supervise
 from ldo_service.runtime.watchdog import Watchdog
+from ldo_service.runtime.worker import Worker
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 
 log = logging.getLogger(__name__)
 
+LEAVE_WITHIN_S = 1.0  # for a step under way when everything else has ended
 ENTANGLED = ("tracker", "mapper", "optimizer")  # have state before the first keyframe is made
 
 
@@ -79,8 +81,10 @@ class Service:
             session = stack.enter_context(open_session(self.network, router=self.is_router))
             try:
                 asyncio.run(self._serve(session, health))
-            except StageStalled as error:
-                _leave(error)  # its thread cannot be stopped, and would keep the process alive
+            except StageError as error:
+                _leave_if_busy(error.exit_code, str(error))
+                raise
+            _leave_if_busy(0, "stopped")
 
     async def _serve(self, session: zenoh.Session, health: HealthCollector) -> None:
         transport = ZenohTransport(session, self.network)
@@ -243,7 +247,10 @@ def _is_fed_from_outside(box: Box) -> bool:
     return any(port.topic in FROM_OUTSIDE for port in box.inputs)
 
 
-def _leave(error: StageStalled) -> None:
-    log.error("%s", error)
-    logging.shutdown()
-    os._exit(error.exit_code)
+def _leave_if_busy(exit_code: int, why: str) -> None:
+    """A thread in the middle of a step cannot be stopped, and aborts the process that ends around
+    it: then leave without ending."""
+    if busy := Worker.left_busy(LEAVE_WITHIN_S):
+        log.error("%s (left in the middle of a step: %s)", why, ", ".join(busy))
+        logging.shutdown()
+        os._exit(exit_code)

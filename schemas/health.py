@@ -18,6 +18,7 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
     waiting: int  # in the mailbox now
     peak: int  # most that ever waited
     paused: int = 0  # left out while the service was paused
+    lost: int = 0  # not lossless only: never came, by the numbers of those that did
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):

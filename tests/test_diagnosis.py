@@ -58,6 +58,7 @@ def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
             seen(health(facts={"labeller_failing": 1.0, "labellings_failed": 2.0})),
             "2 regions so far stay unnamed",
         ),
+        (seen(health(facts={"is_unsaved": 1.0, "saves_failed": 3.0})), "cannot save its last step"),
     ],
 )
 def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:

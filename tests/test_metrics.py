@@ -55,6 +55,7 @@ def test_every_number_of_a_health_message_is_exported(port: int) -> None:
         ("ldo_input_dropped_total", (mapper, keyframes)): 0,
         ("ldo_input_rejected_total", (mapper, keyframes)): 1,
         ("ldo_input_paused_total", (mapper, keyframes)): 0,
+        ("ldo_input_lost_total", (mapper, keyframes)): 0,
         ("ldo_input_gaps_total", (mapper, keyframes)): 2,
         ("ldo_input_waiting", (mapper, keyframes)): 3,
         ("ldo_output_sent_total", (mapper, view)): 90,

@@ -189,10 +189,12 @@ def of_actor(actor: Seen) -> Iterator[Finding]:
 
 def _in_numbers(health: Health) -> str:
     dropped = sum(i.dropped for i in health.inputs)
+    lost = sum(i.lost for i in health.inputs)
     rejected = sum(i.rejected for i in health.inputs)
     state = "held" if health.held else health.state
     return (
         f"{health.actor} (process {health.pid}): {state}, {health.steps} steps of "
         f"{health.step_ms_p50:.1f} ms p50, {health.step_ms_p95:.1f} ms p95, {dropped} dropped, "
-        f"{rejected} rejected, {health.restarts} restarts, {health.rss_mb:.0f} MB"
+        f"{lost} lost on the way, {rejected} rejected, {health.restarts} restarts, "
+        f"{health.rss_mb:.0f} MB"
     )

@@ -81,6 +81,8 @@ class Mailbox:
         with self._lock:
             if self._closed:
                 return
+            if header is not None and not isinstance(inlet, LosslessInlet):
+                inlet.number(header)
             if self._held and not isinstance(inlet, LosslessInlet):
                 inlet.paused += 1
             elif header is None:

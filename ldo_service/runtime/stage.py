@@ -287,7 +287,7 @@ class Stage:
     async def _keep(
         self, delivery: Delivery | None = None, taken: Taken | None = None, whole: bool = False
     ) -> bool:
-        """Save all as of now, that delivery handled. False: it could not, and nobody waits for it."""
+        """Save all as of now, that delivery handled. False: not yet, and nobody waits for it."""
         links, state = self._links(delivery), None
         while True:
             try:
@@ -323,6 +323,11 @@ class Stage:
 
     def _note_unsaved(self, error: Exception) -> None:
         self._saves_failed += 1
+        self._vitals.facts = {
+            **self._vitals.facts,
+            "is_unsaved": 1.0,
+            "saves_failed": self._saves_failed,
+        }
         if not self._is_unsaved:
             self._is_unsaved = True
             self._vitals.failures += 1

@@ -1,11 +1,13 @@
 """A thread that works off what it is given, in order."""
 
 import asyncio
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
 from threading import Lock, Thread
 from typing import Any, ParamSpec, TypeVar
+from weakref import WeakSet
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -18,12 +20,16 @@ class Worker:
     never ends; this one does not. How much may wait is up to who submits.
     """
 
+    _all: "WeakSet[Worker]" = WeakSet()
+
     def __init__(self, name: str) -> None:
+        self.name = name
         self._jobs: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._lock = Lock()
         self._closed = False
         self._thread = Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
+        Worker._all.add(self)
 
     def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
         """Run soon, in the thread. After `close` the future is cancelled at once."""
@@ -49,6 +55,16 @@ class Worker:
         """Wait for the thread after `close`: one that is inside a library while the interpreter
         ends would be killed there, which some libraries answer with an abort."""
         self._thread.join(timeout_s)
+
+    @classmethod
+    def left_busy(cls, within_s: float) -> list[str]:
+        """Names of closed ones that are still at work after so long: the interpreter must not end
+        around them."""
+        until_s = time.monotonic() + within_s
+        closed = [worker for worker in cls._all if worker._closed]
+        for worker in closed:
+            worker.join(max(0.0, until_s - time.monotonic()))
+        return sorted(worker.name for worker in closed if worker._thread.is_alive())
 
     def _work(self) -> None:
         while entry := self._jobs.get():

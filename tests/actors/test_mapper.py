@@ -16,6 +16,7 @@ from ldo_service.gaussians.sleep_choice import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.map_follower import MapFollower
 from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.ledger import Past, Taken, successor
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Detection,
@@ -26,6 +27,7 @@ from ldo_service.schemas import (
     MapRefine,
     MapSnapshot,
     ModelView,
+    encode,
 )
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.semantics.labelling import LabellingConfig
@@ -367,6 +369,44 @@ def test_a_successor_with_the_same_folder_goes_on_as_its_predecessor(keyframes, 
     assert (
         followed(second.finish()).map.rows.tobytes() == followed(first.finish()).map.rows.tobytes()
     )
+
+
+def test_what_was_taken_since_the_checkpoint_gives_the_same_bits_again(
+    keyframes, correction, tmp_path
+) -> None:
+    """Gaussians, keyframes, objects and the numbers of what is to come."""
+    config = replace(LABELLING, folder=str(tmp_path / "keyframes"), checkpoint_keyframes=100)
+    first = Mapper(config)
+    taken = [m for k in keyframes[:6] for m in (k, boxes_of(k))]
+    taken.insert(9, correction)
+    handled(first, taken[:1])
+    state = decode_state(encode_state(first.snapshot()))
+    told = handled(first, taken[1:])
+    shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
+    config = replace(config, folder=str(tmp_path / "copy"))
+    past = Past(state, taken=tuple(map(as_taken, taken[1:])))
+    second = successor(Mapper(config), past, lambda: Mapper(config))
+    one, other = first.checkpoint()["map"], second.checkpoint()["map"]
+    for part in ("map", "semantics", "poses", "links", "to_mend"):
+        assert encode_state(one[part]) == encode_state(other[part]), part
+    version = max(delta.version for delta in deltas_of(told))
+    assert all(delta.version > version for delta in deltas_of(second.resumed()))
+
+
+def as_taken(message) -> Taken:
+    (port,) = (port for port in Mapper.inputs if port.topic.message is type(message))
+    return Taken.of(port.topic.name, encode(message), Situation())
+
+
+def test_a_successor_first_shows_its_whole_map(keyframes) -> None:
+    first, second = Mapper(CONFIG), Mapper(CONFIG)
+    follower = followed(changes(handled(first, keyframes[:3])))
+    second.restore(first.checkpoint())
+    words = list(second.resumed())
+    followed(changes(words), follower)
+    assert_equal_maps(follower, second)
+    assert_equal_maps(followed(changes(words)), second)
+    assert list(Mapper(CONFIG).resumed()) == []
 
 
 def test_corrections_too_small_to_send_add_up(keyframes) -> None:

@@ -25,7 +25,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from ldo_service.map_follower import MapFollower
-from ldo_service.schemas import CameraRgbd
+from ldo_service.schemas import CameraRgbd, Health
 from ldo_service.schemas.topics import MAP_SNAPSHOT
 
 from .camera import Streaming, frames
@@ -148,7 +148,7 @@ class Batch:
         return old
 
     def _disk(self, outcome: Outcome) -> None:
-        """No file may grow beyond a limit: short ones may, or none. Sometimes a kill comes with it."""
+        """No file may grow beyond a limit: short ones may, or none. Sometimes a kill comes too."""
         limit = self.rng.choice([0, 20_000])
         actor = self.rng.choice(KEPT)
         pids = {self._pid(actor)} if self.rng.random() < 0.5 else set(map(self._pid, ACTORS))
@@ -179,7 +179,7 @@ class Batch:
         flag.unlink()
         self._now()
 
-    def _service(self, outcome: Outcome) -> None:
+    def _service(self, _outcome: Outcome) -> None:
         self.life.kill()
         self._now()
         self._restart()
@@ -239,6 +239,7 @@ class Batch:
         """With the camera still: nothing is lost or doubled, and who comes late has the map."""
         witness, life = self.witness, self.life
         self.camera.stop()
+        self._wait_until_still()
         life.wait("all keyframes are handled by all", witness.is_caught_up)
         life.wait("the graph has them all", lambda: set(witness.made) <= witness.placed)
         witness.violations += witness.repeated()
@@ -248,6 +249,22 @@ class Batch:
         self._same_map("who joined late", saved, witness.late)
         witness.join_late(life.client.last(MAP_SNAPSHOT, 10))
         self.camera.start(life.client)
+
+    def _wait_until_still(self) -> None:
+        """Until everybody has said, and said again, that nothing waits or is under way."""
+        seen: dict[str, int] = {}
+        self._now()
+        for _ in range(100):
+            self.life.wait("everybody reports", self._all_report)
+            now = {name: health.steps for name, (_, health) in self.witness.health.items()}
+            if now == seen and all(map(_is_idle, self._healths())):
+                return
+            seen = now
+            self._now()
+        raise NotRecovered("it does not come to rest")
+
+    def _healths(self) -> list[Health]:
+        return [health for _, health in self.witness.health.values()]
 
     def _saved_and_told(self) -> dict[str, Any]:
         """The mapper's map, on the disk and as followers have been told all that changed."""
@@ -260,7 +277,8 @@ class Batch:
         saved = life.saved_map()
         version = saved["told"]["version"]
         life.wait("the last delta", lambda: self.witness.map_version >= version)
-        return saved
+        is_later = self.witness.map_version > version  # a correction came in between
+        return self._saved_and_told() if is_later else saved
 
     def _refined(self) -> int:
         inputs = self.witness.health["mapper"][1].inputs
@@ -287,6 +305,10 @@ class Batch:
             self.witness.violations.append(f"{whose} lost keyframes {sorted(lost)}")
         if len(set(keyframes)) < len(keyframes):
             self.witness.violations.append(f"{whose} has a keyframe twice")
+
+
+def _is_idle(health: Health) -> bool:
+    return health.busy_s == 0 and not any(count.waiting for count in health.inputs)
 
 
 # --- the campaign ---------------------------------------------------------------------------------

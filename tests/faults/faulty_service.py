@@ -1,7 +1,7 @@
 """`ldo` on bad ground: arguments of `ldo`, and in the environment
 
-FAULT_FOLDER   a file `hang-ACTOR` there makes that actor's next step hang, once, and is removed; while
-               `bad_network` is there, messages to this process are lost, late and out of order
+FAULT_FOLDER   a file `hang-ACTOR` there makes that actor's next step hang, once, and is removed;
+               while `bad_network` is there, messages to it are lost, late and out of order
 """
 
 import os

@@ -9,7 +9,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -95,10 +95,8 @@ class Life:
         self.witness.update()
         pids = {self.process.pid, *(health.pid for _, health in self.witness.health.values())}
         for pid in pids | children_of(self.process.pid):
-            try:
+            with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                pass
         self.process.wait()
         self.close()
 
@@ -173,7 +171,9 @@ def difference(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -
         if a.shape != b.shape:
             return f"{name} {a.shape} and {b.shape}"
         if a.tobytes() != b.tobytes():
-            return name
+            others = np.flatnonzero((a != b).reshape(len(a), -1).any(axis=1))
+            anchors = sorted(set(one["anchors"][others].tolist()))
+            return f"{name}: {len(others)} of {len(a)}, of keyframes {anchors}"
     return ""
 
 

@@ -138,3 +138,22 @@ async def test_rejections_are_said_once_an_episode_and_counted_each(caplog) -> N
             transport.deliver(NUMBERS.name, b"", body)
         await eventually(lambda: stage.health().inputs[0].rejected == 3)
     assert len([r for r in caplog.records if "rejected" in r.message]) == 2
+
+
+async def test_what_never_came_is_counted_by_the_numbers_of_what_did() -> None:
+    transport = MemoryTransport()
+    mailbox = Mailbox("me", (In(NUMBERS, Latest(64)),), transport)
+
+    def arrives(epoch: int, *numbers: int) -> int:
+        for seq in numbers:
+            header = encode(Header("source", epoch, seq, 0))
+            transport.deliver(NUMBERS.name, header, encode_message(number(seq)))
+        return mailbox.statistics()[0].lost
+
+    assert arrives(1, 5, 6, 7) == 0, "who comes late has lost nothing"
+    assert arrives(1, 10) == 2
+    assert arrives(1, 9) == 1, "it was only late"
+    assert arrives(2, 0, 1, 3) == 2, "another producer counts anew"
+    transport.deliver(NUMBERS.name, b"", encode_message(number(0)))
+    assert mailbox.statistics()[0].lost == 2, "a foreign program numbers nothing"
+    mailbox.disconnect()

@@ -1,5 +1,6 @@
 """An actor that hangs or raises, and bytes that are no frames, in a live service."""
 
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -215,3 +216,18 @@ def test_a_camera_that_goes_blind_and_sees_again_is_tracked_on(
 
 def facts(service: LiveService) -> dict[str, float]:
     return service.update_health()["frame_source"].facts
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_service_that_is_stopped_in_the_middle_of_a_long_step_ends_without_an_abort(
+    tmp_path: Path, room: Sequence
+) -> None:
+    with live_service(tmp_path, "--set", "mapper.iterations=100000") as service:
+        service.wait_for_actors()
+        begin(service, room)
+        wait_until(lambda: service.update_health()["mapper"].state == "busy", 20, "busy")
+        service.process.send_signal(signal.SIGINT)
+        wait_until(lambda: service.update_health()["tracker"].state == "draining", 20, "draining")
+        assert service.stop() == 0
+        assert "left in the middle of a step: mapper" in service.log

@@ -1,0 +1,326 @@
+"""Robots and subscribers on one router of this machine, with more frames than can be tracked.
+
+    python -m tests.bench.bench_load [--robots 1 4 16] [--minutes 10] [--subscribers 50]
+    python -m tests.bench.bench_load --robots 1 --minutes 30 --times 0.8 --plot docs/soak.png
+
+Each robot is a service of its own that joins the router; its camera sends --times what it tracked
+in a first half minute of 30 Hz. A tenth of the subscribers is slow, a tenth is stopped. Told are
+memory, pose latency and rate in thirds of the time, and what became of each frame.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Event, Lock, Thread
+
+import cv2
+import msgspec
+import numpy as np
+import zenoh
+
+from ldo_service.client import Client, connect
+from ldo_service.errors import ConfigError
+from ldo_service.runtime.network import Network
+from ldo_service.runtime.zenoh_transport import open_session
+from ldo_service.schemas import CameraRgbd, Health, TrackedPose, decode
+from tests.faults.camera import frames
+from tests.service.conftest import free_endpoint
+
+LIGHT = ("mapper.iterations=2", "mapper.threads=1", "service.spawned=[]")  # a process per robot
+SAMPLE_S = 2.0
+SETTLE_S = 30.0  # to find the rate that can be sustained
+QUICK_IN_ONE_PROCESS = 8
+ACTORS = 7
+
+
+@dataclass
+class Robot:
+    """One service, its camera and what is known of both."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    client: Client
+    sent: int = 0
+    poses: int = 0
+    latest_ms: list[float] = field(default_factory=list)  # since the last sample
+    health: dict[str, Health] = field(default_factory=dict)
+    samples: list[tuple[float, float, float, float]] = field(default_factory=list)
+    lock: Lock = field(default_factory=Lock)
+
+    def sample(self, elapsed_s: float, span_s: float) -> None:
+        """Time, resident MB of the service, median latency in ms, poses per second."""
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        with self.lock:
+            latest, self.latest_ms = self.latest_ms, []
+        median_ms = float(np.median(latest)) if latest else float("nan")
+        rss_mb = pages * os.sysconf("SC_PAGESIZE") / 1e6
+        self.samples.append((elapsed_s, rss_mb, median_ms, len(latest) / span_s))
+
+    def heard(self, sample: zenoh.Sample) -> None:
+        pose = decode(sample.payload.to_bytes(), TrackedPose)
+        with self.lock:
+            self.poses += 1
+            self.latest_ms.append(1e-6 * (time.time_ns() - pose.stamp_ns))
+
+    def told(self, sample: zenoh.Sample) -> None:
+        health = decode(sample.payload.to_bytes(), Health)
+        self.health[health.actor] = health
+
+
+class Camera:
+    """Sends `rate_hz` frames to a robot, stamped with the time of sending."""
+
+    def __init__(self, robot: Robot, scene: list[CameraRgbd], rate_hz: float) -> None:
+        self._robot, self._scene, self._period_s = robot, scene, 1 / rate_hz
+        self._stop = Event()
+        self._thread = Thread(target=self._stream, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _stream(self) -> None:
+        due_s = time.monotonic()
+        while not self._stop.wait(max(0.0, due_s - time.monotonic())):
+            due_s = max(due_s + self._period_s, time.monotonic() - 1.0)
+            frame = self._scene[self._robot.sent % len(self._scene)]
+            number, stamp_ns = self._robot.sent, time.time_ns()
+            self._robot.client.send(msgspec.structs.replace(frame, frame=number, stamp_ns=stamp_ns))
+            self._robot.sent += 1
+
+
+# --- the company ----------------------------------------------------------------------------------
+@contextmanager
+def robots_on(network: Network, count: int, folder: Path) -> Iterator[list[Robot]]:
+    with ExitStack() as stack:
+        robots = [_robot(f"robot{i}", network.endpoint, folder, stack) for i in range(count)]
+        until_s = time.monotonic() + 60 + 20 * count
+        while any(len(robot.health) < ACTORS for robot in robots):
+            if time.monotonic() > until_s:
+                raise TimeoutError("not all actors report")
+            time.sleep(0.2)
+        yield robots
+
+
+def _robot(name: str, endpoint: str, folder: Path, stack: ExitStack) -> Robot:
+    settings = [word for setting in LIGHT for word in ("--set", setting)]
+    command = [sys.executable, "-m", "ldo_service", "serve", "--join", "--robot", name]
+    process = subprocess.Popen(
+        [*command, "--endpoint", endpoint, "--state", str(folder / name), *settings],
+        stderr=(folder / f"{name}.log").open("w"),
+    )
+    stack.callback(_end, process)
+    robot = Robot(name, process, stack.enter_context(connect(name, endpoint)))
+    session = stack.enter_context(open_session(Network(name, endpoint)))
+    for topic, heard in (("pose/tracked", robot.heard), ("health/*", robot.told)):
+        handler = zenoh.handlers.Callback(heard, indirect=False)
+        stack.enter_context(session.declare_subscriber(f"ldo/{name}/{topic}", handler))
+    return robot
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    process.send_signal(signal.SIGINT)
+    try:
+        process.wait(60)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+class Crowd:
+    """Subscribers in processes of their own."""
+
+    def __init__(self, endpoint: str, count: int, stack: ExitStack) -> None:
+        slow = dead = count // 10
+        quick = count - slow - dead
+        sizes = [quick // QUICK_IN_ONE_PROCESS] * QUICK_IN_ONE_PROCESS
+        sizes[0] += quick - sum(sizes)
+        self._quick = [self._start(endpoint, n, "quick", stack) for n in sizes if n]
+        if slow:
+            self._start(endpoint, slow, "slow", stack)
+            os.kill(self._start(endpoint, dead, "dead", stack).pid, signal.SIGSTOP)
+
+    def _start(
+        self, endpoint: str, count: int, kind: str, stack: ExitStack
+    ) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "tests.bench.load_listeners", endpoint, str(count), kind],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        stack.callback(process.wait)
+        stack.callback(process.kill)
+        assert process.stdout
+        if process.stdout.readline().strip() != "ready":
+            raise ConfigError(f"{count} {kind} subscribers could not connect")
+        return process
+
+    def poses(self) -> list[int]:
+        """That came to each quick one; ends them."""
+        said = [json.loads(process.communicate(timeout=60)[0]) for process in self._quick]
+        return [counts["ldo/*/pose/tracked"] for of_one in said for counts in of_one]
+
+
+# --- one run --------------------------------------------------------------------------------------
+@dataclass
+class Outcome:
+    robots: list[Robot]
+    rate_hz: float  # sent, per robot
+    crowd: list[int]  # poses that came to each quick subscriber
+
+
+def loaded(
+    count: int, subscribers: int, minutes: float, times: float, scene: list[CameraRgbd]
+) -> Outcome:
+    with ExitStack() as stack:
+        network = Network("router", free_endpoint())
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="load-")))
+        stack.enter_context(open_session(network, router=True))
+        robots = stack.enter_context(robots_on(network, count, folder))
+        sustained_hz = _sustained(robots, scene)
+        rate_hz = times * sustained_hz
+        print(
+            f"{count} robots track {sustained_hz:.1f} Hz each; sent are {rate_hz:.1f}", flush=True
+        )
+        crowd = Crowd(network.endpoint, subscribers, stack)
+        before = sum(robot.poses for robot in robots)
+        cameras = [Camera(robot, scene, rate_hz) for robot in robots]
+        started_s = last_s = time.monotonic()
+        while (now_s := time.monotonic()) < started_s + 60 * minutes:
+            time.sleep(max(0.0, last_s + SAMPLE_S - now_s))
+            now_s = time.monotonic()
+            for robot in robots:
+                robot.sample(now_s - started_s, now_s - last_s)
+            last_s = now_s
+        for camera in cameras:
+            camera.stop()
+        _settle(robots)
+        heard = crowd.poses()
+        print(f"poses {sum(r.poses for r in robots) - before}, quick subscribers {sorted(heard)}")
+        return Outcome(robots, rate_hz, heard)
+
+
+def _sustained(robots: list[Robot], scene: list[CameraRgbd]) -> float:
+    """Poses per second and robot, of frames that come faster."""
+    cameras = [Camera(robot, scene, 30.0) for robot in robots]
+    time.sleep(SETTLE_S / 2)
+    before, started_s = sum(robot.poses for robot in robots), time.monotonic()
+    time.sleep(SETTLE_S / 2)
+    made, took_s = sum(robot.poses for robot in robots) - before, time.monotonic() - started_s
+    for camera in cameras:
+        camera.stop()
+    _settle(robots)
+    for robot in robots:
+        robot.samples.clear()
+        robot.latest_ms.clear()
+    return max(0.2, made / took_s / len(robots))
+
+
+def _settle(robots: list[Robot]) -> None:
+    """Until what waits is handled, and heartbeats have told."""
+    time.sleep(3.0)
+    until_s = time.monotonic() + 60
+    while time.monotonic() < until_s and any(
+        count.waiting for robot in robots for h in robot.health.values() for count in h.inputs
+    ):
+        time.sleep(0.5)
+    time.sleep(2.0)
+
+
+# --- what came of it ------------------------------------------------------------------------------
+def accounts(robot: Robot) -> dict[str, int]:
+    """Frames: what the camera sent, and what became of them."""
+    (camera,) = [i for i in robot.health["frame_source"].inputs if i.topic == "camera/rgbd"]
+    (made,) = [o for o in robot.health["frame_source"].outputs if o.topic == "frame/rgbd"]
+    (taken,) = [i for i in robot.health["tracker"].inputs if i.topic == "frame/rgbd"]
+    return {
+        "sent": robot.sent,
+        "taken": camera.delivered,
+        "dropped": camera.dropped,
+        "lost on the way": camera.lost,
+        "unaccounted for": robot.sent - camera.delivered - camera.dropped - camera.lost,
+        "handed on": made.sent,
+        "tracked": taken.delivered,
+        "dropped by the tracker": taken.dropped,
+        "lost in between": taken.lost,
+        "of these unaccounted for": made.sent - taken.delivered - taken.dropped - taken.lost,
+    }
+
+
+def table(outcome: Outcome) -> str:
+    """Of all robots together, in thirds of the time."""
+    samples = np.array([robot.samples for robot in outcome.robots])  # [R, S, 4]
+    lines = ["| third | memory of a service MB, most | pose latency ms p50 / p95 | poses/s, each |"]
+    lines.append("|---|---|---|---|")
+    for number, third in enumerate(np.array_split(samples, 3, axis=1), 1):
+        p50, p95 = np.nanpercentile(third[..., 2], (50, 95))
+        lines.append(
+            f"| {number} | {third[..., 1].max():.0f} | {p50:.0f} / {p95:.0f} | "
+            f"{third[..., 3].mean():.2f} |"
+        )
+    counted = [accounts(robot) for robot in outcome.robots]
+    total = {name: sum(one[name] for one in counted) for name in counted[0]}
+    return "\n".join([*lines, "", ", ".join(f"{name} {n}" for name, n in total.items())])
+
+
+WIDTH, HEIGHT, LEFT = 640, 130, 70
+
+
+def plot(robot: Robot) -> np.ndarray:
+    """Memory, latency and rate over time, one above the other."""
+    samples = np.array(robot.samples)
+    names = ("memory, MB", "pose latency, ms", "poses per second")
+    panels = [
+        _panel(samples[:, 0] / 60, samples[:, k], name) for k, name in enumerate(names, start=1)
+    ]
+    return np.vstack(panels)
+
+
+def _panel(minutes: np.ndarray, values: np.ndarray, name: str) -> np.ndarray:
+    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    known = np.isfinite(values)
+    top = 1.1 * max(float(values[known].max(initial=0.0)), 1e-9)
+    x = LEFT + (WIDTH - LEFT - 15) * minutes[known] / max(float(minutes.max()), 1e-9)
+    y = (HEIGHT - 22) - (HEIGHT - 50) * values[known] / top
+    line = np.stack([x, y], axis=1).round().astype(np.int32)
+    cv2.line(image, (LEFT, HEIGHT - 22), (WIDTH - 15, HEIGHT - 22), (200, 200, 200), 1)
+    cv2.polylines(image, [line.reshape(-1, 1, 2)], False, (31, 111, 235), 1, cv2.LINE_AA)
+    for text, where in (
+        (name, (LEFT, 18)),
+        (f"{top / 1.1:.4g}", (8, HEIGHT - 22 - round((HEIGHT - 50) / 1.1))),
+        ("0", (8, HEIGHT - 20)),
+        (f"{minutes.max():.0f} min", (WIDTH - 65, HEIGHT - 6)),
+    ):
+        cv2.putText(image, text, where, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (60, 60, 60), 1)
+    return image
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--robots", type=int, nargs="+", default=[1, 4, 16])
+    parser.add_argument("--subscribers", type=int, default=50)
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--times", type=float, default=2.0, help="of the rate that is sustained")
+    parser.add_argument("--plot", type=Path, help="PNG of the first robot's time")
+    arguments = parser.parse_args()
+    scene = frames()
+    for count in arguments.robots:
+        outcome = loaded(count, arguments.subscribers, arguments.minutes, arguments.times, scene)
+        print(table(outcome), flush=True)
+        if arguments.plot:
+            cv2.imwrite(str(arguments.plot), plot(outcome.robots[0])[..., ::-1])
+
+
+if __name__ == "__main__":
+    main()
