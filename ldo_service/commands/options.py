@@ -50,8 +50,10 @@ StateFolder = Annotated[
     Path | None,
     tyro.conf.arg(
         name="state",
+        aliases=["--resume"],
         metavar="DIR",
-        help="where actors keep what a successor needs; default: a temporary folder",
+        help="where actors keep what a successor needs, and go on from what they find; default: a "
+        "temporary folder",
     ),
 ]
 Localise = Annotated[

@@ -276,7 +276,10 @@ class Batch:
             self.witness.violations.append(answer.text)
         saved = life.saved_map()
         version = saved["told"]["version"]
-        life.wait("the last delta", lambda: self.witness.map_version >= version)
+        life.wait(
+            "the last delta",
+            lambda: self.witness.map_version >= version or self.witness.has_missed_deltas(),
+        )
         is_later = self.witness.map_version > version  # a correction came in between
         return self._saved_and_told() if is_later else saved
 
@@ -315,11 +318,10 @@ def _is_idle(health: Health) -> bool:
 def main() -> int:
     arguments = read_arguments()
     out: Path = arguments.out
-    lines = [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
-    done = [line["batch"] for line in lines]
+    done = whole_batches(out, arguments.faults)
     scene = frames()
     for number in range(arguments.first, arguments.first + arguments.batches):
-        if done.count(number) >= arguments.faults:
+        if number in done:
             continue
         with tempfile.TemporaryDirectory(prefix="faults-") as folder, out.open("a") as file:
 
@@ -332,6 +334,16 @@ def main() -> int:
     outcomes = [Outcome(**json.loads(line)) for line in out.read_text().splitlines()]
     print(table(outcomes))
     return int(any(outcome.violations for outcome in outcomes))
+
+
+def whole_batches(out: Path, faults: int) -> set[int]:
+    """Those that OUT has; what it has of others is dropped."""
+    lines = out.read_text().splitlines() if out.exists() else []
+    batches = [json.loads(line)["batch"] for line in lines]
+    whole = {batch for batch in batches if batches.count(batch) >= faults}
+    kept = [f"{line}\n" for line, of in zip(lines, batches, strict=True) if of in whole]
+    out.write_text("".join(kept))
+    return whole
 
 
 def read_arguments() -> argparse.Namespace:

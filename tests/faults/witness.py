@@ -31,6 +31,7 @@ KINDS: dict[str, type[Message]] = {
     "map/snapshot": MapSnapshot,
     "pose/tracked": TrackedPose,
 }
+BEHIND_S = 5.0  # for what is still on its way
 GRANTS = "link/grant/keyframe/new"
 
 
@@ -45,10 +46,12 @@ class Witness:
     placed: set[int] = field(default_factory=set)  # keyframes of the last correction
     graph_version: int = 0
     map_version: int = 0
+    last_delta: tuple[int, int] = (0, -1)  # epoch and number
     pose: TrackedPose | None = None
     health: dict[str, tuple[float, Health]] = field(default_factory=dict)
     follower: MapFollower = field(default_factory=MapFollower)  # from the first message on
     late: MapFollower = field(default_factory=MapFollower)  # from the last fault on
+    _behind_since: float | None = None
     _subscribers: list[object] = field(default_factory=list)
     _heard: deque[tuple[str, bytes, bytes]] = field(default_factory=lambda: deque(maxlen=20_000))
 
@@ -101,6 +104,8 @@ class Witness:
             case Correction():
                 self._corrected(message)
             case MapDelta():
+                of = decode(header, Header)
+                self.last_delta = of.epoch, of.seq
                 self._must_grow("map", self.map_version, message.version)
                 self.map_version = message.version
                 self._follow(message)
@@ -145,6 +150,22 @@ class Witness:
         """Keyframes that a consumer has said to have handled."""
         epoch, handled = self.handled.get(taker, (0, 0))
         return {k for (of, seq), k in self.numbers.items() if of == epoch and seq < handled}
+
+    def has_missed_deltas(self) -> bool:
+        """Whether the mapper said a while ago that it sent more than came: the network may lose
+        what goes outside."""
+        at, mapper = self.health["mapper"]
+        sent = {count.topic: count.sent for count in mapper.outputs}["map/delta"]
+        epoch, seq = self.last_delta
+        came = seq + 1 if mapper.epoch == epoch else 0
+        if came >= sent:
+            self._behind_since = None
+            return False
+        self._behind_since = self._behind_since or at
+        if time.monotonic() - self._behind_since < BEHIND_S:
+            return False
+        self.follower.is_behind = self.late.is_behind = True
+        return True
 
     def is_caught_up(self) -> bool:
         """Whether all consumers have handled every keyframe that was seen."""

@@ -1,0 +1,97 @@
+"""Faults on a real service: here minutes of them, `python -m tests.faults.campaign` has hundreds."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from ldo_service.runtime.links import Grant, Header, encode
+from ldo_service.schemas import encode as encode_message
+from ldo_service.wire import correction_message
+from tests.faults.camera import frames
+from tests.faults.campaign import Batch, Outcome, table, whole_batches
+from tests.faults.witness import GRANTS, TAKERS, Witness
+from tests.schemas.examples import EXAMPLES
+
+
+@pytest.fixture(scope="module")
+def scene() -> list:
+    return frames()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("batch", [0, 1], ids=["actors apart", "one process"])
+def test_after_each_fault_nothing_is_lost_or_doubled(
+    tmp_path: Path, scene: list, batch: int
+) -> None:
+    outcomes: list[Outcome] = []
+    Batch(batch, 7, tmp_path, scene).run(faults=12, tell=outcomes.append)
+    assert len(outcomes) == 12
+    assert [outcome for outcome in outcomes if outcome.violations] == []
+
+
+# --- the judge ------------------------------------------------------------------------------------
+KEYFRAME = EXAMPLES["keyframe"]
+KEYFRAMES = [msgspec.structs.replace(KEYFRAME, keyframe=k, reference=None) for k in range(3)]
+
+
+def hear(witness: Witness, topic: str, message: object, seq: int = 0, epoch: int = 1) -> None:
+    body = encode(message) if isinstance(message, Grant) else encode_message(message)
+    witness._heard.append((topic, encode(Header("somebody", epoch, seq, 0)), body))
+    witness.update()
+
+
+def test_a_witness_sees_a_keyframe_that_is_made_twice() -> None:
+    witness = Witness()
+    hear(witness, "keyframe/new", KEYFRAMES[0])
+    hear(witness, "link/again/keyframe/new", KEYFRAMES[0])
+    assert witness.violations == [], "the same again is a repetition"
+    other = msgspec.structs.replace(KEYFRAMES[0], stamp_ns=99)
+    hear(witness, "keyframe/new", other, seq=1)
+    assert witness.violations == ["keyframe 0 was made twice"]
+
+
+def test_a_witness_knows_what_everybody_has_handled() -> None:
+    witness = Witness()
+    for seq, keyframe in enumerate(KEYFRAMES[:3]):
+        hear(witness, "keyframe/new", keyframe, seq)
+    for taker in TAKERS:
+        assert not witness.is_caught_up()
+        hear(witness, GRANTS, Grant(taker, 1, handled=3, arrived=3, limit=11))
+    assert witness.is_caught_up()
+    hear(witness, GRANTS, Grant("mapper", 1, handled=1, arrived=1, limit=9))
+    assert witness.violations == ["mapper had handled 3 keyframes, and then 1"]
+
+
+def test_a_witness_sees_versions_go_back_and_keyframes_vanish() -> None:
+    witness = Witness()
+    poses = [(k, np.eye(4)) for k in range(2)]
+    first, second = (correction_message(0, n, dict(poses[:n])) for n in (1, 2))
+    hear(witness, "graph/correction", second)
+    assert witness.violations == []
+    hear(witness, "graph/correction", first)
+    went_back, lost = witness.violations
+    assert went_back.startswith("version 1 of the graph came after 2")
+    assert lost.startswith("the graph lost keyframes")
+
+
+def test_a_campaign_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
+    out = tmp_path / "out.jsonl"
+    lines = ['{"batch": 0}'] * 3 + ['{"batch": 1}'] * 2
+    out.write_text("\n".join(lines) + "\n")
+    assert whole_batches(out, 3) == {0}
+    assert out.read_text().splitlines() == lines[:3]
+    assert whole_batches(tmp_path / "new.jsonl", 3) == set()
+
+
+def test_the_table_has_a_row_for_each_kind() -> None:
+    outcomes = [
+        Outcome(0, 0, "kill", pose_s=1.0, recovered_s=2.0),
+        Outcome(0, 1, "disk", pose_s=3.0, recovered_s=4.0, violations=["broken"]),
+    ]
+    kill, whole = table(outcomes).splitlines()[3:]
+    assert kill == "| kill | 1 | 1.0 / 1.0 | 2.0 / 2.0 | 0 |"
+    assert whole.startswith("| all | 2 |")
+    assert whole.endswith("| 1 |")
