@@ -1,4 +1,4 @@
-"""Faults on a real service: here minutes of them, `python -m tests.faults.campaign` has hundreds."""
+"""Faults on a real service: minutes of them; `python -m tests.faults.campaign` has hundreds."""
 
 from pathlib import Path
 
