@@ -97,12 +97,13 @@ class Ledger:
     def is_long(self) -> bool:
         return len(self._taken) >= MOST_TAKEN
 
-    def own(self, own: State, taken: Taken | None) -> dict[str, Any]:
-        """The actor's state, with what it took since, if it is still the one of before."""
+    def own(self, own: State, taken: Taken | None, whole: bool) -> dict[str, Any]:
+        """The actor's state; with what it took since, if that is not `whole`, nor another one than
+        before."""
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
-        if is_new or taken is None:
+        if is_new or whole:
             self._own, self._taken = own, {}
-        else:
+        elif taken is not None:
             self._taken[f"{TAKEN} {self._number}"] = taken
             self._number += 1
         return {**own, **self._taken}

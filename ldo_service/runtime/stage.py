@@ -16,7 +16,8 @@ from . import links
 from .actor import Actor, Situation, State
 from .inlet import Delivery
 from .journal import Journal, Kind
-from .ledger import Ledger, Past, Taken, successor
+from .keeper import Keeper
+from .ledger import Taken
 from .mailbox import Mailbox
 from .orders import Order, OrderTaker
 from .outlet import Outlet
@@ -81,16 +82,13 @@ class Stage:
         journal: Journal | None = None,
     ) -> None:
         self._make, self._transport, self._config = make, transport, config
-        self._store = store or MemoryStore()
+        self._keeper = Keeper(store or MemoryStore())
         self._expected = expected or {}
         self._on_evicted = on_evicted
         self._journal = journal or Journal()
-        self._ledger = Ledger()
         self._actor = self._successor()
         self.name = self._actor.name
         self._epoch = new_epoch()
-        self._is_unsaved = False  # the last step
-        self._saves_failed = 0
         self._vitals = Vitals()
         self._budget = RestartBudget(
             self.name,
@@ -109,7 +107,7 @@ class Stage:
         """Once. Raises RestartsExhausted or StageStalled when it gives up."""
         self._worker = Worker(self.name)
         self._open_outlets()
-        if self._past.is_none and not self._begin():
+        if self._keeper.past.is_none and not self._begin():
             await self._keep()
         self._mailbox = self._open_mailbox()
         self._transport.announce(self.name)
@@ -146,7 +144,7 @@ class Stage:
                 self._expected.get(port.topic.name, ()),
                 self._config.evict_after_s,
                 self._on_evicted,
-                self._past.outputs.get(port.topic.name),
+                self._keeper.past.outputs.get(port.topic.name),
             )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
 
@@ -156,7 +154,7 @@ class Stage:
             self._actor.inputs,
             self._transport,
             max_bytes=round(self._config.max_message_mb * 1e6),
-            past=self._past.inputs,
+            past=self._keeper.past.inputs,
         )
         self._orders = OrderTaker(self.name, self._transport, mailbox.tell)
         if self._drain_requested:
@@ -265,7 +263,7 @@ class Stage:
         )
 
     async def _say_first_words(self) -> None:
-        if self._past.of_actor:
+        if self._keeper.past.of_actor:
             await self._say("resumed", lambda: self._actor.resumed())
 
     async def _say_last_words(self) -> None:
@@ -291,7 +289,9 @@ class Stage:
         links, state = self._links(delivery), None
         while True:
             try:
-                state = state or await self._worker.run(self._compose, links, taken, whole)
+                state = state or await self._worker.run(
+                    self._keeper.compose, self._actor, links, taken, whole
+                )
                 await self._worker.run(self._write, state)
             except Exception as error:
                 self._note_unsaved(error)
@@ -311,31 +311,19 @@ class Stage:
     def _begin(self) -> bool:
         """Save what there is before anyone counts on this stage: at once, as it is little."""
         try:
-            self._write(self._compose(self._links(), None, False))
+            self._write(self._keeper.compose(self._actor, self._links(), None, False))
         except Exception as error:
             self._note_unsaved(error)
-        return not self._is_unsaved
+        return not self._keeper.is_unsaved
 
     def _links(self, delivery: Delivery | None = None) -> State:
-        inputs = self._mailbox.past(delivery) if self._mailbox else self._past.inputs
-        pasts = {out.topic.name: out.past() for out in self._outlets.values()}
-        return self._ledger.links(inputs, {name: past for name, past in pasts.items() if past})
+        inputs = self._mailbox.past(delivery) if self._mailbox else self._keeper.past.inputs
+        outputs = {out.topic.name: out.past() for out in self._outlets.values()}
+        return self._keeper.links(inputs, outputs)
 
     def _note_unsaved(self, error: Exception) -> None:
-        self._saves_failed += 1
-        self._vitals.facts = {
-            **self._vitals.facts,
-            "is_unsaved": 1.0,
-            "saves_failed": self._saves_failed,
-        }
-        if not self._is_unsaved:
-            self._is_unsaved = True
-            self._vitals.failures += 1
-            log.error(
-                "%s: its last step cannot be saved: %r. It tries again, and nothing is mapped that "
-                "a kill would lose: free some disk space, or choose another folder with --state.",
-                self.name, error,
-            )  # fmt: skip
+        self._vitals.failures += self._keeper.failed(self.name, error)
+        self._vitals.facts = {**self._vitals.facts, **self._keeper.facts()}
 
     # --- orders ---------------------------------------------------------------------------------
     async def _obey(self, order: Order, mailbox: Mailbox) -> None:
@@ -348,8 +336,7 @@ class Stage:
                 case "renew":
                     await self._renew(mailbox)
                 case "save":
-                    whole = await self._worker.run(self._compose, self._links(), None, True)
-                    await self._worker.run(self._write, whole)
+                    await self._worker.run(self._save_whole, self._links())
         except Exception as error:
             log.exception("%s could not %s", self.name, order.what)
             self._orders.report(order, f"{type(error).__name__}: {error}")
@@ -358,8 +345,7 @@ class Stage:
 
     async def _renew(self, mailbox: Mailbox) -> None:
         """Begin anew; to everyone else it looks like a process that was started again."""
-        self._store.forget(self.name)
-        self._ledger = Ledger()
+        self._keeper.forget(self.name)
         self._actor = await self._worker.run(self._successor)
         self._epoch = new_epoch()
         self._vitals.facts = {}
@@ -372,31 +358,21 @@ class Stage:
     def _handle(self, message: Message) -> list[Produced]:
         return produce(self._actor, self._actor.handle(message))
 
-    def _compose(self, links: State, taken: Taken | None, whole: bool) -> State:
+    def _successor(self) -> Actor:
+        actor = self._keeper.successor(self._make)
+        self._journal.started(self._keeper.past.of_actor or None)
+        return actor
+
+    def _write(self, state: State) -> None:
+        self._keeper.write(self._actor, state)
         self._vitals.facts = {
             **self._actor.facts(),
             **self._journal.statistics(),
-            **({"saves_failed": self._saves_failed} if self._saves_failed else {}),
+            **self._keeper.facts(),
         }
-        is_whole = whole or self._ledger.is_long
-        own = self._actor.checkpoint() if is_whole else self._actor.snapshot()
-        return {**self._ledger.own(own, None if is_whole else taken), **links}
 
-    def _write(self, state: State) -> None:
-        self._store.save(self.name, state)
-        self._actor.saved()
-        if self._is_unsaved:
-            self._is_unsaved = False
-            log.info("%s is saved again", self.name)
-
-    def _successor(self) -> Actor:
-        fresh = self._make()
-        self._past = Past.of(self._store.load(fresh.name))
-        actor = successor(fresh, self._past, self._make)
-        if self._past.of_actor:
-            log.info("%s goes on from its last state", actor.name)
-        self._journal.started(self._past.of_actor or None)
-        return actor
+    def _save_whole(self, links: State) -> None:
+        self._write(self._keeper.compose(self._actor, links, None, True))
 
     async def _restart(self) -> None:
         """Wait, longer with each failure, and put a successor in place."""

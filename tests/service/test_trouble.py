@@ -228,6 +228,6 @@ def test_a_service_that_is_stopped_in_the_middle_of_a_long_step_ends_without_an_
         begin(service, room)
         wait_until(lambda: service.update_health()["mapper"].state == "busy", 20, "busy")
         service.process.send_signal(signal.SIGINT)
-        wait_until(lambda: service.update_health()["tracker"].state == "draining", 20, "draining")
+        wait_until(lambda: service.update_health()["mapper"].state == "draining", 20, "draining")
         assert service.stop() == 0
         assert "left in the middle of a step: mapper" in service.log
