@@ -4,7 +4,7 @@ After Grisetti, Kuemmerle and Ni, Robust Optimization of Factor Graphs by using 
 Measurements (2012).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -33,14 +33,19 @@ class Condensed:
 
 
 def group_to_condense(
-    active: Sequence[int], measured: Iterable[tuple[int, int]], size: int, window: int
+    active: Sequence[int],
+    measured: Iterable[tuple[int, int]],
+    heads: Container[int],
+    size: int,
+    window: int,
 ) -> list[int]:
     """The oldest `size` active keyframes that odometry connects one after another, and the next;
-    none of the newest `window`. Empty where there are none."""
+    none of the newest `window`. One of `heads`, that others follow, is the first of its group, as
+    it cannot follow itself. Empty where there are none."""
     linked = {frozenset(pair) for pair in measured}
     run: list[int] = []
     for keyframe in active[:-window] if window else active:
-        if not any(frozenset((k, keyframe)) in linked for k in run):
+        if keyframe in heads or not any(frozenset((k, keyframe)) in linked for k in run):
             run = []
         run.append(keyframe)
         if len(run) == size + 1:

@@ -265,8 +265,9 @@ class KeyframeGraph:
     def _condense(self) -> None:
         """What is due; and start anew from what is known now, often enough."""
         config, known = self._config, self._known
+        heads = {k for pair in known.condensed for k in pair}
         group = group_to_condense(
-            known.active, known.odometry, config.condense_keyframes, config.window_keyframes
+            known.active, known.odometry, heads, config.condense_keyframes, config.window_keyframes
         )
         if group:
             known.condense(group, {k: self.pose(k) for k in group})

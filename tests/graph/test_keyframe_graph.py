@@ -344,3 +344,22 @@ def test_incremental_poses_with_loops_equal_a_batch_solution_of_the_stated_objec
         np.testing.assert_allclose(
             graph.pose(i), truth[i] @ se3.exp(x[6 * i - 6 : 6 * i]), atol=2e-4
         )
+
+
+def test_a_keyframe_that_others_follow_never_follows_itself() -> None:
+    """2 is left over where odometry went on from 0; then a measurement ties it to the head 5."""
+    graph = KeyframeGraph(KeyframeGraphConfig(condense_keyframes=2, window_keyframes=2))
+    truth = [se3.exp(np.array([0.0, 0.1 * k, 0.0, 0.1 * k, 0.0, 0.0])) for k in range(14)]
+
+    def of(a: int, b: int) -> RelativePose:
+        return RelativePose(a, b, se3.inverse(truth[a]) @ truth[b], 1e4 * np.eye(6))
+
+    graph.add_first(0, truth[0])
+    others = {3: [0], 5: [4, 2], 9: [8, 2]}
+    for b in range(1, 14):
+        graph.add(*(of(a, b) for a in others.get(b, [b - 1])))
+    poses = graph.poses()
+    assert sorted(poses) == list(range(14))
+    assert graph.variables < 14
+    for k, T_map_keyframe in poses.items():
+        np.testing.assert_allclose(T_map_keyframe, truth[k], atol=1e-6)
