@@ -101,9 +101,12 @@ class Camera:
 
 # --- the company ----------------------------------------------------------------------------------
 @contextmanager
-def robots_on(network: Network, count: int, folder: Path) -> Iterator[list[Robot]]:
+def robots_on(
+    network: Network, count: int, folder: Path, settings: tuple[str, ...]
+) -> Iterator[list[Robot]]:
     with ExitStack() as stack:
-        robots = [_robot(f"robot{i}", network.endpoint, folder, stack) for i in range(count)]
+        endpoint = network.endpoint
+        robots = [_robot(f"robot{i}", endpoint, folder, settings, stack) for i in range(count)]
         until_s = time.monotonic() + 60 + 20 * count
         while any(len(robot.health) < ACTORS for robot in robots):
             if time.monotonic() > until_s:
@@ -112,11 +115,13 @@ def robots_on(network: Network, count: int, folder: Path) -> Iterator[list[Robot
         yield robots
 
 
-def _robot(name: str, endpoint: str, folder: Path, stack: ExitStack) -> Robot:
-    settings = [word for setting in LIGHT for word in ("--set", setting)]
+def _robot(
+    name: str, endpoint: str, folder: Path, settings: tuple[str, ...], stack: ExitStack
+) -> Robot:
+    words = [word for setting in (*LIGHT, *settings) for word in ("--set", setting)]
     command = [sys.executable, "-m", "ldo_service", "serve", "--join", "--robot", name]
     process = subprocess.Popen(
-        [*command, "--endpoint", endpoint, "--state", str(folder / name), *settings],
+        [*command, "--endpoint", endpoint, "--state", str(folder / name), *words],
         stderr=(folder / f"{name}.log").open("w"),
     )
     stack.callback(_end, process)
@@ -181,13 +186,18 @@ class Outcome:
 
 
 def loaded(
-    count: int, subscribers: int, minutes: float, times: float, scene: list[CameraRgbd]
+    count: int,
+    subscribers: int,
+    minutes: float,
+    times: float,
+    settings: tuple[str, ...],
+    scene: list[CameraRgbd],
 ) -> Outcome:
     with ExitStack() as stack:
         network = Network("router", free_endpoint())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="load-")))
         stack.enter_context(open_session(network, router=True))
-        robots = stack.enter_context(robots_on(network, count, folder))
+        robots = stack.enter_context(robots_on(network, count, folder, settings))
         sustained_hz = _sustained(robots, scene)
         rate_hz = times * sustained_hz
         print(
@@ -271,6 +281,8 @@ def table(outcome: Outcome) -> str:
         )
     counted = [accounts(robot) for robot in outcome.robots]
     total = {name: sum(one[name] for one in counted) for name in counted[0]}
+    facts = [robot.health["mapper"].facts for robot in outcome.robots]
+    total |= {name: round(sum(one[name] for one in facts)) for name in ("keyframes", "gaussians")}
     return "\n".join([*lines, "", ", ".join(f"{name} {n}" for name, n in total.items())])
 
 
@@ -312,11 +324,21 @@ def main() -> None:
     parser.add_argument("--subscribers", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--times", type=float, default=2.0, help="of the rate that is sustained")
+    parser.add_argument(
+        "--set", nargs="+", default=[], help="of each service, as `ldo serve` has it"
+    )
     parser.add_argument("--plot", type=Path, help="PNG of the first robot's time")
     arguments = parser.parse_args()
     scene = frames()
     for count in arguments.robots:
-        outcome = loaded(count, arguments.subscribers, arguments.minutes, arguments.times, scene)
+        outcome = loaded(
+            count,
+            arguments.subscribers,
+            arguments.minutes,
+            arguments.times,
+            tuple(arguments.set),
+            scene,
+        )
         print(table(outcome), flush=True)
         if arguments.plot:
             cv2.imwrite(str(arguments.plot), plot(outcome.robots[0])[..., ::-1])
