@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.runtime.links import Grant, Header, encode
+from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
 from ldo_service.wire import correction_message
 from tests.faults.camera import frames
@@ -37,7 +38,9 @@ KEYFRAME = EXAMPLES["keyframe"]
 KEYFRAMES = [msgspec.structs.replace(KEYFRAME, keyframe=k, reference=None) for k in range(3)]
 
 
-def hear(witness: Witness, topic: str, message: object, seq: int = 0, epoch: int = 1) -> None:
+def hear(
+    witness: Witness, topic: str, message: Message | Grant, seq: int = 0, epoch: int = 1
+) -> None:
     body = encode(message) if isinstance(message, Grant) else encode_message(message)
     witness._heard.append((topic, encode(Header("somebody", epoch, seq, 0)), body))
     witness.update()
