@@ -7,14 +7,15 @@ FAULT_FOLDER   a file `hang-ACTOR` there makes that actor's next step hang, once
 import os
 import sys
 import time
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from random import Random
 from threading import Timer
+from typing import Any
 
 from ldo_service import cli, service
-from ldo_service.actors import graph
 from ldo_service.runtime import Actor
+from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.transport import OnMessage
 from ldo_service.runtime.zenoh_transport import ZenohTransport
 
@@ -36,9 +37,9 @@ def hanging(actor: Actor) -> Actor:
     return actor
 
 
-def faulty(box: graph.Box) -> graph.Box:
-    make = box.make
-    return box if make is None else replace(box, make=lambda config: hanging(make(config)))
+class FaultyStage(Stage):
+    def __init__(self, make: Callable[[], Actor], *args: Any, **options: Any) -> None:
+        super().__init__(lambda: hanging(make()), *args, **options)
 
 
 class BadTransport(ZenohTransport):
@@ -61,7 +62,7 @@ class BadTransport(ZenohTransport):
 
 
 if __name__ == "__main__":
-    service.RUNNING = tuple(map(faulty, service.RUNNING))
+    service.Stage = FaultyStage
     service.ZenohTransport = BadTransport
     service.python_command = lambda *arguments: [sys.executable, __file__, *arguments]
     cli.main(sys.argv[1:])

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.actors.graph import RUNNING
+from ldo_service.actors.graph import GRAPH
 from ldo_service.actors.mapper import Mapper
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
@@ -32,7 +32,7 @@ from .witness import Witness
 
 PROGRAM = Path(__file__).with_name("faulty_service.py")
 PATIENCE_S = 120.0  # on a machine with much else to do
-ACTORS = tuple(box.name for box in RUNNING)
+ACTORS = tuple(box.name for box in GRAPH)
 ALL_APART = f"service.spawned=[{','.join(ACTORS)}]"
 LIGHT = (  # what is tested is the runtime: little work for each keyframe, and little patience
     *("mapper.iterations=2", "mapper.threads=1", "stage.stall_after_s=4", "stage.heartbeat_s=0.25"),
