@@ -79,7 +79,8 @@ class Life:
 
     def _read_log(self, process: subprocess.Popen[str]) -> None:
         assert process.stderr
-        self.log.extend(iter(process.stderr.readline, ""))
+        with process.stderr as log:
+            self.log.extend(iter(log.readline, ""))
 
     def _connect(self, network: Network) -> Client:
         until_s = time.monotonic() + PATIENCE_S
