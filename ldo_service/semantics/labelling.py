@@ -12,7 +12,7 @@ from .assignment import UNMATCHED, Assigned, AssignmentConfig, Regions, assign
 from .consistency import ConsistencyConfig, Disagreement, agree
 from .foreground import Foreground, ForegroundConfig, foreground, surfaces
 from .fusion import FusionConfig, fused
-from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe, top_labels
+from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe, top_labels, without_misses
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +107,11 @@ def label_keyframe(
     # what they were seen as
     seen = observations(where, indices, camera, claims, config, is_late=is_late)
     if spared is not None:
+        # what the detector does not know it could not miss, before or now
         is_spared = spared[top_labels(labels[indices])] & (seen.labels == MISS)
         seen.labels[is_spared] = NOT_SEEN
+        is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
+        without_misses(labels, indices[is_named])
     observe(labels, seen, config.labels, threads=threads)
     # what their neighbours say
     touched = indices[seen.labels != NOT_SEEN]

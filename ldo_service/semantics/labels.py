@@ -126,6 +126,24 @@ def observe(
     )
 
 
+def without_misses(labels: np.ndarray, indices: np.ndarray) -> None:
+    """Take background, and the evidence for it, out of rows `indices` [V] of labels [N, 32], in
+    place: what else they were seen as stays, in proportion.
+
+    >>> labels = new_labels(1)
+    >>> row = fields(labels)
+    >>> row["weights"][0, 0], row["evidence"] = 0.25, 2
+    >>> without_misses(labels, np.array([0]))
+    >>> row["weights"][0, 0].item(), row["evidence"].item()
+    (1.0, 0.5)
+    """
+    rows = fields(labels)
+    weights = rows["weights"][indices]
+    named = weights.sum(axis=1)
+    rows["weights"][indices] = weights / np.where(named > 0, named, 1)[:, None]
+    rows["evidence"][indices] *= named
+
+
 def background(labels: np.ndarray) -> np.ndarray:
     """[N] float32, the share of background."""
     return np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)

@@ -167,3 +167,18 @@ def test_an_image_of_labels_is_of_the_largest_sum_not_of_the_nearest_gaussian() 
     shown = render(rows, CAMERA, np.eye(4), contributions=True)
     assert top_image(labels, shown)[31, 47] == CHAIR
     assert label_image(rows, labels, shown, CAMERA, np.eye(4))[31, 47] == LAMP
+
+
+def test_a_name_the_detector_cannot_know_is_not_held_back_by_what_it_missed() -> None:
+    """Ten keyframes of misses are worth 2 answers of 0.9."""
+    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    config = LabellingConfig(labels=LabelConfig(least_px=1))
+    rows, labels = labelled(config, *[nothing] * 10)
+    view = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
+    spared, known = np.zeros(256, bool), labels.copy()
+    spared[LAMP] = True
+    for told, which in ((spared, labels), (None, known)):
+        said = claims(0, 0.9)
+        label_keyframe(rows, which, *view, said, config, is_late=True, spared=told)
+    assert np.mean(top_labels(labels).reshape(64, 96)[thing()] == LAMP) > 0.9
+    assert not top_labels(known).any(), "what it knows, it did miss"
