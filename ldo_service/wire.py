@@ -39,7 +39,7 @@ from ldo_service.semantics.labelling import Claims
 from ldo_service.semantics.landmarks import distributions, labels_of
 from ldo_service.semantics.movable import Box as MovableBox
 from ldo_service.semantics.objects import Objects, Observed
-from ldo_service.semantics.regions_to_name import Region
+from ldo_service.semantics.regions import Region
 from ldo_service.semantics.vocabulary import Vocabulary
 from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
 from ldo_service.tracking.moving import resized

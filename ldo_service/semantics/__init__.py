@@ -9,6 +9,8 @@ letterbox                 an image within the input of a network, and boxes back
 non_maximum_suppression   one box for one object
 detectors                 all of these in their order: an image in, boxes out
 foreground                the object that fills a box
+planes                    what of a keyframe is the room
+segments                  what depth, creases and colour set apart from it
 assignment                which Gaussians a region shows
 fusion                    what detector and labeller say together
 labels                    what each Gaussian is, over time

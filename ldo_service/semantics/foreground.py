@@ -1,5 +1,6 @@
 """What of a detector's box is the object: else the wall behind a chair becomes chair."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp
 
@@ -61,6 +62,17 @@ class Foreground:
         height, width = self.mask.shape
         out[self.row : self.row + height, self.column : self.column + width] = self.mask
         return out
+
+    @property
+    def packed(self) -> tuple[tuple[int, ...], np.ndarray]:
+        """Row, column and shape, and the mask as bits: for a state."""
+        return (self.row, self.column, *self.mask.shape), np.packbits(self.mask)
+
+    @staticmethod
+    def unpacked(place: Sequence[int], bits: np.ndarray) -> "Foreground":
+        row, column, height, width = place
+        mask = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
+        return Foreground(row, column, mask)
 
 
 def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> Surfaces:

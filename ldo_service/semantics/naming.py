@@ -15,10 +15,11 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.views import View
 
 from .class_names import normalised
-from .foreground import Foreground, surfaces
+from .foreground import Foreground
 from .labelling import Claims
 from .regions_to_name import Answer, Opinion, Question, RegionConfig, RegionsToName
-from .trigger import TriggerConfig, candidates, named_objects, standing_apart
+from .segments import segments
+from .trigger import TriggerConfig, candidates, named_objects, regions_of_image
 from .vocabulary import Vocabulary
 
 
@@ -27,13 +28,14 @@ class NamingConfig:
     trigger: TriggerConfig = field(default_factory=TriggerConfig)
     regions: RegionConfig = field(default_factory=RegionConfig)
     reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
+    least_sure: float = 0.5  # of an answer: below, it is more likely another name
     structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")  # no objects, whoever
     # says so: they stay background
     most_open: int = 96  # questions without an answer, some 10 kB each: the labeller has 32 regions
     # waiting, and may be asked three times about each
 
     def __post_init__(self) -> None:
-        if not 0 <= self.reliable <= 1 or self.most_open < 1:
+        if not (0 <= self.reliable <= 1 and 0 <= self.least_sure <= 1) or self.most_open < 1:
             raise ConfigError(f"{self}: reliable must be within 0..1, most_open at least 1.")
 
 
@@ -77,14 +79,15 @@ class Naming:
         """
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
         labels = [vocabulary.name(int(label)) for label in claims.labels]
-        found = surfaces(depth_m, camera, config.foreground)
-        apart = standing_apart(depth_m, found, config)
+        color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
+        found = regions_of_image(
+            segments(color, depth_m, camera, config.segments), depth_m.shape, config
+        )
         doubtful = candidates(
             *(claims.boxes, labels, claims.confidences),
-            *(depth_m, found, camera, is_labelled, apart, config),
+            *(depth_m, camera, is_labelled, found, config),
         )
-        named = named_objects(claims.boxes, is_labelled, apart, config)
-        color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
+        named = named_objects(claims.boxes, is_labelled, found, config)
         sightings = self._regions.see(
             view.keyframe, doubtful, color, depth_m, camera, T_map_keyframe, named
         )
@@ -112,7 +115,10 @@ class Naming:
         if asked is None:
             self._unknown += 1
             return None
-        name = "" if normalised(label) in self.config.structure else label
+        is_told = normalised(label) not in self.config.structure and (
+            confidence >= self.config.least_sure or bool(asked.label)
+        )
+        name = label if is_told else ""
         answer = Answer(name, confidence, keyframe, asked.p_camera, asked.size_m)
         self._regions.answered(region, answer)
         is_name = bool(name) and confidence > 0
@@ -168,7 +174,11 @@ def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocab
     for opinion in opinions:
         if (number := opinion.of.number) is not None:
             labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
-    alone = [opinion for opinion in opinions if opinion.of.number is None]
+    alone = [
+        opinion
+        for opinion in opinions
+        if opinion.of.number is None and not _is_part_of_one(opinion, opinions)
+    ]
     said = np.array([vocabulary.index(opinion.label) for opinion in alone], np.int64)
     boxes = np.array([opinion.of.box_px for opinion in alone], np.float32).reshape(-1, 4)
     return Claims(
@@ -181,14 +191,27 @@ def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocab
     )
 
 
+def _is_part_of_one(opinion: Opinion, opinions: Sequence[Opinion]) -> bool:
+    """Most of its box lies in that of a larger region of the same name: one thing, not two."""
+    box_px = opinion.of.box_px
+    for other in opinions:
+        sides = np.minimum(box_px[2:], other.of.box_px[2:])
+        sides = sides - np.maximum(box_px[:2], other.of.box_px[:2])
+        shared_px = float(np.prod(np.maximum(sides, 0)))
+        is_larger = _area_px(other.of.box_px) > _area_px(box_px)
+        if is_larger and other.label == opinion.label and shared_px > 0.7 * _area_px(box_px):
+            return True
+    return False
+
+
+def _area_px(box_px: np.ndarray) -> float:
+    return float(np.prod(box_px[2:] - box_px[:2]))
+
+
 def _packed(asked: Asked) -> list[Any]:
-    part = asked.part
-    place = part.row, part.column, *part.mask.shape
     seen = asked.p_camera, asked.size_m, asked.label, asked.score
-    return [asked.box_px, place, np.packbits(part.mask), *seen]
+    return [asked.box_px, *asked.part.packed, *seen]
 
 
 def _unpacked(box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any) -> Asked:
-    row, column, height, width = place
-    mask = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
-    return Asked(box_px, Foreground(row, column, mask), *seen)
+    return Asked(box_px, Foreground.unpacked(place, bits), *seen)

@@ -1,7 +1,11 @@
 """Regions that nobody has a name for, followed over keyframes until a labeller can be asked.
 
 A region is where it is: two sightings are of the same one when their middles are nearer than half
-its size. Each keeps its best views, and what the labeller said of it.
+its size, and they are about as large. Each keeps its best views, and what the labeller said of it.
+
+A region is asked about once, when no better view of it has come for a while, and as it was at its
+best. Most regions are no things but parts and shadows of them; so there is a budget, and what has
+most to show goes first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,6 +18,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 
 from .region_views import RegionView, ViewConfig, region_view
+from .regions import Answer, Region, Sighting, in_map, moved, packed, sighting_of, unpacked
 from .trigger import Candidate
 
 
@@ -21,18 +26,25 @@ from .trigger import Candidate
 class RegionConfig:
     views: int = 3  # the best, shown to the labeller
     views_first: int = 2  # before it is asked at all: a single glimpse may be a flaw of depth
+    patience: int = 3  # keyframes without a better view, before it is asked: one may yet come
     most_questions: int = 3  # about a region
+    per_keyframe: float = 0.7  # questions, of all that are due those with most to show: the paper
+    # asks on 10-25 % of the frames (IV.B.8); twice as many regions are no things
+    at_once: int = 4  # questions saved up while there was nothing to ask
     gain: float = 1.3  # of the views' summed quality, before it is asked again
     settled: float = 0.6  # of an answer that needs no second one
     near: float = 0.5  # of its size, between two sightings of a region
     least_quality: float = 0.02  # of a view: worse ones show a labeller nothing
-    alike: float = 0.5  # its size of what an answer spoke of, or the other way round, to be that
-    most: int = 256  # regions; the one not seen for longest is forgotten
+    alike: float = 0.6  # its size of another sighting's, or the other way round, to be the same:
+    # what stands on a table is near its middle
+    most: int = 1024  # regions, some 10 kB each; the one not seen for longest is forgotten
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
-        if min(self.views, self.views_first, self.most_questions, self.most) < 1:
+        if min(self.views, self.views_first, self.most_questions, self.most, self.at_once) < 1:
             raise ConfigError(f"{self}: counts must be at least 1.")
+        if self.patience < 0 or self.per_keyframe <= 0:
+            raise ConfigError(f"{self}: patience at least 0, per_keyframe positive.")
         if not (0 <= self.least_quality <= 1 and 0 <= self.alike <= 1):
             raise ConfigError(f"{self}: least_quality and alike must be within 0..1.")
         if self.views_first > self.views or not (self.gain > 1 and self.near > 0):
@@ -40,44 +52,8 @@ class RegionConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Answer:
-    """What a labeller takes a region for, 0..1 `sure`, and where and how large it was in the
-    keyframe it speaks of; no label: it is no object."""
-
-    label: str
-    sure: float
-    keyframe: int
-    p_camera: np.ndarray
-    size_m: float
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Region:
-    """What is known of a region.
-
-    keyframe, box_px, p_camera, size_m  newest sighting: its middle [3] in that keyframe's camera
-    views           the best, the best first
-    label, score    of the surest detector so far
-    questions       asked so far; `quality` of the views, summed, when it was asked last
-    answer          the surest
-    """
-
-    id: int
-    keyframe: int
-    box_px: tuple[float, float, float, float]
-    p_camera: np.ndarray
-    size_m: float
-    views: tuple[RegionView, ...] = ()
-    label: str = ""
-    score: float = 0.0
-    questions: int = 0
-    quality: float = 0.0
-    answer: Answer | None = None
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class Question:
-    """A region to be asked about now, and its newest sighting."""
+    """A region to be asked about now, as it was at its best."""
 
     region: Region
     candidate: Candidate
@@ -105,6 +81,7 @@ class RegionsToName:
         self.config = config or RegionConfig()
         self._regions: dict[int, Region] = {}  # the one seen last comes last
         self._next_id = 0
+        self._allowed = 0.0  # questions
 
     def __len__(self) -> int:
         return len(self._regions)
@@ -130,34 +107,50 @@ class RegionsToName:
         those of earlier sightings, as they are now; `named`: objects that the map has a name for,
         of which nobody is asked.
         """
-        asked: list[Question] = []
         opinions: list[Opinion] = []
         taken = set[int]()
         for candidate in found:
-            sighting = _sighting(keyframe, candidate, depth_m, camera)
+            sighting = sighting_of(keyframe, candidate, depth_m, camera)
             if sighting is None:
                 continue
             region = self._same(sighting, T_map_keyframe, taken) or self._new(sighting)
             taken.add(region.id)
             args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
-            region = self._with_view(_moved(region, sighting), region_view(*args, self.config.view))
-            if self._is_due(region):
-                quality = sum(view.quality for view in region.views)
-                region = replace(region, questions=region.questions + 1, quality=quality)
-                asked.append(Question(region, candidate))
+            region = moved(region, sighting)
+            region = self._with_view(region, sighting, region_view(*args, self.config.view))
             self._keep(region)
             opinions += self._said_of(region, sighting, candidate, T_map_keyframe)
         for candidate in named:
-            sighting = _sighting(keyframe, candidate, depth_m, camera)
+            sighting = sighting_of(keyframe, candidate, depth_m, camera)
             region = sighting and self._same(sighting, T_map_keyframe, taken)
             if sighting and region:
                 said = self._said_of(region, sighting, candidate, T_map_keyframe)
                 if said:
                     taken.add(region.id)
-                    self._keep(_moved(region, sighting))
+                    self._keep(moved(region, sighting))
                 opinions += said
+        questions = self._questions(keyframe, T_map_keyframe)
         self._forget()
-        return Sightings(asked, opinions)
+        return Sightings(questions, opinions)
+
+    def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[Question]:
+        """About the regions that are due, those with most to show first, as many as are allowed."""
+        config = self.config
+        self._allowed = min(self._allowed + config.per_keyframe, float(config.at_once))
+        due = [r for r in self._regions.values() if self._is_due(r, now, T_map_keyframe)]
+        due.sort(key=lambda region: -region.gained() * _worth(region))
+        asked = [self._asked(region) for region in due[: int(self._allowed)]]
+        self._allowed -= len(asked)
+        return asked
+
+    def _asked(self, region: Region) -> Question:
+        quality = sum(view.quality for view in region.views)
+        region = replace(region, questions=region.questions + 1, quality=quality)
+        self._regions[region.id] = region
+        best = region.best
+        assert best is not None
+        shown = {name: getattr(best, name) for name in ("keyframe", "p_camera", "size_m")}
+        return Question(replace(region, box_px=best.box_px, **shown), best.candidate)
 
     def _keep(self, region: Region) -> None:
         """As the one seen last."""
@@ -167,7 +160,7 @@ class RegionsToName:
     def _said_of(
         self,
         region: Region,
-        sighting: Region,
+        sighting: Sighting,
         candidate: Candidate,
         T_map_keyframe: Mapping[int, np.ndarray],
     ) -> list[Opinion]:
@@ -177,7 +170,7 @@ class RegionsToName:
         if answer is None or not answer.label or answer.keyframe not in T_map_keyframe:
             return []
         small, large = sorted((answer.size_m, sighting.size_m))
-        gap_m = np.linalg.norm(_in_map(answer, T_map_keyframe) - _in_map(sighting, T_map_keyframe))
+        gap_m = np.linalg.norm(in_map(answer, T_map_keyframe) - in_map(sighting, T_map_keyframe))
         is_it = small >= self.config.alike * large and gap_m < self.config.near * small
         return [Opinion(candidate, answer.label, answer.sure)] if is_it else []
 
@@ -188,37 +181,48 @@ class RegionsToName:
             self._regions[region] = replace(known, answer=answer)
 
     def _same(
-        self, sighting: Region, T_map_keyframe: Mapping[int, np.ndarray], taken: set[int]
+        self, sighting: Sighting, T_map_keyframe: Mapping[int, np.ndarray], taken: set[int]
     ) -> Region | None:
         """The nearest region that is near enough."""
-        p_map = _in_map(sighting, T_map_keyframe)
-        best, best_share = None, self.config.near
-        for region in self._regions.values():
-            if region.id in taken or region.keyframe not in T_map_keyframe:
-                continue
-            gap_m = float(np.linalg.norm(_in_map(region, T_map_keyframe) - p_map))
-            share = gap_m / max(region.size_m, sighting.size_m)
-            if share < best_share:
-                best, best_share = region, share
-        return best
+        there = [
+            region
+            for region in self._regions.values()
+            if region.id not in taken and region.keyframe in T_map_keyframe
+        ]
+        if not there:
+            return None
+        sizes_m = np.array([region.size_m for region in there])
+        p_map = np.array([in_map(region, T_map_keyframe) for region in there])
+        gaps_m = np.linalg.norm(p_map - in_map(sighting, T_map_keyframe), axis=1)
+        small = np.minimum(sizes_m, sighting.size_m)
+        is_alike = small >= self.config.alike * np.maximum(sizes_m, sighting.size_m)
+        shares = np.where(is_alike, gaps_m / np.maximum(small, 1e-9), np.inf)
+        best = int(shares.argmin())
+        return there[best] if shares[best] < self.config.near else None
 
-    def _new(self, sighting: Region) -> Region:
+    def _new(self, seen: Sighting) -> Region:
         self._next_id += 1
-        return replace(sighting, id=self._next_id - 1)
+        return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen.p_camera, seen.size_m)
 
-    def _with_view(self, region: Region, view: RegionView) -> Region:
+    def _with_view(self, region: Region, sighting: Sighting, view: RegionView) -> Region:
         if view.quality < self.config.least_quality:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
-        return replace(region, views=tuple(views[: self.config.views]))
+        best = sighting if views[0] is view else region.best
+        return replace(region, best=best, views=tuple(views[: self.config.views]))
 
-    def _is_due(self, region: Region) -> bool:
+    def _is_due(self, region: Region, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> bool:
         is_settled = region.answer is not None and region.answer.sure >= self.config.settled
         if is_settled or region.questions >= self.config.most_questions:
             return False
-        if region.questions == 0:
-            return len(region.views) >= self.config.views_first
-        return sum(view.quality for view in region.views) >= self.config.gain * region.quality
+        best = region.best
+        if best is None or best.keyframe not in T_map_keyframe:
+            return False
+        if len(region.views) < self.config.views_first:
+            return False
+        is_still = now - best.keyframe >= self.config.patience
+        is_better = region.gained() >= (self.config.gain - 1) * region.quality
+        return is_still and (region.questions == 0 or is_better)
 
     def _forget(self) -> None:
         while len(self._regions) > self.config.most:
@@ -227,67 +231,21 @@ class RegionsToName:
     @property
     def packed(self) -> dict[str, Any]:
         """Plain values, bytes and lists, for a state."""
-        regions = [_packed(region) for region in self._regions.values()]
-        return {"next_id": self._next_id, "regions": regions}
+        regions = [packed(region) for region in self._regions.values()]
+        return {"next_id": self._next_id, "allowed": self._allowed, "regions": regions}
 
     @staticmethod
     def unpacked(packed: dict[str, Any], config: RegionConfig) -> "RegionsToName":
         """As it was."""
         out = RegionsToName(config)
-        out._next_id = packed["next_id"]
-        out._regions = {row["id"]: _unpacked(row) for row in packed["regions"]}
+        out._next_id, out._allowed = packed["next_id"], packed["allowed"]
+        out._regions = {row["id"]: unpacked(row) for row in packed["regions"]}
         return out
 
 
-def _packed(region: Region) -> dict[str, Any]:
-    views = [{name: getattr(view, name) for name in RegionView.__slots__} for view in region.views]
-    plain = {name: getattr(region, name) for name in Region.__slots__}
-    answer = region.answer and [getattr(region.answer, name) for name in Answer.__slots__]
-    return {**plain, "p_camera": region.p_camera.tolist(), "views": views, "answer": answer}
-
-
-def _unpacked(row: Mapping[str, Any]) -> Region:
-    views = tuple(RegionView(**{**view, "box_px": tuple(view["box_px"])}) for view in row["views"])
-    changed = {"box_px": tuple(row["box_px"]), "p_camera": np.array(row["p_camera"])}
-    answer = row["answer"] and Answer(*row["answer"])
-    return Region(**{**row, **changed, "views": views, "answer": answer})
-
-
-def _sighting(
-    keyframe: int, candidate: Candidate, depth_m: np.ndarray, camera: Camera
-) -> Region | None:
-    """Without a place among the others yet; None where depth is missing."""
-    part = candidate.part
-    height, width = part.mask.shape
-    window = depth_m[part.row : part.row + height, part.column : part.column + width]
-    depths = window[part.mask & (window > 0)]
-    if depths.size == 0:
-        return None
-    z_m = float(np.median(depths))
-    rows, columns = np.nonzero(part.mask)
-    u, v = part.column + columns.mean(), part.row + rows.mean()
-    ray = np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
-    x0, y0, x1, y1 = (float(value) for value in candidate.box_px)
-    size_m = float(np.sqrt((x1 - x0) * (y1 - y0) / (camera.fx * camera.fy))) * z_m
-    box_px = (x0, y0, x1, y1)
-    label, score = candidate.label, candidate.score
-    return Region(-1, keyframe, box_px, z_m * ray, size_m, label=label, score=score)
-
-
-def _moved(region: Region, sighting: Region) -> Region:
-    """With its newest place, and the surer of two opinions."""
-    surer = max(region, sighting, key=lambda one: one.score)
-    return replace(
-        region,
-        keyframe=sighting.keyframe,
-        box_px=sighting.box_px,
-        p_camera=sighting.p_camera,
-        size_m=sighting.size_m,
-        label=surer.label,
-        score=surer.score,
-    )
-
-
-def _in_map(region: Region | Answer, T_map_keyframe: Mapping[int, np.ndarray]) -> np.ndarray:
-    T = T_map_keyframe[region.keyframe]
-    return T[:3, :3] @ region.p_camera + T[:3, 3]
+def _worth(region: Region) -> float:
+    """What is large is rarely a shadow or a part."""
+    assert region.best is not None
+    of = region.best.candidate
+    factor = 0.3 if of.kind == "convex" else 1.0
+    return factor * float(np.sqrt(np.count_nonzero(of.part.mask)))

@@ -1,47 +1,45 @@
 """Which regions of a keyframe are to be named by an open-vocabulary labeller (paper, III.B).
 
 The paper asks when the best detector is less than 0.6 sure of a region, or gives it no reliable
-label. So a candidate is a box of a hesitant detector that no sure box explains; or an object that
-depth sets apart from walls and floors, which neither a sure box nor the map's labels explain. A
-candidate is followed from keyframe to keyframe by where it is, see `regions_to_name`.
+label. So a candidate is a box of a hesitant detector that no sure box explains; or a region that
+depth, creases or colour set apart, see `segments`, which neither a sure box nor the map's labels
+explain. A candidate is followed from keyframe to keyframe by where it is, see `regions_to_name`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 
-from .foreground import Foreground, ForegroundConfig, Surfaces, foreground
+from .foreground import Foreground, ForegroundConfig, foreground, surfaces
+from .segments import Segment, SegmentConfig
 
-_3X3 = np.ones((3, 3), np.uint8)
+_ORDER = ("flat", "apart", "standing", "convex")  # of regions alike, the first is kept
 
 
 @dataclass(frozen=True, slots=True)
 class TriggerConfig:
     sure: float = 0.6  # of a detector that nobody needs to help (III.B)
     same_iou: float = 0.5  # with a sure box: the hesitant one is of the same thing
+    fits_iou: float = 0.6  # of a hesitant box and a region: the box's thing is the region
+    alike_iou: float = 0.7  # of two regions' boxes: one of them is enough
     explained: float = 0.5  # share of an object's pixels that have a name already
     min_side_px: int = 24  # smaller ones show a labeller nothing
-    max_share: float = 0.25  # of the image: larger ones are rooms, not objects
-    # Of the image: a surface as large is wall, floor or ceiling; and then, for what stands on it, a
-    # table top.
-    structure_shares: tuple[float, ...] = (0.06, 0.01)
-    edge_px: int = 6  # of such a surface: where `surfaces` has no normal, 4 px and a blur
-    opening_px: int = 5  # what is thinner is the edge between two walls
+    max_share: float = 0.5  # of the image: larger ones are rooms, not objects
     min_fill: float = 0.25  # of its box: what fills less is a frame around something
-    most: int = 16  # candidates of a keyframe, the largest first
+    most: int = 32  # candidates of a keyframe, the largest first
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
 
     def __post_init__(self) -> None:
-        shares = self.sure, self.same_iou, self.explained, self.max_share
-        shares = (*shares, self.min_fill, *self.structure_shares)
+        shares = self.sure, self.same_iou, self.fits_iou, self.alike_iou, self.explained
+        shares = (*shares, self.max_share, self.min_fill)
         if not (min(shares) >= 0 and max(shares) <= 1):
             raise ConfigError(f"{self}: shares and scores must be within 0..1.")
-        if min(self.min_side_px, self.opening_px, self.most) < 1:
+        if min(self.min_side_px, self.most) < 1:
             raise ConfigError(f"{self}: sides and counts must be at least 1.")
 
 
@@ -50,7 +48,7 @@ class Candidate:
     """A region that nobody has a reliable name for.
 
     box_px [4], x0 y0 x1 y1; part, what of the box it is; number, label and score of the detector's
-    box, if it is one
+    box, if it is one; kind of the segment, if it is one
     """
 
     box_px: np.ndarray
@@ -58,6 +56,7 @@ class Candidate:
     label: str = ""
     score: float = 0.0
     number: int | None = None
+    kind: str = ""
 
 
 def candidates(
@@ -65,73 +64,90 @@ def candidates(
     labels: Sequence[str],
     scores: np.ndarray,
     depth_m: np.ndarray,
-    found: Surfaces,
     camera: Camera,
     is_labelled: np.ndarray,
-    apart: Sequence[Candidate],
+    found: Sequence[Candidate],
     config: TriggerConfig,
 ) -> list[Candidate]:
     """Regions of a keyframe that a labeller should see, the largest first.
 
     boxes_px, labels, scores  [M, 4], M, [M] of the detector
-    depth_m, found            [H, W], 0 where it is missing, and its surfaces
+    depth_m                   [H, W], 0 where it is missing
     is_labelled               [H, W] bool: the map has a reliable name for what this pixel shows
-    apart                     its objects, as `standing_apart` finds them
+    found                     its regions, as `regions_of_image` finds them
 
     The same arguments give the same candidates.
     """
+    asked, is_taken = _hesitant(boxes_px, labels, scores, depth_m, camera, found, config)
     is_sure = np.asarray(scores) >= config.sure
-    hesitant = hesitant_boxes(boxes_px, scores, config)
-    asked = [
-        Candidate(
-            boxes_px[i],
-            foreground(boxes_px[i], depth_m, found, camera, config.foreground),
-            labels[i],
-            float(scores[i]),
-            i,
-        )
-        for i in hesitant
-    ]
     explained = is_labelled | _painted(boxes_px[is_sure], depth_m.shape)
-    for candidate in asked:
-        explained = explained | candidate.part.image(depth_m.shape)
-    unexplained = [one for one in apart if _share(explained, one.part) < config.explained]
-    asked += [one for one in unexplained if _is_new(one, [a.box_px for a in asked], config)]
-    worth = [c for c in asked if _is_worth_a_look(c, depth_m.shape, config)]
+    asked += [
+        one
+        for one, is_asked in zip(found, is_taken, strict=True)
+        if not is_asked and _share(explained, one.part) < config.explained
+    ]
+    worth = [one for one in asked if _is_worth_a_look(one, depth_m.shape, config)]
     return sorted(worth, key=lambda c: -np.count_nonzero(c.part.mask))[: config.most]
+
+
+def _hesitant(
+    boxes_px: np.ndarray,
+    labels: Sequence[str],
+    scores: np.ndarray,
+    depth_m: np.ndarray,
+    camera: Camera,
+    found: Sequence[Candidate],
+    config: TriggerConfig,
+) -> tuple[list[Candidate], list[bool]]:
+    """Boxes of a detector that is not sure: each is the region that fits it best, else its
+    foreground. And which regions these are."""
+    asked, is_taken, pieces = [], [False] * len(found), None
+    regions_px = _boxes(found)
+    for i in hesitant_boxes(boxes_px, scores, config):
+        label, score = labels[i], float(scores[i])
+        fits = np.where(is_taken, 0, _ious(regions_px, boxes_px[i]))
+        best = int(np.argmax(fits)) if len(fits) else -1
+        if best >= 0 and fits[best] >= config.fits_iou:
+            is_taken[best] = True
+            asked.append(replace(found[best], label=label, score=score, number=i))
+            continue
+        pieces = pieces or surfaces(depth_m, camera, config.foreground)
+        part = foreground(boxes_px[i], depth_m, pieces, camera, config.foreground)
+        asked.append(Candidate(boxes_px[i], part, label, score, i))
+    return asked, is_taken
 
 
 def named_objects(
     boxes_px: np.ndarray,
     is_labelled: np.ndarray,
-    apart: Sequence[Candidate],
+    found: Sequence[Candidate],
     config: TriggerConfig,
 ) -> list[Candidate]:
-    """Those of the objects `apart` that the map has a reliable name for, is_labelled [H, W] bool,
+    """Those of the regions `found` that the map has a reliable name for, is_labelled [H, W] bool,
     and no box [M, 4] is drawn about."""
     return [
         one
-        for one in apart
+        for one in found
         if _share(is_labelled, one.part) >= config.explained
-        and _is_new(one, list(boxes_px), config)
+        and np.all(_ious(boxes_px, one.box_px) < config.same_iou)
     ]
 
 
-def standing_apart(depth_m: np.ndarray, found: Surfaces, config: TriggerConfig) -> list[Candidate]:
-    """Objects that depth [H, W] sets apart from structure, each once. What stands on one is no part
-    of it."""
+def regions_of_image(
+    found: Sequence[Segment], shape: tuple[int, ...], config: TriggerConfig
+) -> list[Candidate]:
+    """The segments that a labeller could tell from an image [H, W], each once. What stands on a
+    thing is no part of it."""
     out: list[Candidate] = []
-    for share in config.structure_shares:
-        parts = depth_objects(depth_m, found, share, config)
-        known = [one.box_px for one in out]
-        finer = [
-            one
-            for one in (Candidate(_box(part), part) for part in parts)
-            if _is_worth_a_look(one, depth_m.shape, config) and _is_new(one, known, config)
-        ]
-        stands = np.any([one.part.image(depth_m.shape) for one in finer], axis=0) if finer else None
-        out = [one if stands is None else _without(one, stands) for one in out] + finer
-    return out
+    for kind in _ORDER:
+        for segment in found:
+            one = Candidate(_box(segment.part), segment.part, kind=segment.kind)
+            if segment.kind != kind or not _is_worth_a_look(one, shape, config):
+                continue
+            if np.all(_ious(_boxes(out), one.box_px) < config.alike_iou):
+                out.append(one)
+    stands = np.any([one.part.image(shape) for one in out if one.kind == "standing"], axis=0)
+    return [_without(one, stands) if one.kind == "apart" and stands.any() else one for one in out]
 
 
 def _without(one: Candidate, others: np.ndarray) -> Candidate:
@@ -139,10 +155,6 @@ def _without(one: Candidate, others: np.ndarray) -> Candidate:
     part, (height, width) = one.part, one.part.mask.shape
     here = others[part.row : part.row + height, part.column : part.column + width]
     return replace(one, part=Foreground(part.row, part.column, part.mask & ~here))
-
-
-def _is_new(one: Candidate, boxes_px: Sequence[np.ndarray], config: TriggerConfig) -> bool:
-    return all(_iou(one.box_px, box_px) < config.same_iou for box_px in boxes_px)
 
 
 def hesitant_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConfig) -> list[int]:
@@ -154,46 +166,9 @@ def hesitant_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConf
     """
     kept: list[int] = []
     for i in np.argsort(-np.asarray(scores), kind="stable"):
-        if all(_iou(boxes_px[i], boxes_px[k]) < config.same_iou for k in kept):
+        if np.all(_ious(boxes_px[kept], boxes_px[i]) < config.same_iou):
             kept.append(int(i))
     return [i for i in kept if scores[i] < config.sure]
-
-
-def depth_objects(
-    depth_m: np.ndarray, found: Surfaces, structure_share: float, config: TriggerConfig
-) -> list[Foreground]:
-    """What stands apart in depth once surfaces over this share of the image are taken away."""
-    is_structure = found.sizes > structure_share * depth_m.size
-    is_structure[0] = False  # edges
-    joined = _joined(depth_m, config.foreground.max_gap)
-    structure = _with_edges(
-        is_structure[found.labels], joined & (found.labels == 0), config.edge_px
-    )
-    side = np.ones((config.opening_px, config.opening_px), np.uint8)
-    apart = cv2.morphologyEx((joined & ~structure).astype(np.uint8), cv2.MORPH_OPEN, side)
-    return list(_components(apart))
-
-
-def _joined(depth_m: np.ndarray, max_gap: float) -> np.ndarray:
-    """Measured, and without a step of depth to a neighbour."""
-    inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-6), 0).astype(np.float32)
-    low = cv2.erode(inverse, _3X3)
-    return (low > 0) & (cv2.dilate(inverse, _3X3) <= (1 + max_gap) * low)
-
-
-def _with_edges(structure: np.ndarray, edges: np.ndarray, grow_px: int) -> np.ndarray:
-    """Surfaces end some pixels before their edges do, because normals are taken across pixels."""
-    for _ in range(grow_px):
-        structure = structure | (edges & (cv2.dilate(structure.astype(np.uint8), _3X3) > 0))
-    return structure
-
-
-def _components(mask: np.ndarray) -> Iterator[Foreground]:
-    count, parts, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    for part in range(1, count):
-        column, row, width, height, _area = (int(value) for value in boxes[part])
-        window = np.asarray(parts)[row : row + height, column : column + width]
-        yield Foreground(row, column, window == part)
 
 
 def _is_worth_a_look(candidate: Candidate, shape: tuple[int, ...], config: TriggerConfig) -> bool:
@@ -224,7 +199,18 @@ def _painted(boxes_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return image
 
 
-def _iou(a: np.ndarray, b: np.ndarray) -> float:
-    sides = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
-    both = float(np.prod(np.maximum(sides, 0)))
-    return both / (float(np.prod(a[2:] - a[:2]) + np.prod(b[2:] - b[:2])) - both)
+def _ious(boxes_px: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """[M] of boxes [M, 4] with one."""
+    low, high = np.maximum(boxes_px[:, :2], box_px[:2]), np.minimum(boxes_px[:, 2:], box_px[2:])
+    sides = np.maximum(high - low, 0)
+    both = sides[:, 0] * sides[:, 1]
+    return both / (_areas(boxes_px) + _areas(box_px[None])[0] - both)
+
+
+def _areas(boxes_px: np.ndarray) -> np.ndarray:
+    return (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
+
+
+def _boxes(found: Sequence[Candidate]) -> np.ndarray:
+    """[M, 4]"""
+    return np.array([one.box_px for one in found], float).reshape(-1, 4)

@@ -22,7 +22,9 @@ from ldo_service.wire import crops_of, label_request_message
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
-CONFIG = RegionConfig(views_first=2, views=3, most_questions=2)
+CONFIG = RegionConfig(
+    views_first=2, views=3, most_questions=2, patience=0, per_keyframe=9, at_once=9
+)
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (*SHAPE, 3), np.uint8)
 
@@ -77,6 +79,35 @@ def test_it_is_the_same_where_the_camera_moved_and_another_one_elsewhere() -> No
     walk.see(thing(left=60))
     assert walk.see(thing(left=30), at_x_m=0.5) == [0]
     assert walk.see(thing(left=60), at_x_m=0.5) == []
+    assert len(walk.regions) == 2
+
+
+def test_it_is_asked_about_at_its_best_once_no_better_view_comes() -> None:
+    walk = Walk(replace(CONFIG, patience=2))
+    grey = np.full_like(COLOR, 128)
+    grey[::7] = 140
+    assert [walk.see(thing(), color=grey) for _ in range(2)] == [[], []]
+    assert walk.see(thing(left=62)) == [], "far sharper: a better one may come"
+    assert walk.see(thing(), color=grey) == []
+    walk.T_map_keyframe[4] = moved()
+    depth_m = np.full(SHAPE, 2.0, np.float32)
+    out_of_sight = 4, [], COLOR, depth_m, CAMERA, walk.T_map_keyframe
+    (question,) = walk.regions.see(*out_of_sight).questions
+    assert (question.region.keyframe, question.region.box_px[0]) == (2, 61.5)
+    assert question.candidate.part.column == 62
+
+
+def test_questions_have_a_budget_and_what_has_most_to_show_goes_first() -> None:
+    walk = Walk(replace(CONFIG, per_keyframe=0.5, at_once=1, most_questions=1))
+    many = [thing(left=5, side=20), thing(left=40, side=40), thing(left=100, side=30)]
+    asked = [walk.see(*many) for _ in range(8)]
+    assert asked == [[], [1], [], [2], [], [0], [], []]
+
+
+def test_what_is_near_but_of_another_size_is_another() -> None:
+    walk = Walk()
+    walk.see(thing(left=60, side=30))
+    walk.see(thing(left=66, top=46, side=17))
     assert len(walk.regions) == 2
 
 

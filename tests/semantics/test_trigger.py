@@ -9,18 +9,20 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.semantics import region_views, trigger
-from ldo_service.semantics.foreground import ForegroundConfig, surfaces
+from ldo_service.semantics.segments import segments
 from ldo_service.semantics.trigger import (
+    Candidate,
     TriggerConfig,
     candidates,
-    depth_objects,
     named_objects,
-    standing_apart,
+    regions_of_image,
 )
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 WALL_M, NEAR_M = 3.0, 2.0
-CONFIG = TriggerConfig(min_side_px=12, structure_shares=(0.1,))
+CONFIG = TriggerConfig(min_side_px=12)
+GREY = np.full((120, 160, 3), 128, np.uint8)
+LOOSE = TriggerConfig(min_side_px=22, min_fill=0.1)
 NOBODY = np.zeros((120, 160), bool)
 
 
@@ -34,10 +36,14 @@ def wall_with(*boxes: tuple[int, int, int, int]) -> np.ndarray:
 
 def asked(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config=CONFIG):
     boxes = np.reshape(np.array(boxes, float), (-1, 4))
-    found = surfaces(depth_m, CAMERA, config.foreground)
+    found = regions(depth_m, config)
     scores = np.array(scores)
-    apart = standing_apart(depth_m, found, config)
-    return candidates(boxes, labels, scores, depth_m, found, CAMERA, is_labelled, apart, config)
+    return candidates(boxes, labels, scores, depth_m, CAMERA, is_labelled, found, config)
+
+
+def regions(depth_m: np.ndarray, config: TriggerConfig = CONFIG) -> list[Candidate]:
+    found = segments(GREY, depth_m, CAMERA, config.segments)
+    return regions_of_image(found, depth_m.shape, config)
 
 
 THING = (60, 40, 89, 79)
@@ -68,7 +74,13 @@ def test_a_box_is_asked_about_below_the_score_of_the_paper(score: float, count: 
     assert len(found) == count, "the object in it is not asked about a second time"
     for one in found:
         assert (one.label, one.score) == ("vase", score)
-        assert one.box_px.tolist() == list(box)
+        assert one.box_px == pytest.approx(np.array(box), abs=3), "of what stands there"
+
+
+def test_a_box_around_no_region_is_asked_about_as_it_is() -> None:
+    box = (10.5, 10.5, 50.5, 60.5)
+    (found,) = asked(wall_with((10, 10, 28, 60)), [box], ["vase"], [0.3], config=LOOSE)
+    assert found.box_px.tolist() == list(box)
 
 
 def test_a_hesitant_box_of_what_a_sure_one_has_is_not_asked_about() -> None:
@@ -89,7 +101,7 @@ def test_what_the_map_has_a_name_for_is_found_again_where_no_box_is() -> None:
     depth_m = wall_with(THING, (110, 40, 139, 79))
     is_labelled = np.zeros((120, 160), bool)
     is_labelled[:, :100] = True
-    apart = standing_apart(depth_m, surfaces(depth_m, CAMERA, CONFIG.foreground), CONFIG)
+    apart = regions(depth_m)
     assert len(apart) == 2
     none, box = np.zeros((0, 4)), np.array([[59.5, 39.5, 89.5, 79.5]])
     (found,) = named_objects(none, is_labelled, apart, CONFIG)
@@ -99,8 +111,9 @@ def test_what_the_map_has_a_name_for_is_found_again_where_no_box_is() -> None:
 
 def test_things_too_small_or_as_large_as_rooms_are_left_out() -> None:
     assert asked(wall_with((60, 40, 67, 79))) == []
-    large = asked(wall_with((20, 10, 139, 109)), config=TriggerConfig(structure_shares=(1.0,)))
-    assert large == []
+    large = wall_with((20, 10, 139, 109))
+    assert len(asked(large, config=replace(CONFIG, max_share=0.7))) == 1
+    assert asked(large, config=replace(CONFIG, max_share=0.5)) == []
 
 
 def test_missing_depth_is_no_object() -> None:
@@ -121,23 +134,18 @@ def test_the_largest_come_first_and_no_more_than_the_most() -> None:
 def test_two_things_at_different_depths_that_overlap_are_two() -> None:
     depth_m = wall_with((40, 40, 79, 79))
     depth_m[30:90, 80:110] = 1.2
-    found = surfaces(depth_m, CAMERA, ForegroundConfig())
-    parts = depth_objects(depth_m, found, 0.2, TriggerConfig())
-    assert [part.mask.shape for part in parts] == [(58, 28), (38, 38)]
+    shapes = [one.part.mask.shape for one in regions(depth_m)]
+    assert shapes == [pytest.approx((58, 28), abs=3), pytest.approx((38, 38), abs=3)]
 
 
-def test_what_stands_on_a_table_is_asked_about_beside_the_table() -> None:
-    """A table top of a third of the image, seen from the front, and a thing 40 cm before it."""
-    depth_m = wall_with((20, 50, 139, 109))
-    depth_m[60:90, 60:90] = 1.6
-    both = replace(CONFIG, structure_shares=(0.5, 0.1), max_share=0.5)
-    widths = [found.part.mask.shape[1] for found in asked(depth_m, config=both)]
-    assert widths[-1] == pytest.approx(30, abs=3)
-    with_table = asked(depth_m, config=replace(both, structure_shares=(0.5,)))
-    assert max(found.part.mask.shape[1] for found in with_table) > 100
+def test_two_regions_alike_are_one() -> None:
+    kinds = [one.kind for one in regions(wall_with(THING))]
+    assert kinds == ["apart"], "what no crease divides is convex too"
 
 
-@pytest.mark.parametrize("fields", [{"sure": 1.5}, {"min_side_px": 0}, {"most": 0}])
+@pytest.mark.parametrize(
+    "fields", [{"sure": 1.5}, {"min_side_px": 0}, {"most": 0}, {"fits_iou": -1}]
+)
 def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
     with pytest.raises(ConfigError):
         TriggerConfig(**fields)
