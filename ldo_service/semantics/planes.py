@@ -23,8 +23,8 @@ _LEAST = np.float32(1e-6)
 
 @dataclass(frozen=True, slots=True)
 class PlaneConfig:
-    """Chosen on `synthetic:flat`, painted otherwise. Lengths in pixels are those of the small image
-    that all of this is done in."""
+    """Set on `synthetic:flat` by how well regions cover its things, and not varied since. Lengths
+    in pixels are those of the small image that all of this is done in."""
 
     width_px: int = 320  # of that image: normals over a few pixels are steady enough there
     blur_px: float = 2.0  # of inverse depth, before normals are taken
