@@ -233,6 +233,7 @@ class Mapper(Actor):
     def _refine(self, message: MapRefine) -> Iterator[Output]:
         self._map.refine(message.iterations, (message.first_rate, message.last_rate))
         self._semantics.refresh()
+        self._checkpoint = {}  # is due: half a minute of work, and perhaps no keyframe follows
         yield from self._refinement()
         yield from self._teller.deltas(self._now(), with_changed=True)
         yield from self._objects()

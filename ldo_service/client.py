@@ -10,9 +10,10 @@ Imports no numerics. A subscriber never slows the robot: it gets the newest mess
 does not take in time is dropped on its side.
 """
 
+import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -58,6 +59,7 @@ from ldo_service.schemas.topics import (
 )
 
 M = TypeVar("M", bound=Message)
+log = logging.getLogger(__name__)
 
 
 class Client:
@@ -191,8 +193,7 @@ class Client:
         with self._subscriber(name, keep) as subscriber:
 
             def inbox() -> list[M]:
-                samples = iter(subscriber.try_recv, None)
-                return [_message(sample, of) for sample in samples]
+                return list(_readable(iter(subscriber.try_recv, None), of))
 
             yield inbox
 
@@ -203,7 +204,7 @@ class Client:
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
         )
-        return [_message(r.ok, topic.message) for r in replies if r.ok is not None]
+        return list(_readable((r.ok for r in replies if r.ok is not None), topic.message))
 
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
         """The objects of the map as of now. Raises ConfigError when nobody answers: a map without
@@ -325,6 +326,15 @@ def _header(sample: Any) -> Header:
 
 def _message(sample: Any, of: type[M]) -> M:
     return decode(sample.payload.to_bytes(), of)
+
+
+def _readable(samples: Iterable[Any], of: type[M]) -> Iterator[M]:
+    """Their messages; what cannot be decoded, as of another version, is left out and said."""
+    for sample in samples:
+        try:
+            yield _message(sample, of)
+        except msgspec.DecodeError as error:
+            log.warning("a %s cannot be read and is left out: %s", of.__name__, error)
 
 
 @contextmanager

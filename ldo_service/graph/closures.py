@@ -74,6 +74,8 @@ class Closures:
             chosen = [c for c in chosen if c is not worst]
             variables, cost = solve(chosen)
         kept = {pair_of(c) for c in chosen}
+        if pair_of(closure) not in kept and pair_of(closure) in self.accepted:
+            return Verdict(False), variables  # what it would have replaced stays
         dropped = tuple(pair for pair in self.accepted if pair not in kept)
         return Verdict(pair_of(closure) in kept, dropped), variables
 
@@ -103,12 +105,14 @@ class Closures:
         accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
         if verdict.is_accepted:
             accepted |= {pair: closure}
-        refused = (*self.refused, pair) if pair not in accepted else self.refused
+        now_refused = {pair} - accepted.keys()
+        refused = (p for p in (*self.refused, *now_refused) if p not in accepted)
+        left = (p for p in (*self.left, *verdict.dropped) if p not in accepted)
         return replace(
             self,
             accepted=accepted,
-            refused=self._remembered(p for p in refused if p not in accepted),
-            left=self._remembered(p for p in (*self.left, *verdict.dropped) if p not in accepted),
+            refused=self._remembered(p for p in refused if p not in verdict.dropped),
+            left=self._remembered(p for p in left if p not in now_refused),
         )
 
     def without(self, pairs: Collection[Pair]) -> "Closures":

@@ -168,10 +168,11 @@ class Verifier:
         for a, b, T in islice(_pairs_in_map(old, new, T_old_new), self._config.map_pairs):
             check = self._met(Proposal(a, b, T, "map"))
             if check is not None and check.closure is not None:
-                found.append(replace(check.proposal, T_old_new=check.closure.T_a_b))
-                if self._has_witness(found[0], found[1:], self._config.map_witness_rad):
-                    return self._with_semantics(found[0], old, new)
-        refused = "the map alone says so" if found else "the map has them elsewhere"
+                met = replace(check.proposal, T_old_new=check.closure.T_a_b)
+                if self._has_witness(met, found, self._config.map_witness_rad):
+                    return self._with_semantics(met, old, new)
+                found.append(met)
+        refused = "the map alone says so" if found else "the map does not bring them together"
         return Proposal(old.views[0], new.views[0], np.eye(4), refused=refused)
 
     def _met(self, proposal: Proposal) -> Check | None:

@@ -1,6 +1,7 @@
 """A recording as a data set: what the frame source took, frame by frame."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -11,7 +12,7 @@ import numpy as np
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig, joined
 from ldo_service.datasets import Sequence, SequenceOptions, open_sequence
 from ldo_service.errors import DataError, FrameError
-from ldo_service.geometry import RawFrame, Trajectory
+from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.pairing import Pairing
 from ldo_service.runtime.mcap_index import Place
 from ldo_service.runtime.recording import JournalFile, recorded_actors
@@ -86,8 +87,14 @@ class RecordingSequence(Sequence):
                 f"{CAMERA_DEPTH.name}: was frame_source recorded?"
             )
         stamps_ns = np.array([frame.color.stamp_ns for frame in self._frames], np.int64)
-        camera = camera_of(self._frames[0].message(0).camera)
-        super().__init__(folder.resolve().name, camera, stamps_ns)
+        super().__init__(folder.resolve().name, self._camera(folder), stamps_ns)
+
+    def _camera(self, folder: Path) -> Camera:
+        """That of the first frame that can be read."""
+        for index, frame in enumerate(self._frames):
+            with suppress(FrameError):
+                return camera_of(frame.message(index).camera)
+        raise DataError(f"{folder}: none of its {len(self._frames)} frames can be read.")
 
     def read(self, index: int) -> RawFrame:
         return self._frames[index].read(index)

@@ -5,6 +5,7 @@ not be changed afterwards.
 """
 
 import logging
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
@@ -87,7 +88,8 @@ class FolderStore:
         self._saved[actor], self._files[actor] = dict(state), new
 
     def load(self, actor: str) -> State | None:
-        """None when nothing was saved, or what was saved cannot be read: said in the log."""
+        """None when nothing was saved, or what was saved cannot be read: said in the log, and
+        kept beside it, the last time it happened, for whoever can make something of it."""
         folder = self._folder / actor
         try:
             files = _read_contents(folder)
@@ -96,6 +98,7 @@ class FolderStore:
             }
         except (OSError, ValueError) as error:  # a name may hold a null byte
             log.error("%s: its saved state cannot be read and is left out: %s", actor, error)
+            _set_aside(folder)
             return None
         return parts or None
 
@@ -106,6 +109,15 @@ class FolderStore:
             file.unlink()
         self._saved.pop(actor, None)
         self._files.pop(actor, None)
+
+
+def _set_aside(folder: Path) -> None:
+    aside = folder.with_name(f"{folder.name}.unreadable")
+    try:
+        shutil.rmtree(aside, ignore_errors=True)
+        folder.rename(aside)
+    except OSError as error:
+        log.error("%s cannot be kept as %s: %s", folder, aside.name, error.strerror)
 
 
 def _sweep(folder: Path, files: Mapping[str, str]) -> None:

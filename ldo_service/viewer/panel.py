@@ -38,7 +38,8 @@ def of_summary(summary: Mapping[str, Any]) -> str:
     rows = [
         f"| {escaped(actor)} | {ms['p50']:.0f} | {ms['p95']:.0f} |"
         for actor, ms in (stages if isinstance(stages, dict) else {}).items()
-        if isinstance(ms, dict) and {"p50", "p95"} <= ms.keys()
+        if isinstance(ms, dict)
+        and all(isinstance(ms.get(name), int | float) for name in ("p50", "p95"))
     ]
     table = ["| actor | ms p50 | p95 |\n|---|---|---|", *rows] if rows else []
     return "\n\n".join(filter(None, (", ".join([*counts, *speed]), "\n".join(table))))

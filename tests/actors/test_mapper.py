@@ -186,6 +186,15 @@ def test_a_request_to_refine_makes_the_map_better_and_is_told(keyframes) -> None
     assert seen_psnr(after.map.rows, frame, T) > seen_psnr(rows, frame, T) + 1
 
 
+def test_what_was_refined_is_in_the_checkpoint_at_once(keyframes) -> None:
+    mapper = Mapper(SLOW_CHECKPOINTS)
+    handled(mapper, keyframes[:2])
+    before = mapper.snapshot()
+    assert mapper.snapshot()["map"] is before["map"], "no keyframe was added"
+    list(mapper.handle(MapRefine(stamp_ns=0, iterations=5)))
+    assert mapper.snapshot()["map"] is not before["map"]
+
+
 def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
     optimiser = OptimiserConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
     builder = MapBuilderConfig(optimiser=optimiser)

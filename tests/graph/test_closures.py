@@ -5,6 +5,7 @@ import pytest
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.graph.closures import Closures, Verdict
 from ldo_service.graph.keyframe_graph import KeyframeGraph
 
 from .walks import (
@@ -88,6 +89,25 @@ def test_a_pair_that_is_judged_again_is_told_once() -> None:
     assert not graph.close(false).is_accepted
     assert graph.closures.refused == ()
     assert [*graph.closures.accepted] == [(8, 108)]
+
+
+def test_an_accepted_closure_stays_when_its_pair_is_measured_worse() -> None:
+    truth = round_trips(120, 100)
+    graph = walked(truth[0], odometry(truth, 2, window=3))
+    assert graph.close(off_by(truth, 8, 108, *[0] * 6)).is_accepted
+    for shift_m in np.arange(0.05, 1.0, 0.05):
+        verdict = graph.close(off_by(truth, 8, 108, 0, 0, 0, shift_m, 0, 0))
+        assert verdict.dropped == ()
+        assert [*graph.closures.accepted] == [(8, 108)]
+    assert graph.closures.left == ()
+
+
+def test_a_pair_that_left_and_is_refused_is_told_once() -> None:
+    pair, other = (RelativePose(3, b, np.eye(4), REFINED) for b in (50, 60))
+    closures = Closures().after(pair, Verdict(True)).after(other, Verdict(True, ((3, 50),)))
+    assert (closures.left, closures.refused) == (((3, 50),), ())
+    closures = closures.after(pair, Verdict(False))
+    assert (closures.left, closures.refused) == ((), ((3, 50),))
 
 
 def test_a_second_join_of_two_components_is_judged() -> None:

@@ -16,6 +16,8 @@ from tests.semantics.labellers.server import says, serving
 from .conftest import live
 
 FRAMES = 12
+REGIONS = "mapper.semantics.naming.regions"
+SOON = (ROUGH, f"{REGIONS}.patience=0", f"{REGIONS}.per_keyframe=4")  # the stream is short
 
 
 def has_answers(stages: dict[str, Stage]) -> bool:
@@ -33,7 +35,7 @@ def names_taken(folder: Path) -> list[str]:
 
 def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_path: Path) -> None:
     with serving(says("samovar", 0.9)) as server:
-        settings = (ROUGH, f"vlm_labeller.url={server.url}")
+        settings = (*SOON, f"vlm_labeller.url={server.url}")
         config = load_config(settings=settings)
         asyncio.run(live(tmp_path / "recording", room, config, FRAMES, until=has_answers))
     assert "samovar" in names_taken(tmp_path / "recording")

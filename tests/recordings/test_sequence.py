@@ -65,6 +65,18 @@ def test_a_damaged_frame_is_a_bad_frame(spoilt: Path) -> None:
     assert "frame_source.mcap, frame 1" in bad[0]
 
 
+def test_a_first_frame_that_is_damaged_hides_no_other(spoilt: Path) -> None:
+    path = spoilt / "frame_source.mcap"
+    content = bytearray(path.read_bytes())
+    place = content.index(b"\xabdepth_scale")
+    content[place : place + 3] = b"\xabXX"
+    path.write_bytes(content)
+    sequence = RecordingSequence(spoilt)
+    assert sequence.camera == sequence.read(1).camera
+    with pytest.raises(FrameError):
+        sequence.read(0)
+
+
 def test_a_recording_without_camera_is_bad_data(spoilt: Path) -> None:
     (spoilt / "frame_source.mcap").unlink()
     with pytest.raises(DataError, match="camera/rgbd"):

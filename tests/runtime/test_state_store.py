@@ -127,6 +127,16 @@ def test_a_broken_file_is_left_out_and_said(
     assert FolderStore(tmp_path).load("mapper") == {"step": [2]}
 
 
+def test_what_could_not_be_read_is_kept_beside_what_is_saved_next(tmp_path: Path) -> None:
+    for step in (1, 2):
+        FolderStore(tmp_path).save("mapper", {"one": [step], "two": [step]})
+        (tmp_path / "mapper" / "two.a").write_bytes(b"")
+        assert FolderStore(tmp_path).load("mapper") is None
+        assert FolderStore(tmp_path).load("mapper") is None, "as if nothing had been saved"
+        kept = (tmp_path / "mapper.unreadable" / "one.a").read_bytes()
+        assert state_store.decode_state(kept) == [step]
+
+
 def test_a_missing_file_is_left_out_and_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
