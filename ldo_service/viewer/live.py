@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from ldo_service.client import Client
-from ldo_service.schemas import Keyframe, Message
+from ldo_service.schemas import Keyframe
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
@@ -44,7 +44,7 @@ class Live:
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
-            stack.enter_context(service.listen(_name(topic), _message(topic), keep))
+            stack.enter_context(service.listen(_name(topic), topic.message, keep))
             for topic, keep in KEPT.items()
         ]
         self._until_camera = stack.enter_context(ExitStack())
@@ -82,8 +82,3 @@ def live(service: Client, config: ViewerConfig) -> Iterator[Live]:
 
 def _name(topic: Topic) -> str:
     return f"{topic.name}/*" if topic is HEALTH else topic.name
-
-
-def _message(topic: Topic) -> type[Message]:
-    assert topic.message is not None
-    return topic.message
