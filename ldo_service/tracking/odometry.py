@@ -269,15 +269,8 @@ class Odometry:
         return anchor.carried_to(now, self.config.prior)
 
     def _judged(self, candidate: Candidate) -> Status:
-        state, limits = self._state, self.config.judgement
-        return judge(
-            candidate.alignment,
-            candidate.second_agrees,
-            state.history,
-            state.status,
-            limits,
-            candidate.is_expected,
-        )
+        state = self._state
+        return judge(candidate, state.history, state.status, self.config.judgement)
 
     def _apart_from(self, segment: int) -> Places:
         """The places of segments that are not joined to one."""

@@ -149,7 +149,7 @@ class Relocaliser:
     def _is_sure(self, candidate: Candidate, guess: np.ndarray, history: History) -> bool:
         alignment = candidate.alignment
         difference = se3.inverse(guess) @ alignment.T_reference_camera
-        verdict = judge(alignment, None, history, Status.LOST, self.judgement)
+        verdict = judge(candidate, history, Status.LOST, self.judgement)
         return (
             verdict is Status.OK
             and alignment.geometric_inliers >= self.config.min_geometric_inliers

@@ -1,13 +1,15 @@
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.tracking import Alignment, Status
+from ldo_service.tracking.candidates import Candidate
 from ldo_service.tracking.judgement import History, JudgementConfig, judge
 
-CONFIG = JudgementConfig()
+CONFIG, MEDIAN_DEPTH_M = JudgementConfig(), 2.0
 SOUND = Alignment(
     T_reference_camera=np.eye(4),
     information=np.eye(6),
@@ -26,8 +28,12 @@ SOUND = Alignment(
 PAST = History((3.0, 4.0, 5.0), (0.8, 1.0, 1.2))
 
 
-def verdict(previous: Status = Status.OK, agree: bool | None = None, **changes: float) -> Status:
-    return judge(replace(SOUND, **changes), agree, PAST, previous, CONFIG)
+def candidate(agree: bool | None = None, **changes: Any) -> Candidate:
+    return Candidate(replace(SOUND, **changes), "direct", MEDIAN_DEPTH_M, agree)
+
+
+def verdict(previous: Status = Status.OK, agree: bool | None = None, **changes: Any) -> Status:
+    return judge(candidate(agree, **changes), PAST, previous, CONFIG)
 
 
 def test_sound_alignment_is_ok_whatever_came_before() -> None:
@@ -89,15 +95,30 @@ def test_only_ok_leads_back_from_a_loss() -> None:
     assert verdict(Status.LOST, overlap=0.4) is Status.OK
 
 
+def test_a_place_found_from_afar_may_fit_worse_than_one_found_where_it_was_seen() -> None:
+    afar = np.eye(4)
+    afar[0, 3] = 0.4 * MEDIAN_DEPTH_M  # 0.4 rad of parallax
+    noisy = {"intensity_sigma": 2.0 * 4.0}
+    assert verdict(Status.LOST, **noisy) is Status.LOST
+    assert verdict(Status.LOST, T_reference_camera=afar, **noisy) is Status.OK
+
+
+def test_no_distance_excuses_more_noise_than_tracking_bears() -> None:
+    far = np.eye(4)
+    far[0, 3] = 3.0 * MEDIAN_DEPTH_M
+    noisy = {"intensity_sigma": 1.05 * CONFIG.weak_residual * 4.0}
+    assert verdict(Status.LOST, T_reference_camera=far, **noisy) is Status.LOST
+
+
 def test_noise_below_that_of_any_camera_may_rise_unpunished() -> None:
     perfect = History((1.0,) * 5, (0.2,) * 5)
-    textured = replace(SOUND, intensity_sigma=4.5, depth_noise_scale=1.0)
-    assert judge(textured, None, perfect, Status.OK, CONFIG) is Status.OK
+    textured = candidate(intensity_sigma=4.5, depth_noise_scale=1.0)
+    assert judge(textured, perfect, Status.OK, CONFIG) is Status.OK
 
 
 def test_without_a_past_noise_is_compared_with_a_usual_cameras() -> None:
     def first(**changes: float) -> Status:
-        return judge(replace(SOUND, **changes), None, History(), Status.OK, CONFIG)
+        return judge(candidate(**changes), History(), Status.OK, CONFIG)
 
     assert first() is Status.OK
     assert first(intensity_sigma=41.0) is Status.LOST
@@ -114,3 +135,5 @@ def test_history_forgets_beyond_its_length() -> None:
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ConfigError, match="residual"):
         JudgementConfig(weak_residual=6.0)
+    with pytest.raises(ConfigError, match="relocalised_residual"):
+        JudgementConfig(relocalised_residual=0.9)
