@@ -62,6 +62,7 @@ log = logging.getLogger(__name__)
 
 UNIT_WITHIN = 1e-3  # of a quaternion's norm: four digits, as people copy them, and then normalised
 MANY_MISSED = 30  # frames in a row that no prior reaches: a second, no hiccup any more
+VIEWS = "keyframe", "supporting"  # of the odometry's state, each a part of its own
 RECENT_KEYFRAMES = 32  # four windows of keyframe/new: the optimizer cannot be further behind
 
 
@@ -204,7 +205,7 @@ class Tracker(Actor):
             keyframe = self._odometry.make_keyframe(frame, tracked)
             window = self._odometry.window(tracked)
         else:
-            keyframe = self._odometry.make_supporting(tracked)
+            keyframe = self._odometry.make_supporting(frame, tracked)
         self._poses.chain(
             keyframe,
             tracked.keyframe,
@@ -314,10 +315,10 @@ class Tracker(Actor):
         """All that does not change with each pose of a prior."""
         state = self._odometry.state()
         places = {f"place_{place['id']}": place for place in state.pop("places")}
-        keyframe, correction = state.pop("keyframe"), self._saved_correction
+        views = {name: state.pop(name) for name in VIEWS}
         localise = self.config.localise
         now = {"odometry": state, "poses": self._poses.snapshot(), "localise": localise}
-        return {**places, "keyframe": keyframe, "correction": correction, "now": now}
+        return {**places, **views, "correction": self._saved_correction, "now": now}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]
@@ -327,8 +328,9 @@ class Tracker(Actor):
                 f"{self.config.localise or '(none)'}. Choose another folder with --state."
             )
         places = [part for name, part in state.items() if name.startswith("place_")]
-        kept = {"places": sorted(places, key=itemgetter("id")), "keyframe": state["keyframe"]}
-        self._odometry.restore({**now["odometry"], **kept})
+        views = {name: state[name] for name in VIEWS}
+        by_id = sorted(places, key=itemgetter("id"))
+        self._odometry.restore({**now["odometry"], **views, "places": by_id})
         self._prior, self._parts = Prior.unpacked(state["prior"]), None
         self._poses.restore(now["poses"])
         self._saved_correction = state["correction"]

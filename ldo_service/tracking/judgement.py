@@ -38,11 +38,11 @@ class JudgementConfig:
     lost_overlap: float = 0.08
     least_intensity_sigma: float = 2.0  # grey levels: what any camera has, for the comparison
     least_depth_noise_scale: float = 0.5
-    # A place recognised without a prediction must show more (the prototype's limit), and fit better:
-    # within this many times the running median where it is seen from the same pose, plus so much
-    # per radian of motion and parallax from it (`motion.extent`), as the noise of true finds grows:
-    # kitchen, p50 1.4 at 0.15 rad and 2.0 at 0.55. At most weak_residual. With 1.6 at any distance
-    # a third fewer kitchen frames were found, and no fewer false ones in the flat's twin corridor.
+    # A place recognised without a prediction must show more (the prototype's limit) and fit better:
+    # within this many times the running median seen from the same pose, plus so much per radian of
+    # motion and parallax from it (`motion.extent`), as the noise of true finds grows (kitchen, p50
+    # 1.4 at 0.15 rad, 2.0 at 0.55), and within weak_residual. 1.6 at any distance found a third
+    # fewer of the kitchen's frames, and one more false one in the flat's twin corridor.
     relocalised_overlap: float = 0.35
     relocalised_residual: float = 1.3
     relocalised_residual_per_rad: float = 2.0

@@ -6,7 +6,7 @@
             odometry.make_keyframe(frame, tracked)
             measurements = odometry.window(tracked)  # of it, from keyframes before its reference
         elif tracked.wants_mapping:
-            odometry.make_supporting(tracked)
+            odometry.make_supporting(frame, tracked)
         elif tracked.may_begin:  # a new segment
             odometry.make_keyframe(frame, odometry.begin_segment(frame))
 
@@ -35,7 +35,7 @@ from .judgement import History, JudgementConfig, Status, judge
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping, movable_in
 from .motion import Motion
 from .moving import MovingConfig, spread, watch
-from .places import Places, PlacesConfig, place_of, thumbnail_of
+from .places import Place, Places, PlacesConfig, place_of, thumbnail_of
 from .prior import Anchor, PriorConfig, Reading
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
@@ -110,7 +110,7 @@ class Odometry:
         if status is Status.WEAK and not self._relocaliser.is_familiar(view, self._state.trusted):
             status = Status.LOST
         if status is Status.LOST:
-            found = self._found(view, self._state.places, is_lost=True)
+            found = self._found(view, self._places_when_lost(), is_lost=True)
             if found is None:
                 return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
@@ -150,21 +150,13 @@ class Odometry:
         if tracked.join is not None:
             segments = self._state.segments.joined(tracked.segment, tracked.join.segment)
             self._state = replace(self._state, segments=segments)
-        before, view = self._state, self._view(frame)
-        view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
-        keyframe = Keyframe(
-            view,
-            tracked.T_odom_camera,
-            before.next_id,
-            tracked.segment,
-            has_moved=before.is_moving,
-            left_out=tracked.is_moving,
-        )
-        place = place_of(keyframe, self.config.features, self.config.places, before.history)
+        before = self._state
+        keyframe = self._keyframe_of(frame, tracked)
         self._state = replace(
             before,
-            places=before.places.added(place, self.config.places),
+            places=before.places.added(self._place_of(keyframe), self.config.places),
             keyframe=keyframe,
+            supporting=None,
             frames_since_keyframe=0,
             next_id=before.next_id + 1,
             T_odom_mapped=tracked.T_odom_camera,
@@ -194,11 +186,19 @@ class Odometry:
         if mask.any():
             self._state = replace(self._state, keyframe=replace(current, movable=mask))
 
-    def make_supporting(self, tracked: Tracked) -> int:
-        """Go on against the same keyframe; the id of this frame as one that is only mapped."""
-        number = self._state.next_id
-        self._state = replace(self._state, next_id=number + 1, T_odom_mapped=tracked.T_odom_camera)
-        return number
+    def make_supporting(self, frame: RgbdFrame, tracked: Tracked) -> int:
+        """Go on against the same keyframe; the id of this frame as one that is only mapped.
+
+        The last of them is remembered: a camera that gets lost may still see what it showed.
+        """
+        supporting = self._keyframe_of(frame, tracked)
+        self._state = replace(
+            self._state,
+            supporting=self._place_of(supporting),
+            next_id=supporting.id + 1,
+            T_odom_mapped=tracked.T_odom_camera,
+        )
+        return supporting.id
 
     @property
     def keyframe(self) -> int | None:
@@ -208,7 +208,7 @@ class Odometry:
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values.
 
-        Its `places` and `keyframe` are the same objects until they change.
+        Its `places`, `keyframe` and `supporting` are the same objects until they change.
         """
         return packed(self._state)
 
@@ -271,6 +271,30 @@ class Odometry:
     def _judged(self, candidate: Candidate) -> Status:
         state = self._state
         return judge(candidate, state.history, state.status, self.config.judgement)
+
+    def _keyframe_of(self, frame: RgbdFrame, tracked: Tracked) -> Keyframe:
+        view = self._view(frame)
+        view = replace(view, depth_m=view.depth_m.copy())  # a camera may reuse its buffer
+        return Keyframe(
+            view,
+            tracked.T_odom_camera,
+            self._state.next_id,
+            tracked.segment,
+            has_moved=self._state.is_moving,
+            left_out=tracked.is_moving,
+        )
+
+    def _place_of(self, keyframe: Keyframe) -> Place:
+        return place_of(keyframe, self.config.features, self.config.places, self._state.history)
+
+    def _places_when_lost(self) -> Places:
+        """With the last frame mapped, which shows more of where the camera was than the last
+        keyframe."""
+        before = self._state
+        if before.supporting is not None:
+            places = before.places.added(before.supporting, self.config.places)
+            self._state = replace(before, places=places, supporting=None)
+        return self._state.places
 
     def _apart_from(self, segment: int) -> Places:
         """The places of segments that are not joined to one."""

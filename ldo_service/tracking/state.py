@@ -19,6 +19,7 @@ from .segments import Segments
 class State:
     places: Places = field(default_factory=Places)  # for relocalisation
     keyframe: Keyframe | None = None  # the one tracked against, usually the newest
+    supporting: Place | None = None  # the last frame mapped, where it is none of these
     motion: Motion = field(default_factory=Motion)
     history: History = field(default_factory=History)
     status: Status = Status.OK
@@ -38,6 +39,7 @@ def packed(state: State) -> dict[str, Any]:
     return {
         "places": [place.packed for place in state.places.all],
         "keyframe": None if state.keyframe is None else state.keyframe.packed,
+        "supporting": None if state.supporting is None else state.supporting.packed,
         "motion": asdict(state.motion),
         "history": asdict(state.history),
         "status": state.status.value,
@@ -56,10 +58,11 @@ def packed(state: State) -> dict[str, Any]:
 def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
     """The inverse of `packed`, under the same configuration."""
     keyframe, suspicion, is_moving = values["keyframe"], values["suspicion"], values["is_moving"]
-    anchor = values["anchor"]
+    supporting, anchor = values["supporting"], values["anchor"]
     return State(
         places=Places(tuple(Place.unpacked(place) for place in values["places"])),
         keyframe=None if keyframe is None else Keyframe.unpacked(keyframe, config),
+        supporting=None if supporting is None else Place.unpacked(supporting),
         motion=Motion(**values["motion"]),
         history=History(**{name: tuple(noise) for name, noise in values["history"].items()}),
         status=Status(values["status"]),

@@ -49,7 +49,7 @@ class Tracker:
         if tracked.wants_keyframe:
             self._odometry.make_keyframe(self._as_mapped(frame, tracked), tracked)
         elif tracked.wants_mapping:
-            self._odometry.make_supporting(tracked)
+            self._odometry.make_supporting(frame, tracked)
         return tracked.T_odom_camera, tracked.status is Status.OK
 
     def _map(self, frame: RgbdFrame, tracked: Tracked) -> None:

@@ -104,7 +104,7 @@ def ours() -> Step:
         if tracked.wants_keyframe:
             odometry.make_keyframe(frame, tracked)
         elif tracked.wants_mapping:
-            odometry.make_supporting(tracked)
+            odometry.make_supporting(frame, tracked)
         return tracked.T_odom_camera, tracked.status is Status.OK
 
     return step

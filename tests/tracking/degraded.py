@@ -150,7 +150,7 @@ def follow(frames: Iterator[RgbdFrame], stamps_ns: np.ndarray) -> list[Step]:
         if tracked.wants_keyframe:
             odometry.make_keyframe(frame, tracked)
         elif tracked.wants_mapping:
-            odometry.make_supporting(tracked)
+            odometry.make_supporting(frame, tracked)
         k = int(np.searchsorted(stamps_ns, frame.stamp_ns))
         steps.append(Step(k, frame.index, tracked.status, tracked.T_odom_camera))
     return steps

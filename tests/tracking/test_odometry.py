@@ -11,6 +11,7 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
+from ldo_service.tracking.keyframes import KeyframeConfig
 
 T_ELSEWHERE = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
 
@@ -21,6 +22,8 @@ def track(odometry: Odometry, frames: Sequence[RgbdFrame]) -> list[Tracked]:
         results.append(odometry.track(frame))
         if results[-1].wants_keyframe:
             odometry.make_keyframe(frame, results[-1])
+        elif results[-1].wants_mapping:
+            odometry.make_supporting(frame, results[-1])
     return results
 
 
@@ -43,8 +46,8 @@ def test_walk_is_followed_and_keyframes_are_made(room, make_walk) -> None:
     results = track(Odometry(), [room.view(T, index=k) for k, T in enumerate(truth)])
     assert {r.status for r in results} == {Status.OK}
     assert largest_error_m(results, truth) < 5e-3
-    made = [index for index, r in enumerate(results) if r.wants_keyframe]  # `track` makes each
-    assert 2 < len(made) < 14
+    assert 2 < sum(r.wants_keyframe for r in results) < 14
+    made = [index for index, r in enumerate(results) if r.wants_mapping]  # `track` numbers each
     last = results[-1]
     assert last.keyframe is not None
     between = se3.inverse(truth[made[last.keyframe]]) @ truth[-1]
@@ -185,6 +188,24 @@ def test_a_place_left_long_ago_is_found_again(large_room) -> None:
     assert {r.status for r in after} == {Status.OK}
     assert largest_error_m(after, walk[1:]) < 0.01
     assert_bitwise_equal(track(restored, frames[1:]), after)
+
+
+def test_a_lost_camera_is_found_by_the_last_frame_mapped(large_room) -> None:
+    """It went on where its keyframe shows nothing any more; after a restart in between too."""
+    rarely = KeyframeConfig(
+        min_overlap=0.0, max_frames=1000, max_rotation_rad=np.pi, max_translation=100.0,
+        supporting=0.1,
+    )  # fmt: skip
+    turned = [se3.exp(np.array([0.0, 0.06 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
+    odometry, restored = (Odometry(OdometryConfig(keyframes=rarely)) for _ in range(2))
+    known = track(odometry, [large_room.view(T) for T in turned[:13]])
+    assert [r.wants_keyframe for r in known] == [True] + 12 * [False]
+    restored.restore(decode_state(encode_state(odometry.state())))
+    frames = [large_room.blank(), large_room.view(turned[-1])]
+    *_, found = track(odometry, frames)
+    assert (found.status, found.method) == (Status.OK, "relocalised")
+    np.testing.assert_allclose(found.T_odom_camera, turned[-1], atol=0.01)
+    assert_bitwise_equal(track(restored, frames)[-1:], [found])
 
 
 @pytest.mark.parametrize("size", [(161, 121), (80, 60), (128, 128), (97, 200)])

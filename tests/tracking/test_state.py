@@ -22,11 +22,13 @@ def test_empty_state_survives_packing() -> None:
 
 def test_keyframe_and_places_survive_packing(room) -> None:
     place = place_of(keyframe_of(room, 3), FeatureConfig(), PlacesConfig())
-    state = State(places=Places((place,)), keyframe=keyframe_of(room, 5), frames_since_keyframe=4)
+    state = State(Places((place,)), keyframe_of(room, 5), place, frames_since_keyframe=4)
     restored = unpacked(packed(state), PyramidConfig())
     assert [place.id for place in restored.places.all] == [3]
     assert restored.keyframe is not None
     assert restored.keyframe.id == 5
+    assert restored.supporting is not None
+    assert restored.supporting.id == 3
     assert restored.frames_since_keyframe == 4
 
 
