@@ -7,7 +7,7 @@ SOURCES := pyproject.toml CMakeLists.txt $(wildcard ldo_service/kernels/*.cpp ld
 help:  ## what can be made
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
 
-demo: .venv/installed  ## the main job on a small synthetic room: a table and a picture
+demo: .venv/installed  ## the main job on a built-in synthetic room: a table and three pictures
 	$(BIN)/ldo demo --out build/demo --overwrite
 
 test: .venv/tests  ## the default test suite
