@@ -1,0 +1,175 @@
+"""What grows with keyframes, and whose it is: a camera that goes to and fro in a room, without end.
+
+    python -m tests.bench.bench_month [--keyframes 3000] [--set actor.field=value ...]
+
+All actors on the logical clock at 160x120. After each to and fro each actor is walked through,
+attribute by attribute, and its state is encoded as it is saved. Told are bytes per keyframe over
+the second half, when caches are full: a line for what grows, and sums. `unseen` is what the process
+grew by beyond what was found: gtsam, allocators, fragments.
+"""
+
+import argparse
+import gc
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import FunctionType, MethodType, ModuleType
+
+import msgspec
+import numpy as np
+
+from ldo_service.actors.graph import make_actors
+from ldo_service.config import load_config
+from ldo_service.runtime import Actor
+from ldo_service.runtime.logical_clock import LogicalClock
+from ldo_service.runtime.process import give_back_free_memory, resident_mb
+from ldo_service.runtime.state_store import encode_state
+from ldo_service.schemas import CameraRgbd, Keyframe, Message
+from tests.faults.camera import PERIOD_NS, frames
+
+LIGHT = ("mapper.iterations=2", "mapper.threads=1")
+SHARED = (type, ModuleType, FunctionType, MethodType)  # belong to no actor
+DEEP = 4  # attributes in a name
+LEAST_BYTES = 1.0  # per keyframe, to be told
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    keyframes: int
+    held: dict[str, int]  # bytes in memory, by the path of attributes
+    saved: dict[str, int]  # bytes of the state, by actor
+    resident: float  # bytes of the process
+
+
+def lap(scene: list[CameraRgbd], number: int) -> Iterator[CameraRgbd]:
+    """There and back, with frame numbers and stamps that go on from lap to lap."""
+    for index, frame in enumerate(scene, start=number * len(scene)):
+        stamp_ns = 1_000_000_000 + index * PERIOD_NS
+        yield msgspec.structs.replace(frame, frame=index, stamp_ns=stamp_ns)
+
+
+# --- what an actor holds --------------------------------------------------------------------------
+def held_by(actors: list[Actor]) -> dict[str, int]:
+    """Bytes by path; what several hold counts for the first."""
+    seen: set[int] = set()
+    held: dict[str, int] = {}
+    for actor in actors:
+        _walk(actor, actor.name, 0, seen, held)
+    return held
+
+
+def _walk(thing: object, path: str, depth: int, seen: set[int], held: dict[str, int]) -> None:
+    """Attributes of our own classes get a name each; all below counts for the last of them."""
+    if id(thing) in seen or isinstance(thing, SHARED):
+        return
+    if depth < DEEP and type(thing).__module__.startswith("ldo_service"):
+        seen.add(id(thing))
+        held[path] = held.get(path, 0) + sys.getsizeof(thing)
+        for name, value in _attributes(thing).items():
+            _walk(value, f"{path}.{name}", depth + 1, seen, held)
+    else:
+        held[path] = held.get(path, 0) + _deep_size(thing, seen)
+
+
+def _attributes(thing: object) -> dict[str, object]:
+    slots = [name for kind in type(thing).__mro__ for name in getattr(kind, "__slots__", ())]
+    of_slots = {name: getattr(thing, name) for name in slots if hasattr(thing, name)}
+    of_slots.pop("__dict__", None), of_slots.pop("__weakref__", None)
+    return {**of_slots, **getattr(thing, "__dict__", {})}
+
+
+def _deep_size(thing: object, seen: set[int]) -> int:
+    total, waiting = 0, [thing]
+    while waiting:
+        one = waiting.pop()
+        if id(one) in seen or isinstance(one, SHARED):
+            continue
+        seen.add(id(one))
+        total += sys.getsizeof(one)
+        waiting.extend(_referents(one))
+    return total
+
+
+def _referents(one: object) -> list[object]:
+    if isinstance(one, np.ndarray):
+        return [] if one.base is None else [one.base]
+    if isinstance(one, memoryview):
+        return [one.obj]
+    return gc.get_referents(one)
+
+
+# --- the journey ----------------------------------------------------------------------------------
+def journey(keyframes: int, settings: list[str]) -> Iterator[Sample]:
+    config, scene = load_config(settings=[*LIGHT, *settings]), frames()
+    actors, made, laps = make_actors(config), 0, 0
+
+    def observe(_actor: str, message: Message, _step_ms: float) -> None:
+        nonlocal made
+        made += isinstance(message, Keyframe)
+
+    for actor in actors:
+        actor.handle = keeping(actor)
+    with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
+        while made < keyframes:
+            for _tick in clock.run(lap(scene, laps)):
+                pass
+            laps += 1
+            yield sample(actors, made)
+
+
+def keeping(actor: Actor) -> Callable[[Message], Iterator[Message]]:
+    """Its handler, which asks for its state after each message as a stage does: it may be kept."""
+    handle = actor.handle
+
+    def handled(message: Message) -> Iterator[Message]:
+        yield from handle(message)
+        actor.snapshot()
+        actor.saved()
+
+    return handled
+
+
+def sample(actors: list[Actor], keyframes: int) -> Sample:
+    saved = {actor.name: len(encode_state(actor.snapshot())) for actor in actors}
+    gc.collect()
+    give_back_free_memory()
+    return Sample(keyframes, held_by(actors), saved, 1e6 * resident_mb())
+
+
+def growth(samples: list[Sample]) -> tuple[dict[str, float], dict[str, float], float]:
+    """Bytes per keyframe over the second half: by path, of saved states by actor, resident."""
+    first, last = samples[len(samples) // 2 - 1], samples[-1]
+    n = last.keyframes - first.keyframes
+    held = {path: (size - first.held.get(path, 0)) / n for path, size in last.held.items()}
+    saved = {actor: (size - first.saved[actor]) / n for actor, size in last.saved.items()}
+    return held, saved, (last.resident - first.resident) / n
+
+
+def report(samples: list[Sample]) -> None:
+    held, saved, resident = growth(samples)
+    print("| held by | bytes per keyframe | kB now |\n|---|---|---|")
+    for path, slope in sorted(held.items(), key=lambda item: -item[1]):
+        if slope >= LEAST_BYTES:
+            print(f"| {path} | {slope:.0f} | {samples[-1].held[path] / 1e3:.0f} |")
+    for actor, slope in saved.items():
+        mine = sum(s for path, s in held.items() if path.split(".")[0] == actor)
+        print(f"| {actor}, in all; saved {slope:.0f} | {mine:.0f} | |")
+    print(f"| resident, and unseen {resident - sum(held.values()):.0f} | {resident:.0f} | |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--keyframes", type=int, default=3000)
+    parser.add_argument("--set", nargs="+", default=[], help="as `ldo serve` has it")
+    arguments = parser.parse_args()
+    samples: list[Sample] = []
+    for one in journey(arguments.keyframes, arguments.set):
+        samples.append(one)
+        total = sum(one.held.values())
+        print(f"{one.keyframes} keyframes: {total / 1e6:.1f} MB found, {one.resident / 1e6:.0f} MB "
+              f"resident", flush=True)  # fmt: skip
+    report(samples)
+
+
+if __name__ == "__main__":
+    main()
