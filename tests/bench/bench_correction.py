@@ -61,8 +61,10 @@ def measure_mapper(gaussians: int, keyframes: int, repeats: int) -> None:
         body = encode(message)
         start = time.process_time()
         received = keyframe_poses_of(decode(body, Correction))
-        moved = poses.correct(number + 1, received)
-        world.move_anchors(moved)
+        before = poses.of(T_map)
+        poses.correct(number + 1, received)
+        T_new_old = poses.of(T_map) @ se3.inverse(before)
+        world.move_anchors(dict(zip(T_map, T_new_old, strict=True)))
         took.append(1e3 * (time.process_time() - start))
 
     took: list[float] = []
