@@ -4,6 +4,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from ldo_service.errors import ConfigError
 from ldo_service.geometry.relative_pose import RelativePose
 
@@ -22,10 +24,15 @@ class ClosuresConfig:
     most_cost: float = 20.06
     most_sigmas: float = 3.0  # of a residual that stays, in any direction (RTAB-Map's guard)
     rivals: int = 3  # earlier closures that may leave in place of a new one, the least fitting
+    most: int = (
+        500  # believed at a time: each is 1 kB, and one more to solve with; then the one goes
+    )
+    # that another is nearest to
     remembered: int = 256  # refused ones, and ones that left, to tell
 
     def __post_init__(self) -> None:
-        if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0 or self.remembered < 1:
+        counts = self.most, self.remembered
+        if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0 or min(counts) < 1:
             raise ConfigError(f"{self}: gates must be positive, counts not negative.")
 
 
@@ -110,10 +117,20 @@ class Closures:
         left = (p for p in (*self.left, *verdict.dropped) if p not in accepted)
         return replace(
             self,
-            accepted=accepted,
+            accepted=self._thinned(accepted),
             refused=self._remembered(p for p in refused if p not in verdict.dropped),
             left=self._remembered(p for p in left if p not in now_refused),
         )
+
+    def _thinned(self, accepted: Mapping[Pair, RelativePose]) -> Mapping[Pair, RelativePose]:
+        """Without one too many: the older of the two that join the most alike keyframes."""
+        if len(accepted) <= self.config.most:
+            return accepted
+        pairs = np.array(list(accepted))
+        apart = np.abs(pairs[:, None] - pairs[None]).sum(axis=2)
+        np.fill_diagonal(apart, np.iinfo(apart.dtype).max)
+        older = int(np.argmin(apart)) // len(pairs)
+        return {p: c for place, (p, c) in enumerate(accepted.items()) if place != older}
 
     def without(self, pairs: Collection[Pair]) -> "Closures":
         """When other measurements hold what these say."""

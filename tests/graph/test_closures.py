@@ -5,7 +5,7 @@ import pytest
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
-from ldo_service.graph.closures import Closures, Verdict
+from ldo_service.graph.closures import Closures, ClosuresConfig, Verdict
 from ldo_service.graph.keyframe_graph import KeyframeGraph
 
 from .walks import (
@@ -133,3 +133,11 @@ def test_a_closure_between_components_joins_them() -> None:
     assert graph.close(off_by(truth, 2, 17, *[0] * 6)).is_accepted
     for keyframe, T in graph.poses().items():
         np.testing.assert_allclose(T, truth[keyframe], atol=1e-5)
+
+
+def test_the_older_of_two_closures_that_say_the_same_makes_room() -> None:
+    known = Closures(ClosuresConfig(most=3))
+    for a, b in ((10, 200), (12, 202), (90, 300), (10, 301)):
+        known = known.after(RelativePose(a, b, np.eye(4), np.eye(6)), Verdict(True))
+    assert list(known.accepted) == [(12, 202), (90, 300), (10, 301)]
+    assert known.refused == known.left == ()
