@@ -25,12 +25,13 @@ _DISK_FULL = (
 class KeyframeStoreConfig:
     cache_mb: float = 256.0  # in memory: 119 keyframes of 640x480 with 2.15 MB each
     quota_mb: float = 4096.0  # on disk: some 8,000 keyframes of 640x480 with 0.5 MB each
+    most: int = 20_000  # on disk, however small: each takes 3 kB of memory too, for its view
     newest_kept: int = 8  # that the quota never touches: they are worked on
 
     def __post_init__(self) -> None:
-        if not (self.cache_mb >= 0 and self.quota_mb > 0 and self.newest_kept >= 1):
+        if not (self.cache_mb >= 0 and self.quota_mb > 0 and min(self.newest_kept, self.most) >= 1):
             raise ConfigError(
-                f"{self}: cache_mb must be at least 0, quota_mb positive, newest_kept at least 1."
+                f"{self}: cache_mb must be at least 0, quota_mb positive, the others at least 1."
             )
 
 
@@ -126,7 +127,8 @@ class KeyframeStore:
 
     # --- quota ------------------------------------------------------------------------------------
     def _make_room(self) -> None:
-        while sum(self._files.sizes.values()) > 1e6 * self.config.quota_mb:
+        sizes, config = self._files.sizes, self.config
+        while sum(sizes.values()) > 1e6 * config.quota_mb or len(sizes) > config.most:
             keyframe = self._most_redundant()
             if keyframe is None:
                 return

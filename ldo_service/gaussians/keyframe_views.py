@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.geometry import Camera
+from ldo_service.geometry.records import PoseTable
 
 from .anchor_spheres import PlacedCamera
 from .exposure import Exposure
@@ -19,23 +20,35 @@ from .views import View
 class KeyframeViews:
     """Views by keyframe: where each stands is in memory, what it saw is in the store.
 
-    `cameras`, `poses` (T_map_camera [4, 4]), `exposures` and `horizons` have every keyframe that
-    ever was, in order: 1.3 kB each. A view is there while its images are.
+    `poses` (T_map_camera [4, 4]) has every keyframe that ever was, for Gaussians hang on it: 136
+    bytes each. A view is there while its images are, and so are `cameras`, `exposures` and
+    `horizons`, in the same order: 1.5 kB each.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
         self.store = store
         self.cameras: dict[int, Camera] = {}
-        self.poses: dict[int, np.ndarray] = {}
+        self.poses = PoseTable()
         self.exposures: dict[int, Exposure] = {}
         self.horizons: dict[int, Horizon] = {}
 
-    def add(self, view: View) -> None:
+    def add(self, view: View) -> list[int]:
+        """The newest one; those without images, of which only their poses are known from now on."""
         if not self.poses:
             self.store.keep_only(())  # what another journey left in the folder
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
         self.horizons[view.keyframe] = Horizon.of(view.depth_m)
+        return self._forgotten(view.keyframe)
+
+    def _forgotten(self, newest: int) -> list[int]:
+        if len(self.cameras) <= len(self.store):
+            return []
+        gone = [k for k in self.cameras if k != newest and k not in self.store]
+        for table in (self.cameras, self.exposures, self.horizons):
+            for keyframe in gone:
+                del table[keyframe]
+        return gone
 
     def leave_out(self, keyframe: int, pixels: np.ndarray) -> None:
         """Those pixels [H, W] bool of its images count no more. Raises KeyError as a view does."""
@@ -46,7 +59,7 @@ class KeyframeViews:
         self.store.put(replace(images, mask=counts.astype(np.uint8)))
 
     def placed(self, keyframe: int) -> PlacedCamera:
-        """Its camera where it stands, and how far it saw."""
+        """Its camera where it stands, and how far it saw. Raises KeyError as a view does."""
         camera, T_map_camera = self.cameras[keyframe], self.poses[keyframe]
         return PlacedCamera(camera, T_map_camera, self.horizons[keyframe])
 
@@ -77,9 +90,10 @@ class KeyframeViews:
         exposures = [exposure.matrix for exposure in self.exposures.values()]
         horizons = [horizon.farthest_m for horizon in self.horizons.values()]
         return {
-            "keyframes": list(self.poses),
+            "placed": np.array(list(self.poses), np.int64),
+            "keyframes": list(self.cameras),
             "cameras": [(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in self.cameras.values()],
-            "T_map_camera": np.array(list(self.poses.values())).reshape(-1, 4, 4),
+            "T_map_camera": self.poses.of(self.poses),
             "exposures": np.array(exposures, np.float32).reshape(-1, 2, 3),
             "horizons": np.array(horizons, np.float32).reshape(-1, *BLOCKS),
         }
@@ -88,7 +102,7 @@ class KeyframeViews:
         """Become what `state` is the snapshot of; images of later keyframes are dropped."""
         keyframes = state["keyframes"]
         self.cameras = dict(zip(keyframes, (Camera(*c) for c in state["cameras"]), strict=True))
-        self.poses = dict(zip(keyframes, state["T_map_camera"], strict=True))
+        self.poses.become(state["placed"], state["T_map_camera"])
         self.exposures = dict(zip(keyframes, map(Exposure.of, state["exposures"]), strict=True))
         self.horizons = dict(zip(keyframes, map(Horizon, state["horizons"]), strict=True))
         self.store.keep_only(keyframes)

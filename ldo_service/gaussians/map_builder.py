@@ -10,6 +10,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.geometry.records import PoseTable
 
 from .anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
 from .changes import ChangeLog, Changes
@@ -91,7 +92,7 @@ class MapBuilder:
         self._threads, self._memory = threads, RenderMemory()
         self._optimiser = Optimiser(self.config.optimiser, threads=threads)
         self._log = ChangeLog()
-        self._told: dict[int, np.ndarray] = {}  # T_map_keyframe that others know
+        self._told = PoseTable()  # T_map_keyframe that others know, of those with images
         self._newest: int | None = None
         self._shown: tuple[int, Rendering] | None = None  # of a keyframe, while the map stays
         self._iterations = self._unusable = self._pruned = self._excess = 0
@@ -119,10 +120,12 @@ class MapBuilder:
         self._insert(frame, T_map_camera, keyframe, before, exposure, is_moving)
         counts = None if is_moving is None else (~is_moving).astype(np.uint8)
         view = replace(View.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts)
-        self.views.add(view)
         self._told[keyframe], self._newest = T_map_camera, keyframe
+        for forgotten in self.views.add(view):
+            del self._told[forgotten]
+            self._optimiser.forget_view(forgotten)
         touched = self._fit(self._plan(view, MOST_PER_EFFORT * iterations), effort=iterations)
-        if len(self._told) % self.config.prune_keyframes == 0:
+        if len(self.views) % self.config.prune_keyframes == 0:
             self._prune_misshapen(touched)
         self._prune_unconfirmed(keyframe)
 
@@ -263,7 +266,7 @@ class MapBuilder:
         """Fit to random keyframes, with steps that shrink or grow from one rate to the other."""
         known, self._shown = self.views.store.keyframes(), None
         if known:
-            chosen = self._rng(len(self._told), self._iterations).integers(
+            chosen = self._rng(len(self.views), self._iterations).integers(
                 len(known), size=iterations
             )
             self._fit([known[i] for i in chosen], rates)
@@ -271,11 +274,12 @@ class MapBuilder:
     # --- after a correction -----------------------------------------------------------------------
     def mend(self, keyframe: int, iterations: int) -> int:
         """A keyframe that was laid over earlier ones: what the map holds twice there is held once,
-        and a few iterations fit it to the keyframe. How many Gaussians went.
+        and a few iterations fit it to the keyframe. How many Gaussians went; none where its images
+        are forgotten.
 
         One keyframe at a time, so that nobody waits long.
         """
-        if keyframe not in self.views.poses:
+        if keyframe not in self.views.cameras:
             return 0
         self._shown = None
         self._wake(self.views.placed(keyframe))
@@ -348,7 +352,7 @@ class MapBuilder:
         changed: to them sleeping Gaussians are as before."""
         if len(self.gaussians) <= self.config.sleep.max_active:
             return
-        keyframes = list(self.views.poses)[-self.config.recent_cameras :]
+        keyframes = list(self.views.cameras)[-self.config.recent_cameras :]
         recent = [self.views.placed(keyframe) for keyframe in keyframes]
         rows, anchors = self.gaussians.rows, self.gaussians.anchors
         clumps = clumps_of(self.gaussians.means, anchors, self.config.sleep.clump_m)
@@ -377,12 +381,12 @@ class MapBuilder:
         """T_map_keyframe of keyframes that the optimiser moved since others were told."""
         poses = self.views.poses
         is_news = se3.differ(
-            np.array(list(poses.values())),
-            np.array([self._told[keyframe] for keyframe in poses]),
+            poses.of(self._told),
+            self._told.of(self._told),
             self.config.refined_m,
             self.config.refined_rad,
         )
-        moved = {k: poses[k] for k, is_new in zip(poses, is_news, strict=True) if is_new}
+        moved = {k: poses[k] for k, is_new in zip(self._told, is_news, strict=True) if is_new}
         self._told.update(moved)
         return moved
 
@@ -393,7 +397,7 @@ class MapBuilder:
         self.gaussians.move_anchors(T_new_old)
         self.sleeping.move(T_new_old)
         self.views.poses.update(T_map)
-        self._told.update(T_map)
+        self._told.update({k: T for k, T in T_map.items() if k in self._told})
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -403,7 +407,7 @@ class MapBuilder:
             "sleeping": self.sleeping.snapshot(),
             "optimiser": self._optimiser.snapshot(),
             "views": self.views.snapshot(),
-            "told": np.array(list(self._told.values())).reshape(-1, 4, 4),
+            "told": self._told.of(self._told),
             "newest": self._newest,
             "iterations": self._iterations,
         }
@@ -418,7 +422,7 @@ class MapBuilder:
         self._optimiser.restore(state["optimiser"])
         self.views.restore(state["views"])
         self.sleeping.restore(state["sleeping"])
-        self._told = dict(zip(self.views.poses, state["told"], strict=True))
+        self._told.become(self.views.cameras, state["told"])
         self._newest, self._iterations, self._shown = state["newest"], state["iterations"], None
         self._log.all_told(self.gaussians)
 

@@ -183,6 +183,10 @@ class Optimiser:
         """[N] int32, how many steps each Gaussian has made: those whose count grew have changed."""
         return self._adam.steps(gaussians)
 
+    def forget_view(self, keyframe: int) -> None:
+        """It will not be optimised against again."""
+        self._views.forget(keyframe)
+
     def snapshot(self) -> dict[str, np.ndarray]:
         """A copy of all moments, as named arrays."""
         return self._adam.snapshot() | self._views.snapshot()

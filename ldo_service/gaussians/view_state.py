@@ -25,6 +25,9 @@ class ViewMoments:
         out = mean / (1 - BETA1**steps) / (np.sqrt(square / (1 - BETA2**steps)) + EPSILON)
         return out.reshape(gradient.shape)
 
+    def forget(self, keyframe: int) -> None:
+        self._moments.pop(keyframe, None)
+
     def snapshot(self) -> dict[str, np.ndarray]:
         keyframes = sorted(self._moments)
         moments = [self._moments[k] for k in keyframes]

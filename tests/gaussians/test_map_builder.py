@@ -1,5 +1,6 @@
 """Keyframes become a map that looks like them, the same way each time, in bounded memory."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import OptimiserConfig, PruningConfig, render
+from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, WindowConfig
 from ldo_service.gaussians.sleep_choice import SleepConfig
 from ldo_service.geometry import se3
@@ -217,3 +219,27 @@ def test_what_moves_is_neither_mapped_nor_fitted(posed: dict) -> None:
     inside = (u > 20) & (u < 49) & (v > 15) & (v < 39)
     assert not inside.any()
     assert len(maps[0]) > 100
+
+
+def test_a_keyframe_without_images_is_known_by_its_pose_alone(posed: dict, tmp_path: Path) -> None:
+    """And a successor goes on with the same bits."""
+    config = MapBuilderConfig(
+        store=KeyframeStoreConfig(cache_mb=0.0, most=2, newest_kept=1), prune_keyframes=2
+    )
+    first, second = (MapBuilder(config, folder=tmp_path / name) for name in ("first", "second"))
+    for keyframe, i in enumerate(KEYFRAMES[:3]):
+        first.add(*posed[i], keyframe, 5)
+    assert list(first.views.cameras) == [0, 2]
+    assert list(first.views.poses) == [0, 1, 2]
+    assert first.mend(1, 5) == 0
+    shutil.copytree(tmp_path / "first", tmp_path / "second", dirs_exist_ok=True)
+    second = MapBuilder(config, folder=tmp_path / "second")
+    second.restore(first.snapshot())
+    T_new_old = se3.exp(np.full(6, 0.01))
+    for builder in (first, second):
+        builder.move(dict.fromkeys(range(3), T_new_old))
+        builder.add(*posed[KEYFRAMES[3]], 3, 5)
+        builder.refine(5)
+        assert builder.refined().keys() <= {0, 3}
+    assert first.gaussians.rows.tobytes() == second.gaussians.rows.tobytes()
+    np.testing.assert_array_equal(first.views.poses[1], T_new_old @ posed[KEYFRAMES[1]][1])
