@@ -101,6 +101,8 @@ class MapperConfig:
     # the others long
     changed_keyframes: int = 5  # between telling how old Gaussians changed: the optimiser touches
     # all that is in view at every keyframe
+    measured_keyframes: int = 64  # the newest, of which each measurement is taken anew when the
+    # renderer moves them; of older ones, which the optimizer has condensed, that from the reference
     checkpoint_keyframes: int = 5  # between saved maps: after a crash so many are mapped again
     motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
     motion_min_rad: float = 2e-4  # As builder.refined_m: what is not told must not be taken back
@@ -113,7 +115,7 @@ class MapperConfig:
     def __post_init__(self) -> None:
         counts = (
             *(self.snapshot_keyframes, self.part_gaussians, self.checkpoint_keyframes),
-            self.changed_keyframes,
+            *(self.changed_keyframes, self.measured_keyframes),
         )
         if min(self.iterations, self.least_iterations) < 0:
             raise ConfigError("mapper.iterations and least_iterations must not be negative.")
@@ -169,7 +171,7 @@ class Mapper(Actor):
         )
         self._objects_teller = ObjectsTeller()
         self._poses = KeyframePoses()
-        self._links = KeyframeLinks(self._poses)
+        self._links = KeyframeLinks(self._poses, self.config.measured_keyframes)
         self._teller = MapTeller(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
         self._to_mend: list[int] = []  # keyframes that corrections moved far
@@ -276,9 +278,7 @@ class Mapper(Actor):
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         held = self._links.acknowledged(message.refinements)
         self._poses.correct(message.graph_version, keyframe_poses_of(message), held=held)
-        config = self.config
-        torn = self._misplaced(config.mending_min_m, config.mending_min_rad)
-        misplaced = self._misplaced(config.motion_min_m, config.motion_min_rad)
+        misplaced, torn = self._misplaced()
         motions = tuple(self._motion(keyframe) for keyframe in misplaced)
         self._to_mend = sorted({*self._to_mend, *torn})
         if motions:
@@ -288,17 +288,15 @@ class Mapper(Actor):
             yield self._teller.delta(self._now(), motions=motions)
             yield from self._objects()
 
-    def _misplaced(self, least_m: float, least_rad: float) -> list[int]:
-        """Keyframes that are so far from where their Gaussians are; too little to show adds up
-        until it is enough."""
-        poses = self._map.views.poses
-        are_far = se3.differ(
-            np.array([self._poses[keyframe] for keyframe in poses]),
-            np.array(list(poses.values())),
-            least_m,
-            least_rad,
-        )
-        return [keyframe for keyframe, is_far in zip(poses, are_far, strict=True) if is_far]
+    def _misplaced(self) -> tuple[list[int], list[int]]:
+        """Keyframes that are so far from where their Gaussians are that it shows, and those that
+        are far off; too little to show adds up until it is enough."""
+        config, placed = self.config, self._map.views.poses
+        keyframes = np.array(list(placed), np.int64)
+        T_now, T_gaussians = self._poses.of(placed), placed.of(placed)
+        shows = se3.differ(T_now, T_gaussians, config.motion_min_m, config.motion_min_rad)
+        is_torn = se3.differ(T_now, T_gaussians, config.mending_min_m, config.mending_min_rad)
+        return keyframes[shows].tolist(), keyframes[is_torn].tolist()
 
     def _mend(self, most: int, iterations: int) -> None:
         """Some of the keyframes that corrections laid over others, the newest first. At the end
