@@ -122,8 +122,8 @@ class Tracker(Actor):
         self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = Odometry(self.config.odometry)
         self._poses = KeyframePoses()  # of the last keyframes and the one tracked against
-        self._correction: Correction | None = None  # the last: places all keyframes, old ones too
-        self._saved_correction = b""
+        self._correction = b""  # the last, as a body: places all keyframes, old ones too
+        self._joined: dict[int, int] = {}  # segments placed in an older one, as it says
         self._made = self._without_room = 0
         self._prior = Prior()
         self._verdicts: Counter[Verdict] = Counter()  # on poses of the prior
@@ -244,7 +244,7 @@ class Tracker(Actor):
     # --- poses ------------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> None:
         if message.graph_version > self._poses.version:
-            self._correction, self._saved_correction = message, encode(message)
+            self._correction, self._joined = encode(message), dict(message.joined)
         T_map = keyframe_poses_of(message, only=self._poses)
         self._poses.correct(message.graph_version, T_map)
 
@@ -255,8 +255,9 @@ class Tracker(Actor):
             return
         T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_keyframe_camera)
         self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe, tracked.segment)
-        if self._correction is not None:
-            T_map = keyframe_poses_of(self._correction, only=(keyframe,))
+        if self._correction:
+            correction = decode(self._correction, Correction)
+            T_map = keyframe_poses_of(correction, only=(keyframe,))
             self._poses.place(keyframe, T_map.get(keyframe, self._poses[keyframe]))
 
     def _tracked_pose(
@@ -301,8 +302,7 @@ class Tracker(Actor):
 
     def _placed_in(self, segment: int) -> int:
         """The oldest segment that it is joined to, as the optimizer knows."""
-        joined = () if self._correction is None else self._correction.joined
-        return dict(joined).get(segment, segment)
+        return self._joined.get(segment, segment)
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -318,7 +318,7 @@ class Tracker(Actor):
         views = {name: state.pop(name) for name in VIEWS}
         localise = self.config.localise
         now = {"odometry": state, "poses": self._poses.snapshot(), "localise": localise}
-        return {**places, **views, "correction": self._saved_correction, "now": now}
+        return {**places, **views, "correction": self._correction, "now": now}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]
@@ -333,9 +333,9 @@ class Tracker(Actor):
         self._odometry.restore({**now["odometry"], **views, "places": by_id})
         self._prior, self._parts = Prior.unpacked(state["prior"]), None
         self._poses.restore(now["poses"])
-        self._saved_correction = state["correction"]
-        body = self._saved_correction
-        self._correction = decode(body, Correction) if body else None
+        self._correction = state["correction"]
+        if self._correction:
+            self._joined = dict(decode(self._correction, Correction).joined)
 
     def facts(self) -> dict[str, float]:
         refused = self._verdicts[Verdict.LATE] + self._verdicts[Verdict.BROKEN]

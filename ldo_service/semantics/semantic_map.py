@@ -33,10 +33,15 @@ class SemanticMapConfig:
     most_names: int = MOST_LABELS  # of the vocabulary; a later name is `other`
     most_waiting: int = 8  # keyframes whose boxes came before they were mapped: as many as may be
     # on their way to the mapper
+    most_said_again: int = 64  # the newest keyframes whose boxes came: after a restart those of a
+    # window, 8, come once more
 
     def __post_init__(self) -> None:
-        if self.most_waiting < 0 or self.most_names > MOST_LABELS:
-            raise ConfigError(f"{self}: most_waiting at least 0, most_names up to {MOST_LABELS}.")
+        if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MOST_LABELS:
+            raise ConfigError(
+                f"{self}: most_waiting at least 0, most_said_again 1, most_names up to "
+                f"{MOST_LABELS}."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,9 +80,10 @@ class SemanticMap:
         self.naming = Naming(self.config.naming) if has_labeller else None
         self._map, self._threads = map_, threads
         self._by_detector, self._by_labeller = set[int](), set[int]()  # labels they gave
-        self._done: set[int] = set()  # keyframes
+        self._done: dict[int, None] = {}  # the newest keyframes, in order
         self._waiting: dict[int, Claims | None] = {}  # by keyframe, the first to come first
         self._disagreement = Disagreement(0.0, 0.0)
+        self._labelled = 0  # keyframes
         self._boxes = self._repeated = self._too_early = self._without_images = 0
         self._answers_without_images = self._movable = 0
 
@@ -116,7 +122,10 @@ class SemanticMap:
 
     def _learn(self, keyframe: int, found: Claims | None) -> Learnt | None:
         """Its images may be forgotten by now, then nobody can tell what is in the boxes."""
-        self._done.add(keyframe)
+        self._done[keyframe] = None
+        self._labelled += 1
+        while len(self._done) > self.config.most_said_again:
+            del self._done[next(iter(self._done))]
         if not self._map.views.is_readable(keyframe):
             self._without_images += 1
             return None
@@ -231,7 +240,8 @@ class SemanticMap:
         return {
             "vocabulary": self.vocabulary.packed,
             "objects": self.objects.packed,
-            "done": np.array(sorted(self._done), np.int64),
+            "done": list(self._done),
+            "labelled": self._labelled,
             "waiting": [(keyframe, _packed(claims)) for keyframe, claims in self._waiting.items()],
             "naming": self.naming and self.naming.packed,
             "given": [sorted(self._by_detector), sorted(self._by_labeller)],
@@ -240,7 +250,7 @@ class SemanticMap:
     def restore(self, state: Mapping[str, Any]) -> None:
         self.vocabulary = Vocabulary.unpacked(state["vocabulary"])
         self.objects = Objects.unpacked(state["objects"], self.config.objects)
-        self._done = set(state["done"].tolist())
+        self._done, self._labelled = dict.fromkeys(state["done"]), state["labelled"]
         self._waiting = {
             keyframe: Claims(*arrays) if arrays else None for keyframe, arrays in state["waiting"]
         }
@@ -256,7 +266,7 @@ class SemanticMap:
             labelled = int(np.count_nonzero(top_labels(self._map.gaussians.labels) != BACKGROUND))
         return {
             "gaussians_labelled": labelled,  # of those awake
-            "keyframes_labelled": len(self._done),
+            "keyframes_labelled": self._labelled,
             "boxes": self._boxes,
             "boxes_repeated": self._repeated,  # messages, said again after a restart
             "boxes_too_early": self._too_early,  # messages, of keyframes that never came in time

@@ -9,6 +9,7 @@ grew by beyond what was found: gtsam, allocators, fragments.
 """
 
 import argparse
+import ctypes
 import gc
 import sys
 from collections.abc import Callable, Iterator
@@ -33,12 +34,23 @@ DEEP = 4  # attributes in a name
 LEAST_BYTES = 1.0  # per keyframe, to be told
 
 
+class Mallinfo2(ctypes.Structure):
+    """glibc's, over all arenas; bytes."""
+
+    _fields_ = [
+        *((name, ctypes.c_size_t) for name in ("arena", "ordblks", "smblks", "hblks", "mapped")),
+        *((name, ctypes.c_size_t) for name in ("usmblks", "fsmblks", "in_use", "free", "keepcost")),
+    ]
+
+
 @dataclass(frozen=True, slots=True)
 class Sample:
     keyframes: int
     held: dict[str, int]  # bytes in memory, by the path of attributes
     saved: dict[str, int]  # bytes of the state, by actor
     resident: float  # bytes of the process
+    in_use: int  # bytes that glibc gave out, but small objects of Python
+    free: int  # and that it keeps for later
 
 
 def lap(scene: list[CameraRgbd], number: int) -> Iterator[CameraRgbd]:
@@ -133,7 +145,14 @@ def sample(actors: list[Actor], keyframes: int) -> Sample:
     saved = {actor.name: len(encode_state(actor.snapshot())) for actor in actors}
     gc.collect()
     give_back_free_memory()
-    return Sample(keyframes, held_by(actors), saved, 1e6 * resident_mb())
+    return Sample(keyframes, held_by(actors), saved, 1e6 * resident_mb(), *allocated())
+
+
+def allocated() -> tuple[int, int]:
+    libc = ctypes.CDLL(None)
+    libc.mallinfo2.restype = Mallinfo2
+    told = libc.mallinfo2()
+    return told.in_use + told.mapped, told.free
 
 
 def growth(samples: list[Sample]) -> tuple[dict[str, float], dict[str, float], float]:
@@ -166,8 +185,12 @@ def main() -> None:
     for one in journey(arguments.keyframes, arguments.set):
         samples.append(one)
         total = sum(one.held.values())
-        print(f"{one.keyframes} keyframes: {total / 1e6:.1f} MB found, {one.resident / 1e6:.0f} MB "
-              f"resident", flush=True)  # fmt: skip
+        print(
+            f"{one.keyframes} keyframes: {total / 1e6:.1f} MB found, "
+            f"{one.resident / 1e6:.0f} MB resident, {one.in_use / 1e6:.1f} MB of glibc's in use, "
+            f"{one.free / 1e6:.1f} MB free",
+            flush=True,
+        )
     report(samples)
 
 
