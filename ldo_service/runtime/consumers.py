@@ -66,8 +66,8 @@ class Consumers:
         consumer.alive = True
         consumer.handled = max(consumer.handled, grant.handled)
         consumer.arrived = grant.arrived  # not the most ever: a successor may have less
-        if grant.limit > consumer.limit:
-            consumer.limit, consumer.shut_since_s = grant.limit, None
+        if grant.limit > consumer.limit or grant.waits_for_disk:
+            consumer.limit, consumer.shut_since_s = max(grant.limit, consumer.limit), None
         return consumer
 
     def leave(self, name: str) -> None:

@@ -163,8 +163,9 @@ class LosslessInlet(Inlet):
             handled = max(handled, being_handled.header.seq + 1)
         return InletPast(self.epoch, handled)
 
-    def grant(self, consumer: str) -> Join | Grant:
+    def grant(self, consumer: str, *, waits_for_disk: bool = False) -> Join | Grant:
         if not self.is_welcome:
             return Join(consumer)
         limit = self.handled + self.window
-        return Grant(consumer, self.epoch, self.handled, self.arrived, limit, self.gap)
+        where = self.epoch, self.handled, self.arrived, limit
+        return Grant(consumer, *where, self.gap, waits_for_disk)

@@ -54,7 +54,7 @@ class Keeper:
             self.is_unsaved = False
             log.info("%s is saved again", actor.name)
 
-    def failed(self, name: str, error: Exception) -> bool:
+    def failed(self, name: str, error: OSError) -> bool:
         """Count a save that failed; whether it is the first since one succeeded, which is said."""
         self._failed += 1
         is_first, self.is_unsaved = not self.is_unsaved, True

@@ -52,6 +52,7 @@ class Grant(msgspec.Struct, frozen=True, tag="grant", array_like=True):
     arrived: int  # every seq below has arrived
     limit: int  # the first seq that may not be sent yet
     gap: bool = False  # `arrived` was sent and did not arrive
+    waits_for_disk: bool = False  # it takes nothing until its disk does, and is not to be evicted
 
     def __post_init__(self) -> None:
         if not 0 <= self.handled <= self.arrived < MAX_SEQ or self.limit < self.handled:

@@ -51,6 +51,7 @@ class Mailbox:
         self._ready = asyncio.Event()
         self._wake_pending = self._grant_pending = False
         self._closed = self._held = False
+        self.waits_for_disk = False  # then it takes nothing, and that is no fault of this process
         self._orders: deque[Order] = deque()
         self._grants: dict[str, Publisher] = {}
         self._inlets: dict[str, Inlet] = {}
@@ -210,7 +211,7 @@ class Mailbox:
 
     def _send_grant(self, inlet: LosslessInlet) -> None:
         with self._lock:
-            grant = inlet.grant(self._consumer)
+            grant = inlet.grant(self._consumer, waits_for_disk=self.waits_for_disk)
         self._grants[inlet.port.topic.name].post(b"", encode(grant))
 
     def close(self) -> None:

@@ -21,6 +21,7 @@ from .ledger import Taken
 from .mailbox import Mailbox
 from .orders import Order, OrderTaker
 from .outlet import Outlet
+from .outlets import Outlets
 from .ports import Lossless
 from .restart import RestartBudget
 from .state_store import MemoryStore, StateStore
@@ -54,6 +55,10 @@ class StageConfig:
             raise ConfigError(f"{self}: counts and times must be positive.")
 
 
+class LeftUnsaved(Exception):
+    """A stage is to end, and the disk takes nothing: what it did last will be done again."""
+
+
 class Stage:
     """`run` until `drain` or cancelled.
 
@@ -64,7 +69,7 @@ class Stage:
     A step counts when it is saved: only then is what it made for such consumers sent, and what it
     took acknowledged. While the disk takes nothing the stage tries again and does no more steps.
     One whose outputs never wait goes on, makes nothing for them, and sends what it made once it is
-    saved; one without such neighbours goes on too.
+    saved; one without such neighbours goes on too. One that is to end does not wait for a disk.
     """
 
     JOURNAL_WITHIN_S = 5.0  # a stage that ends waits so long for its journal to be written
@@ -100,7 +105,7 @@ class Stage:
         self._drain_requested = False
         self._mailbox: Mailbox | None = None
         self._rejecting: set[Topic] = set()  # topics whose last message could not be decoded
-        self._outlets: dict[type[Message], Outlet] = {}
+        self._outlets = Outlets()
 
     # --- life -----------------------------------------------------------------------------------
     async def run(self) -> None:
@@ -135,8 +140,8 @@ class Stage:
             self._mailbox.close()
 
     def _open_outlets(self) -> None:
-        for port in self._actor.outputs:
-            self._outlets[port.topic.message] = Outlet(
+        self._outlets = Outlets(
+            Outlet(
                 port,
                 self.name,
                 self._epoch,
@@ -146,6 +151,8 @@ class Stage:
                 self._on_evicted,
                 self._keeper.past.outputs.get(port.topic.name),
             )
+            for port in self._actor.outputs
+        )
         self._health = self._transport.publisher(f"{HEALTH.name}/{self.name}")
 
     def _open_mailbox(self) -> Mailbox:
@@ -167,8 +174,7 @@ class Stage:
         mailbox.close()
         mailbox.disconnect()
         self._orders.close()
-        for outlet in self._outlets.values():
-            outlet.close()
+        self._outlets.close()
         self._health.close()
 
     async def _close_journal(self) -> None:
@@ -180,21 +186,36 @@ class Stage:
 
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
-        for outlet in self._outlets.values():
-            await outlet.release()  # what a predecessor made
-        await self._say_first_words()
-        while delivery := await mailbox.take():
-            if isinstance(delivery, Order):
-                await self._obey(delivery, mailbox)
-                continue
-            message = self._decode(delivery)
-            if message is not None:
-                self._journal.took(delivery, message.stamp_ns)
-                await self._step(message, delivery)
-            mailbox.done(delivery, rejected=message is None)
-        await self._say_last_words()
-        for outlet in self._outlets.values():
-            await outlet.flush()
+        try:
+            await self._outlets.release()  # what a predecessor made
+            await self._say_first_words()
+            while delivery := await self._next(mailbox):
+                await self._take(delivery, mailbox)
+            await self._say_last_words()
+            if self._keeper.is_unsaved:
+                raise LeftUnsaved
+            await self._outlets.flush()
+        except LeftUnsaved:
+            log.error("%s ends and its last step is not saved: it will be done again", self.name)
+
+    async def _next(self, mailbox: Mailbox) -> Delivery | Order | None:
+        """While something is not saved, it is tried again meanwhile."""
+        while self._keeper.is_unsaved:
+            try:
+                return await asyncio.wait_for(mailbox.take(), self.SAVE_AGAIN_S)
+            except TimeoutError:
+                await self._tell([])
+        return await mailbox.take()
+
+    async def _take(self, delivery: Delivery | Order, mailbox: Mailbox) -> None:
+        if isinstance(delivery, Order):
+            await self._obey(delivery, mailbox)
+            return
+        message = self._decode(delivery)
+        if message is not None:
+            self._journal.took(delivery, message.stamp_ns)
+            await self._step(message, delivery)
+        mailbox.done(delivery, rejected=message is None)
 
     def _decode(self, delivery: Delivery) -> Message | None:
         topic, header = delivery.port.topic, delivery.header
@@ -224,41 +245,38 @@ class Stage:
         )  # fmt: skip
 
     async def _try(self, message: Message, delivery: Delivery) -> bool:
-        """Handle, save, send; False when the handler failed and a successor is in place."""
+        """Handle, save, send; False when it failed and a successor is in place."""
         self._look_around()
         try:
             with self._vitals.step():
                 produced = await self._worker.run(self._handle, message)
+            self._outlets.hold(produced)
+            is_saved = await self._keep(delivery, self._taken(delivery))
+        except LeftUnsaved:
+            raise
         except Exception as error:
             log.exception("%s failed on %s", self.name, type(message).__name__)
             self._journal.stepped("failed", self._actor.situation, error=repr(error))
             await self._restart()
             return False
         self._journal.stepped("done", self._actor.situation, produced)
-        lags, situation = self._actor.lags, self._actor.situation
-        taken = Taken.of(delivery.port.topic.name, delivery.body, situation) if lags else None
-        await self._tell(produced, delivery, taken)
+        await self._outlets.release(is_saved=is_saved)
         self._vitals.finished(message, is_timed=bool(produced) or not self._actor.outputs)
         return True
 
-    async def _tell(
-        self,
-        produced: list[Produced],
-        delivery: Delivery | None = None,
-        taken: Taken | None = None,
-        whole: bool = False,
-    ) -> None:
-        for out in produced:
-            self._outlets[type(out.message)].hold(out.message, out.body)
-        is_saved = await self._keep(delivery, taken, whole)
-        for outlet in self._outlets.values():
-            if is_saved or outlet.past() is None:
-                await outlet.release()
+    def _taken(self, delivery: Delivery) -> Taken | None:
+        """For an actor whose state lags."""
+        if not self._actor.lags:
+            return None
+        return Taken.of(delivery.port.topic.name, delivery.body, self._actor.situation)
+
+    async def _tell(self, produced: list[Produced], *, whole: bool = False) -> None:
+        self._outlets.hold(produced)
+        await self._outlets.release(is_saved=await self._keep(whole=whole))
 
     def _look_around(self) -> None:
-        never_wait = [outlet for outlet in self._outlets.values() if outlet.port.never_wait]
         self._actor.situation = Situation(
-            room={outlet.topic: outlet.room() for outlet in never_wait},
+            room=self._outlets.room(),
             waiting=self._mailbox.waiting() if self._mailbox else {},
         )
 
@@ -285,43 +303,49 @@ class Stage:
     async def _keep(
         self, delivery: Delivery | None = None, taken: Taken | None = None, whole: bool = False
     ) -> bool:
-        """Save all as of now, that delivery handled. False: not yet, and nobody waits for it."""
-        links, state = self._links(delivery), None
-        while True:
-            try:
-                state = state or await self._worker.run(
-                    self._keeper.compose, self._actor, links, taken, whole
-                )
-                await self._worker.run(self._write, state)
-            except Exception as error:
-                self._note_unsaved(error)
-            else:
-                return True
+        """Save all as of now, that delivery handled. False: not yet, and nobody waits for it.
+
+        Raises what the actor raises when it is asked for its state, and LeftUnsaved when the stage
+        is to end and the disk takes nothing.
+        """
+        state = await self._worker.run(
+            self._keeper.compose, self._actor, self._links(delivery), taken, whole
+        )
+        while not await self._is_written(state):
             if not self._waits_for_disk:
                 return False
+            if self._drain_requested:
+                raise LeftUnsaved
             await asyncio.sleep(self.SAVE_AGAIN_S)
+        return True
+
+    async def _is_written(self, state: State) -> bool:
+        try:
+            await self._worker.run(self._write, state)
+        except OSError as error:
+            self._note_unsaved(error)
+        if self._mailbox:
+            self._mailbox.waits_for_disk = self._keeper.is_unsaved
+        return not self._keeper.is_unsaved
 
     @property
     def _waits_for_disk(self) -> bool:
-        if any(outlet.port.never_wait for outlet in self._outlets.values()):
-            return False
         takes = any(isinstance(port.policy, Lossless) for port in self._actor.inputs)
-        return takes or any(outlet.past() for outlet in self._outlets.values())
+        return not self._outlets.never_wait and (takes or self._outlets.have_expected)
 
     def _begin(self) -> bool:
         """Save what there is before anyone counts on this stage: at once, as it is little."""
         try:
             self._write(self._keeper.compose(self._actor, self._links(), None, False))
-        except Exception as error:
+        except OSError as error:
             self._note_unsaved(error)
         return not self._keeper.is_unsaved
 
     def _links(self, delivery: Delivery | None = None) -> State:
         inputs = self._mailbox.past(delivery) if self._mailbox else self._keeper.past.inputs
-        outputs = {out.topic.name: out.past() for out in self._outlets.values()}
-        return self._keeper.links(inputs, outputs)
+        return self._keeper.links(inputs, self._outlets.past())
 
-    def _note_unsaved(self, error: Exception) -> None:
+    def _note_unsaved(self, error: OSError) -> None:
         self._vitals.failures += self._keeper.failed(self.name, error)
         self._vitals.facts = {**self._vitals.facts, **self._keeper.facts()}
 
@@ -350,8 +374,7 @@ class Stage:
         self._epoch = new_epoch()
         self._vitals.facts = {}
         mailbox.renew()
-        for outlet in self._outlets.values():
-            outlet.renew(self._epoch)
+        self._outlets.renew(self._epoch)
         await self._keep()
 
     # --- in the actor's thread ------------------------------------------------------------------
@@ -385,8 +408,7 @@ class Stage:
                 log.exception("%s cannot go on from its last state", self.name)
                 continue
             self._vitals.restarts += 1
-            for outlet in self._outlets.values():
-                outlet.take_back()
+            self._outlets.take_back()
             await self._say_first_words()
             return
 
@@ -394,8 +416,7 @@ class Stage:
     async def _beat(self, mailbox: Mailbox) -> None:
         while True:
             mailbox.send_grants()
-            for outlet in self._outlets.values():
-                outlet.check_windows()
+            self._outlets.check_windows()
             header = links.Header(self.name, self._epoch, 0, self._vitals.last_stamp_ns)
             self._health.post(links.encode(header), encode(self.health()))
             if self._vitals.busy_s > self._config.stall_after_s:
@@ -409,7 +430,7 @@ class Stage:
             epoch=self._epoch,
             held=self._mailbox is not None and self._mailbox.is_held,
             inputs=self._mailbox.statistics() if self._mailbox else (),
-            outputs=tuple(outlet.statistics() for outlet in self._outlets.values()),
+            outputs=self._outlets.statistics(),
         )
 
 

@@ -43,3 +43,13 @@ def test_an_evicted_consumer_is_back_when_it_has_handled_something() -> None:
     assert consumers.room(4) == 0
     assert consumers.is_still_stuck(Grant("mapper", 1, 2, 4, 6))
     assert not consumers.is_still_stuck(Grant("mapper", 1, 3, 4, 7))
+
+
+def test_who_waits_for_its_disk_is_not_overdue() -> None:
+    consumers = Consumers(["mapper"])
+    consumers.join("mapper", 0)
+    waits = Grant("mapper", 1, 0, 4, 4, waits_for_disk=True)
+    for now_s in range(0, 60, 5):
+        consumers.grant(waits)
+        assert consumers.overdue(now_s, patience_s=10, seq=4) == []
+    assert consumers.overdue(now_s=71, patience_s=10, seq=4) == ["mapper"], "it went silent"

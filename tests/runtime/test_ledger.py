@@ -175,9 +175,10 @@ async def test_whoever_is_killed_and_when_each_value_arrives_once(
 # --- a disk that takes nothing --------------------------------------------------------------------
 class Moody(MemoryStore):
     is_full = False
+    fails = ""  # for this actor alone
 
     def save(self, actor: str, state: State) -> None:
-        if self.is_full:
+        if self.is_full or self.fails == actor:
             raise OSError(28, "No space left on device")
         super().save(actor, state)
 
@@ -215,11 +216,75 @@ async def test_who_never_waits_goes_on_without_a_disk_and_makes_nothing_to_lose(
         await eventually(lambda: giver.health().steps == 5)
         assert adder.health().steps == 0, "the first is held, and for the others there is no room"
         store.is_full = False
-        await send(feed, number(6))
-        await eventually(lambda: adder.health().steps == 1)
+        await eventually(lambda: adder.health().steps == 1)  # though no message comes
         await send(feed, number(7))
         await eventually(lambda: adder.health().steps == 2)
     assert store.load("giver")["given"] == 2
+
+
+@pytest.mark.parametrize("kind", ["giver", "adder"])
+async def test_a_soft_stop_does_not_wait_for_a_disk(kind: str, caplog) -> None:
+    """And who goes on from there does the step again."""
+    transport, store = MemoryTransport(), Moody()
+    giver = Stage(Giver, transport, config=QUICK, store=store, expected=EXPECTED)
+    adder = Stage(Adder, transport, config=QUICK, store=store)
+    feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), transport)
+    ending = {"giver": giver, "adder": adder}[kind]
+    async with running(giver, adder) as tasks:
+        await eventually(lambda: giver._outlets[Number].room() == 4)
+        store.fails = kind
+        await send(feed, number(1))
+        await eventually(lambda: ending.health().failures == 1)
+        ending.drain()
+        await eventually(tasks[kind == "adder"].done)
+    assert f"{kind} ends and its last step is not saved" in caplog.text
+    past = Past.of(store.load(kind))
+    assert past.own.get("given", 0) == 0
+    assert past.own.get("values", []) == []
+
+
+async def test_a_stage_that_waits_for_its_disk_says_so_to_its_producers() -> None:
+    transport, store = MemoryTransport(), Moody()
+    adder = Stage(Adder, transport, config=QUICK, store=store)
+    evicted: list[str] = []
+    numbers = Outlet(
+        Out(NUMBERS), "source", new_epoch(), transport, ("adder",), 0.1, evicted.append
+    )
+    async with running(adder):
+        await eventually(lambda: numbers.room() == 4)
+        store.fails = "adder"
+        for value in range(4):
+            await send(numbers, number(value))
+        await eventually(lambda: adder.health().failures == 1)
+        for _ in range(30):
+            numbers.check_windows()
+            await asyncio.sleep(0.01)
+        assert numbers.room() == 0
+        store.fails = ""
+        await eventually(lambda: adder.health().steps == 4)
+    assert evicted == []
+
+
+async def test_a_state_that_cannot_be_made_is_no_full_disk(caplog) -> None:
+    """The step fails as any other, and is set aside the second time."""
+
+    class Broken(Adder):
+        def snapshot(self) -> State:
+            if self.values[-1:] == [2]:
+                raise TypeError("no state")
+            return super().snapshot()
+
+    transport = MemoryTransport()
+    adder = Stage(Broken, transport, config=QUICK)
+    numbers = Outlet(Out(NUMBERS), "source", new_epoch(), transport, ("adder",))
+    async with running(adder):
+        for value in (1, 2, 3):
+            await send(numbers, number(value))
+        await eventually(lambda: adder.health().steps == 2)
+        assert adder.health().set_aside == 1
+        assert cast(Adder, adder._actor).values == [1, 3]
+    assert "no state" in caplog.text
+    assert "free some disk space" not in caplog.text
 
 
 # --- what a lagging actor took --------------------------------------------------------------------
