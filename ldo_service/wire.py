@@ -24,7 +24,6 @@ from ldo_service.schemas import (
     LoopCandidate,
     LoopClosure,
     MapObject,
-    MapObjects,
     MeasuredPose,
     ObjectObservation,
     ObjectView,
@@ -38,7 +37,7 @@ from ldo_service.semantics.distributions import entropy, sparse
 from ldo_service.semantics.labelling import Claims
 from ldo_service.semantics.landmarks import distributions, labels_of
 from ldo_service.semantics.movable import Box as MovableBox
-from ldo_service.semantics.objects import Objects, Observed
+from ldo_service.semantics.objects import Observed
 from ldo_service.semantics.regions import Region
 from ldo_service.semantics.vocabulary import Vocabulary
 from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
@@ -186,13 +185,6 @@ def claims_of(message: DetectionBoxes, vocabulary: Vocabulary) -> Claims:
     )
 
 
-def crop_message(color: np.ndarray) -> Image:
-    """A crop [h, w, 3] uint8 RGB as JPEG."""
-    height, width = color.shape[:2]
-    data = memoryview(codecs.encode_jpeg(color))
-    return Image(encoding="jpeg", width=width, height=height, data=data)
-
-
 def label_request_message(region: Region, stamp_ns: int) -> LabelRequest:
     """What is asked about a region; `stamp_ns` is that of its newest keyframe."""
     crops = (
@@ -308,18 +300,6 @@ def raw_frame_of(message: CameraRgbd, index: int) -> RawFrame:
         depth=codecs.decode_depth(depth.encoding, depth.width, depth.height, depth.data),
         depth_scale=message.depth_scale,
         camera=camera_of(message.camera),
-    )
-
-
-def objects_message(
-    objects: Objects, names: Sequence[str], version: int, graph_version: int, stamp_ns: int
-) -> MapObjects:
-    """All objects; `names` of the vocabulary."""
-    return MapObjects(
-        stamp_ns=stamp_ns,
-        version=version,
-        graph_version=graph_version,
-        objects=map_objects(objects.landmarks, names),
     )
 
 

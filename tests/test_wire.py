@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from ldo_service.objects_teller import ObjectsTeller
 from ldo_service.schemas import MapObjects, decode, encode
 from ldo_service.semantics.landmarks import distributions, entropies
-from ldo_service.wire import objects_message, observation_messages, transform
+from ldo_service.wire import observation_messages, transform
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
 
 
@@ -12,7 +13,7 @@ def test_objects_and_observations_travel_as_they_are() -> None:
     stage = Stage()
     told = list(stage.walk(THINGS, poses(20)[:6]))
     table = stage.objects.landmarks
-    message = objects_message(stage.objects, NAMES.names, 5, 3, stamp_ns=7)
+    message = ObjectsTeller().message(stage.objects, NAMES.names, 5, 3, stamp_ns=7)
     assert decode(encode(message), MapObjects) == message
     assert [one.id for one in message.objects] == table["id"].tolist() != []
     for one, landmark, p in zip(message.objects, table, distributions(table), strict=True):

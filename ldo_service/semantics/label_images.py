@@ -9,14 +9,6 @@ from ldo_service.geometry import Camera
 from .labels import BACKGROUND, background, fields, top_labels
 
 
-def top_image(labels: np.ndarray, shown: Rendering) -> np.ndarray:
-    """[H, W] uint8, per pixel the likeliest label of the Gaussian that made most of it; background
-    where none did. `shown` has contributions."""
-    assert shown.contributions is not None
-    top = shown.contributions.top
-    return np.where(top >= 0, top_labels(labels)[top], BACKGROUND).astype(np.uint8)
-
-
 def reliable_image(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
     """[H, W] bool, where the Gaussian that made most of a pixel, `top` [H, W], has a label but
     background with that probability, or more."""

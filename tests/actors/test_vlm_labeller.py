@@ -12,6 +12,7 @@ import pytest
 from ldo_service.actors.vlm_labeller import VlmLabeller, VlmLabellerConfig, require_labeller
 from ldo_service.config import Config
 from ldo_service.errors import ConfigError, EndpointError, ModelError, ReplayDiverged
+from ldo_service.geometry import codecs
 from ldo_service.recordings.replay import open_recording
 from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import Out
@@ -24,10 +25,16 @@ from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL
 from ldo_service.semantics.labellers import Opinion
 from ldo_service.semantics.labellers.endpoint import EndpointConfig
 from ldo_service.semantics.labellers.http_labeller import HttpConfig
-from ldo_service.wire import crop_message
 from tests.runtime.cast import QUICK, eventually, running, send
 from tests.semantics.labellers.encoders import ColorPair, embeddings, plain, vocabulary
 from tests.semantics.labellers.server import hangs, says, sends, serving
+
+
+def crop_message(color: np.ndarray) -> Image:
+    """A crop [h, w, 3] uint8 RGB as JPEG."""
+    height, width = color.shape[:2]
+    data = memoryview(codecs.encode_jpeg(color))
+    return Image(encoding="jpeg", width=width, height=height, data=data)
 
 
 def request(region: int = 7, color: str = "red", **fields) -> LabelRequest:

@@ -44,9 +44,9 @@ from ldo_service.semantics.foreground import (
     surfaces,
 )
 from ldo_service.semantics.fusion import FusionConfig
-from ldo_service.semantics.label_images import label_image, top_image
+from ldo_service.semantics.label_images import label_image
 from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
-from ldo_service.semantics.labels import LabelConfig, new_labels, top_labels
+from ldo_service.semantics.labels import BACKGROUND, LabelConfig, new_labels, top_labels
 from ldo_service.semantics.trigger import TriggerConfig
 from ldo_service.semantics.vocabulary import Vocabulary
 
@@ -266,6 +266,14 @@ class Report:
             views.append(LabelPicture(f"frame {k}", view))
         sheet = label_sheet(views, scene.vocabulary.names, scene.truth.class_names)
         cv2.imwrite(str(self._pictures / f"{name.replace(' ', '_')}.jpg"), sheet[..., ::-1])
+
+
+def top_image(labels: np.ndarray, shown: Rendering) -> np.ndarray:
+    """[H, W] uint8, per pixel the likeliest label of the Gaussian that made most of it; background
+    where none did."""
+    assert shown.contributions is not None
+    top = shown.contributions.top
+    return np.where(top >= 0, top_labels(labels)[top], BACKGROUND).astype(np.uint8)
 
 
 def judge_all(scene: Scene, runs: list[Follower], builder: MapBuilder, report: Report) -> None:

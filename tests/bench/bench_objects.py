@@ -27,7 +27,6 @@ from ldo_service.semantics.labels import fields, new_labels
 from ldo_service.semantics.objects import Objects
 from ldo_service.semantics.search import search
 from ldo_service.semantics.vocabulary import Vocabulary
-from ldo_service.wire import objects_message
 
 CAMERA, OBJECTS, EACH, WALL = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), 1000, 400, 76_000
 ROOM_M, AWAY_M = 20.0, 3.0
@@ -106,7 +105,9 @@ def main() -> None:
     known = rooms.rows, rooms.labels, view.ids, view.anchors
     print("refresh", milliseconds(lambda _: objects.refresh(*known), given.repeats))
     names = Vocabulary().names
-    told = milliseconds(lambda _: encode(objects_message(objects, names, 0, 0, 0)), given.repeats)
+    told = milliseconds(
+        lambda _: encode(ObjectsTeller().message(objects, names, 0, 0, 0)), given.repeats
+    )
     print("tell   ", told)
     teller = ObjectsTeller()
 
@@ -115,7 +116,7 @@ def main() -> None:
         encode(teller.message(objects, names, 0, 0, 0))
 
     print("observe and tell", milliseconds(observe_and_tell, given.repeats))
-    found = objects_message(objects, names, 0, 0, 0).objects
+    found = ObjectsTeller().message(objects, names, 0, 0, 0).objects
     print("search ", milliseconds(lambda n: search(COCO[n], _named(found)), given.repeats))
 
 
