@@ -11,7 +11,7 @@ import logging
 import os
 import signal
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,7 +157,7 @@ class Service:
                 lambda: make(config),
                 transport,
                 config=self.config.stage,
-                store=FolderStore(self.state / "state"),
+                store=FolderStore(self.state / "state", syncs=self.config.service.sync_state),
                 expected={
                     out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
                 },
@@ -241,6 +241,22 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
             f"{folder} has no readable state of {', '.join(missing)} beside that of the others. "
             "Choose another folder with --state, or delete this one to start anew."
         )
+    for topic, producer, consumer in _ahead(pasts):
+        raise ConfigError(
+            f"in {folder} the state of {consumer} is newer than that of {producer}: it has had "
+            f"messages of {topic} that were not made yet. Bring all of the folder back from one "
+            "copy, choose another with --state, or delete this one to start anew."
+        )
+
+
+def _ahead(pasts: Mapping[str, Past]) -> Iterator[tuple[str, str, str]]:
+    """Topics of which a consumer had more than its producer made, and both their names."""
+    for producer, past in pasts.items():
+        for topic, made in past.outputs.items():
+            for consumer, other in pasts.items():
+                had = other.inputs.get(topic)
+                if had and had.epoch == made.epoch and had.handled > made.seq:
+                    yield topic, producer, consumer
 
 
 def _is_fed_from_outside(box: Box) -> bool:

@@ -65,6 +65,7 @@ class Outlet:
         self._unhandled = deque(past.unhandled)
         self._unsent = deque(past.unhandled)
         self._changed = asyncio.Event()  # something about a consumer
+        self._ahead: set[str] = set()  # consumers that know messages we do not
         self._repeating: asyncio.Task[None] | None = None
         self._closed = False
         self._parts: list[tuple[bytes, bytes]] = []  # of a state that is not complete yet
@@ -182,9 +183,8 @@ class Outlet:
             self._repeating.cancel()
         self._epoch, self._seq = epoch, 0
         self._consumers = Consumers(self._consumers.expected)
-        self._unhandled.clear()
-        self._unsent.clear()
-        self._parts.clear()
+        for forgotten in (self._unhandled, self._unsent, self._parts, self._ahead):
+            forgotten.clear()
         self._last_value = ()
         self._post_welcomes()
 
@@ -193,12 +193,24 @@ class Outlet:
 
     def _granted(self, grant: Grant) -> None:
         if grant.arrived > self._seq:
-            return  # of messages that were never sent
+            self._say_older_than(grant)
+            return
         consumer = self._consumers.grant(grant)
         self._forget_handled()
         if consumer.arrived < self._next:
             self._repeat(consumer, grant.gap)
         self._changed.set()
+
+    def _say_older_than(self, grant: Grant) -> None:
+        """It has had messages that were never sent."""
+        if grant.consumer not in self._ahead:
+            log.error(
+                "%s: %s has had %d messages, and %d were made: its state is newer than that of %s, "
+                "and nothing is sent to it. Bring both back from one copy, or begin anew with `ldo "
+                "control reset`.",
+                self.topic.name, grant.consumer, grant.arrived, self._seq, self._source,
+            )  # fmt: skip
+        self._ahead.add(grant.consumer)
 
     def _forget_handled(self) -> None:
         oldest = self._consumers.handled(self._seq)

@@ -7,7 +7,7 @@ from threading import Event
 
 import pytest
 
-from ldo_service.runtime.links import again_key, data_key, grant_key, welcome_key
+from ldo_service.runtime.links import OutletPast, again_key, data_key, grant_key, welcome_key
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.ports import Out
 from ldo_service.runtime.stage import StageConfig
@@ -252,3 +252,20 @@ async def test_bytes_that_are_no_grant_or_welcome_are_left_alone(
         await eventually(lambda: seen == [0])
     assert "unreadable welcome" in caplog.text
     assert "unreadable grant" in caplog.text
+
+
+async def test_a_producer_older_than_its_consumer_says_what_to_do(caplog) -> None:
+    transport, seen = MemoryTransport(), []
+    stage = collector(transport, seen)
+    source = outlet(transport, "collector")
+    async with running(stage):
+        for value in range(3):
+            await send(source, number(value))
+        await eventually(lambda: len(seen) == 3)
+        source.close()
+        older = Outlet(
+            Out(NUMBERS), "producer", 9, transport, ("collector",), past=OutletPast(1, 1)
+        )
+        await eventually(lambda: "ldo control reset" in caplog.text)
+        assert older.room() == 0
+    assert caplog.text.count("collector has had 3 messages, and 1 were made") == 1

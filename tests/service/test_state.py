@@ -43,3 +43,13 @@ def test_one_that_lost_a_part_of_a_journey_is_refused(tmp_path: Path, missing: s
     saved(tmp_path, 5, *(name for name in ACTORS if name != missing))
     with pytest.raises(ConfigError, match=f"no readable state of {missing} beside"):
         claim(tmp_path)
+
+
+def test_one_whose_tracker_is_of_an_older_copy_is_refused(tmp_path: Path) -> None:
+    """The mapper would take new keyframes for old ones that came again."""
+    saved(tmp_path, 5, *ACTORS)
+    had = {"in": {"keyframe/new": (1, 6)}, "out": {}}
+    state = {**Mapper().snapshot(), "stage.links": had}
+    FolderStore(tmp_path / "state").save("mapper", state)
+    with pytest.raises(ConfigError, match="mapper is newer than that of tracker"):
+        claim(tmp_path)
