@@ -25,6 +25,7 @@ import zenoh
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.keys import Keys
 from ldo_service.runtime.links import ALIVE, Header, encode
+from ldo_service.runtime.numbers import Numbers
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
 from ldo_service.schemas import (
     CameraColor,
@@ -179,10 +180,14 @@ class Client:
             yield message
 
     def messages(self, topic: Topic, keep: int = 1) -> Iterator[tuple[Header, Message]]:
-        """Header and message of each sample on a topic, for ever."""
+        """Header and message of each sample on a topic, for ever; what a producer repeats that was
+        started again is left out."""
+        numbers = Numbers()
         with self._subscriber(topic.name, keep) as subscriber:
             for sample in subscriber:
-                yield _header(sample), _message(sample, topic.message)
+                header = _header(sample)
+                if numbers.came(header):
+                    yield header, _message(sample, topic.message)
 
     @contextmanager
     def listen(self, name: str, of: type[M], keep: int = 256) -> Iterator[Callable[[], list[M]]]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from ldo_service.schemas import InputCount
 
 from .links import OUTSIDE, Grant, Header, InletPast, Join
+from .numbers import Numbers
 from .ports import In, Latest, Lossless
 
 
@@ -30,18 +31,12 @@ class Inlet:
     gaps: int = 0
     peak: int = 0
     paused: int = 0
-    lost: int = 0
-    producer: tuple[str, int] = ("", 0)  # name and epoch of who sent the last one
-    next_seq: int = 0  # of that producer
+    numbers: Numbers = field(default_factory=Numbers)
 
     def number(self, header: Header) -> None:
-        """Count those that never came; one that comes late after all is none of them."""
-        if header is OUTSIDE:
-            return
-        if (header.source, header.epoch) != self.producer:
-            self.producer, self.next_seq = (header.source, header.epoch), header.seq
-        self.lost += header.seq - self.next_seq if header.seq >= self.next_seq else -1
-        self.next_seq = max(self.next_seq, header.seq + 1)
+        """Count those that never came."""
+        if header is not OUTSIDE:
+            self.numbers.came(header)
 
     def accept(self, header: Header) -> bool:  # noqa: ARG002
         """Whether to take the message in."""
@@ -93,7 +88,7 @@ class Inlet:
             waiting=len(self.waiting),
             peak=self.peak,
             paused=self.paused,
-            lost=max(0, self.lost),
+            lost=self.numbers.lost,
         )
 
 

@@ -153,6 +153,7 @@ async def test_what_never_came_is_counted_by_the_numbers_of_what_did() -> None:
     assert arrives(1, 5, 6, 7) == 0, "who comes late has lost nothing"
     assert arrives(1, 10) == 2
     assert arrives(1, 9) == 1, "it was only late"
+    assert arrives(1, 9, 10, 7) == 1, "these came again"
     assert arrives(2, 0, 1, 3) == 2, "another producer counts anew"
     transport.deliver(NUMBERS.name, b"", encode_message(number(0)))
     assert mailbox.statistics()[0].lost == 2, "a foreign program numbers nothing"
