@@ -49,6 +49,8 @@ class ServiceConfig:
     spawned: tuple[str, ...] = ("optimizer",)  # in processes of their own: gtsam holds the GIL
     drain_s: float = 10.0  # a soft stop waits so long for each stage to finish what it has
     silent_after_s: float = 10.0  # a process without a heartbeat for so long is killed
+    sync_state: bool = False  # a step is on the disk before it is told: a power cut costs what a
+    # kill does, and each step three syncs, 12 ms on a virtual disk. False: it may cost the state
     control_timeout_s: float = 10.0  # for each actor to obey; the slowest step measured is 0.6 s
     keys: str = ""  # folder that `ldo keys add` made, for TLS; --keys names another
     max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped; a 4K frame can have 58 MB

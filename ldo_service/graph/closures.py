@@ -25,7 +25,7 @@ class ClosuresConfig:
     most_sigmas: float = 3.0  # of a residual that stays, in any direction (RTAB-Map's guard)
     rivals: int = 3  # earlier closures that may leave in place of a new one, the least fitting
     most: int = (
-        500  # believed at a time: each is 1 kB, and one more to solve with; then the one goes
+        500  # believed at a time, 1 kB each and one more to solve with; beyond, the one goes
     )
     # that another is nearest to
     remembered: int = 256  # refused ones, and ones that left, to tell

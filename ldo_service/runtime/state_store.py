@@ -5,6 +5,7 @@ not be changed afterwards.
 """
 
 import logging
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -56,12 +57,11 @@ class FolderStore:
 
     Each part has a file, and `contents.msgpack` names the files that belong together. A new part
     goes to a new file and the contents change last, in one rename: a reader finds the whole old
-    state or the whole new one. Not synced to the disk at each step: a power cut may cost the last
-    seconds.
+    state or the whole new one. `syncs`: after a power cut too; otherwise that may cost it.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, *, syncs: bool = False) -> None:
+        self._folder, self._syncs = folder, syncs
         self._saved: dict[str, State] = {}
         self._files: dict[str, dict[str, str]] = {}  # by actor: part to file
 
@@ -79,13 +79,25 @@ class FolderStore:
         for part, value in state.items():
             if part not in saved or saved[part] is not value:
                 new[part] = f"{part}.b" if old.get(part) == f"{part}.a" else f"{part}.a"
-                (folder / new[part]).write_bytes(encode_state(value))
+                self._write(folder / new[part], encode_state(value))
         new = {part: new[part] for part in state}
         if new != old:
-            _write_contents(folder, new)
+            self._write_contents(folder, new)
         for file in set(old.values()) - set(new.values()):
             (folder / file).unlink(missing_ok=True)
         self._saved[actor], self._files[actor] = dict(state), new
+
+    def _write_contents(self, folder: Path, files: Mapping[str, str]) -> None:
+        temporary = folder / f"{CONTENTS}.new"
+        self._write(temporary, msgspec.msgpack.encode(files))
+        temporary.rename(folder / CONTENTS)
+        if self._syncs:
+            sync(folder)
+
+    def _write(self, path: Path, body: bytes) -> None:
+        path.write_bytes(body)
+        if self._syncs:
+            sync(path)
 
     def load(self, actor: str) -> State | None:
         """None when nothing was saved, or what was saved cannot be read: said in the log, and
@@ -139,10 +151,13 @@ def _read_contents_or_nothing(folder: Path) -> dict[str, str]:
         return {}
 
 
-def _write_contents(folder: Path, files: Mapping[str, str]) -> None:
-    temporary = folder / f"{CONTENTS}.new"
-    temporary.write_bytes(msgspec.msgpack.encode(files))
-    temporary.rename(folder / CONTENTS)
+def sync(path: Path) -> None:
+    """Return when a file, or the names in a folder, are on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
 
 
 def encode_state(value: object) -> bytes:

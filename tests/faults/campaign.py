@@ -244,7 +244,7 @@ class Batch:
         life.wait("the graph has them all", lambda: set(witness.made) <= witness.placed)
         witness.violations += witness.repeated()
         saved = self._saved_and_told()
-        self._same_keyframes("the mapper", saved["map"]["views"]["keyframes"])
+        self._same_keyframes("the mapper", saved["map"]["views"]["placed"].tolist())
         self._same_map("a follower", saved, witness.follower)
         self._same_map("who joined late", saved, witness.late)
         witness.join_late(life.client.last(MAP_SNAPSHOT, 10))

@@ -150,3 +150,26 @@ def test_a_missing_file_is_left_out_and_said(
 def test_what_is_no_plain_value_is_refused(tmp_path: Path, value: Any) -> None:
     with pytest.raises((NotImplementedError, TypeError)):
         FolderStore(tmp_path).save("mapper", {"strange": value})
+
+
+def test_what_must_outlive_a_power_cut_is_synced_before_it_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And nothing of the old state goes before the new one's name is on the disk."""
+    synced: list[tuple[str, list[str]]] = []
+    folder, sync = tmp_path / "mapper", state_store.sync
+
+    def noted(path: Path) -> None:
+        sync(path)
+        synced.append((path.name, sorted(file.name for file in folder.iterdir())))
+
+    monkeypatch.setattr(state_store, "sync", noted)
+    store, same = FolderStore(tmp_path, syncs=True), [0]
+    for step in (1, 2):
+        synced.clear()
+        store.save("mapper", {"same": same, "step": [step]})
+    contents, new = state_store.CONTENTS, f"{state_store.CONTENTS}.new"
+    assert [name for name, _ in synced] == ["step.b", new, "mapper"]
+    assert new in synced[1][1]
+    assert synced[2][1] == [contents, "same.a", "step.a", "step.b"]
+    assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
