@@ -29,7 +29,16 @@ from ldo_service.schemas import CameraRgbd, Health
 from ldo_service.schemas.topics import MAP_SNAPSHOT
 
 from .camera import Streaming, frames
-from .life import ACTORS, ALL_APART, Life, NotRecovered, arrays_of, difference, followed
+from .life import (
+    ACTORS,
+    ALL_APART,
+    Life,
+    NotRecovered,
+    Shown,
+    arrays_of,
+    difference,
+    saved_objects,
+)
 from .witness import TAKERS, Witness
 
 RATE_HZ = 5.0
@@ -49,6 +58,7 @@ class Outcome:
     pose_s: float = 0.0  # from the fault until a pose is OK
     recovered_s: float = 0.0  # and until everybody reports and has handled a new keyframe
     keyframes: int = 0
+    objects: int = 0
     violations: list[str] = field(default_factory=list)
 
 
@@ -61,6 +71,7 @@ class Batch:
         self.life = Life(folder, self.witness, settings)
         self.camera = Streaming(scene, RATE_HZ)
         self.compared = 0  # maps of followers with the mapper's
+        self.objects = 0  # in the map
         self._killed: set[int] = set()  # processes
         self._now()
 
@@ -89,7 +100,7 @@ class Batch:
         except NotRecovered as error:
             self.witness.violations.append(f"{error}\n{self.life.tail()}")
             self._begin_again()
-        outcome.keyframes = len(self.witness.made)
+        outcome.keyframes, outcome.objects = len(self.witness.made), self.objects
         outcome.violations, self.witness.violations = self.witness.violations, []
         return outcome
 
@@ -191,7 +202,7 @@ class Batch:
         if self.life.process.poll() is None:
             self.life.kill()
         self.life.close()
-        expected = self.life.expected_map()
+        expected = self.life.expected()
         self.camera.skip(self.rng.randrange(8))
         self.life.start()
         if expected is not None:
@@ -245,6 +256,7 @@ class Batch:
         witness.violations += witness.repeated()
         saved = self._saved_and_told()
         self._same_keyframes("the mapper", saved["map"]["views"]["placed"].tolist())
+        self._same_objects(saved)
         self._same_map("a follower", saved, witness.follower)
         self._same_map("who joined late", saved, witness.late)
         witness.join_late(life.client.last(MAP_SNAPSHOT, 10))
@@ -295,19 +307,31 @@ class Batch:
         if what := difference(saved["map"]["map"], arrays_of(follower)):
             self.witness.violations.append(f"the map of {whose} has other {what}")
 
-    def _must_show(self, expected: MapFollower) -> None:
-        self.life.wait("the map is shown", self._shown)
-        if what := difference(arrays_of(expected), arrays_of(followed(self._shown()))):
+    def _must_show(self, expected: Shown) -> None:
+        self.life.wait("the map is shown", lambda: self._is_shown(expected))
+        shown = self.life.told()
+        assert shown is not None
+        if what := difference(arrays_of(expected.map), arrays_of(shown.map)):
             self.witness.violations.append(f"the map after the restart has other {what}")
+        if expected.objects != shown.objects:
+            self.witness.violations.append("the map after the restart has other objects")
 
-    def _shown(self) -> list[Any]:
-        return self.life.client.last(MAP_SNAPSHOT, 10)
+    def _is_shown(self, expected: Shown) -> bool:
+        """Objects are told after the map."""
+        shown = self.life.told()
+        return shown is not None and len(shown.objects) >= len(expected.objects)
 
     def _same_keyframes(self, whose: str, keyframes: list[int]) -> None:
         if lost := set(self.witness.made) - set(keyframes):
             self.witness.violations.append(f"{whose} lost keyframes {sorted(lost)}")
         if len(set(keyframes)) < len(keyframes):
             self.witness.violations.append(f"{whose} has a keyframe twice")
+
+    def _same_objects(self, saved: dict[str, Any]) -> None:
+        told, on_disk = self.life.told(), saved_objects(saved)
+        if told is None or told.objects != on_disk:
+            self.witness.violations.append("other objects are told than saved")
+        self.objects = len(on_disk)
 
 
 def _is_idle(health: Health) -> bool:
@@ -361,7 +385,7 @@ def summary_of(outcome: Outcome) -> str:
     return (
         f"batch {outcome.batch} fault {outcome.number:2d}  {outcome.kind:13s} {outcome.what:28s} "
         f"pose {outcome.pose_s:5.1f} s, all {outcome.recovered_s:5.1f} s, "
-        f"{outcome.keyframes} keyframes  {said}"
+        f"{outcome.keyframes} keyframes, {outcome.objects} objects  {said}"
     )
 
 

@@ -10,6 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -21,12 +22,16 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
+from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.map_follower import MapFollower
 from ldo_service.runtime.ledger import Past, successor
 from ldo_service.runtime.network import Network
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.zenoh_transport import open_session
-from ldo_service.schemas import MapSnapshot
+from ldo_service.schemas import MapObject, MapObjects, MapSnapshot
+from ldo_service.schemas.topics import MAP_OBJECTS, MAP_SNAPSHOT
+from ldo_service.semantics.semantic_map import SemanticMap
+from ldo_service.wire import map_objects
 
 from .witness import Witness
 
@@ -37,11 +42,31 @@ ALL_APART = f"service.spawned=[{','.join(ACTORS)}]"
 LIGHT = (  # what is tested is the runtime: little work for each keyframe, and little patience
     *("mapper.iterations=2", "mapper.threads=1", "stage.stall_after_s=4", "stage.heartbeat_s=0.25"),
     *("service.silent_after_s=5", "stage.max_restarts=1000", "service.drain_s=60"),
+    "detector.model=demo",  # finds some objects in the room
 )
 
 
 class NotRecovered(Exception):
     pass
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a service shows of its map."""
+
+    map: MapFollower
+    objects: tuple[MapObject, ...]
+
+    @classmethod
+    def of(cls, messages: Iterable[Any]) -> "Shown | None":
+        """None where there is no map."""
+        follower, objects = MapFollower(), ()
+        for message in messages:
+            if isinstance(message, MapObjects):
+                objects = message.objects
+            else:
+                follower.take(message)
+        return cls(follower, objects) if follower.version else None
 
 
 class Life:
@@ -135,7 +160,12 @@ class Life:
         assert state is not None
         return state["map"]
 
-    def expected_map(self) -> MapFollower | None:
+    def told(self) -> Shown | None:
+        """What who joins now is told."""
+        topics = MAP_SNAPSHOT, MAP_OBJECTS
+        return Shown.of(message for topic in topics for message in self.client.last(topic, 10))
+
+    def expected(self) -> Shown | None:
         """What a service must show that goes on from the state on the disk: its checkpoint, with
         what was taken since handled again in this process. None before the first keyframe."""
         past = Past.of(FolderStore(self.state / "state").load("mapper"))
@@ -149,16 +179,15 @@ class Life:
         def make() -> Mapper:
             return Mapper(config.mapper)
 
-        mapper = successor(make(), past, make)
-        snapshot = [m for m in mapper.resumed() if isinstance(m, MapSnapshot)]
-        return followed(snapshot) if snapshot else None
+        said = successor(make(), past, make).resumed()
+        return Shown.of(m for m in said if isinstance(m, MapSnapshot | MapObjects))
 
 
-def followed(parts: Iterable[Any]) -> MapFollower:
-    follower = MapFollower()
-    for part in parts:
-        follower.take(part)
-    return follower
+def saved_objects(state: Mapping[str, Any]) -> tuple[MapObject, ...]:
+    """Of the mapper's checkpoint."""
+    semantics = SemanticMap(MapBuilder())
+    semantics.restore(state["semantics"])
+    return map_objects(semantics.objects.landmarks, semantics.names)
 
 
 def arrays_of(follower: MapFollower) -> dict[str, np.ndarray]:
