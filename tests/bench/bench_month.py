@@ -1,6 +1,7 @@
 """What grows with keyframes, and whose it is: a camera that goes to and fro in a room, without end.
 
-    python -m tests.bench.bench_month [--keyframes 3000] [--set actor.field=value ...]
+    python -m tests.bench.bench_month [--keyframes 3000] [--csv FILE] [--set actor.field=value ...]
+    python -m tests.bench.bench_month --plot PNG --beside OLD.csv NEW.csv
 
 All actors on the logical clock at 160x120. After each to and fro each actor is walked through,
 attribute by attribute, and its state is encoded as it is saved. Told are bytes per keyframe over
@@ -9,13 +10,16 @@ grew by beyond what was found: gtsam, allocators, fragments.
 """
 
 import argparse
+import csv
 import ctypes
 import gc
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from types import FunctionType, MethodType, ModuleType
 
+import cv2
 import msgspec
 import numpy as np
 
@@ -120,7 +124,7 @@ def journey(keyframes: int, settings: list[str]) -> Iterator[Sample]:
         made += isinstance(message, Keyframe)
 
     for actor in actors:
-        actor.handle = keeping(actor)
+        keep_state(actor)
     with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
         while made < keyframes:
             for _tick in clock.run(lap(scene, laps)):
@@ -129,8 +133,8 @@ def journey(keyframes: int, settings: list[str]) -> Iterator[Sample]:
             yield sample(actors, made)
 
 
-def keeping(actor: Actor) -> Callable[[Message], Iterator[Message]]:
-    """Its handler, which asks for its state after each message as a stage does: it may be kept."""
+def keep_state(actor: Actor) -> None:
+    """Ask for its state after each message, as a stage does: it may be kept."""
     handle = actor.handle
 
     def handled(message: Message) -> Iterator[Message]:
@@ -138,7 +142,7 @@ def keeping(actor: Actor) -> Callable[[Message], Iterator[Message]]:
         actor.snapshot()
         actor.saved()
 
-    return handled
+    actor.handle = handled
 
 
 def sample(actors: list[Actor], keyframes: int) -> Sample:
@@ -176,11 +180,52 @@ def report(samples: list[Sample]) -> None:
     print(f"| resident, and unseen {resident - sum(held.values()):.0f} | {resident:.0f} | |")
 
 
+# --- beside each other ----------------------------------------------------------------------------
+WIDTH, HEIGHT, MARGIN = 640, 260, 50
+COLORS = ((200, 80, 40), (31, 111, 235), (40, 140, 60))  # RGB, one a file
+
+
+def save(path: Path, samples: list[Sample]) -> None:
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(("keyframes", "found_mb", "resident_mb"))
+        for one in samples:
+            rows.writerow((one.keyframes, sum(one.held.values()) / 1e6, one.resident / 1e6))
+
+
+def plot(files: list[Path]) -> np.ndarray:
+    """What was found in memory over keyframes, a line a file."""
+    image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+    runs = [np.loadtxt(path, delimiter=",", skiprows=1) for path in files]
+    most = np.max([run.max(axis=0) for run in runs], axis=0)
+    size = np.array([WIDTH - 2 * MARGIN, -(HEIGHT - 2 * MARGIN)])
+    for number, (path, run) in enumerate(zip(files, runs, strict=True)):
+        points = (MARGIN, HEIGHT - MARGIN) + size * run[:, :2] / most[:2]
+        color, line = COLORS[number], points.round().astype(np.int32).reshape(-1, 1, 2)
+        cv2.polylines(image, [line], False, color, 1, cv2.LINE_AA)
+        write(image, path.stem, (MARGIN + 120 * number, HEIGHT - 12), color)
+    write(image, f"MB held by the actors, 0 to {most[1]:.0f}", (MARGIN, 24))
+    write(image, f"{most[0]:.0f} keyframes", (WIDTH - 140, HEIGHT - 34))
+    return image
+
+
+def write(
+    image: np.ndarray, text: str, at: tuple[int, int], color: tuple[int, int, int] = (60, 60, 60)
+) -> None:
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--keyframes", type=int, default=3000)
     parser.add_argument("--set", nargs="+", default=[], help="as `ldo serve` has it")
+    parser.add_argument("--csv", type=Path)
+    parser.add_argument("--plot", type=Path)
+    parser.add_argument("--beside", type=Path, nargs="+", default=[], help="CSV files")
     arguments = parser.parse_args()
+    if arguments.plot:
+        cv2.imwrite(str(arguments.plot), plot(arguments.beside)[..., ::-1])
+        return
     samples: list[Sample] = []
     for one in journey(arguments.keyframes, arguments.set):
         samples.append(one)
@@ -192,6 +237,8 @@ def main() -> None:
             flush=True,
         )
     report(samples)
+    if arguments.csv:
+        save(arguments.csv, samples)
 
 
 if __name__ == "__main__":
