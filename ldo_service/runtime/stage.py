@@ -4,13 +4,10 @@ import asyncio
 import logging
 import secrets
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 
-import msgspec
-
-from ldo_service.errors import ConfigError, StageStalled
-from ldo_service.schemas import Health, Message, decode, encode
-from ldo_service.schemas.topics import HEALTH, Topic
+from ldo_service.errors import StageStalled
+from ldo_service.schemas import Health, Message, encode
+from ldo_service.schemas.topics import HEALTH
 
 from . import links
 from .actor import Actor, Situation, State
@@ -23,7 +20,9 @@ from .orders import Order, OrderTaker
 from .outlet import Outlet
 from .outlets import Outlets
 from .ports import Lossless
+from .reader import Reader
 from .restart import RestartBudget
+from .stage_config import StageConfig
 from .state_store import MemoryStore, StateStore
 from .step import Produced, produce
 from .transport import Transport
@@ -31,28 +30,6 @@ from .vitals import Vitals
 from .worker import Worker
 
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class StageConfig:
-    """How patient the runtime is with an actor."""
-
-    max_restarts: int = 5  # within restart_window_s; more is a fault that a restart does not cure
-    restart_window_s: float = 60.0
-    restart_delay_s: float = 0.05  # doubled with each failure in the window
-    restart_delay_max_s: float = 5.0
-    heartbeat_s: float = 0.5  # a stopped process shows within two of these
-    stall_after_s: float = 60.0  # 100x the slowest step measured (mapper, 1.5 M Gaussians)
-    evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
-    max_message_mb: float = 64.0  # larger ones are not decoded: raw colour and depth of 8 MP are 58
-
-    def __post_init__(self) -> None:
-        times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
-        if (
-            min(*times, self.max_message_mb) <= 0
-            or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
-        ):
-            raise ConfigError(f"{self}: counts and times must be positive.")
 
 
 class LeftUnsaved(Exception):
@@ -80,13 +57,14 @@ class Stage:
         make: Callable[[], Actor],
         transport: Transport,
         *,
-        config: StageConfig = StageConfig(),
+        config: StageConfig | None = None,
         store: StateStore | None = None,
         expected: Mapping[str, frozenset[str]] | None = None,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         journal: Journal | None = None,
     ) -> None:
-        self._make, self._transport, self._config = make, transport, config
+        self._make, self._transport = make, transport
+        self._config = config = config or StageConfig()
         self._keeper = Keeper(store or MemoryStore())
         self._expected = expected or {}
         self._on_evicted = on_evicted
@@ -104,7 +82,7 @@ class Stage:
         )
         self._drain_requested = False
         self._mailbox: Mailbox | None = None
-        self._rejecting: set[Topic] = set()  # topics whose last message could not be decoded
+        self._reader = Reader(self.name)
         self._outlets = Outlets()
 
     # --- life -----------------------------------------------------------------------------------
@@ -211,26 +189,11 @@ class Stage:
         if isinstance(delivery, Order):
             await self._obey(delivery, mailbox)
             return
-        message = self._decode(delivery)
+        message = self._reader.message_of(delivery)
         if message is not None:
             self._journal.took(delivery, message.stamp_ns)
             await self._step(message, delivery)
         mailbox.done(delivery, rejected=message is None)
-
-    def _decode(self, delivery: Delivery) -> Message | None:
-        topic, header = delivery.port.topic, delivery.header
-        try:
-            message = decode(delivery.body, topic.message)
-        except msgspec.DecodeError as error:
-            if topic not in self._rejecting:
-                log.warning(
-                    "%s: %s #%d from %s rejected: %s. Those that follow are counted.",
-                    self.name, topic.name, header.seq, header.source, error,
-                )  # fmt: skip
-            self._rejecting.add(topic)
-            return None
-        self._rejecting.discard(topic)
-        return message
 
     async def _step(self, message: Message, delivery: Delivery) -> None:
         for _attempt in range(2):

@@ -1,0 +1,25 @@
+"""How patient the runtime is with an actor."""
+
+from dataclasses import dataclass
+
+from ldo_service.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class StageConfig:
+    max_restarts: int = 5  # within restart_window_s; more is a fault that a restart does not cure
+    restart_window_s: float = 60.0
+    restart_delay_s: float = 0.05  # doubled with each failure in the window
+    restart_delay_max_s: float = 5.0
+    heartbeat_s: float = 0.5  # a stopped process shows within two of these
+    stall_after_s: float = 60.0  # 100x the slowest step measured (mapper, 1.5 M Gaussians)
+    evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
+    max_message_mb: float = 64.0  # larger ones are not decoded: raw colour and depth of 8 MP are 58
+
+    def __post_init__(self) -> None:
+        times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
+        if (
+            min(*times, self.max_message_mb) <= 0
+            or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
+        ):
+            raise ConfigError(f"{self}: counts and times must be positive.")
