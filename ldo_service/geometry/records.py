@@ -55,8 +55,16 @@ class Records:
         if self._count == len(self._room):
             more = np.zeros(max(LEAST_ROOM, int((GROWTH - 1) * self._count)), self._room.dtype)
             self._room = np.concatenate([self._room, more])
-        self._room[row + 1 : self._count + 1] = self._room[row : self._count].copy()
+        self._room[row + 1 : self._count + 1] = self._room[row : self._count]
         self._count += 1
+
+    def remove(self, id_: int) -> None:
+        """Raises KeyError when it is not known."""
+        row = self.row(id_)
+        if row is None:
+            raise KeyError(id_)
+        self._room[row : self._count - 1] = self._room[row + 1 : self._count]
+        self._count -= 1
 
     def keep_only(self, ids: Iterable[int]) -> None:
         self.become(self.all[np.sort(np.unique(self.rows(ids)))])
@@ -96,7 +104,7 @@ class PoseTable(MutableMapping[int, np.ndarray]):
         self._records.put(id_, T)
 
     def __delitem__(self, id_: int) -> None:
-        self._records.keep_only(id for id in self._records.ids.tolist() if id != id_)
+        self._records.remove(id_)
 
     def __iter__(self) -> Iterator[int]:
         return iter(self._records.ids.tolist())

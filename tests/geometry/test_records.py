@@ -1,8 +1,9 @@
 """Records are found by id, whatever the order they came in."""
 
 import numpy as np
+import pytest
 
-from ldo_service.geometry.records import LEAST_ROOM, Records
+from ldo_service.geometry.records import LEAST_ROOM, PoseTable, Records
 
 NUMBER = np.dtype([("id", np.int64), ("value", float)])
 
@@ -35,6 +36,25 @@ def test_what_is_not_kept_is_forgotten_and_can_come_again() -> None:
     made.keep_only([9, 3, 7])
     made.put(5, 0.0)
     assert made.all.tolist() == [(3, 1.5), (5, 0.0), (9, 4.5)]
+
+
+def test_poses_are_what_a_dict_would_hold() -> None:
+    rng = np.random.default_rng(1)
+    table, twin = PoseTable(), dict[int, np.ndarray]()
+    for id_ in rng.integers(0, 300, size=500).tolist():
+        if id_ in twin and id_ % 3:
+            del table[id_], twin[id_]
+        else:
+            table[id_] = twin[id_] = rng.normal(size=(4, 4))
+    assert list(table) == sorted(twin)
+    np.testing.assert_array_equal(table.of(twin), list(twin.values()))
+    copy = PoseTable()
+    copy.become(table, table.of(table))
+    assert all(copy[id_].tobytes() == twin[id_].tobytes() for id_ in table)
+    with pytest.raises(KeyError):
+        del table[1000]
+    with pytest.raises(KeyError):
+        table[1000]
 
 
 def test_a_fifth_of_the_room_is_empty_at_most() -> None:
