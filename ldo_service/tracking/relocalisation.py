@@ -20,7 +20,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
 from .align import AlignConfig
-from .candidates import Candidate, attempt
+from .candidates import Candidate, apart_rad, attempt
 from .features import (
     FeatureConfig,
     FeaturePose,
@@ -147,14 +147,11 @@ class Relocaliser:
         return None
 
     def _is_sure(self, candidate: Candidate, guess: np.ndarray, history: History) -> bool:
-        alignment = candidate.alignment
-        difference = se3.inverse(guess) @ alignment.T_reference_camera
-        verdict = judge(candidate, history, Status.LOST, self.judgement)
-        return (
-            verdict is Status.OK
-            and alignment.geometric_inliers >= self.config.min_geometric_inliers
-            and extent(difference, candidate.median_depth_m) < self.config.agreement_rad
-        )
+        agrees = apart_rad(candidate, guess) < self.config.agreement_rad
+        witnessed = replace(candidate, second_agrees=agrees)
+        verdict = judge(witnessed, history, Status.LOST, self.judgement)
+        inliers = candidate.alignment.geometric_inliers
+        return verdict is Status.OK and inliers >= self.config.min_geometric_inliers
 
     def _has_rival(self, place: Place, pose: FeaturePose, poses: Iterable[PosedPlace]) -> bool:
         """Whether another place explains the view nearly as well, from far elsewhere."""

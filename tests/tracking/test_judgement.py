@@ -95,6 +95,12 @@ def test_only_ok_leads_back_from_a_loss() -> None:
     assert verdict(Status.LOST, overlap=0.4) is Status.OK
 
 
+def test_a_find_that_features_agree_with_may_show_less() -> None:
+    assert verdict(Status.LOST, agree=True, overlap=0.2) is Status.OK
+    assert verdict(Status.LOST, agree=True, overlap=0.16) is Status.LOST
+    assert verdict(Status.LOST, agree=False, overlap=0.4) is Status.LOST
+
+
 def test_a_place_found_from_afar_may_fit_worse_than_one_found_where_it_was_seen() -> None:
     afar = np.eye(4)
     afar[0, 3] = 0.4 * MEDIAN_DEPTH_M  # 0.4 rad of parallax
