@@ -8,6 +8,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
+from ldo_service.gaussians.render import Contributions
 from ldo_service.gaussians.views import View
 
 from .association import MapView
@@ -131,9 +132,8 @@ class SemanticMap:
             return None
         # who may walk away
         found = found and self._without_movable(keyframe, found)
-        view = _of_map(self._map.views[keyframe])
         # who makes its image
-        made_by = self._map.made_by(keyframe)
+        view, made_by = self._seen(keyframe)
         # what is said of it, and what is to be asked
         claims, asked = self._with_names(view, made_by.top, found or NOTHING)
         # what they are
@@ -143,6 +143,16 @@ class SemanticMap:
         # which objects they are
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims.boxes)
         return Learnt(keyframe, self.objects.observe(seen, self._spared()), asked)
+
+    def _seen(self, keyframe: int) -> tuple[View, Contributions]:
+        """A keyframe, and who makes its image. Where depth is missing, as on what is dark, it is
+        the map's, which other keyframes measured; what was left out of the map has none."""
+        made_by, view = self._map.made_by(keyframe), self._map.views[keyframe]
+        in_map_m = self._map.shown(keyframe).median_depth_m
+        depth_m = np.where(view.depth_m > 0, view.depth_m, in_map_m)
+        if view.mask is not None:
+            depth_m *= view.mask > 0
+        return replace(view, depth_m=depth_m), made_by
 
     def _without_movable(self, keyframe: int, found: Claims) -> Claims:
         """What may walk away belongs to no map: neither its surface nor its name."""
@@ -222,8 +232,8 @@ class SemanticMap:
             self._answers_without_images += 1
             return False
         self._by_labeller.update(claims.open_labels.tolist())
-        view, indices = _of_map(self._map.views[keyframe]), self._map.made_by(keyframe).indices
-        self._label(view, indices, claims, is_late=True)
+        view, made_by = self._seen(keyframe)
+        self._label(view, made_by.indices, claims, is_late=True)
         self.refresh(view)
         return True
 
@@ -280,13 +290,6 @@ class SemanticMap:
             **(self.naming.statistics() if self.naming else {}),
             "answers_without_images": self._answers_without_images,  # of keyframes forgotten
         }
-
-
-def _of_map(view: View) -> View:
-    """Without the depth of what was left out of the map."""
-    if view.mask is None:
-        return view
-    return replace(view, depth_m=view.depth_m * (view.mask > 0))
 
 
 def _packed(claims: Claims | None) -> list[np.ndarray]:

@@ -72,6 +72,21 @@ def test_what_is_in_a_box_gets_its_label_and_the_rest_does_not(posed) -> None:
     assert semantics.statistics()["label_disagreement_literal"] > 0
 
 
+def test_where_depth_is_missing_the_map_knows_it(posed) -> None:
+    """A dark screen that the second keyframe did not measure is labelled all the same."""
+    frame, T_map_camera = posed[0]
+    dark = frame.depth_m.copy()
+    dark[5:56, 5:41] = 0
+    builder = built([posed[0], (replace(frame, depth_m=dark), T_map_camera)])
+    semantics = SemanticMap(builder, BY_BOX)
+    semantics.claim(1, claims())
+    p_camera = se3.transform(se3.inverse(T_map_camera), builder.gaussians.means)
+    u, v = frame.camera.project(p_camera).T
+    inside = (u > 7) & (u < 38) & (v > 7) & (v < 53)
+    # what lies behind a rendered edge is off by more than the depth test allows
+    assert np.mean(top_labels(builder.gaussians.labels)[inside] == CHAIR) > 0.6
+
+
 def test_boxes_may_come_before_their_keyframe(posed) -> None:
     usual = [("map", 0), ("box", 0), ("map", 1), ("box", 1)]
     early = [("box", 0), ("map", 0), ("box", 1), ("map", 1)]
