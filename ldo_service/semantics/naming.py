@@ -1,12 +1,12 @@
 """What an open-vocabulary labeller is asked, and what its answers are about (paper, III.B).
 
 An answer comes late. It speaks of the pixels that a keyframe showed of a region, so these are kept
-until then; and it stays with the region: where a later keyframe shows that again, the labeller has
-the same opinion of it.
+until then; and it stays with the region, as a vote for its name beside those of the detector's
+boxes: where a later keyframe shows that again, it still has the name.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from .foreground import Foreground
 from .labelling import Claims
 from .regions_to_name import Answer, Opinion, Question, RegionConfig, RegionsToName
 from .segments import segments
-from .trigger import TriggerConfig, candidates, named_objects, regions_of_image
+from .trigger import Candidate, TriggerConfig, candidates, named_objects, regions_of_image
 from .vocabulary import Vocabulary
 
 
@@ -41,13 +41,10 @@ class NamingConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Asked:
-    """What a question was about: a part of a box in a keyframe, where it was in that camera's frame
-    [3] and how large, and the detector's word on it."""
+    """What a question was about: a part of a box in a keyframe, and the detector's word on it."""
 
     box_px: np.ndarray
     part: Foreground
-    p_camera: np.ndarray
-    size_m: float
     label: str
     score: float
 
@@ -61,6 +58,7 @@ class Naming:
         self._regions = RegionsToName(self.config.regions)
         self._open: dict[tuple[int, int], Asked] = {}  # by region and keyframe, the oldest first
         self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
+        self._outvoted = 0
 
     # --- questions --------------------------------------------------------------------------------
     def see(
@@ -93,13 +91,13 @@ class Naming:
         )
         for question in sightings.questions:
             self._remember(question)
+        claims = replace(claims, parts=fitting_parts(len(claims.boxes), doubtful))
         return with_opinions(claims, sightings.opinions, vocabulary), sightings.questions
 
     def _remember(self, question: Question) -> None:
         region, of = question.region, question.candidate
         self._questions += 1
-        place = region.p_camera, region.size_m
-        asked = Asked(of.box_px, of.part, *place, of.label, of.score)
+        asked = Asked(of.box_px, of.part, of.label, of.score)
         self._open[region.id, region.keyframe] = asked
         while len(self._open) > self.config.most_open:
             del self._open[next(iter(self._open))]
@@ -119,12 +117,14 @@ class Naming:
             confidence >= self.config.least_sure or bool(asked.label)
         )
         name = label if is_told else ""
-        answer = Answer(name, confidence, keyframe, asked.p_camera, asked.size_m)
-        self._regions.answered(region, answer)
+        known_as = self._regions.answered(region, Answer(name, confidence))
         is_name = bool(name) and confidence > 0
         self._named += is_name
         self._unnamed += not is_name
         if not is_name:
+            return None
+        if known_as != name:
+            self._outvoted += 1
             return None
         said = vocabulary.index(name)
         return Claims(
@@ -163,17 +163,30 @@ class Naming:
             "questions_overdue": self._overdue,  # given up for newer ones
             "answers_named": self._named,
             "answers_unnamed": self._unnamed,  # no opinion, or nobody could look
+            "answers_outvoted": self._outvoted,  # boxes of the region say otherwise
             "answers_unknown": self._unknown,  # to questions given up, or said again
         }
 
 
+def fitting_parts(boxes: int, found: Sequence[Candidate]) -> tuple[Foreground | None, ...]:
+    """Of each box of the detector the thing that depth and creases set apart there, or None where
+    none fits. What colour sets apart has the rim of what it lies on."""
+    parts: list[Foreground | None] = [None] * boxes
+    for one in found:
+        if one.number is not None and one.kind not in ("", "flat"):
+            parts[one.number] = one.part
+    return tuple(parts)
+
+
 def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocabulary) -> Claims:
-    """Claims of a detector with what a labeller said before of the same regions: of a box of the
-    detector beside its label, of other regions alone."""
+    """Claims of a detector with the names of the same regions: of a box of the detector in place of
+    its label, which has a vote in the name, of other regions alone."""
     labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
+    by_detector, parts = claims.confidences.copy(), claims.parts or (None,) * len(claims.boxes)
     for opinion in opinions:
         if (number := opinion.of.number) is not None:
             labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
+            by_detector[number] = 0  # its word is a part of the opinion
     alone = [
         opinion
         for opinion in opinions
@@ -184,10 +197,10 @@ def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocab
     return Claims(
         np.concatenate([claims.boxes, boxes]),
         np.concatenate([claims.labels, said]),
-        np.concatenate([claims.confidences, np.zeros(len(alone), np.float32)]),
+        np.concatenate([by_detector, np.zeros(len(alone), np.float32)]),
         np.concatenate([labels, said]),
         np.concatenate([confidences, np.array([one.sure for one in alone], np.float32)]),
-        (*[None] * len(claims.boxes), *[opinion.of.part for opinion in alone]),
+        (*parts, *[opinion.of.part for opinion in alone]),
     )
 
 
@@ -209,8 +222,7 @@ def _area_px(box_px: np.ndarray) -> float:
 
 
 def _packed(asked: Asked) -> list[Any]:
-    seen = asked.p_camera, asked.size_m, asked.label, asked.score
-    return [asked.box_px, *asked.part.packed, *seen]
+    return [asked.box_px, *asked.part.packed, asked.label, asked.score]
 
 
 def _unpacked(box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any) -> Asked:

@@ -1,7 +1,8 @@
 """Regions that nobody has a name for, followed over keyframes until a labeller can be asked.
 
-A region is where it is: two sightings are of the same one when their middles are nearer than half
-its size, and they are about as large. Each keeps its best views, and what the labeller said of it.
+Two sightings are of the same region when most of what each shows of the other lies in it (see
+`same_region`). Each keeps its best views, and what was said of it: it has the name that most speaks
+for, be it the detector's boxes or the labeller's answers.
 
 A region is asked about once, when no better view of it has come for a while, and as it was at its
 best. Most regions are no things but parts and shadows of them; so there is a budget, and what has
@@ -15,10 +16,20 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import Camera
+from ldo_service.geometry import Camera, se3
 
 from .region_views import RegionView, ViewConfig, region_view
-from .regions import Answer, Region, Sighting, in_map, moved, packed, sighting_of, unpacked
+from .regions import (
+    Answer,
+    Region,
+    Sighting,
+    packed,
+    seen_again,
+    sighting_of,
+    unpacked,
+    with_vote,
+)
+from .same_region import Projected, projected, share_back
 from .trigger import Candidate
 
 
@@ -28,15 +39,17 @@ class RegionConfig:
     views_first: int = 2  # before it is asked at all: a single glimpse may be a flaw of depth
     patience: int = 3  # keyframes without a better view, before it is asked: one may yet come
     most_questions: int = 3  # about a region
-    per_keyframe: float = 0.7  # questions, of all that are due those with most to show: the paper
-    # asks on 10-25 % of the frames (IV.B.8); twice as many regions are no things
+    per_keyframe: float = 1.5  # questions, of all that are due those with most to show: half are
+    # about no things. The paper asks on 10-25 % of the frames (IV.B.8): 0.3 here
     at_once: int = 4  # questions saved up while there was nothing to ask
     gain: float = 1.3  # of the views' summed quality, before it is asked again
     settled: float = 0.6  # of an answer that needs no second one
-    near: float = 0.5  # of its size, between two sightings of a region
+    answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's
+    least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
+    overlap: float = 0.6  # of what two sightings show of each other, to be of the same region
+    max_gap_m: float = 0.1  # of depth, from a point to what is seen there (delta_z, III.A)
+    least_points: int = 12  # that one sees of the other
     least_quality: float = 0.02  # of a view: worse ones show a labeller nothing
-    alike: float = 0.6  # its size of another sighting's, or the other way round, to be the same:
-    # what stands on a table is near its middle
     most: int = 1024  # regions, some 10 kB each; the one not seen for longest is forgotten
     view: ViewConfig = field(default_factory=ViewConfig)
 
@@ -45,10 +58,10 @@ class RegionConfig:
             raise ConfigError(f"{self}: counts must be at least 1.")
         if self.patience < 0 or self.per_keyframe <= 0:
             raise ConfigError(f"{self}: patience at least 0, per_keyframe positive.")
-        if not (0 <= self.least_quality <= 1 and 0 <= self.alike <= 1):
-            raise ConfigError(f"{self}: least_quality and alike must be within 0..1.")
-        if self.views_first > self.views or not (self.gain > 1 and self.near > 0):
-            raise ConfigError(f"{self}: views_first at most views, gain over 1, near positive.")
+        if not (0 <= self.least_quality <= 1):
+            raise ConfigError(f"{self}: least_quality must be within 0..1.")
+        if self.views_first > self.views or not (self.gain > 1 and self.overlap > 0):
+            raise ConfigError(f"{self}: views_first at most views, gain over 1, overlap positive.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -109,25 +122,27 @@ class RegionsToName:
         """
         opinions: list[Opinion] = []
         taken = set[int]()
+        known = self._known(keyframe, depth_m, camera, T_map_keyframe)
         for candidate in found:
             sighting = sighting_of(keyframe, candidate, depth_m, camera)
             if sighting is None:
                 continue
-            region = self._same(sighting, T_map_keyframe, taken) or self._new(sighting)
+            region = self._same(sighting, known, taken) or self._new(sighting)
             taken.add(region.id)
-            args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
-            region = moved(region, sighting)
-            region = self._with_view(region, sighting, region_view(*args, self.config.view))
+            region = seen_again(region, sighting)
+            if candidate.score < self.config.settled:
+                args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
+                region = self._with_view(region, sighting, region_view(*args, self.config.view))
             self._keep(region)
-            opinions += self._said_of(region, sighting, candidate, T_map_keyframe)
+            opinions += self._said_of(region, candidate)
         for candidate in named:
             sighting = sighting_of(keyframe, candidate, depth_m, camera)
-            region = sighting and self._same(sighting, T_map_keyframe, taken)
+            region = sighting and self._same(sighting, known, taken)
             if sighting and region:
-                said = self._said_of(region, sighting, candidate, T_map_keyframe)
+                said = self._said_of(region, candidate)
                 if said:
                     taken.add(region.id)
-                    self._keep(moved(region, sighting))
+                    self._keep(seen_again(region, sighting))
                 opinions += said
         questions = self._questions(keyframe, T_map_keyframe)
         self._forget()
@@ -145,64 +160,69 @@ class RegionsToName:
 
     def _asked(self, region: Region) -> Question:
         quality = sum(view.quality for view in region.views)
-        region = replace(region, questions=region.questions + 1, quality=quality)
+        shape = region.best if region.best and region.questions == 0 else region.shape
+        region = replace(region, questions=region.questions + 1, quality=quality, shape=shape)
         self._regions[region.id] = region
         best = region.best
         assert best is not None
-        shown = {name: getattr(best, name) for name in ("keyframe", "p_camera", "size_m")}
-        return Question(replace(region, box_px=best.box_px, **shown), best.candidate)
+        return Question(replace(region, keyframe=best.keyframe, box_px=best.box_px), best.candidate)
 
     def _keep(self, region: Region) -> None:
         """As the one seen last."""
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
 
-    def _said_of(
-        self,
-        region: Region,
-        sighting: Sighting,
-        candidate: Candidate,
-        T_map_keyframe: Mapping[int, np.ndarray],
-    ) -> list[Opinion]:
-        """The answer, where what is seen now is where that spoke of, and about as large: what
-        stands on a table is near enough to be the same region, and no table."""
-        answer = region.answer
-        if answer is None or not answer.label or answer.keyframe not in T_map_keyframe:
-            return []
-        small, large = sorted((answer.size_m, sighting.size_m))
-        gap_m = np.linalg.norm(in_map(answer, T_map_keyframe) - in_map(sighting, T_map_keyframe))
-        is_it = small >= self.config.alike * large and gap_m < self.config.near * small
-        return [Opinion(candidate, answer.label, answer.sure)] if is_it else []
+    def _said_of(self, region: Region, candidate: Candidate) -> list[Opinion]:
+        """Its name, once it was asked about: boxes alone are told anyway, where they are."""
+        label, sure = self.name(region)
+        return [Opinion(candidate, label, sure)] if label and region.answer else []
 
-    def answered(self, region: int, answer: Answer) -> None:
-        """The labeller has spoken of it; a confident answer needs no second one."""
+    def name(self, region: Region) -> tuple[str, float]:
+        """What most speaks for, and how sure the surest was; nothing where little does."""
+        label, total, most = max(region.votes, key=lambda vote: vote[1], default=("", 0.0, 0.0))
+        return (label, most) if total >= self.config.least_votes else ("", 0.0)
+
+    def answered(self, region: int, answer: Answer) -> str:
+        """The labeller has spoken of it; its name now. A confident answer needs no second one."""
         known = self._regions.get(region)
-        if known is not None and answer.sure > (known.answer.sure if known.answer else 0):
-            self._regions[region] = replace(known, answer=answer)
+        if known is None:
+            return answer.label
+        votes = with_vote(known.votes, answer.label, answer.sure, self.config.answer_weight)
+        is_surer = answer.sure > (known.answer.sure if known.answer else 0)
+        known = replace(known, votes=votes, answer=answer if is_surer else known.answer)
+        self._regions[region] = known
+        return self.name(known)[0]
 
-    def _same(
-        self, sighting: Sighting, T_map_keyframe: Mapping[int, np.ndarray], taken: set[int]
-    ) -> Region | None:
-        """The nearest region that is near enough."""
-        there = [
-            region
-            for region in self._regions.values()
-            if region.id not in taken and region.keyframe in T_map_keyframe
-        ]
-        if not there:
-            return None
-        sizes_m = np.array([region.size_m for region in there])
-        p_map = np.array([in_map(region, T_map_keyframe) for region in there])
-        gaps_m = np.linalg.norm(p_map - in_map(sighting, T_map_keyframe), axis=1)
-        small = np.minimum(sizes_m, sighting.size_m)
-        is_alike = small >= self.config.alike * np.maximum(sizes_m, sighting.size_m)
-        shares = np.where(is_alike, gaps_m / np.maximum(small, 1e-9), np.inf)
-        best = int(shares.argmin())
-        return there[best] if shares[best] < self.config.near else None
+    def _same(self, sighting: Sighting, known: "_Known", taken: set[int]) -> Region | None:
+        """The region that it is most of, and that is most of it."""
+        shares = known.seen.shares_in(sighting.candidate.part)
+        shares[known.seen.counts < self.config.least_points] = 0
+        best, most = None, self.config.overlap
+        for i in np.flatnonzero(shares >= self.config.overlap):
+            region = known.regions[int(i)]
+            if region.id in taken:
+                continue
+            back = share_back(sighting, region, *known.place, self.config.least_points)
+            if min(back, shares[i]) >= most:
+                best, most = self._regions[region.id], min(back, float(shares[i]))
+        return best
+
+    def _known(
+        self,
+        keyframe: int,
+        depth_m: np.ndarray,
+        camera: Camera,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> "_Known":
+        there = [r for r in self._regions.values() if r.shape.keyframe in T_map_keyframe]
+        T_camera_map = se3.inverse(T_map_keyframe[keyframe])
+        place = depth_m.shape, camera, T_map_keyframe
+        args = depth_m, camera, T_camera_map, T_map_keyframe, self.config.max_gap_m
+        return _Known(there, projected(there, *args), place)
 
     def _new(self, seen: Sighting) -> Region:
         self._next_id += 1
-        return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen.p_camera, seen.size_m)
+        return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen)
 
     def _with_view(self, region: Region, sighting: Sighting, view: RegionView) -> Region:
         if view.quality < self.config.least_quality:
@@ -212,8 +232,7 @@ class RegionsToName:
         return replace(region, best=best, views=tuple(views[: self.config.views]))
 
     def _is_due(self, region: Region, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> bool:
-        is_settled = region.answer is not None and region.answer.sure >= self.config.settled
-        if is_settled or region.questions >= self.config.most_questions:
+        if self._is_settled(region) or region.questions >= self.config.most_questions:
             return False
         best = region.best
         if best is None or best.keyframe not in T_map_keyframe:
@@ -223,6 +242,10 @@ class RegionsToName:
         is_still = now - best.keyframe >= self.config.patience
         is_better = region.gained() >= (self.config.gain - 1) * region.quality
         return is_still and (region.questions == 0 or is_better)
+
+    def _is_settled(self, region: Region) -> bool:
+        """Somebody was sure of it."""
+        return max(region.score, region.answer.sure if region.answer else 0) >= self.config.settled
 
     def _forget(self) -> None:
         while len(self._regions) > self.config.most:
@@ -241,6 +264,15 @@ class RegionsToName:
         out._next_id, out._allowed = packed["next_id"], packed["allowed"]
         out._regions = {row["id"]: unpacked(row) for row in packed["regions"]}
         return out
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Known:
+    """Regions, what a keyframe sees of them, and where that is."""
+
+    regions: list[Region]
+    seen: Projected
+    place: tuple[tuple[int, ...], Camera, Mapping[int, np.ndarray]]
 
 
 def _worth(region: Region) -> float:

@@ -69,7 +69,8 @@ def candidates(
     found: Sequence[Candidate],
     config: TriggerConfig,
 ) -> list[Candidate]:
-    """Regions of a keyframe that a labeller should see, the largest first.
+    """Regions of a keyframe that a labeller should see, and those that the detector is sure of, to
+    be followed; the largest first.
 
     boxes_px, labels, scores  [M, 4], M, [M] of the detector
     depth_m                   [H, W], 0 where it is missing
@@ -78,7 +79,7 @@ def candidates(
 
     The same arguments give the same candidates.
     """
-    asked, is_taken = _hesitant(boxes_px, labels, scores, depth_m, camera, found, config)
+    asked, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, config)
     is_sure = np.asarray(scores) >= config.sure
     explained = is_labelled | _painted(boxes_px[is_sure], depth_m.shape)
     asked += [
@@ -86,11 +87,15 @@ def candidates(
         for one, is_asked in zip(found, is_taken, strict=True)
         if not is_asked and _share(explained, one.part) < config.explained
     ]
-    worth = [one for one in asked if _is_worth_a_look(one, depth_m.shape, config)]
+    worth = [
+        one
+        for one in asked
+        if one.score >= config.sure or _is_worth_a_look(one, depth_m.shape, config)
+    ]
     return sorted(worth, key=lambda c: -np.count_nonzero(c.part.mask))[: config.most]
 
 
-def _hesitant(
+def _boxed(
     boxes_px: np.ndarray,
     labels: Sequence[str],
     scores: np.ndarray,
@@ -99,11 +104,11 @@ def _hesitant(
     found: Sequence[Candidate],
     config: TriggerConfig,
 ) -> tuple[list[Candidate], list[bool]]:
-    """Boxes of a detector that is not sure: each is the region that fits it best, else its
-    foreground. And which regions these are."""
+    """Boxes of a detector: each is the region that fits it best, else its foreground. And which
+    regions these are."""
     asked, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
-    for i in hesitant_boxes(boxes_px, scores, config):
+    for i in distinct_boxes(boxes_px, scores, config):
         label, score = labels[i], float(scores[i])
         fits = np.where(is_taken, 0, _ious(regions_px, boxes_px[i]))
         best = int(np.argmax(fits)) if len(fits) else -1
@@ -157,18 +162,18 @@ def _without(one: Candidate, others: np.ndarray) -> Candidate:
     return replace(one, part=Foreground(part.row, part.column, part.mask & ~here))
 
 
-def hesitant_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConfig) -> list[int]:
-    """Those that the detector is not sure of, and of the same thing the best of them.
+def distinct_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConfig) -> list[int]:
+    """Of the same thing the best of them.
 
     >>> boxes = np.array([[0, 0, 10, 10], [1, 0, 10, 10], [20, 0, 30, 10.0]])
-    >>> hesitant_boxes(boxes, np.array([0.9, 0.4, 0.5]), TriggerConfig())
-    [2]
+    >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), TriggerConfig())
+    [0, 2]
     """
     kept: list[int] = []
     for i in np.argsort(-np.asarray(scores), kind="stable"):
         if np.all(_ious(boxes_px[kept], boxes_px[i]) < config.same_iou):
             kept.append(int(i))
-    return [i for i in kept if scores[i] < config.sure]
+    return kept
 
 
 def _is_worth_a_look(candidate: Candidate, shape: tuple[int, ...], config: TriggerConfig) -> bool:

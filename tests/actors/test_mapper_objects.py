@@ -196,7 +196,7 @@ def test_a_successor_goes_on_with_objects_bit_for_bit(tmp_path: Path) -> None:
     second.restore(state)
     ends = []
     for mapper in (first, second):
-        made = [*mapper.handle(answer(question, "lava lamp")), *walk(mapper, WAY[5:9], first=5)]
+        made = [*mapper.handle(answer(question, "lava lamp")), *walk(mapper, WAY[5:12], first=5)]
         ends.append([*made, *mapper.finish()])
     for kind in (MapObjects, ObjectObservation, LabelRequest):
         one, other = ([encode(unversioned(m)) for m in of(kind, end)] for end in ends)

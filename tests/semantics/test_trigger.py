@@ -34,7 +34,12 @@ def wall_with(*boxes: tuple[int, int, int, int]) -> np.ndarray:
     return depth_m
 
 
-def asked(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config=CONFIG):
+def asked(*args, **kwargs) -> list[Candidate]:
+    """But for what the detector is sure of, which is followed alone."""
+    return [one for one in followed(*args, **kwargs) if one.score < CONFIG.sure]
+
+
+def followed(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config=CONFIG):
     boxes = np.reshape(np.array(boxes, float), (-1, 4))
     found = regions(depth_m, config)
     scores = np.array(scores)
@@ -72,6 +77,7 @@ def test_a_box_is_asked_about_below_the_score_of_the_paper(score: float, count: 
     box = (59.5, 39.5, 89.5, 79.5)
     found = asked(wall_with(THING), [box], ["vase"], [score])
     assert len(found) == count, "the object in it is not asked about a second time"
+    assert len(followed(wall_with(THING), [box], ["vase"], [score])) == 1
     for one in found:
         assert (one.label, one.score) == ("vase", score)
         assert one.box_px == pytest.approx(np.array(box), abs=3), "of what stands there"

@@ -1,0 +1,46 @@
+"""What boxes of a detector become beside the names of regions."""
+
+import numpy as np
+
+from ldo_service.semantics.foreground import Foreground
+from ldo_service.semantics.labelling import Claims
+from ldo_service.semantics.naming import fitting_parts, with_opinions
+from ldo_service.semantics.regions_to_name import Opinion
+from ldo_service.semantics.trigger import Candidate
+from ldo_service.semantics.vocabulary import Vocabulary
+
+PART = Foreground(10, 20, np.ones((30, 40), bool))
+BOX = np.array([19.5, 9.5, 59.5, 39.5], np.float32)
+
+
+def region(number: int | None = None, kind: str = "apart") -> Candidate:
+    return Candidate(BOX, PART, "tv", 0.5, number, kind)
+
+
+def boxed(*names: str) -> tuple[Claims, Vocabulary]:
+    vocabulary = Vocabulary(256)
+    labels = np.array([vocabulary.index(name) for name in names])
+    boxes = np.tile(BOX, (len(names), 1))
+    return Claims.of_detector(boxes, labels, np.full(len(names), 0.5, np.float32)), vocabulary
+
+
+def test_a_box_is_the_thing_that_fits_it() -> None:
+    found = [region(2), region(0, "flat"), region(1, ""), region(None)]
+    assert fitting_parts(4, found) == (None, None, PART, None)
+
+
+def test_the_name_of_a_region_stands_in_place_of_a_box_s_label() -> None:
+    claims, vocabulary = boxed("tv", "chair")
+    named = with_opinions(claims, [Opinion(region(0), "microwave", 0.9)], vocabulary)
+    assert named.confidences.tolist() == [0, 0.5]
+    assert named.open_labels[0] == vocabulary.index("microwave")
+    assert named.open_confidences.tolist() == [np.float32(0.9), 0]
+    assert claims.confidences.tolist() == [0.5, 0.5], "as it was"
+
+
+def test_a_region_without_a_box_is_a_claim_of_its_own() -> None:
+    claims, vocabulary = boxed("chair")
+    named = with_opinions(claims, [Opinion(region(), "globe", 0.8)], vocabulary)
+    assert len(named.boxes) == 2
+    assert (named.confidences[1], named.open_confidences[1]) == (0, np.float32(0.8))
+    assert named.parts == (None, PART)
