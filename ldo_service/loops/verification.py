@@ -29,7 +29,7 @@ from .surface_fit import SurfaceFit, SurfaceFitConfig, surface_fit
 
 NOTHING = Matched(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
-MapPose = Callable[[View, View], np.ndarray | None]  # T_old_new [4, 4]; None: it is not known
+KnownPose = Callable[[View, View], np.ndarray | None]  # T_old_new [4, 4]; None: not known
 OPENED = 12  # keyframes kept ready for alignment, 3 MB each: a query and some candidates
 FIT_LEVEL = 1  # of the pyramid, 160 pixels wide: 19,200 points say what overlaps
 
@@ -154,18 +154,18 @@ class Verifier:
             reason = f"{count} landmarks agree"
             return Proposal(old.views[0], new.views[0], np.eye(4), refused=reason)
         semantics = matched(old.landmarks, new.landmarks, pairs[motion.inliers])
-        a, b = _nearest_pair(old, new, motion.T_a_b)
-        T_old_new = _between(a, b, motion.T_a_b)
+        nearest = _nearest_pairs(old, new, lambda a, b: _between(a, b, motion.T_a_b))
+        a, b, T_old_new = next(nearest)
         return Proposal(a, b, T_old_new, "landmarks", count, semantics)
 
-    def by_map(self, old: Subgraph, new: Subgraph, T_old_new: MapPose) -> Proposal:
+    def by_map(self, old: Subgraph, new: Subgraph, T_old_new: KnownPose) -> Proposal:
         """Where the map has them, if that brings them together, and the images of two new keyframes
         refine it to one and the same pose: what sees a place from elsewhere shares few features.
 
         It finds no loop that drift tore open; it ties what was seen twice before it drifts apart.
         """
         found: list[Proposal] = []
-        for a, b, T in islice(_pairs_in_map(old, new, T_old_new), self._config.map_pairs):
+        for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
             check = self._met(Proposal(a, b, T, "map"))
             if check is not None and check.closure is not None:
                 met = replace(check.proposal, T_old_new=check.closure.T_a_b)
@@ -250,10 +250,10 @@ def _likely_pairs(old: Subgraph, new: Subgraph) -> Iterator[tuple[View, View]]:
     return (pairs[index] for index in np.argsort(-np.array(shared), kind="stable"))
 
 
-def _pairs_in_map(
-    old: Subgraph, new: Subgraph, T_old_new: MapPose
+def _nearest_pairs(
+    old: Subgraph, new: Subgraph, T_old_new: KnownPose
 ) -> Iterator[tuple[View, View, np.ndarray]]:
-    """Each new keyframe with the old one that the map has nearest to it, the nearest first; with
+    """Each new keyframe with the old one that a pose brings nearest to it, the nearest first; with
     T_old_new [4, 4]."""
     nearest = []
     for b in new.views:
@@ -264,12 +264,6 @@ def _pairs_in_map(
             nearest.append((apart[index], known[index]))
     for index in np.argsort([apart for apart, _ in nearest], kind="stable"):
         yield nearest[index][1]
-
-
-def _nearest_pair(old: Subgraph, new: Subgraph, T_oldodom_newodom: np.ndarray) -> tuple[View, View]:
-    pairs = list(product(old.views, new.views))
-    apart = [extent(_between(a, b, T_oldodom_newodom), a.place.median_depth_m) for a, b in pairs]
-    return pairs[int(np.argmin(apart))]
 
 
 def _between(old: View, new: View, T_oldodom_newodom: np.ndarray) -> np.ndarray:
