@@ -99,6 +99,7 @@ class LoopCloser(Actor):
         self._newest = -1  # keyframe taken
         self._accepted = self._refused = self._without_boxes = self._repeated = 0
         self._parts: dict[str, Any] | None = None  # of the state
+        self._saved_poses: dict[str, Any] | None = None  # likewise; None: they have changed
 
     def handle(
         self, message: Keyframe | DetectionBoxes | Correction
@@ -109,6 +110,7 @@ class LoopCloser(Actor):
         if isinstance(message, Correction):
             T_map = keyframe_poses_of(message, only=self.poses)
             self.poses.correct(message.graph_version, T_map)
+            self._saved_poses = None
             self._joined = dict(message.joined)
             return
         if isinstance(message, Keyframe):
@@ -123,6 +125,7 @@ class LoopCloser(Actor):
             self._repeated += 1  # sent again after a restart
             return
         self._newest = message.keyframe
+        self._saved_poses = None
         self.poses.chain(
             message.keyframe,
             message.reference,
@@ -155,6 +158,7 @@ class LoopCloser(Actor):
             yield from self._told(finding)
         if findings or not self.recogniser.is_open:
             self.poses.keep_only(self._needed())
+            self._saved_poses = None
 
     def _seen(
         self, waiting: Waiting, boxes: DetectionBoxes | None
@@ -199,7 +203,8 @@ class LoopCloser(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """A part for each subgraph and waiting keyframe, written once, and one for the rest."""
+        """A part for each subgraph and waiting keyframe, written once; the words, where some are
+        new; the poses, where some have changed; and one for the rest."""
         if self._parts is None:
             self._parts = self._all_parts()
         return self._parts
@@ -209,6 +214,7 @@ class LoopCloser(Actor):
         subgraphs = {f"subgraph_{s['keyframes'][0]}": s for s in state.pop("subgraphs")}
         views = {f"view_{view['place']['id']}": view for view in state.pop("views")}
         waiting = {f"waiting_{k}": w.place.packed for k, w in self._waiting.items()}
+        words = {"words": state.pop("words")}  # the same array until one is learnt
         now = {
             **state,
             "waiting": {k: w.facts for k, w in self._waiting.items()},
@@ -216,9 +222,14 @@ class LoopCloser(Actor):
             "newest": self._newest,
             "joined": list(self._joined.items()),
             "vocabulary": self._vocabulary.packed,
-            "poses": self.poses.snapshot(),
         }
-        return {**subgraphs, **views, **waiting, "now": now}
+        return {**subgraphs, **views, **waiting, **words, **self._poses_part(), "now": now}
+
+    def _poses_part(self) -> dict[str, Any]:
+        """0.4 kB for each view that is kept: the largest part, and boxes do not change it."""
+        if self._saved_poses is None:
+            self._saved_poses = self.poses.snapshot()
+        return {"poses": self._saved_poses}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]
@@ -228,7 +239,7 @@ class LoopCloser(Actor):
             return [state[name] for name in sorted(names, key=lambda n: int(n[len(kind) :]))]
 
         kept = {"subgraphs": parts("subgraph_"), "views": parts("view_")}
-        self.recogniser.restore({**now, **kept})
+        self.recogniser.restore({**now, **kept, "words": state["words"]})
         self._waiting = {
             int(k): Waiting(Place.unpacked(state[f"waiting_{k}"]), *facts)
             for k, facts in now["waiting"].items()
@@ -238,8 +249,8 @@ class LoopCloser(Actor):
         self._newest, self._joined = now["newest"], dict(map(tuple, now["joined"]))
         self._vocabulary = Vocabulary.unpacked(now["vocabulary"])
         self.poses = KeyframePoses()
-        self.poses.restore(now["poses"])
-        self._parts = None
+        self.poses.restore(state["poses"])
+        self._parts = self._saved_poses = None
 
     def facts(self) -> dict[str, float]:
         return {

@@ -44,7 +44,8 @@ class VisualWords:
             fresh.append(int(far[0]))
             differing = BITS[descriptors ^ descriptors[fresh[-1]]].sum(axis=1)
             nearest = np.minimum(nearest, differing)
-        self.words = np.concatenate([self.words, descriptors[fresh]])
+        if fresh:
+            self.words = np.concatenate([self.words, descriptors[fresh]])
 
     def histogram(self, descriptors: np.ndarray) -> np.ndarray:
         """[count] float32: how many descriptors [N, 32] are nearest to each word."""

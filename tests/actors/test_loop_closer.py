@@ -256,6 +256,16 @@ def test_a_state_writes_what_is_new_alone(there) -> None:
             assert after[name] is part
 
 
+def test_boxes_alone_write_no_poses(there) -> None:
+    actor = LoopCloser()
+    handled(actor, [*told(there[:6]), there[6]])
+    before = dict(actor.snapshot())
+    handled(actor, [boxes_of(there[6])])
+    after = actor.snapshot()
+    assert after["now"] is not before["now"]
+    assert after["poses"] is before["poses"]
+
+
 def test_a_keyframe_sent_twice_counts_once(there) -> None:
     actor = LoopCloser()
     handled(actor, told([*there[:4], *there[2:4], *there[4:]]))
