@@ -1,0 +1,122 @@
+"""What closing loops is worth where odometry drifts, and how long a correction keeps others.
+
+    python tests/bench/bench_drift.py [SOURCE] [--scale 0.01] [--turn 0.5] [--set KEY=VALUE ...]
+
+The whole graph over SOURCE (synthetic:flat), every fifth frame held out: as it is; with odometry
+that drifts by --scale of the way and --turn degrees for each metre of it; and that without closing
+loops. `odometry` is the track by itself, `online` what was published at the time. Pauses: CPU ms of
+each actor over one correction, the worst of the run, beside the Gaussians in memory at its end.
+"""
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ldo_service.actors.graph import make_actors
+from ldo_service.config import Config, load_config
+from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.evaluation.views import Judged, evaluate_rendering
+from ldo_service.geometry import Trajectory
+from ldo_service.runs.finished import read_run
+from ldo_service.runs.folder import prepare
+from ldo_service.runs.job import Job
+from ldo_service.runs.over_file import run_over_file, with_all_cores
+from ldo_service.runs.source import Selection
+from ldo_service.runtime import Actor
+from ldo_service.schemas import Correction, Message, TrackedPose
+from ldo_service.wire import transform
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.runs.mistaken import Drift, DriftingTracker, standing_in
+
+NO_LOOPS = "loop_closer.is_on=false"
+NONE = Drift(scale=0.0, turn_rad_per_m=0.0)
+
+
+@dataclass
+class Watched:
+    """An actor, what it says of poses, and CPU ms of each correction that it takes."""
+
+    actor: Actor
+    odometry: list[tuple[float, np.ndarray]] = field(default_factory=list)  # s, T_odom_camera
+    pauses_ms: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        handle = self.actor.handle
+
+        def watching(message: Message) -> Iterator[Message]:
+            start_s = time.thread_time()
+            made = list(handle(message))
+            if isinstance(message, Correction):
+                self.pauses_ms.append(1e3 * (time.thread_time() - start_s))
+            self.odometry += [
+                (1e-9 * pose.stamp_ns, transform(pose.T_odom_camera))
+                for pose in made
+                if isinstance(pose, TrackedPose) and pose.status != "LOST"
+            ]
+            yield from made
+
+        self.actor.handle = watching
+
+
+def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
+    """A run, judged."""
+    config = with_all_cores(config)
+    actors = {actor.name: actor for actor in make_actors(config)}
+    actors["tracker"] = DriftingTracker(config.tracker, drift)
+    tracker, *others = [Watched(actors[name]) for name in ("tracker", "loop_closer", "mapper")]
+    prepare(folder, overwrite=False)
+    with standing_in(*actors.values()):
+        record = run_over_file(Job(sequence, folder, config, Selection(), print), lambda _: None)
+    odometry = Trajectory(*map(np.array, zip(*tracker.odometry, strict=True)))
+    run = read_run(folder)
+    tracks = (odometry, run.estimates["online"], run.estimates["final"])
+    truth = sequence.truth()
+    assert truth is not None, f"{sequence.name} has no ground truth"
+    ate_cm = [100 * evaluate_trajectory(track, truth).ate_m.rmse for track in tracks]
+    held_out = Judged(Judged.of(run.frames).held_out, ())
+    rendered = evaluate_rendering(
+        sequence, held_out, run.maps, lambda _: None, threads=os.cpu_count() or 1
+    )
+    pauses = [f"{max(watched.pauses_ms):.0f}" for watched in (tracker, *others)]
+    awake = actors["mapper"].facts()["gaussians"]
+    return (
+        f"{' | '.join(f'{cm:.2f}' for cm in ate_cm)} | {record.loops.accepted} | "
+        f"{rendered[0].mean('psnr_db'):.2f} | {' | '.join(pauses)} | {awake:,.0f} |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("source", nargs="?", default="synthetic:flat", metavar="SOURCE")
+    parser.add_argument("--scale", type=float, default=0.01)
+    parser.add_argument("--turn", type=float, default=0.5, metavar="DEGREES")
+    parser.add_argument("--set", nargs="*", default=(), metavar="KEY=VALUE")
+    parser.add_argument("--hold-out", type=int, default=5)
+    options = parser.parse_args()
+    sequence = open_sequence(options.source)
+    settings = (f"tracker.hold_out={options.hold_out}", *options.set)
+    drift = Drift(options.scale, np.radians(options.turn))
+    runs = {
+        "no drift": (settings, NONE),
+        "drift": (settings, drift),
+        "drift, no loops": ((*settings, NO_LOOPS), drift),
+    }
+    print("| run | odometry cm | online cm | final cm | closures | PSNR dB held out ", end="")
+    print("| pause ms tracker | loop closer | mapper | Gaussians |\n|" + "---|" * 10)
+    for name, (chosen, drifting) in runs.items():
+        with tempfile.TemporaryDirectory() as folder:
+            print(f"| {name} | ", end="", flush=True)
+            print(row(sequence, load_config(settings=chosen), drifting, Path(folder)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

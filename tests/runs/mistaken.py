@@ -1,0 +1,126 @@
+"""Actors that err by what is known: odometry that drifts, and places taken for others."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from unittest.mock import patch
+
+import numpy as np
+
+from ldo_service.actors.graph import make_actors
+from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
+from ldo_service.actors.tracker import Tracker, TrackerConfig
+from ldo_service.config import Config
+from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.runtime import Actor
+from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandidate, LoopClosure
+from ldo_service.tracking.odometry import Odometry, OdometryConfig
+from ldo_service.tracking.prior import Reading
+from ldo_service.tracking.tracked import Tracked
+from ldo_service.wire import measured_message
+
+UP_ODOM = np.array([0.0, -1.0, 0.0])  # of a camera held level at the start
+SURE = np.diag(np.repeat([1e-3, 2e-3], 3) ** -2.0)  # rad and m: as images refine a true closure
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """What is added to every motion between two frames."""
+
+    scale: float = 0.01  # share of the distance
+    turn_rad_per_m: float = np.radians(0.5)  # about the vertical
+
+    def of(self, T_odom_before: np.ndarray, T_before_now: np.ndarray) -> np.ndarray:
+        """T_before_now [4, 4] as odometry that drifts says it."""
+        T, way_m = T_before_now.copy(), np.linalg.norm(T_before_now[:3, 3])
+        T[:3, 3] *= 1 + self.scale
+        up_now = (T_odom_before @ T_before_now)[:3, :3].T @ UP_ODOM
+        return T @ se3.exp(np.r_[self.turn_rad_per_m * way_m * up_now, 0, 0, 0])
+
+
+class DriftingOdometry(Odometry):
+    """Tracks as ever, and says that the camera went elsewhere. For a camera that is never lost."""
+
+    def __init__(self, config: OdometryConfig, drift: Drift) -> None:
+        super().__init__(config)
+        self._drift = drift
+        self._right: Tracked | None = None  # the last frame, as it was tracked
+        self._T_drifted = np.eye(4)  # T_odom_camera, as it is told
+        self._told: dict[int, np.ndarray] = {}  # T_odom_keyframe, likewise
+
+    def track(self, frame: RgbdFrame, prior: Reading | None = None) -> Tracked:
+        before, self._right = self._right, super().track(frame, prior)
+        if before is not None:
+            T_before_now = se3.inverse(before.T_odom_camera) @ self._right.T_odom_camera
+            T_step = self._drift.of(before.T_odom_camera, T_before_now)
+            self._T_drifted = se3.orthonormalised(self._T_drifted @ T_step)
+        T_keyframe_camera = np.eye(4)
+        if self._right.keyframe is not None:
+            T_keyframe_camera = se3.inverse(self._told[self._right.keyframe]) @ self._T_drifted
+        return replace(
+            self._right, T_odom_camera=self._T_drifted, T_keyframe_camera=T_keyframe_camera
+        )
+
+    def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
+        return self._noted(super().make_keyframe(frame, self._as_tracked(tracked)))
+
+    def make_supporting(self, tracked: Tracked) -> int:
+        return self._noted(super().make_supporting(self._as_tracked(tracked)))
+
+    def window(self, tracked: Tracked) -> list[RelativePose]:
+        return [
+            replace(m, T_a_b=se3.inverse(self._told[m.a]) @ self._told[m.b])
+            for m in super().window(self._as_tracked(tracked))
+        ]
+
+    def _as_tracked(self, told: Tracked) -> Tracked:
+        assert self._right is not None
+        right = self._right
+        T_odom_camera, T_keyframe_camera = right.T_odom_camera, right.T_keyframe_camera
+        return replace(told, T_odom_camera=T_odom_camera, T_keyframe_camera=T_keyframe_camera)
+
+    def _noted(self, keyframe: int) -> int:
+        self._told[keyframe] = self._T_drifted
+        return keyframe
+
+
+class DriftingTracker(Tracker):
+    def __init__(self, config: TrackerConfig, drift: Drift) -> None:
+        super().__init__(config)
+        self._odometry = DriftingOdometry(config.odometry, drift)
+
+
+class MistakenLoopCloser(LoopCloser):
+    """Says of some keyframes, besides what it finds, that they stand beside old ones.
+
+    beside  by keyframe: the old one, and T_old_keyframe [4, 4] that it claims
+    """
+
+    def __init__(
+        self, config: LoopCloserConfig, beside: Mapping[int, tuple[int, np.ndarray]]
+    ) -> None:
+        super().__init__(config)
+        self._beside = dict(beside)
+
+    def handle(
+        self, message: Keyframe | DetectionBoxes | Correction
+    ) -> Iterator[LoopClosure | LoopCandidate]:
+        yield from super().handle(message)
+        if isinstance(message, Keyframe) and message.keyframe in self._beside:
+            old, T_old_keyframe = self._beside[message.keyframe]
+            closure = RelativePose(old, message.keyframe, T_old_keyframe, SURE)
+            pose = measured_message(closure)
+            yield LoopClosure(stamp_ns=message.stamp_ns, pose=pose, overlap=0.8, rmse_m=0.005)
+
+
+@contextmanager
+def standing_in(*actors: Actor) -> Iterator[None]:
+    """Within, runs over files have these in place of those of the same names."""
+    names = {actor.name: actor for actor in actors}
+
+    def made(config: Config) -> Sequence[Actor]:
+        return [names.get(actor.name, actor) for actor in make_actors(config)]
+
+    with patch("ldo_service.runs.over_file.make_actors", made):
+        yield
