@@ -24,16 +24,17 @@ class ClosuresConfig:
     most_cost: float = 20.06
     most_sigmas: float = 3.0  # of a residual that stays, in any direction (RTAB-Map's guard)
     rivals: int = 3  # earlier closures that may leave in place of a new one, the least fitting
-    most: int = (
-        500  # believed at a time, 1 kB each and one more to solve with; beyond, the one goes
-    )
-    # that another is nearest to
+    # believed at a time, 1 kB each and one more to solve with; beyond, the one goes that another is
+    # nearest to
+    most: int = 500
+    doubts: int = 16  # refused ones kept that contradict a join: three that agree outvote it
     remembered: int = 256  # refused ones, and ones that left, to tell
 
     def __post_init__(self) -> None:
-        counts = self.most, self.remembered
-        if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0 or min(counts) < 1:
+        if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0:
             raise ConfigError(f"{self}: gates must be positive, counts not negative.")
+        if min(self.most, self.doubts, self.remembered) < 1:
+            raise ConfigError(f"{self}: most, doubts and remembered must be at least 1.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +136,12 @@ class Closures:
     def without(self, pairs: Collection[Pair]) -> "Closures":
         """When other measurements hold what these say."""
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
+
+    def exchanged(self, join: Pair, closure: Pair) -> "Closures":
+        """When a closure joins two components in place of another, which leaves."""
+        refused = tuple(pair for pair in self.refused if pair != closure)
+        left = self._remembered((*(pair for pair in self.left if pair != closure), join))
+        return replace(self, refused=refused, left=left)
 
     def _remembered(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
         """The newest of them."""

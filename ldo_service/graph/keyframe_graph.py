@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
 
 from .closures import Closures, ClosuresConfig, Pair, Verdict
 from .condensing import group_to_condense
 from .factors import NoiseConfig, Sight, information
+from .joining import T_new_old, contradicted, judged, outvoted
 from .measurements import Measurements
 from .packing import pack_relative, pack_sights, unpack_relative, unpack_sights
-from .solver import Name, Solver, Variables, point_key, solved
+from .solver import Name, Solver, Variables, point_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,9 @@ class KeyframeGraph:
         """What somebody recognised, between known keyframes: is it believed, and what left for it.
 
         See `closures`; a refused one leaves no trace in any pose. Between two components there is
-        nothing to judge it by, and it joins them. Raises KeyError when a keyframe is not known.
+        nothing to judge it by, and it joins them; where more of those that it refutes later agree
+        with each other than with it, one of them joins instead. Raises KeyError when a keyframe is
+        not known.
         """
         if self.first_of(closure.a) != self.first_of(closure.b):
             self._join(closure)
@@ -140,37 +142,40 @@ class KeyframeGraph:
         start, known = self._solver.variables(), self._known
         if known.in_head(closure.a)[0] == known.in_head(closure.b)[0]:
             return self._refuse(closure)  # too late: both hang on one variable by now
-        verdict, variables = known.closures.judged(
-            closure,
-            lambda closures: solved(known.with_closures(closures, self._initial), start),
-            known.closure_sigmas,
-        )
+        verdict, variables = judged(known, closure, start, self._initial)
         self.solved_times += 1
+        if not verdict.changes:
+            return self._refuse(closure)
         known.closures = known.closures.after(closure, verdict)
-        if verdict.changes:
-            self._rebase(variables)
-        else:
-            self._note("refuse", measured=pack_relative([closure]))
+        self._rebase(variables)
         return verdict
 
     def _join(self, measured: RelativePose) -> None:
         """Two components become one: the younger moves as a whole into the older one's frame,
-        T_new_old = T_map_a T_a_b T_map_b^-1 (or its inverse), before everything is solved again."""
+        before everything is solved again."""
         first_a, first_b = self.first_of(measured.a), self.first_of(measured.b)
-        T_new_old = self.pose(measured.a) @ measured.T_a_b @ se3.inverse(self.pose(measured.b))
-        if first_a > first_b:
-            T_new_old = se3.inverse(T_new_old)
-        T_new_old = se3.orthonormalised(T_new_old)
+        moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)
-        moved = self._known.move_component(younger, older, T_new_old, self._solver.variables())
+        moved = self._known.move_component(younger, older, moves, self._solver.variables())
         self._known.joins[measured.a, measured.b] = measured
         self._rebase(moved)
 
     def _refuse(self, closure: RelativePose) -> Verdict:
-        verdict = Verdict(False)
-        self._known.closures = self._known.closures.after(closure, verdict)
-        self._note("refuse", measured=pack_relative([closure]))
-        return verdict
+        """Unless more closures agree with it than with the join that it contradicts."""
+        known, variables = self._known, self._solver.variables()
+        known.closures = known.closures.after(closure, Verdict(False))
+        joined = contradicted(known, closure)
+        self._note("refuse", measured=pack_relative([closure]), is_doubt=joined is not None)
+        if joined is None:
+            return Verdict(False)
+        known.doubt(closure)
+        better = outvoted(known, joined, closure, self.pose, variables, self._initial)
+        if better is None:
+            return Verdict(False)
+        self._known, variables = better
+        self._rebase(variables)
+        gone = (p for p in known.closures.accepted if p not in self.closures.accepted)
+        return Verdict(True, (joined.pair, *gone))
 
     # --- landmarks --------------------------------------------------------------------------------
     def see(self, sights: Sequence[Sight], placed: Mapping[int, np.ndarray]) -> None:
@@ -321,3 +326,5 @@ class KeyframeGraph:
                 (closure,) = unpack_relative(what["measured"])
                 self._note(change, **what)
                 self._known.closures = self._known.closures.after(closure, Verdict(False))
+                if what["is_doubt"]:
+                    self._known.doubt(closure)

@@ -1,6 +1,6 @@
 """All that is known of keyframes and landmarks, and the factors that say it."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any
 
 import gtsam
@@ -9,7 +9,7 @@ import numpy as np
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
 
-from .closures import Closures, ClosuresConfig, Pair
+from .closures import Closures, ClosuresConfig, Pair, pair_of
 from .condensing import bridges, carried, condensed
 from .factors import (
     NoiseConfig,
@@ -38,6 +38,7 @@ class Measurements:
         self.condensed: dict[Pair, RelativePose] = {}  # heads, each in the one before
         self.joins: dict[Pair, RelativePose] = {}  # between what were components
         self.closures = Closures(closures)
+        self.doubts: dict[Pair, RelativePose] = {}  # closures that contradict a join, the newest
         self.sights: dict[Pair, Sight] = {}  # by keyframe and landmark
         self.followers = Followers.none()
         self.rows: dict[int, int] = {}  # of followers
@@ -95,14 +96,15 @@ class Measurements:
         self.rows = self.followers.index()
         self.active = [k for k in self.active if k not in group[:-1]]
         outside = [self.between_variables(m) for m in gone if not {m.a, m.b} <= set(group)]
-        for m in bridges(outside, [(m.a, m.b) for m in self._relative()]):
+        for m in bridges(outside, [(m.a, m.b) for m in self.relative()]):
             self.measure(m)
 
-    def _relative(self) -> Iterable[RelativePose]:
-        """All that holds variables together for good."""
+    def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
+        """All that holds variables together for good, or all but one join."""
         yield from self.odometry.values()
         yield from self.condensed.values()
-        yield from map(self.between_variables, self.joins.values())
+        joins = (m for pair, m in self.joins.items() if pair != without)
+        yield from map(self.between_variables, joins)
 
     # --- heads ------------------------------------------------------------------------------------
     def in_head(self, keyframe: int) -> tuple[int, np.ndarray]:
@@ -185,10 +187,19 @@ class Measurements:
         """All of a component into another: its variables and its landmarks."""
         theirs = {k for k, first in self.first_of.items() if first == younger}
         self.first_of.update(dict.fromkeys(theirs, older))
+        return self.moved(theirs, T_new_old, variables)
+
+    def moved(self, theirs: Set[int], T_new_old: np.ndarray, variables: Variables) -> Variables:
+        """With some keyframes, and the landmarks in their images, elsewhere."""
         points = {point_key(s.landmark) for s in self.sights.values() if s.keyframe in theirs}
         moved = {k: T_new_old @ variables[k] for k in variables.keys() & theirs}
         moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}
         return {k: moved.get(k, value) for k, value in variables.items()}
+
+    def doubt(self, closure: RelativePose) -> None:
+        """Keep what contradicts a join."""
+        doubts = {**self.doubts, pair_of(closure): closure}
+        self.doubts = dict(list(doubts.items())[-self.closures.config.doubts :])
 
     # --- state ------------------------------------------------------------------------------------
     def packed(self) -> dict[str, Any]:
@@ -199,6 +210,7 @@ class Measurements:
             "odometry": pack_relative(self.odometry.values()),
             "condensed": pack_relative(self.condensed.values()),
             "joins": pack_relative(self.joins.values()),
+            "doubts": pack_relative(self.doubts.values()),
             "closures": self.closures.packed(),
             "sights": pack_sights(self.sights.values()),
             "followers": self.followers.packed(),
@@ -208,7 +220,7 @@ class Measurements:
         keyframes = packed["keyframes"].tolist()
         self.first_of = dict(zip(keyframes, packed["first_of"].tolist(), strict=True))
         self.active = packed["active"].tolist()
-        for name in ("odometry", "condensed", "joins"):
+        for name in ("odometry", "condensed", "joins", "doubts"):
             setattr(self, name, {(m.a, m.b): m for m in unpack_relative(packed[name])})
         self.closures = Closures.unpacked(self.closures.config, packed["closures"])
         self.sights = {(s.keyframe, s.landmark): s for s in unpack_sights(packed["sights"])}
