@@ -10,7 +10,7 @@ A keyframe waits for its boxes. Without a detector these come too, and say that 
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -154,8 +154,7 @@ class LoopCloser(Actor):
         findings = self.recogniser.add(
             place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._joined
         )
-        for finding in findings:
-            yield from self._told(finding)
+        yield from self._told(findings)
         if findings or not self.recogniser.is_open:
             self.poses.keep_only(self._needed())
             self._saved_poses = None
@@ -186,15 +185,23 @@ class LoopCloser(Actor):
             self.config.loops.verification.landmarks,
         )
 
-    def _told(self, finding: Finding) -> Iterator[LoopClosure | LoopCandidate]:
-        closure = finding.closure
-        if closure is None:
-            self._refused += 1
-        else:
-            self._accepted += 1
-            log.info("keyframe %d closes a loop with %d", closure.b, closure.a)
-            yield loop_closure_message(finding)
-        yield loop_candidate_message(finding)
+    def _told(self, findings: Iterable[Finding]) -> Iterator[LoopClosure | LoopCandidate]:
+        for finding in findings:
+            closure = finding.closure
+            if closure is None:
+                self._refused += 1
+            else:
+                self._accepted += 1
+                log.info("keyframe %d closes a loop with %d", closure.b, closure.a)
+                yield loop_closure_message(finding)
+            yield loop_candidate_message(finding)
+
+    def finish(self) -> Iterator[LoopClosure | LoopCandidate]:
+        """What waits, and the keyframes that a subgraph was begun with."""
+        self._parts = None
+        for keyframe in list(self._waiting):
+            yield from self._recognise(keyframe)
+        yield from self._told(self.recogniser.rest(self.poses, self._joined))
 
     def _needed(self) -> list[int]:
         """Keyframes that are kept as views, and those that the optimizer may not have placed."""

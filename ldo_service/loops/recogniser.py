@@ -100,6 +100,16 @@ class Recogniser:
         self._open.append(self._view(place, frame, stamp_ns, sightings))
         if not is_whole(self._open, self._config.subgraphs):
             return []
+        return self._completed(poses, joined)
+
+    def rest(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
+        """As `add`, when no keyframe follows: what was begun is whole, if it is long enough. A walk
+        often ends where it began."""
+        if len(self._open) < self._config.subgraphs.least:
+            return []
+        return self._completed(poses, joined)
+
+    def _completed(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
         new, self._open = self._subgraph(self._open), []
         findings = self._findings(new, poses, joined)
         kept = spread(new.views, self._config.subgraphs.kept_views)

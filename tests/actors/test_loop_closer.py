@@ -284,6 +284,17 @@ def test_boxes_that_never_come_hold_nobody_up(there, back) -> None:
     assert alone.facts()["keyframes_without_boxes"] == len([*there, *back]) - MOST_WAITING
 
 
+def test_what_a_walk_ends_with_is_compared_though_no_keyframe_follows(there, back) -> None:
+    actor = LoopCloser()
+    said = handled(actor, told([*there, *back[:3]]))
+    assert not any(one.keyframe == back[2].keyframe for one in candidates(said))
+    last = list(actor.finish())
+    (closure,) = closures(last)
+    assert {one.keyframes for one in candidates(last)} == {tuple(k.keyframe for k in back[:3])}
+    assert closure.pose.reference in {k.keyframe for k in there}
+    assert not list(actor.finish()), "once"
+
+
 def test_memory_is_bounded(there, back) -> None:
     config = LoopCloserConfig(loops=LoopsConfig(retrieval=RetrievalConfig(count=3)))
     actor = LoopCloser(config)

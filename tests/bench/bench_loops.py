@@ -14,6 +14,7 @@ import argparse
 import os
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -106,9 +107,9 @@ def tracked(sequence: Sequence, model: str) -> list[Message]:
 def closed(messages: list[Message], seen: dict[int, SeenKeyframe], stages: Stages) -> LoopErrors:
     actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(stages=stages)))
     candidates, closures = [], []
-    for message in messages:
+    for step in (*(partial(actor.handle, message) for message in messages), actor.finish):
         start_s = time.process_time()
-        said = list(actor.handle(message))
+        said = list(step())
         ms = 1e3 * (time.process_time() - start_s)
         compared = [one for one in said if not isinstance(one, LoopClosure)]
         closures += [one for one in said if isinstance(one, LoopClosure)]
