@@ -44,7 +44,7 @@ class VerificationConfig:
     witness_rad: float = 0.08  # rotation plus parallax between what the two say
     pairs: int = 15  # of keyframes whose features are matched, at 3 ms each
     map_pairs: int = 3  # of keyframes that are aligned where the map has them, at 15 ms each
-    map_overlap: float = 0.35  # of either's surface, more than where features vouch
+    blind_overlap: float = 0.35  # of either's surface, where no features vouch for the pose
     map_witness_rad: float = 0.02  # between what two of these say: half a centimetre in a room
     refined_rad: float = 0.1  # how far the images may move the pose of the features, or of the map,
     refined_landmarks_rad: float = 0.4  # and that of landmarks, whose centres are vague
@@ -178,7 +178,7 @@ class Verifier:
     def _met(self, proposal: Proposal) -> Check | None:
         """None, without an alignment, where either sees too little of what the other does."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
-        T_old_new, least = proposal.T_old_new, self._config.map_overlap
+        T_old_new, least = proposal.T_old_new, self._config.blind_overlap
         if self._fit(old, new, T_old_new).overlap < least:
             return None
         if self._fit(new, old, se3.inverse(T_old_new)).overlap < least:
@@ -197,7 +197,8 @@ class Verifier:
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         alignment = align(old.reference, new.view, se3.inverse(proposal.T_old_new), self._align)
         fit = self._fit(old, new, alignment.T_reference_camera)
-        refused = self._objection(proposal, alignment, fit)
+        back = self._fit(new, old, se3.inverse(alignment.T_reference_camera))
+        refused = self._objection(proposal, alignment, fit, min(fit.overlap, back.overlap))
         measured = RelativePose(
             proposal.old.keyframe,
             proposal.new.keyframe,
@@ -220,8 +221,10 @@ class Verifier:
         points, there = new.reference.points[level], old.view.levels[level]
         return surface_fit(points, T_old_new, there.depth_m, there.camera, self._config.fit)
 
-    def _objection(self, proposal: Proposal, alignment: Alignment, fit: SurfaceFit) -> str:
-        """What speaks against a pose; nothing: ""."""
+    def _objection(
+        self, proposal: Proposal, alignment: Alignment, fit: SurfaceFit, shared: float
+    ) -> str:
+        """What speaks against a pose; nothing: "". `shared`: of either's surface, at least."""
         config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
         limit = config.refined_landmarks_rad if by_landmarks else config.refined_rad
@@ -231,8 +234,9 @@ class Verifier:
             return "the images do not fix the pose"
         if abs(np.log(max(alignment.gain, 1e-6))) > np.log(config.max_gain):
             return f"brightness differs {alignment.gain:.2f} times"
-        if fit.overlap < config.fit.min_overlap:
-            return f"overlap {fit.overlap:.2f}"
+        by_features = proposal.evidence == "features"
+        if shared < (config.fit.min_overlap if by_features else config.blind_overlap):
+            return f"overlap {shared:.2f}"
         if fit.rmse_m > config.fit.max_rmse_m:
             return f"surfaces are {100 * fit.rmse_m:.1f} cm apart"
         if fit.conflict > config.fit.max_conflict:

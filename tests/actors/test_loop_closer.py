@@ -227,6 +227,18 @@ def test_planted_poses_are_refused(there, back) -> None:
         assert planted.refused
 
 
+def test_landmarks_alone_are_not_believed_where_little_is_seen_twice(room) -> None:
+    """Frames 9 and 72 share a third of what they see: enough where features vouch for the pose."""
+    actor, config = LoopCloser(), LoopsConfig()
+    keyframes = keyframes_of(room, range(9, 14), 0, 0), keyframes_of(room, range(72, 77), 5, 500)
+    handled(actor, told([*keyframes[0], *keyframes[1]]))
+    old, new = (subgraph.views[0] for subgraph in actor.recogniser.subgraphs)
+    verifier = Verifier(config.pyramid, config.align, config.features, config.verification)
+    T = se3.inverse(true_pose(room, 9)) @ true_pose(room, 72)
+    assert verifier.confirm(Proposal(old, new, T, "features", 99)).closure is not None
+    assert verifier.confirm(Proposal(old, new, T, "landmarks", 99)).refused.startswith("overlap")
+
+
 def test_nothing_depends_on_anything_but_the_messages(there, back, said) -> None:
     again = handled(LoopCloser(), told([*there, *back]))
     assert [encode(message) for message in again] == [encode(message) for message in said]
