@@ -73,6 +73,7 @@ class LoopErrors:
     position_errors_m: tuple[float, ...]  # of the closures
     rotation_errors_deg: tuple[float, ...]
     ms: tuple[float, ...]  # of the candidates
+    retrieved_queries: int = 0  # of `queries`, with a true partner among their candidates
 
     @property
     def precision(self) -> float | None:
@@ -118,7 +119,8 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
     subgraphs = _subgraphs(found, keyframes)
     index = {subgraph: number for number, subgraph in enumerate(subgraphs)}
     partners = _true_pairs(subgraphs, keyframes)
-    pairs = [(index.get(c.newer), index.get(c.older)) for c in found.candidates if c.is_closure]
+    compared = [(index.get(c.newer), index.get(c.older)) for c in found.candidates]
+    pairs = [pair for pair, c in zip(compared, found.candidates, strict=True) if c.is_closure]
     right = {pair for pair in pairs if pair in partners}
     have_partner = {newer for newer, _ in partners}
     errors = [_error(c, keyframes) for c in found.closures if _are_known(c, keyframes)]
@@ -131,6 +133,7 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
         position_errors_m=tuple(m for m, _ in errors),
         rotation_errors_deg=tuple(deg for _, deg in errors),
         ms=tuple(c.ms for c in found.candidates if c.ms is not None),
+        retrieved_queries=len({newer for newer, _ in partners.intersection(compared)}),
     )
 
 

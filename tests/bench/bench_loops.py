@@ -7,7 +7,8 @@ SOURCE: data sets or synthetic sequences; default: tum/kitchen and replica/apart
 LDO_DATA, and synthetic:flat. Coarse: one subgraph among 1000 of random histograms. Fine: each
 source is tracked once, its keyframes are looked at by the detector, if one is named, and are given
 to the loop closer; CPU time is of one core, per candidate, with the finding of its pose and the
-proof. What is found is judged as by `ldo eval`.
+proof. What is found is judged as by `ldo eval`. Retrieved: subgraphs with a true partner among the
+candidates of theirs.
 """
 
 import argparse
@@ -132,7 +133,8 @@ def row(errors: LoopErrors) -> str:
     cm = 100 * np.array(errors.position_errors_m or (0.0,))
     deg = np.array(errors.rotation_errors_deg or (0.0,))
     return (
-        f"{errors.candidates} | {errors.closures} | {share(errors.precision)} | "
+        f"{errors.candidates} | {errors.retrieved_queries} | {errors.closures} | "
+        f"{share(errors.precision)} | "
         f"{errors.closed_queries} of {errors.queries} | {share(errors.recall)} | "
         f"{np.median(cm):.2f} / {cm.max():.2f} | {np.median(deg):.2f} / {deg.max():.2f} | "
         f"{p50:.0f} / {p95:.0f} |"
@@ -155,8 +157,8 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     print(f"coarse: {coarse_ms():.2f} ms CPU among {SUBGRAPHS} subgraphs\n")
-    print("| source | stages | candidates | closures | precision | closed | recall ", end="")
-    print("| cm p50 / max | deg p50 / max | CPU ms p50 / p95 |\n|" + "---|" * 10)
+    print("| source | stages | candidates | retrieved | closures | precision | closed ", end="")
+    print("| recall | cm p50 / max | deg p50 / max | CPU ms p50 / p95 |\n|" + "---|" * 11)
     for source in arguments.sources or default_sources():
         sequence = open_sequence(source)
         messages = tracked(sequence, arguments.model)

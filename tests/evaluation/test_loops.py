@@ -67,7 +67,7 @@ def test_a_right_closure_is_precise_and_complete() -> None:
         (LoopClosed(7, 2, true_pose(2, 7)),),
     )
     errors = evaluate_loops(found, THERE_AND_BACK)
-    assert (errors.precision, errors.recall) == (1, 1)
+    assert (errors.precision, errors.recall, errors.retrieved_queries) == (1, 1, 1)
     assert (errors.queries, errors.candidates) == (1, 2)
     assert errors.position_errors_m == (0,)
     assert errors.ms == (20, 20)
@@ -78,8 +78,13 @@ def test_a_false_closure_costs_precision_and_brings_no_recall() -> None:
     T[1, 3] = 0.3
     found = FoundLoops((compared(AGAIN, AWAY, True),), (LoopClosed(7, 4, T),))
     errors = evaluate_loops(found, THERE_AND_BACK)
-    assert (errors.precision, errors.recall) == (0, 0)
+    assert (errors.precision, errors.recall, errors.retrieved_queries) == (0, 0, 0)
     assert errors.position_errors_m == pytest.approx((0.3,))
+
+
+def test_a_true_pair_that_was_compared_and_refused_was_retrieved() -> None:
+    errors = evaluate_loops(FoundLoops((compared(AGAIN, FIRST, False),), ()), THERE_AND_BACK)
+    assert (errors.recall, errors.retrieved_queries) == (0, 1)
 
 
 def test_what_was_never_compared_still_counts_as_missed() -> None:
