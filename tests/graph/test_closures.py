@@ -135,14 +135,14 @@ def test_a_closure_between_components_joins_them() -> None:
         np.testing.assert_allclose(T, truth[keyframe], atol=1e-5)
 
 
-<<<<<<< HEAD
 def test_the_older_of_two_closures_that_say_the_same_makes_room() -> None:
     known = Closures(ClosuresConfig(most=3))
     for a, b in ((10, 200), (12, 202), (90, 300), (10, 301)):
         known = known.after(RelativePose(a, b, np.eye(4), np.eye(6)), Verdict(True))
     assert list(known.accepted) == [(12, 202), (90, 300), (10, 301)]
     assert known.refused == known.left == ()
-=======
+
+
 # --- joins ----------------------------------------------------------------------------------------
 TWO = round_trips(60, 60)
 FALSE_JOIN = (3, 38, 0, 0.3, 0, 1.0, 0, 0.5)  # a, b, and by how much it is off: rad, m
@@ -217,4 +217,3 @@ def test_of_two_joins_in_a_row_the_contradicted_one_falls() -> None:
     assert not graph.close(off_by(truth, *TRUE_ONES[0])).is_accepted
     assert graph.close(off_by(truth, 12, 72)).dropped == (FALSE_JOIN[:2],)
     assert ate_m(graph, truth) < 1e-3
->>>>>>> 5f8ed9e (Let closures outvote the measurement that joined two segments)
