@@ -8,12 +8,13 @@ its distribution over C classes. The paper's four kinds of edges, and what they 
 
     odometry      |log(T_ab^-1 T_a^-1 T_b)|^2_Omega          consecutive keyframes, refinements
     loops         rho(|log(T_ab^-1 T_a^-1 T_b)|^2_Omega)     verified pairs
-    observations  rho(w_kl |pi(T_k^-1 mu_l) - z_kl|^2 / sigma_px^2) + lambda w_kl KL(p_l || q_kl)
+    observations  s rho(w_kl |pi(T_k^-1 mu_l) - z_kl|^2 / sigma_px^2) + lambda w_kl KL(p_l || q_kl)
     similarity    w_sem / 2 (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j],
                   landmarks i, j that a keyframe shows together
 
 with lambda = 0.5, w_sem = 0.1, z_kl the centre of a detected box and q_kl the distribution of what
 is in it. The printed similarity has a direction and the pair has none: half of each is taken.
+s = 1/32 for what the sights of one object err by together (`factors.NoiseConfig`).
 w_kl = exp(-2 H(q_kl)) above 0.5 nats, else 1: what was observed vaguely counts less. The entropy is
 that of the observation, known beforehand; that of p_l would change the weights with the solution.
 

@@ -34,6 +34,9 @@ class NoiseConfig:
     # part of it, and which side is seen, moves it by a share of its size; detectors add some px.
     sigma_box_px: float = 4.0
     sigma_box_share: float = 0.15
+    # That is the same error in all sights of an object, so N of them inform less than N: as many as
+    # are kept of a landmark (`landmarks.most_sights`) count as one.
+    independent_sights: float = 1 / 32
     robust_sigmas: float = 2.385  # of Cauchy's kernel: 95 % efficient on Gaussian noise
 
     def __post_init__(self) -> None:
@@ -42,6 +45,8 @@ class NoiseConfig:
             raise ConfigError(f"{self}: every sigma must be positive.")
         if min(getattr(self, name) for name in optional) < 0:
             raise ConfigError(f"{self}: drift must not be negative.")
+        if self.independent_sights > 1:
+            raise ConfigError(f"independent_sights={self.independent_sights:g} must be at most 1.")
 
     @property
     def floor(self) -> np.ndarray:
@@ -102,17 +107,19 @@ def relative_factor(
 
 
 def sight_factor(
-    sight: Sight, variable: int, T_variable_keyframe: np.ndarray, robust_sigmas: float
+    sight: Sight, variable: int, T_variable_keyframe: np.ndarray, noise: NoiseConfig
 ) -> gtsam.NonlinearFactor:
-    """rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2); `variable` is the keyframe, or what it follows.
+    """s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_sights`; `variable` is the
+    keyframe, or what it follows.
 
     A point behind the camera costs a constant and pulls nowhere."""
-    sigma = sight.sigma_px / np.sqrt(sight.weight)
-    noise = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), robust_sigmas)
+    share = np.sqrt(noise.independent_sights)
+    sigma = sight.sigma_px / np.sqrt(sight.weight) / share
+    model = _robust(gtsam.noiseModel.Isotropic.Sigma(2, sigma), share * noise.robust_sigmas)
     fx, fy, cx, cy = sight.intrinsics
     return gtsam.GenericProjectionFactorCal3_S2(
         sight.center_px,
-        noise,
+        model,
         variable,
         point_key(sight.landmark),
         gtsam.Cal3_S2(fx, fy, 0.0, cx, cy),

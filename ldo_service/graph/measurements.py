@@ -152,7 +152,7 @@ class Measurements:
             case "closure":
                 return self._closure_factor(self.closures.accepted[pair], self._noise.robust_sigmas)
         sight = self.sights[pair]
-        return sight_factor(sight, *self.in_head(sight.keyframe), self._noise.robust_sigmas)
+        return sight_factor(sight, *self.in_head(sight.keyframe), self._noise)
 
     def with_closures(
         self, closures: Iterable[RelativePose], initial: Variables
