@@ -27,7 +27,7 @@ class ClosuresConfig:
     # believed at a time, 1 kB each and one more to solve with; beyond, the one goes that another is
     # nearest to
     most: int = 500
-    doubts: int = 16  # refused ones kept that contradict a join: three that agree outvote it
+    doubts: int = 16  # refused ones kept that contradict a join: two that agree outvote it
     remembered: int = 256  # refused ones, and ones that left, to tell
 
     def __post_init__(self) -> None:

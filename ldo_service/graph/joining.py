@@ -6,7 +6,7 @@ a doubt, and once more closures agree with a doubt than with the join, it joins 
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Set
+from collections.abc import Callable, Iterable, Set
 from copy import copy
 from dataclasses import dataclass
 
@@ -51,13 +51,11 @@ def T_new_old(measured: RelativePose, pose: Pose, *, moves_b: bool) -> np.ndarra
     return se3.orthonormalised(T if moves_b else se3.inverse(T))
 
 
-def contradicted(known: Measurements, closure: RelativePose) -> Joined | None:
-    """The join that alone says where the ends of a closure are to each other."""
-    for pair in known.joins:
-        joined = Joined(pair, _hanging_on(known, pair))
-        if joined.is_across(pair_of(closure)):
-            return joined
-    return None
+def contradicted(known: Measurements, closure: RelativePose) -> list[Joined]:
+    """The joins each of which alone says where the ends of a closure are to each other: several in
+    a row, of which one may be wrong."""
+    joins = (Joined(pair, _hanging_on(known, pair)) for pair in known.joins)
+    return [joined for joined in joins if joined.is_across(pair_of(closure))]
 
 
 def _hanging_on(known: Measurements, join: Pair) -> Set[int]:
@@ -71,6 +69,26 @@ def _hanging_on(known: Measurements, join: Pair) -> Set[int]:
         front = {b for a in front for b in links[a]} - held
     ours = (k for k, theirs in known.first_of.items() if theirs == first)
     return {k for k in ours if known.in_head(k)[0] not in held}
+
+
+def best_without(
+    known: Measurements,
+    joins: Iterable[Joined],
+    closure: RelativePose,
+    pose: Pose,
+    variables: Variables,
+    initial: Variables,
+) -> tuple[Joined, Measurements, Variables] | None:
+    """The join that is outvoted, and what is known without it. Of several the one without which
+    most closures are believed; None where two are as good."""
+    found = [
+        (joined, *other)
+        for joined in joins
+        if (other := outvoted(known, joined, closure, pose, variables, initial)) is not None
+    ]
+    most = max((len(other.closures.accepted) for _, other, _ in found), default=0)
+    best = [one for one in found if len(one[1].closures.accepted) == most]
+    return best[0] if len(best) == 1 else None
 
 
 def outvoted(

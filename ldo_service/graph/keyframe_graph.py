@@ -12,7 +12,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from .closures import Closures, ClosuresConfig, Pair, Verdict
 from .condensing import group_to_condense
 from .factors import NoiseConfig, Sight, information
-from .joining import T_new_old, contradicted, judged, outvoted
+from .joining import T_new_old, best_without, contradicted, judged
 from .measurements import Measurements
 from .packing import pack_relative, pack_sights, unpack_relative, unpack_sights
 from .solver import Name, Solver, Variables, point_key
@@ -161,18 +161,19 @@ class KeyframeGraph:
         self._rebase(moved)
 
     def _refuse(self, closure: RelativePose) -> Verdict:
-        """Unless more closures agree with it than with the join that it contradicts."""
+        """Unless more closures agree with it than with a join that it contradicts. Of several joins
+        the one falls that takes the fewest closures with it; where that is not one, all stay."""
         known, variables = self._known, self._solver.variables()
         known.closures = known.closures.after(closure, Verdict(False))
-        joined = contradicted(known, closure)
-        self._note("refuse", measured=pack_relative([closure]), is_doubt=joined is not None)
-        if joined is None:
+        joins = contradicted(known, closure)
+        self._note("refuse", measured=pack_relative([closure]), is_doubt=bool(joins))
+        if not joins:
             return Verdict(False)
         known.doubt(closure)
-        better = outvoted(known, joined, closure, self.pose, variables, self._initial)
+        better = best_without(known, joins, closure, self.pose, variables, self._initial)
         if better is None:
             return Verdict(False)
-        self._known, variables = better
+        joined, self._known, variables = better
         self._rebase(variables)
         gone = (p for p in known.closures.accepted if p not in self.closures.accepted)
         return Verdict(True, (joined.pair, *gone))

@@ -205,15 +205,46 @@ def test_a_successor_knows_what_contradicted_a_join() -> None:
     np.testing.assert_array_equal(graph.placed()[1], successor.placed()[1])
 
 
-def test_of_two_joins_in_a_row_the_contradicted_one_falls() -> None:
-    """A third component hangs on the second, and goes where that goes."""
-    truth = round_trips(90, 60)
+def in_three(truth: list[np.ndarray]) -> KeyframeGraph:
     graph = apart(truth[:60])
     graph.add_first(60, se3.exp(np.full(6, -0.2)))
     for b in range(61, 90):
         graph.add(RelativePose(b - 1, b, se3.inverse(truth[b - 1]) @ truth[b], REFINED))
+    return graph
+
+
+def test_of_two_joins_in_a_row_the_contradicted_one_falls() -> None:
+    """A third component hangs on the second, and goes where that goes."""
+    truth = round_trips(90, 60)
+    graph = in_three(truth)
     graph.close(off_by(truth, *FALSE_JOIN))
     assert graph.close(off_by(truth, 40, 70)).is_accepted
     assert not graph.close(off_by(truth, *TRUE_ONES[0])).is_accepted
     assert graph.close(off_by(truth, 12, 72)).dropped == (FALSE_JOIN[:2],)
+    assert ate_m(graph, truth) < 1e-3
+
+
+def test_of_two_joins_in_a_row_the_one_that_others_agree_with_stays() -> None:
+    truth = round_trips(90, 60)
+    graph = in_three(truth)
+    for pair in TRUE_ONES[:2]:
+        assert graph.close(off_by(truth, *pair)).is_accepted
+    false_join = (40, 70, *FALSE_JOIN[2:])
+    assert graph.close(off_by(truth, *false_join)).is_accepted, "nothing to judge it by"
+    assert not graph.close(off_by(truth, 5, 65)).is_accepted
+    assert graph.close(off_by(truth, 12, 72)).dropped == (false_join[:2],)
+    assert set(graph.closures.accepted) >= {TRUE_ONES[1]}
+    assert ate_m(graph, truth) < 1e-3
+
+
+def test_where_either_of_two_joins_may_be_wrong_both_stay() -> None:
+    truth = round_trips(90, 60)
+    graph = in_three(truth)
+    graph.close(off_by(truth, *TRUE_ONES[0]))
+    graph.close(off_by(truth, 40, 70, *FALSE_JOIN[2:]))
+    for pair in ((5, 65), (12, 72), (20, 80)):
+        assert not graph.close(off_by(truth, *pair)).is_accepted
+    between = graph.close(off_by(truth, *TRUE_ONES[1]))  # the first join was right
+    assert between.is_accepted
+    assert graph.close(off_by(truth, 8, 68)).dropped == ((40, 70),)
     assert ate_m(graph, truth) < 1e-3
