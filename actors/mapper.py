@@ -142,6 +142,7 @@ class Mapper(Actor):
 
     name = "mapper"
     lags = True  # it writes the whole map every few keyframes
+    finishes_last = True  # a closure of the last keyframes corrects the map
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),

@@ -35,10 +35,10 @@ class Actor:
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
     lags = False  # its snapshots may be of an earlier step: what it took since is kept beside them
-    talks_outside = (
-        False  # asks what no journal records: a replay leaves it out, and who takes what
-    )
-    # it makes is fed from what it took then
+    finishes_last = False  # its last words tell what came of the others'
+    # asks what no journal records: a replay leaves it out, and who takes what it makes is fed from
+    # what it took then
+    talks_outside = False
 
     def __init__(self) -> None:
         self.situation = Situation()
@@ -55,7 +55,7 @@ class Actor:
         return iter(())
 
     def finish(self) -> Iterator[Message]:
-        """Last words before a soft stop."""
+        """Last words before a soft stop. `finishes_last`: after all others have said theirs."""
         return iter(())
 
     def snapshot(self) -> State:

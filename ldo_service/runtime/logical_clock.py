@@ -120,8 +120,9 @@ class LogicalClock:
         self._settle_all()
 
     def finish(self) -> None:
-        """Let each actor say its last words, producers first. A run may still follow."""
-        for thread in self._threads:
+        """Let each actor say its last words, producers first, and those last that tell what came of
+        the others'. A run may still follow."""
+        for thread in sorted(self._threads, key=lambda thread: thread.actor.finishes_last):
             self._expect(thread, self._tick, thread.finish())
             self._settle_all()
 

@@ -90,8 +90,8 @@ class Stage:
         """Once. Raises RestartsExhausted or StageStalled when it gives up."""
         self._worker = Worker(self.name)
         self._open_outlets()
-        if self._keeper.past.is_none and not self._begin():
-            await self._keep()
+        if self._keeper.past.is_none:
+            self._begin()
         self._mailbox = self._open_mailbox()
         self._transport.announce(self.name)
         tasks = {
@@ -165,6 +165,8 @@ class Stage:
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         try:
+            if self._keeper.is_unsaved:
+                await self._keep()
             await self._outlets.release()  # what a predecessor made
             await self._say_first_words()
             while delivery := await self._next(mailbox):
@@ -296,13 +298,13 @@ class Stage:
         takes = any(isinstance(port.policy, Lossless) for port in self._actor.inputs)
         return not self._outlets.never_wait and (takes or self._outlets.have_expected)
 
-    def _begin(self) -> bool:
-        """Save what there is before anyone counts on this stage: at once, as it is little."""
+    def _begin(self) -> None:
+        """Save what there is before anyone counts on this stage: at once, as it is little. What the
+        disk does not take is tried again before the first step."""
         try:
             self._write(self._keeper.compose(self._actor, self._links(), None, False))
         except OSError as error:
             self._note_unsaved(error)
-        return not self._keeper.is_unsaved
 
     def _links(self, delivery: Delivery | None = None) -> State:
         inputs = self._mailbox.past(delivery) if self._mailbox else self._keeper.past.inputs
