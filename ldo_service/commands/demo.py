@@ -28,6 +28,7 @@ from .run import with_options
 
 FRAMES = 70  # of the flat: what stands in its first room
 HOLD_OUT = 5  # every 5th frame is tracked and never mapped
+PROCESSES = 4  # to ray cast: each takes seconds to begin, and a second for a frame
 NETWORKS = "demo"  # those that come with the package
 
 
@@ -50,7 +51,7 @@ def demo(
     sequence = FlatSequence.named("flat")
     prepare(out, overwrite)
     with progress("ray casting", FRAMES, console) as advance:
-        prerender(sequence.config, os.cpu_count() or 1, range(FRAMES), advance)
+        prerender(sequence.config, min(os.cpu_count() or 1, PROCESSES), range(FRAMES), advance)
     job = Job(sequence, out, demo_config(), Selection(max_frames=FRAMES), console.print)
     with progress("tracking and mapping", job.work, console) as advance:
         record = run_over_file(job, advance)

@@ -55,6 +55,8 @@ class VerificationConfig:
     def __post_init__(self) -> None:
         if min(self.min_inliers, self.witness_inliers) < 6 or self.pairs < 1:
             raise ConfigError(f"{self}: inliers must be at least 6, pairs at least 1.")
+        if not 0 <= self.blind_overlap <= 1:
+            raise ConfigError(f"blind_overlap={self.blind_overlap:g} must be within 0..1.")
         angles = (self.witness_rad, self.refined_rad, self.refined_landmarks_rad)
         if min(*angles, self.map_witness_rad) <= 0 or self.map_pairs < 0:
             raise ConfigError(f"{self}: angles must be positive, map_pairs not negative.")

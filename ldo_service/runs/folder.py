@@ -75,6 +75,7 @@ WRITTEN = frozenset(
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
         *(PLACES, OBJECTS, LOOPS, SEMANTICS, f"{REFINED}/{SEMANTICS}", f"{REFINED}/{OBJECTS}"),
         *("trajectory.png", "rendering.png", "labels.png"),  # by `eval` and `demo`
+        "views.png",  # by `demo` up to 0.1
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
     }

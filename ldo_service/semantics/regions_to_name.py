@@ -40,7 +40,7 @@ class RegionConfig:
     patience: int = 3  # keyframes without a better view, before it is asked: one may yet come
     most_questions: int = 3  # about a region
     per_keyframe: float = 1.5  # questions, of all that are due those with most to show: half are
-    # about no things. The paper asks on 10-25 % of the frames (IV.B.8): 0.3 here
+    # about no things. The paper asks on 10-25 % of the frames (IV.B.8); the flat, 0.8
     at_once: int = 4  # questions saved up while there was nothing to ask
     gain: float = 1.3  # of the views' summed quality, before it is asked again
     settled: float = 0.6  # of an answer that needs no second one
@@ -60,8 +60,14 @@ class RegionConfig:
             raise ConfigError(f"{self}: patience at least 0, per_keyframe positive.")
         if not (0 <= self.least_quality <= 1):
             raise ConfigError(f"{self}: least_quality must be within 0..1.")
-        if self.views_first > self.views or not (self.gain > 1 and self.overlap > 0):
-            raise ConfigError(f"{self}: views_first at most views, gain over 1, overlap positive.")
+        if self.views_first > self.views or not self.gain > 1:
+            raise ConfigError(f"{self}: views_first at most views, gain over 1.")
+        if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
+            raise ConfigError(
+                f"{self}: overlap within 0..1, max_gap_m positive, least_points at least 1."
+            )
+        if not (self.answer_weight > 0 and self.least_votes >= 0):
+            raise ConfigError(f"{self}: answer_weight positive, least_votes not negative.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -65,8 +65,8 @@ class DriftingOdometry(Odometry):
     def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
         return self._noted(super().make_keyframe(frame, self._as_tracked(tracked)))
 
-    def make_supporting(self, tracked: Tracked) -> int:
-        return self._noted(super().make_supporting(self._as_tracked(tracked)))
+    def make_supporting(self, frame: RgbdFrame, tracked: Tracked) -> int:
+        return self._noted(super().make_supporting(frame, self._as_tracked(tracked)))
 
     def window(self, tracked: Tracked) -> list[RelativePose]:
         return [

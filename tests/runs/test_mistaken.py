@@ -26,6 +26,8 @@ def followed(odometry: Odometry, frames: list[RgbdFrame]) -> tuple[np.ndarray, l
             for m in odometry.window(tracked):
                 T_chained = T_odom_keyframe[m.a] @ m.T_a_b
                 np.testing.assert_allclose(T_chained, T_odom_keyframe[m.b], atol=2e-3)
+        elif tracked.wants_mapping:
+            T_odom_keyframe[odometry.make_supporting(frame, tracked)] = tracked.T_odom_camera
     return np.array(T_odom), keyframes
 
 
