@@ -69,7 +69,10 @@ class FolderStore:
         if not state:
             return
         folder = self._folder / actor
+        is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
+        if is_new and self._syncs:
+            sync(self._folder)
         saved = self._saved.get(actor, {})
         if actor not in self._files:
             self._files[actor] = _read_contents_or_nothing(folder)

@@ -165,9 +165,10 @@ def test_what_must_outlive_a_power_cut_is_synced_before_it_is_named(
 
     monkeypatch.setattr(state_store, "sync", noted)
     store, same = FolderStore(tmp_path, syncs=True), [0]
-    for step in (1, 2):
-        synced.clear()
-        store.save("mapper", {"same": same, "step": [step]})
+    store.save("mapper", {"same": same, "step": [1]})
+    assert synced[0][0] == tmp_path.name, "the name of its folder"
+    synced.clear()
+    store.save("mapper", {"same": same, "step": [2]})
     contents, new = state_store.CONTENTS, f"{state_store.CONTENTS}.new"
     assert [name for name, _ in synced] == ["step.b", new, "mapper"]
     assert new in synced[1][1]
