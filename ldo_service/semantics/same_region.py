@@ -62,7 +62,10 @@ def share_back(
     T_map_keyframe: Mapping[int, np.ndarray],
     least: int,
 ) -> float:
-    """Of the points of a sighting that lie in the image of the region's: the share in its part."""
+    """Of the points of a sighting that lie in the image of the region's: the share in its part.
+
+    What something hid there counts against it: a thing that is seen whole now, and was mostly
+    hidden at its best so far, is a new region."""
     known = region.shape
     T = se3.inverse(T_map_keyframe[known.keyframe]) @ T_map_keyframe[seen.keyframe]
     rows, columns, is_inside = pixels(seen.p_camera @ T[:3, :3].T + T[:3, 3], camera, shape)

@@ -45,7 +45,7 @@ class TriggerConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Candidate:
-    """A region that nobody has a reliable name for.
+    """A region that nobody has a reliable name for, or that the detector is sure of.
 
     box_px [4], x0 y0 x1 y1; part, what of the box it is; number, label and score of the detector's
     box, if it is one; kind of the segment, if it is one
@@ -92,7 +92,10 @@ def candidates(
         for one in asked
         if one.score >= config.sure or _is_worth_a_look(one, depth_m.shape, config)
     ]
-    return sorted(worth, key=lambda c: -np.count_nonzero(c.part.mask))[: config.most]
+    size = {id(one): np.count_nonzero(one.part.mask) for one in worth}
+    # a sure box is no question: it gives way where there is no room for both
+    kept = sorted(worth, key=lambda c: (c.score >= config.sure, -size[id(c)]))[: config.most]
+    return sorted(kept, key=lambda c: -size[id(c)])
 
 
 def _boxed(

@@ -137,6 +137,12 @@ def test_the_largest_come_first_and_no_more_than_the_most() -> None:
     assert len(asked(depth_m, config=replace(CONFIG, most=2))) == 2
 
 
+def test_what_is_sure_gives_way_to_what_is_to_be_asked_about() -> None:
+    small, big = (10, 40, 29, 59), (60, 20, 119, 99)
+    (one,) = followed(wall_with(small, big), [big], ["tv"], [0.9], config=replace(CONFIG, most=1))
+    assert one.score < CONFIG.sure
+
+
 def test_two_things_at_different_depths_that_overlap_are_two() -> None:
     depth_m = wall_with((40, 40, 79, 79))
     depth_m[30:90, 80:110] = 1.2
