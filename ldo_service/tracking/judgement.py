@@ -127,12 +127,12 @@ def _limits(previous: Status, candidate: Candidate, config: JudgementConfig) -> 
     if previous is Status.LOST:
         moved_rad = extent(candidate.alignment.T_reference_camera, candidate.median_depth_m)
         residual = config.relocalised_residual + config.relocalised_residual_per_rad * moved_rad
-        least = config.min_overlap / config.recovery_margin
+        overlap = config.min_overlap / config.recovery_margin
+        if not candidate.second_agrees:
+            overlap = max(overlap, config.relocalised_overlap)
         return replace(
             config,
-            min_overlap=least
-            if candidate.second_agrees
-            else max(least, config.relocalised_overlap),
+            min_overlap=overlap,
             weak_residual=min(config.weak_residual, residual),
         )
     return replace(

@@ -105,45 +105,34 @@ def test_nothing_is_dropped_not_even_by_latest() -> None:
     assert len(newest.seen) == 10
 
 
+class Talker(Doubler):
+    def finish(self) -> Iterator[Message]:
+        yield Double(stamp_ns=9, value=-1)
+
+
+class Counter(Mixer):
+    outputs = (Out(PIECES),)
+
+    def finish(self) -> Iterator[Message]:
+        yield Piece(stamp_ns=0, version=len(self.seen), part=0, parts=1)
+
+
 def test_last_words_come_producers_first_after_everything_else() -> None:
-    class Talker(Doubler):
-        def finish(self) -> Iterator[Message]:
-            yield Double(stamp_ns=9, value=-1)
-
-    class Last(Mixer):
-        outputs = (Out(PIECES),)
-
-        def finish(self) -> Iterator[Message]:
-            yield Piece(stamp_ns=0, version=len(self.seen), part=0, parts=1)
-
-    mixer = Last()
-    made = run([Talker(), mixer], {"doubler": 4}, 3)
-    assert mixer.seen[-2:] == ["D4", "D-1"]
+    counter = Counter()
+    made = run([Talker(), counter], {"doubler": 4}, 3)
+    assert counter.seen[-2:] == ["D4", "D-1"]
     assert made[-1] == ("mixer", Piece(stamp_ns=0, version=7, part=0, parts=1))
 
 
 def test_who_tells_what_came_of_the_others_last_words_comes_last() -> None:
-    class Talker(Doubler):
+    class LastTalker(Talker):
         finishes_last = True
 
-        def finish(self) -> Iterator[Message]:
-            yield Double(stamp_ns=9, value=-1)
-
-    class Last(Mixer):
-        outputs = (Out(PIECES),)
-
-        def finish(self) -> Iterator[Message]:
-            yield Piece(stamp_ns=0, version=len(self.seen), part=0, parts=1)
-
-    made = run([Talker(), Last()], {"doubler": 4}, 3)
+    made = run([LastTalker(), Counter()], {"doubler": 4}, 3)
     assert [name for name, _ in made[-2:]] == ["mixer", "doubler"]
 
 
 def test_an_empty_source_still_lets_actors_finish() -> None:
-    class Talker(Doubler):
-        def finish(self) -> Iterator[Message]:
-            yield Double(stamp_ns=9, value=-1)
-
     assert run([Talker()], {}, 0) == [("doubler", Double(stamp_ns=9, value=-1))]
 
 
