@@ -14,6 +14,8 @@ from ldo_service.gaussians.render_reference import render_reference
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels import _rasterise
 
+from .scenes import camera_of, gaussians
+
 GROUPS = {
     "mean": slice(0, 3),
     "log_scale": slice(3, 6),
@@ -34,25 +36,6 @@ for name in {key.split("/")[0] for key in given}:
     result[f"{name}/rows"][gradients.indices] = gradients.rows
     result[f"{name}/xi"] = gradients.xi
 """
-
-
-def camera_of(width: int, height: int) -> Camera:
-    return Camera(width, height, 0.9 * width, 0.8 * width, 0.45 * width, 0.55 * height)
-
-
-def gaussians(n: int, seed: int, *, depth_m: tuple[float, float] = (0.5, 4.0)) -> np.ndarray:
-    """Rows in front of the origin, a third of them beyond the edges of the image."""
-    rng = np.random.default_rng(seed)
-    z = rng.uniform(*depth_m, n)
-    rows = np.zeros((n, 16), np.float32)
-    rows[:, 0] = rng.uniform(-0.8, 0.9, n) * np.abs(z)
-    rows[:, 1] = rng.uniform(-0.8, 0.7, n) * np.abs(z)
-    rows[:, 2] = z
-    rows[:, 3:6] = np.log(0.05 * np.abs(z[:, None]) * rng.uniform(0.1, 2, (n, 3)))
-    rows[:, 6:10] = rng.normal(size=(n, 4))
-    rows[:, 10] = rng.uniform(-3, 6, n)
-    rows[:, 11:14] = rng.uniform(0, 1, (n, 3))
-    return rows
 
 
 def nearly_opaque() -> np.ndarray:
