@@ -13,12 +13,14 @@ from .consistency import ConsistencyConfig, Disagreement, agree
 from .foreground import Foreground, ForegroundConfig, foreground, surfaces
 from .fusion import FusionConfig, fused
 from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe, top_labels, without_misses
+from .nesting import NestingConfig, without_nested
 
 
 @dataclass(frozen=True, slots=True)
 class LabellingConfig:
     region: Literal["foreground", "box"] = "foreground"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
+    nesting: NestingConfig = field(default_factory=NestingConfig)
     assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     labels: LabelConfig = field(default_factory=LabelConfig)
@@ -121,7 +123,7 @@ def label_keyframe(
 def regions_of(
     claims: Claims, depth_m: np.ndarray, camera: Camera, config: LabellingConfig
 ) -> Regions:
-    """The boxes, or the objects in them."""
+    """The boxes, or the objects in them, each without those that lie on it."""
     if config.region == "box" or len(claims.boxes) == 0:
         return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
     known = claims.parts or (None,) * len(claims.boxes)
@@ -132,6 +134,7 @@ def regions_of(
             part or foreground(box, depth_m, found, camera, config.foreground)
             for box, part in zip(claims.boxes, known, strict=True)
         ]
+    parts = without_nested(parts, claims.scores(), config.nesting)
     return Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
 
 
