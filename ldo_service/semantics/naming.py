@@ -78,12 +78,12 @@ class Naming:
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
         labels = [vocabulary.name(int(label)) for label in claims.labels]
         color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
-        found = regions_of_image(
-            segments(color, depth_m, camera, config.segments), depth_m.shape, config
-        )
+        apart = segments(color, depth_m, camera, config.segments)
+        found = regions_of_image(apart, depth_m.shape, config)
+        room = [one.part for one in apart if one.kind == "room"]
         doubtful = candidates(
             *(claims.boxes, labels, claims.confidences),
-            *(depth_m, camera, is_labelled, found, config),
+            *(depth_m, camera, is_labelled, found, config, room),
         )
         named = named_objects(claims.boxes, is_labelled, found, config)
         sightings = self._regions.see(
@@ -169,11 +169,12 @@ class Naming:
 
 
 def fitting_parts(boxes: int, found: Sequence[Candidate]) -> tuple[Foreground | None, ...]:
-    """Of each box of the detector the thing that depth and creases set apart there, or None where
-    none fits. What colour sets apart has the rim of what it lies on."""
+    """Of each box of the detector the thing that depth and creases set apart there, or what of it
+    is no room, or None where nobody looked. What colour sets apart has the rim of what it lies
+    on."""
     parts: list[Foreground | None] = [None] * boxes
     for one in found:
-        if one.number is not None and one.kind not in ("", "flat"):
+        if one.number is not None and one.kind != "flat":
             parts[one.number] = one.part
     return tuple(parts)
 

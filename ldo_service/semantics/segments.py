@@ -5,6 +5,7 @@
     convex     what of that no concave crease divides: a cabinet beside an oven (Stein et al., CVPR
                2014: things are convex, and creases between them concave)
     flat       lies on structure, and is of another colour: a picture, a window, a rug
+    room       a plane of structure itself: no thing, but what the box of one may show beside it
 
 They overlap: a couch with its cushions is apart, the cushions stand on it.
 """
@@ -22,7 +23,7 @@ from ldo_service.geometry import Camera
 from .foreground import Foreground
 from .planes import PlaneConfig, Planes, Relief, disc, planes, relief, shrink_factor, structure
 
-Kind = Literal["apart", "standing", "convex", "flat"]
+Kind = Literal["apart", "standing", "convex", "flat", "room"]
 _3X3 = np.ones((3, 3), np.uint8)
 
 
@@ -77,10 +78,14 @@ def segments(
         shown.append(("flat", mask))
     # at the size of the image
     k = shrink_factor(camera.width, config.planes)
-    return [
+    things = [
         Segment(kind, _enlarged(_filled(part) if kind == "flat" else part, k))
         for kind, mask in shown
         for part in components(mask, config.min_px)
+    ]
+    numbers = np.unique(of_room[of_room > 0])
+    return things + [
+        Segment("room", _enlarged(Foreground(0, 0, of_room == number), k)) for number in numbers
     ]
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 
-from .foreground import Foreground, ForegroundConfig, foreground, surfaces
+from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
 from .segments import Segment, SegmentConfig
 
 _ORDER = ("flat", "apart", "standing", "convex")  # of regions alike, the first is kept
@@ -68,6 +68,7 @@ def candidates(
     is_labelled: np.ndarray,
     found: Sequence[Candidate],
     config: TriggerConfig,
+    room: Sequence[Foreground] = (),
 ) -> list[Candidate]:
     """Regions of a keyframe that a labeller should see, and those that the detector is sure of, to
     be followed; the largest first.
@@ -76,10 +77,11 @@ def candidates(
     depth_m                   [H, W], 0 where it is missing
     is_labelled               [H, W] bool: the map has a reliable name for what this pixel shows
     found                     its regions, as `regions_of_image` finds them
+    room                      planes of the room, see `segments`
 
     The same arguments give the same candidates.
     """
-    asked, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, config)
+    asked, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, room, config)
     is_sure = np.asarray(scores) >= config.sure
     explained = is_labelled | _painted(boxes_px[is_sure], depth_m.shape)
     asked += [
@@ -105,10 +107,11 @@ def _boxed(
     depth_m: np.ndarray,
     camera: Camera,
     found: Sequence[Candidate],
+    room: Sequence[Foreground],
     config: TriggerConfig,
 ) -> tuple[list[Candidate], list[bool]]:
-    """Boxes of a detector: each is the region that fits it best, else its foreground. And which
-    regions these are."""
+    """Boxes of a detector: each is the region that fits it best, else its foreground without the
+    room. And which regions these are."""
     asked, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
     for i in distinct_boxes(boxes_px, scores, config):
@@ -121,8 +124,29 @@ def _boxed(
             continue
         pieces = pieces or surfaces(depth_m, camera, config.foreground)
         part = foreground(boxes_px[i], depth_m, pieces, camera, config.foreground)
+        part = without_room(part, room, config.foreground.min_inside)
         asked.append(Candidate(boxes_px[i], part, label, score, i))
     return asked, is_taken
+
+
+def without_room(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
+    """Without those planes of the room that mostly go on outside of it: a wall between the leaves
+    of a plant, a floor between the legs of a table. Where that is most of it, as of a clock on its
+    wall, it stays whole. `inside`: share of a plane within the box, to be a part of the thing.
+
+    >>> plant, wall = np.ones((2, 4), bool), np.zeros((6, 8), bool)
+    >>> wall[:, 3:] = True
+    >>> without_room(Foreground(2, 1, plant), [Foreground(0, 0, wall)], 0.5).mask[0].tolist()
+    [True, True, False, False]
+    """
+    mask = part.mask.copy()
+    for plane in room:
+        here = plane.mask[pixels_of(_box(part), plane.mask.shape)]
+        rows, columns = here.shape
+        if np.count_nonzero(here) < inside * np.count_nonzero(plane.mask):
+            mask[:rows, :columns] &= ~here
+    is_most_left = 2 * np.count_nonzero(mask) >= np.count_nonzero(part.mask)
+    return Foreground(part.row, part.column, mask) if is_most_left else part
 
 
 def named_objects(

@@ -26,7 +26,7 @@ def boxed(*names: str) -> tuple[Claims, Vocabulary]:
 
 def test_a_box_is_the_thing_that_fits_it() -> None:
     found = [region(2), region(0, "flat"), region(1, ""), region(None)]
-    assert fitting_parts(4, found) == (None, None, PART, None)
+    assert fitting_parts(4, found) == (None, PART, PART, None)
 
 
 def test_the_name_of_a_region_stands_in_place_of_a_box_s_label() -> None:

@@ -61,7 +61,10 @@ def noisy(depth_m: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def test_a_bare_room_has_nothing_to_name() -> None:
-    assert segments(painted(), room(), CAMERA, SegmentConfig()) == []
+    bare = segments(painted(), room(), CAMERA, SegmentConfig())
+    assert [one.kind for one in bare] == ["room", "room"], "floor and wall"
+    assert np.sum([one.part.image(SHAPE) for one in bare], axis=0).max() == 1
+    assert np.mean([one.part.image(SHAPE).mean() for one in bare]) > 0.4
     assert segments(painted(), np.zeros(SHAPE, np.float32), CAMERA, SegmentConfig()) == []
 
 

@@ -9,6 +9,7 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.semantics import region_views, trigger
+from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.segments import segments
 from ldo_service.semantics.trigger import (
     Candidate,
@@ -16,6 +17,7 @@ from ldo_service.semantics.trigger import (
     candidates,
     named_objects,
     regions_of_image,
+    without_room,
 )
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
@@ -87,6 +89,25 @@ def test_a_box_around_no_region_is_asked_about_as_it_is() -> None:
     box = (10.5, 10.5, 50.5, 60.5)
     (found,) = asked(wall_with((10, 10, 28, 60)), [box], ["vase"], [0.3], config=LOOSE)
     assert found.box_px.tolist() == list(box)
+
+
+def test_a_wall_seen_through_a_box_s_thing_is_no_part_of_it() -> None:
+    """A trellis 0.3 m before a wall: what is between its bars is inside of it."""
+    bars = [(left, 30, left + 5, 89) for left in (60, 72, 84, 96)]
+    is_bar = wall_with(*bars, (60, 30, 101, 35), (60, 84, 101, 89)) == NEAR_M
+    depth_m = np.where(is_bar, WALL_M - 0.3, WALL_M).astype(np.float32)
+    told = np.array([(60, 30, 101, 89)], float), ["tv"], np.array([0.9]), depth_m, CAMERA, NOBODY
+    wall = Foreground(0, 0, ~is_bar)
+    (whole,), (cut,) = (candidates(*told, [], CONFIG, room) for room in ([], [wall]))
+    was, now = (one.part.image(is_bar.shape) for one in (whole, cut))
+    assert np.mean(was[is_bar]) > 0.95
+    assert np.count_nonzero(was & ~is_bar) > 100, "or it shows nothing"
+    assert np.array_equal(now, was & is_bar)
+
+
+def test_what_hangs_flat_on_a_wall_stays_whole() -> None:
+    clock, wall = Foreground(40, 60, np.ones((30, 30), bool)), np.ones((120, 160), bool)
+    assert without_room(clock, [Foreground(0, 0, wall)], 0.5) is clock
 
 
 def test_a_hesitant_box_of_what_a_sure_one_has_is_not_asked_about() -> None:
