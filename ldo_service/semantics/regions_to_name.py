@@ -184,9 +184,12 @@ class RegionsToName:
         return [Opinion(candidate, label, sure)] if label and region.answer else []
 
     def name(self, region: Region) -> tuple[str, float]:
-        """What most speaks for, and how sure the surest was; nothing where little does."""
+        """What most speaks for, and how sure: as the surest was, by the share of all votes that are
+        for it; nothing where little speaks for it."""
         label, total, most = max(region.votes, key=lambda vote: vote[1], default=("", 0.0, 0.0))
-        return (label, most) if total >= self.config.least_votes else ("", 0.0)
+        if total == 0 or total < self.config.least_votes:
+            return "", 0.0
+        return label, most * total / sum(votes for _, votes, _ in region.votes)
 
     def answered(self, region: int, answer: Answer) -> str:
         """The labeller has spoken of it; its name now. A confident answer needs no second one."""

@@ -100,6 +100,19 @@ def test_questions_have_a_budget_and_what_has_most_to_show_goes_first() -> None:
     assert asked == [[], [1], [], [2], [], [0], [], []]
 
 
+def test_a_name_is_less_sure_the_more_speaks_for_another() -> None:
+    walk = Walk()
+    walk.see(thing())
+    walk.answered("oven", 0.6)
+    region = walk.regions.get(0)
+    assert region is not None
+    assert walk.regions.name(region) == ("oven", 0.6)
+    walk.answered("tv", 0.4)
+    region = walk.regions.get(0)
+    assert region is not None
+    assert walk.regions.name(region) == ("oven", pytest.approx(0.6 * 0.36 / (0.36 + 0.16)))
+
+
 def test_what_is_near_but_of_another_size_is_another() -> None:
     walk = Walk()
     walk.see(thing(left=60, side=30))
@@ -153,7 +166,8 @@ def test_what_was_said_of_a_region_is_told_where_it_is_seen_again() -> None:
     at = COLOR, depth_m, CAMERA, walk.T_map_keyframe
     asked_about, known, other = thing(), thing(left=62), thing(left=120)
     (opinion,) = walk.regions.see(keyframe, [asked_about], *at).opinions
-    assert (opinion.of, opinion.label, opinion.sure) == (asked_about, "teapot", 0.5)
+    assert (opinion.of, opinion.label) == (asked_about, "teapot")
+    assert opinion.sure == pytest.approx(0.5 * 0.25 / (0.25 + 0.16))
     seen = walk.regions.see(keyframe, [], *at, named=[known, other])
     assert [(one.of, one.label) for one in seen.opinions] == [(known, "teapot")]
     on_it, around_it = thing(left=70, top=50, side=10), thing(left=20, top=5, side=110)
@@ -181,7 +195,7 @@ def test_boxes_and_answers_vote_for_the_name_of_a_region() -> None:
     walk.T_map_keyframe[keyframe] = moved()
     at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, walk.T_map_keyframe
     (opinion,) = walk.regions.see(keyframe, [thing()], *at).opinions
-    assert (opinion.label, opinion.sure) == ("refrigerator", 0.4)
+    assert (opinion.label, opinion.sure) == ("refrigerator", pytest.approx(0.4 * 1.6 / 3.04))
     assert walk.regions.answered(0, Answer("cabinet", 0.5)) == "refrigerator"
 
 
