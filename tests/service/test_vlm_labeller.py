@@ -3,10 +3,13 @@
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from ldo_service.datasets.synthetic.flat import FlatSequence
 from ldo_service.errors import ConfigError
-from ldo_service.schemas import LabelNames, MapDelta
+from ldo_service.geometry import se3
+from ldo_service.schemas import LabelNames, MapDelta, MapObject, MapObjects
 from ldo_service.schemas.topics import LABEL_NAMES
 from tests.semantics.labellers.encoders import ColorPair, vocabulary
 from tests.semantics.labellers.server import hangs, says, serving
@@ -100,3 +103,48 @@ def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path)
             server.over.set()
             assert service.stop() == 0
             assert "Traceback" not in service.log
+
+
+PICTURE = 9  # of the flat: it hangs over the couch, is whole in frame 30, and has no box of COCO
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_name_added_while_it_runs_is_found_on_what_is_seen_after(tmp_path: Path) -> None:
+    """The built-in networks in the flat, from a list that lacks the name."""
+    (tmp_path / "names.txt").write_text("couch\nlamp\ncabinet\nwindow\ndoor\n")
+    demo = ("detector.model=demo", "vlm_labeller.model=demo", "mapper.iterations=2")
+    use = (*demo, f"vlm_labeller.names={tmp_path / 'names.txt'}")
+    with (
+        live_service(tmp_path, *(word for one in use for word in ("--set", one))) as service,
+        service.client.listen("map/objects", MapObjects) as objects,
+    ):
+        service.wait_for_actors()
+        publisher = service.publisher("synthetic:flat", "--rate", "1", "--max-frames", "50")
+        service.wait_for_poses(4, timeout_s=60)
+        assert "picture frame" in service.client.add_label("picture frame")
+        p_picture, told = _seen_at(PICTURE, 30), list[MapObject]()
+
+        def is_found() -> bool:
+            told[:] = [one for message in objects() for one in message.objects] or told
+            named = [one for one in told if one.name == "picture frame"]
+            return any(np.linalg.norm(np.subtract(o.centroid, p_picture)) < 0.3 for o in named)
+
+        wait_until(is_found, 60, "found")
+        publisher.kill()
+        publisher.wait()
+        assert service.stop() == 0
+        assert "Traceback" not in service.log
+
+
+def _seen_at(instance: int, frame: int) -> np.ndarray:
+    """[3] m, the middle of what a frame of the flat shows of a thing, in the map's frame, which is
+    that of the first camera."""
+    sequence = FlatSequence.named("flat")
+    truth, T = sequence.labels(frame), sequence.truth().T_world_camera
+    depth_m, camera = sequence[frame].depth_m, sequence.camera
+    v, u = np.nonzero((truth.instance_ids == instance) & (depth_m > 0))
+    z = depth_m[v, u]
+    p_camera = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z])
+    T_map_camera = se3.inverse(T[0]) @ T[frame]
+    return T_map_camera[:3, :3] @ np.median(p_camera, axis=1) + T_map_camera[:3, 3]
