@@ -1,6 +1,6 @@
 """Things at random places, where they meet nothing."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +31,7 @@ Point = tuple[float, float, float]
 GAP_M = 0.015  # less than this may things overlap: they stand on rugs
 TRIES = 12  # places for a thing before it is left out
 HEADROOM_M = 0.6  # above tables and seats
+CHAIRS_MOST, PUSHED_M = 4, (-0.15, 0.3)  # at a table, and how far under it
 
 # To the back wall, the front wall and the sides: which way the front of a thing there looks.
 TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT = (1.0, 0.0), (-1.0, 0.0), (0.0, -1.0), (0.0, 1.0)
@@ -46,6 +47,7 @@ class Builder:
     size_m: tuple[float, float]
     doorway: tuple[np.ndarray, np.ndarray]  # low and high corner [3] of what stays free
     things: list[Thing] = field(default_factory=list)
+    _extents: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
     def build(self, label: str, heading: Heading, shapes: tuple[int, ...] = ()) -> Thing:
         """One of its shapes at the origin."""
@@ -62,6 +64,7 @@ class Builder:
             placed = Thing(thing.label, tuple(Placement(at)(solid) for solid in thing.solids))
             if self._is_free(*extent(placed), carrier):
                 self.things.append(placed)
+                self._extents.append(extent(placed))
                 return placed
         return None
 
@@ -72,7 +75,8 @@ class Builder:
         half = np.array(self.size_m) / 2 + 1e-3
         if (low[:2] < -half).any() or (high[:2] > half).any() or high[2] > HEIGHT_M:
             return False
-        others = [self.doorway, *(extent(t) for t in self.things if t is not carrier)]
+        things = zip(self.things, self._extents, strict=True)
+        others = [self.doorway, *(extent for thing, extent in things if thing is not carrier)]
         return not any(
             (low < other_high - GAP_M).all() and (high > other_low + GAP_M).all()
             for other_low, other_high in others
@@ -93,17 +97,37 @@ def furnish(builder: Builder) -> None:
     rng = builder.rng
     for label in _some(rng, AT_WALLS, 15, 23):
         thing = builder.build(label, TO_FRONT, STANDING.get(label, ()))
-        placed = builder.put(*_along_walls(builder, thing, on_floor=True))
-        if placed is not None:
-            _load(builder, placed)
+        _place(builder, *_along_walls(builder, thing, on_floor=True))
     for label in _some(rng, tuple(HUNG) * 2, 3, 6):
         shapes = (FLAT_SHAPES[label],) if label in FLAT_SHAPES else ()
         builder.put(*_along_walls(builder, builder.build(label, TO_FRONT, shapes), on_floor=False))
     for label in _some(rng, ON_THE_FLOOR, 7, 13):
         thing = _turned(builder, builder.build(label, TO_FRONT, STANDING.get(label, ())))
-        placed = builder.put(thing, _anywhere(builder))
-        if placed is not None:
-            _load(builder, placed)
+        _place(builder, thing, _anywhere(builder))
+
+
+def _place(builder: Builder, thing: Thing, places: Iterable[Point]) -> None:
+    """With what belongs to it: chairs at a table, things on it."""
+    placed = builder.put(thing, places)
+    if placed is not None:
+        if placed.label == "dining table":
+            _seat(builder, placed)
+        _load(builder, placed)
+
+
+def _seat(builder: Builder, table: Thing) -> None:
+    """Put chairs at its long sides, pushed under it more or less."""
+    low, high = extent(table)
+    across = int(np.argmin((high - low)[:2]))
+    for _ in range(int(builder.rng.integers(CHAIRS_MOST + 1))):
+        is_beyond = builder.rng.random() < 0.5
+        way = ((TO_RIGHT, TO_LEFT), (TO_BACK, TO_FRONT))[across][is_beyond]
+        chair = _turned(builder, builder.build("chair", TO_FRONT), (way,))
+        out_m = extent(chair)[1][across] - builder.between(*PUSHED_M)
+        place = np.zeros(3)
+        place[across] = high[across] + out_m if is_beyond else low[across] - out_m
+        place[1 - across] = builder.between(low[1 - across], high[1 - across])
+        builder.put(chair, [(float(place[0]), float(place[1]), 0.0)], table)
 
 
 def _some(rng: np.random.Generator, labels: tuple[str, ...], least: int, most: int) -> list[str]:
@@ -113,9 +137,11 @@ def _some(rng: np.random.Generator, labels: tuple[str, ...], least: int, most: i
     return [labels[k] for k in chosen]
 
 
-def _turned(builder: Builder, thing: Thing) -> Thing:
-    """By any quarter turn, and a little more."""
-    quarter = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[int(builder.rng.integers(4))]
+def _turned(
+    builder: Builder, thing: Thing, ways: Sequence[Heading] = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)
+) -> Thing:
+    """To one of these sides, and a little more."""
+    quarter = ways[int(builder.rng.integers(len(ways)))]
     askew = ASKEW[int(builder.rng.integers(len(ASKEW)))]
     turns = (Placement((0.0, 0.0, 0.0), quarter), Placement((0.0, 0.0, 0.0), askew))
     return Thing(thing.label, tuple(turns[0](turns[1](solid)) for solid in thing.solids))

@@ -21,7 +21,7 @@ from ldo_service.datasets.synthetic.flat.paint import Paints, materials
 from ldo_service.datasets.synthetic.flat.scene import Flat
 from ldo_service.datasets.synthetic.solids import Solid
 
-VERSION = 2  # raise it with every change that alters a room
+VERSION = 3  # raise it with every change that alters a room
 LAMP = 2  # index of the renderer's lamp above the origin
 HALLWAY_M = 1.4  # of what is seen through the doorway
 WIDTH_M, DEPTH_M = (3.6, 5.4), (3.2, 4.8)  # least and most

@@ -19,6 +19,7 @@ EYE_M = (1.2, 1.6)  # above the floor, as a hand holds a camera
 GAZE_SLOPE = (-0.45, 0.05)
 CLEARANCE_M = 0.3  # of the eye from things
 WALL_AHEAD_M = 1.3  # nearer to a wall, nobody looks at it
+GLANCES, NEAR_M = 2, 3.0  # before a frame is taken where most is to be seen, within so much
 SHARE_MIN = 3.9e-4  # of the image, of an object that is told: 30 pixels
 WINDOWS = 6  # tried per frame for a piece of the building
 PURITY = 0.8  # of such a window
@@ -143,17 +144,34 @@ def _building(class_ids: np.ndarray, rng: np.random.Generator) -> Iterator[tuple
 
 
 def _poses(flat: Flat, count: int, rng: np.random.Generator) -> np.ndarray:
-    """T_world_camera [count, 4, 4] of eyes where nothing stands, looking anywhere."""
+    """T_world_camera [count, 4, 4] of eyes where nothing stands; of a few that look anywhere, those
+    before which most things are."""
     boxes = [thing.bounds_m for thing in flat.things]
+    centres_m = np.array([centre for centre, _ in boxes])
+    found = []
+    for _ in range(count):
+        glances = [_glance(flat, boxes, rng) for _ in range(GLANCES)]
+        found.append(max(glances, key=lambda T: _things_before(T, centres_m)))
+    return np.array(found)
+
+
+def _glance(
+    flat: Flat, boxes: list[tuple[np.ndarray, np.ndarray]], rng: np.random.Generator
+) -> np.ndarray:
     reach = np.array(layout.inside_m(flat)) / 2 - 0.35
-    found: list[np.ndarray] = []
-    while len(found) < count:
+    while True:
         eye = np.append(rng.uniform(-reach, reach), rng.uniform(*EYE_M))
         way = rng.normal(size=2)
         way /= np.sqrt(way @ way)
         ahead = eye[:2] + WALL_AHEAD_M * way
         is_blocked = any((np.abs(eye - c) < s / 2 + CLEARANCE_M).all() for c, s in boxes)
         if not is_blocked and (np.abs(ahead) < reach + 0.35).all():
-            gaze = np.array([*way, rng.uniform(*GAZE_SLOPE)])
-            found.append(look_at(eye, eye + gaze))
-    return np.array(found)
+            return look_at(eye, eye + np.array([*way, rng.uniform(*GAZE_SLOPE)]))
+
+
+def _things_before(T_world_camera: np.ndarray, centres_m: np.ndarray) -> int:
+    """How many have their middle in the image, and are near."""
+    x, y, z = ((centres_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
+    half_x, half_y = 0.5 / FOCAL_PER_WIDTH, 0.5 * HEIGHT_PX / WIDTH_PX / FOCAL_PER_WIDTH
+    is_near = (z > 0) & (z < NEAR_M)
+    return int(np.sum(is_near & (np.abs(x) < half_x * z) & (np.abs(y) < half_y * z)))
