@@ -125,16 +125,17 @@ Apache-2.0, like the rest. Written by `python networks/train_demo.py`, which als
 
 ## What they are
 - `detector.onnx`: the layout of YOLOv8. `images` [1, 3, 256, 320], RGB 0..1, the image centred on
-  grey 114; `output0` [1, 4 + C, 1680]. A first look at the whole image proposes boxes; the best 40
+  grey 114; `output0` [1, 4 + C, 1680]. A first look at the whole image proposes boxes; the best 64
   are looked at again by a copy of the image encoder, and have scores. Classes of COCO that the
   catalogue of the synthetic scenes has, named in its metadata:
   {coco}.
 - `image_encoder.onnx`: the layout of CLIP. `pixel_values` [N, 3, 64, 64], RGB with CLIP's mean
   and deviation: the object's box and a tenth of its sides around, in proportion, in the middle of
-  a square of CLIP's mean. `image_embeds` [N, D] of length 1.
-- `text_embeddings.npz`: `names` [T], `embeddings` [T, D] of length 1 and `logit_scale`, which
-  calibrates softmax(logit_scale * image . text) over all T names (also in the encoder's
-  metadata). The names: those of the detector;
+  a square of CLIP's mean. `image_embeds` [N, D] of length 1, of the crop and its mirror image.
+- `text_embeddings.npz`: `names` [T], `embeddings` [T, D] of length 1 and `logit_scale` (also in the
+  encoder's metadata) of softmax(logit_scale * image . text) over all T names. It suits the regions
+  that a labeller is asked about, many of them no whole things; of whole things the names are surer
+  than they say. The names: those of the detector;
   {others};
   and {building}, which say that there is no object.
 
@@ -174,13 +175,17 @@ Names of crops by true name: share named right, among all names.
 
 ## Limits
 - Large things seen in part (the corner of a bed, a couch's side, a table under what lies on it) are
-  often boxed or named wrong; so are a bench, a cabinet and a shelf from the side. Where a thing is
-  seen well, from its best views, names are far better than the table says, which counts every view.
+  often boxed or named wrong; so are a cabinet and a suitcase, and a shelf from the side. Where a
+  thing is seen well, from its best views, names are far better than the table says, which counts
+  every view.
 - An apple, an orange, a sports ball and a mouse are a ball each here, in any colour: what tells
   them apart is size, which a crop does not show, and what lies about them. A door is a bare board,
-  and taken for wall.
+  and can be taken for wall.
 - Things of a few pixels (mouse, remote, cell phone, fruit) are mostly missed.
-- Scores of the detector are not probabilities; confidences of the names are calibrated on rooms
-  of the same kind, over the whole table, and mean nothing for pictures of anything else.
+- Scores of the detector are not probabilities: sure boxes (0.6 or more) are right more often than
+  that. Confidences of the names suit regions of rooms of the same kind, over the whole table, and
+  mean nothing for pictures of anything else.
+- A region that is a piece of wall or of shadow is taken for a thing more often than not; few such
+  answers are confident.
 - Training is short, by intent: with more steps both networks still improve.
 """

@@ -1,7 +1,5 @@
 """Crops as the image encoder takes them."""
 
-from collections.abc import Callable
-
 import cv2
 import numpy as np
 
@@ -11,21 +9,33 @@ DEVIATION = np.array([0.26862954, 0.26130258, 0.27577711], np.float32)
 MARGIN = 0.1  # of a box's sides, that a crop has around it
 
 
-def crop(
-    image: np.ndarray, box_px: np.ndarray, changed: Callable[[np.ndarray], np.ndarray] = np.asarray
-) -> np.ndarray:
-    """A box of an image [H, W, 3], changed, in the middle of a square of CLIP's mean."""
+def crop(image: np.ndarray, box_px: np.ndarray, side_px: int = INPUT_PX) -> np.ndarray:
+    """A box of an image [H, W, 3] in the middle of a square of CLIP's mean."""
+    return framed(resized(cut(image, box_px), side_px), side_px)
+
+
+def cut(image: np.ndarray, box_px: np.ndarray) -> np.ndarray:
+    """The part [h, w, ...] of an image [H, W, ...] that a box holds."""
     last_px = np.array(image.shape[1::-1]) - 1
     x0, y0 = np.floor(np.clip(box_px[:2], 0, last_px)).astype(int)
     x1, y1 = np.ceil(np.minimum(box_px[2:], image.shape[1::-1])).astype(int)
-    x1, y1 = max(x1, x0 + 1), max(y1, y0 + 1)
-    part = image[y0:y1, x0:x1]
-    scale = INPUT_PX / max(part.shape[:2])
-    size = tuple(max(1, round(side * scale)) for side in part.shape[1::-1])
-    inner = cv2.resize(part, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR)
-    canvas = np.full((INPUT_PX, INPUT_PX, 3), np.round(MEAN * 255), np.uint8)
-    left, top = (INPUT_PX - size[0]) // 2, (INPUT_PX - size[1]) // 2
-    canvas[top : top + size[1], left : left + size[0]] = changed(inner)
+    return image[y0 : max(y1, y0 + 1), x0 : max(x1, x0 + 1)]
+
+
+def resized(part: np.ndarray, side_px: int, is_ids: bool = False) -> np.ndarray:
+    """In proportion, with its longer side so long; ids are not mixed."""
+    scale = side_px / max(part.shape[:2])
+    width, height = (max(1, round(side * scale)) for side in part.shape[1::-1])
+    mixed = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return cv2.resize(part, (width, height), interpolation=cv2.INTER_NEAREST if is_ids else mixed)
+
+
+def framed(part: np.ndarray, side_px: int) -> np.ndarray:
+    """In the middle of a square of CLIP's mean."""
+    canvas = np.full((side_px, side_px, 3), np.round(MEAN * 255), np.uint8)
+    height, width = part.shape[:2]
+    left, top = (side_px - width) // 2, (side_px - height) // 2
+    canvas[top : top + height, left : left + width] = part
     return canvas
 
 

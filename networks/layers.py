@@ -153,6 +153,11 @@ class Graph:
     def mean(self, x: str) -> str:
         return self.node("GlobalAveragePool", x)
 
+    def mirrored(self, x: str) -> str:
+        """Left and right exchanged."""
+        ends = (self.integers(value) for value in (-1, -(2**31), 3, -1))
+        return self.node("Slice", x, *ends)
+
     def node(self, kind: str, *inputs: str, output: str = "", **attributes) -> str:
         """Add a node; the name of what it gives."""
         output = output or f"{kind.lower()}_{len(self.nodes)}"
@@ -164,6 +169,12 @@ class Graph:
         outputs = [f"{x}.{k}" for k in range(len(sizes))]
         parts = self.integers(*sizes)
         self.nodes.append(helper.make_node("Split", [x, parts], outputs, axis=axis))
+        return outputs
+
+    def halves(self, x: str) -> tuple[str, str]:
+        """The first half of a batch and the second."""
+        outputs = f"{x}.first", f"{x}.second"
+        self.nodes.append(helper.make_node("Split", [x], outputs, axis=0))
         return outputs
 
     def integers(self, *values: int) -> str:

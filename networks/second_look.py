@@ -22,10 +22,10 @@ from encoder import Pair, embedded
 from layers import Graph
 from onnx import TensorProto
 
-LOOKS = 40  # boxes that are looked at twice
-DISTINCT_IOU = 0.6  # boxes that overlap more are looked at once
+LOOKS = 64  # boxes that are looked at twice
+DISTINCT_IOU = 0.7  # boxes that overlap more are looked at once
 # Logits of both looks are added, each with less than its full weight: they see the same pixels.
-FIRST_WEIGHT, SECOND_WEIGHT = 0.75, 0.5  # the best on the rooms for calibration
+FIRST_WEIGHT, SECOND_WEIGHT = 0.5, 0.6  # the best on the rooms for calibration
 
 
 def export(first: First, pair: Pair, scale: float, path: Path) -> None:
@@ -55,7 +55,7 @@ def output(
     corners, fit, logits = (part[0] for part in first.look(image[None]))
     cells = np.flatnonzero(is_chosen)
     parts = np.array([crop(image, enlarged(corners[cell], MARGIN)) for cell in cells])
-    cosines = SECOND_WEIGHT * scale * pair.images(parts) @ pair.texts.T
+    cosines = SECOND_WEIGHT * scale * pair.images(parts, with_mirror=False) @ pair.texts.T
     nothing = np.log(np.exp(cosines[:, len(THINGS) :]).sum(axis=1, keepdims=True))
     second = np.hstack((cosines[:, : len(THINGS)], nothing))
     names = jax.nn.softmax(FIRST_WEIGHT * logits[cells] + second)[:, : len(NAMES)]
@@ -82,7 +82,7 @@ def _rows(graph: Graph, x: str, cells: str) -> str:
 
 def _second_logits(graph: Graph, boxes: str, pair: Pair, scale: float) -> str:
     """[K, T + 1] of names and nothing, by the pair."""
-    images = embedded(graph, _crops(graph, boxes))
+    images = embedded(graph, _crops(graph, boxes), with_mirror=False)  # there are many
     cosines = graph.node("MatMul", images, graph.constant(SECOND_WEIGHT * scale * pair.texts.T))
     things, building = graph.split(cosines, (len(THINGS), len(pair.texts) - len(THINGS)))
     nothing = graph.node("ReduceLogSumExp", building, axes=[1], keepdims=1)

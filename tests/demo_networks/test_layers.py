@@ -44,3 +44,15 @@ def test_both_readings_of_a_network_tell_the_same(layers: ModuleType, tmp_path: 
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
     theirs = np.asarray(session.run(None, {"image": image.transpose(0, 3, 1, 2).copy()})[0])[0]
     np.testing.assert_allclose(theirs, mine, atol=HALF)
+
+
+def test_a_mirror_image_and_halves_of_a_batch(layers: ModuleType, tmp_path: Path) -> None:
+    graph = layers.Graph({}, {})
+    both = graph.node("Concat", "image", graph.mirrored("image"), axis=0)
+    first, second = graph.halves(both)
+    told = graph.node("Sub", first, second, output="told")
+    shape = ("n", 3, 4, 5)
+    graph.save(tmp_path / "net.onnx", ("image", shape), (told, shape), {})
+    image = np.random.default_rng(0).random((2, 3, 4, 5), np.float32)
+    theirs = onnxruntime.InferenceSession(tmp_path / "net.onnx").run(None, {"image": image})[0]
+    np.testing.assert_array_equal(np.asarray(theirs), image - image[..., ::-1])
