@@ -34,12 +34,6 @@ def test_settings_change_what_the_file_left(tmp_path: Path) -> None:
     assert (config.tracker.hold_out, config.mapper.threads) == (5, 2)
 
 
-@pytest.mark.parametrize("value", ["2e-4", "2.0e-4", "0.0002", "+2E-4"])
-def test_a_small_number_may_be_written_as_a_power_of_ten(value: str) -> None:
-    config = load_config(settings=(f"mapper.builder.optimiser.rotation_rate_rad={value}",))
-    assert config.mapper.builder.optimiser.rotation_rate_rad == 2e-4
-
-
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty.yaml").write_text("")
     assert load_config(tmp_path / "empty.yaml") == Config()
