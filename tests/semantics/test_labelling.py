@@ -8,11 +8,11 @@ import pytest
 from ldo_service.gaussians import render
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
-from ldo_service.semantics.assignment import AssignmentConfig
+from ldo_service.semantics.assignment import AssignmentConfig, Regions
 from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.fusion import FusionConfig
 from ldo_service.semantics.label_images import label_image, reliable_image
-from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
+from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe, regions_of
 from ldo_service.semantics.labels import LabelConfig, fields, new_labels, top_labels
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
@@ -183,3 +183,15 @@ def test_a_name_the_detector_cannot_know_is_not_held_back_by_what_it_missed() ->
         label_keyframe(rows, which, *view, said, config, is_late=True, spared=told)
     assert np.mean(top_labels(labels).reshape(64, 96)[thing()] == LAMP) > 0.9
     assert not top_labels(known).any(), "what it knows, it did miss"
+
+
+def test_what_lies_on_a_thing_is_no_part_of_its_region() -> None:
+    table, cup = (Foreground(20, 36, np.ones(shape, bool)) for shape in ((24, 24), (6, 6)))
+    boxes = np.array([[35.5, 19.5, 59.5, 43.5], [35.5, 19.5, 41.5, 25.5]])
+    told = Claims.of_detector(boxes, np.array([CHAIR, LAMP]), np.array([0.9, 0.7], np.float32))
+    regions = regions_of(
+        replace(told, parts=(table, cup)), depth_image(), CAMERA, LabellingConfig()
+    )
+    table.mask[:6, :6] = False
+    expected = Regions.of_foregrounds(boxes, told.scores(), (table, cup))
+    np.testing.assert_array_equal(regions.sums, expected.sums)
