@@ -78,12 +78,12 @@ class Naming:
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
         labels = [vocabulary.name(int(label)) for label in claims.labels]
         color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
-        apart = segments(color, depth_m, camera, config.segments)
-        found = regions_of_image(apart, depth_m.shape, config)
-        room = [one.part for one in apart if one.kind == "room"]
+        shown = segments(color, depth_m, camera, config.segments)
+        found = regions_of_image(shown, depth_m.shape, config)
+        room = [one.part for one in shown if one.kind == "room"]
         doubtful = candidates(
             *(claims.boxes, labels, claims.confidences),
-            *(depth_m, camera, is_labelled, found, config, room),
+            *(depth_m, camera, is_labelled, found, room, config),
         )
         named = named_objects(claims.boxes, is_labelled, found, config)
         sightings = self._regions.see(

@@ -67,8 +67,8 @@ def candidates(
     camera: Camera,
     is_labelled: np.ndarray,
     found: Sequence[Candidate],
+    room: Sequence[Foreground],
     config: TriggerConfig,
-    room: Sequence[Foreground] = (),
 ) -> list[Candidate]:
     """Regions of a keyframe that a labeller should see, and those that the detector is sure of, to
     be followed; the largest first.
@@ -111,7 +111,7 @@ def _boxed(
     config: TriggerConfig,
 ) -> tuple[list[Candidate], list[bool]]:
     """Boxes of a detector: each is the region that fits it best, else its foreground without the
-    room. And which regions these are."""
+    room, if that leaves enough to show. And which regions these are."""
     asked, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
     for i in distinct_boxes(boxes_px, scores, config):
@@ -124,8 +124,9 @@ def _boxed(
             continue
         pieces = pieces or surfaces(depth_m, camera, config.foreground)
         part = foreground(boxes_px[i], depth_m, pieces, camera, config.foreground)
-        part = without_room(part, room, config.foreground.min_inside)
-        asked.append(Candidate(boxes_px[i], part, label, score, i))
+        whole = Candidate(boxes_px[i], part, label, score, i)
+        cut = replace(whole, part=without_room(part, room, config.foreground.min_inside))
+        asked.append(cut if _is_worth_a_look(cut, depth_m.shape, config) else whole)
     return asked, is_taken
 
 

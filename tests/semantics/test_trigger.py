@@ -45,7 +45,7 @@ def followed(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config
     boxes = np.reshape(np.array(boxes, float), (-1, 4))
     found = regions(depth_m, config)
     scores = np.array(scores)
-    return candidates(boxes, labels, scores, depth_m, CAMERA, is_labelled, found, config)
+    return candidates(boxes, labels, scores, depth_m, CAMERA, is_labelled, found, [], config)
 
 
 def regions(depth_m: np.ndarray, config: TriggerConfig = CONFIG) -> list[Candidate]:
@@ -98,11 +98,23 @@ def test_a_wall_seen_through_a_box_s_thing_is_no_part_of_it() -> None:
     depth_m = np.where(is_bar, WALL_M - 0.3, WALL_M).astype(np.float32)
     told = np.array([(60, 30, 101, 89)], float), ["tv"], np.array([0.9]), depth_m, CAMERA, NOBODY
     wall = Foreground(0, 0, ~is_bar)
-    (whole,), (cut,) = (candidates(*told, [], CONFIG, room) for room in ([], [wall]))
+    (whole,), (cut,) = (candidates(*told, [], room, CONFIG) for room in ([], [wall]))
     was, now = (one.part.image(is_bar.shape) for one in (whole, cut))
     assert np.mean(was[is_bar]) > 0.95
     assert np.count_nonzero(was & ~is_bar) > 100, "or it shows nothing"
     assert np.array_equal(now, was & is_bar)
+
+
+def test_a_box_of_which_the_wall_leaves_too_little_is_asked_about_with_it() -> None:
+    box = (50, 30, 109, 109)
+    is_bar = wall_with((78, 30, 81, 109), (50, 30, 109, 33), (50, 106, 109, 109)) == NEAR_M
+    depth_m = np.where(is_bar, WALL_M - 0.3, WALL_M).astype(np.float32)
+    told = np.array([box], float), ["tv"], np.array([0.4]), depth_m, CAMERA, NOBODY
+    wall = ~is_bar
+    wall[96:] = False
+    (found,) = candidates(*told, [], [Foreground(0, 0, wall)], CONFIG)
+    assert np.count_nonzero(found.part.mask) > 1.2 * CONFIG.min_fill * 59 * 79
+    assert np.count_nonzero(found.part.image(wall.shape) & wall) > 100
 
 
 def test_what_hangs_flat_on_a_wall_stays_whole() -> None:
