@@ -134,8 +134,8 @@ Apache-2.0, like the rest. Written by `python networks/train_demo.py`, which als
   a square of CLIP's mean. `image_embeds` [N, D] of length 1, of the crop and its mirror image.
 - `text_embeddings.npz`: `names` [T], `embeddings` [T, D] of length 1 and `logit_scale` (also in the
   encoder's metadata) of softmax(logit_scale * image . text) over all T names. It suits the regions
-  that a labeller is asked about, many of them no whole things; of whole things the names are surer
-  than they say. The names: those of the detector;
+  that a labeller is asked about, many of them no whole things; of whole things names are right
+  more often than they say. The names: those of the detector;
   {others};
   and {building}, which say that there is no object.
 

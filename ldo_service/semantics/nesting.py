@@ -13,11 +13,11 @@ from .foreground import Foreground
 @dataclass(frozen=True, slots=True)
 class NestingConfig:
     """Two regions of which one lies in the other are no rivals: both may be there. As rivals, by
-    score, a cup of 0.5 is a table of 0.9."""
+    score, a table of 0.9 would win the pixels of a cup of 0.5."""
 
     inside: float = 0.8  # share of the smaller one, to lie in the larger
     times: float = 2.0  # as large: less, and they are of one thing
-    least_score: float = 0.5  # of the smaller: two of five of the demo's boxes below are wrong
+    least_score: float = 0.5  # of the smaller: many boxes below are wrong
 
     def __post_init__(self) -> None:
         if not (0 < self.inside <= 1 and self.times > 1 and self.least_score >= 0):

@@ -1,4 +1,4 @@
-"""What geometry and colour set apart in a keyframe, whatever it is: regions worth a name.
+"""What geometry and colour set apart in a keyframe: regions worth a name, and the room around them.
 
     apart      hangs together in depth, and is no structure (see `planes`)
     standing   what of that stands on a flat piece: a cup on a table, a cushion on a couch
