@@ -3,7 +3,8 @@
 The paper asks when the best detector is less than 0.6 sure of a region, or gives it no reliable
 label. So a candidate is a box of a hesitant detector that no sure box explains; or a region that
 depth, creases or colour set apart, see `segments`, which neither a sure box nor the map's labels
-explain. A candidate is followed from keyframe to keyframe by where it is, see `regions_to_name`.
+explain. What stands on a thing is not explained by the name of that thing. A candidate is followed
+from keyframe to keyframe by where it is, see `regions_to_name`.
 """
 
 from collections.abc import Sequence
@@ -87,7 +88,8 @@ def candidates(
     asked += [
         one
         for one, is_asked in zip(found, is_taken, strict=True)
-        if not is_asked and _share(explained, one.part) < config.explained
+        if not is_asked
+        and (one.kind == "standing" or _share(explained, one.part) < config.explained)
     ]
     worth = [
         one
@@ -142,7 +144,7 @@ def without_room(part: Foreground, room: Sequence[Foreground], inside: float) ->
     """
     mask = part.mask.copy()
     for plane in room:
-        here = plane.mask[pixels_of(_box(part), plane.mask.shape)]
+        here = plane.mask[pixels_of(part.box_px, plane.mask.shape)]
         rows, columns = here.shape
         if np.count_nonzero(here) < inside * np.count_nonzero(plane.mask):
             mask[:rows, :columns] &= ~here
@@ -174,7 +176,7 @@ def regions_of_image(
     out: list[Candidate] = []
     for kind in _ORDER:
         for segment in found:
-            one = Candidate(_box(segment.part), segment.part, kind=segment.kind)
+            one = Candidate(segment.part.box_px, segment.part, kind=segment.kind)
             if segment.kind != kind or not _is_worth_a_look(one, shape, config):
                 continue
             if np.all(_ious(_boxes(out), one.box_px) < config.alike_iou):
@@ -210,13 +212,6 @@ def _is_worth_a_look(candidate: Candidate, shape: tuple[int, ...], config: Trigg
     is_object = size_px <= config.max_share * shape[0] * shape[1]
     is_filled = size_px >= config.min_fill * width * height
     return bool(is_object and is_filled and min(width, height) >= config.min_side_px)
-
-
-def _box(part: Foreground) -> np.ndarray:
-    height, width = part.mask.shape
-    return np.array(
-        [part.column - 0.5, part.row - 0.5, part.column + width - 0.5, part.row + height - 0.5]
-    )
 
 
 def _share(explained: np.ndarray, part: Foreground) -> float:

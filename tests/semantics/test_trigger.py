@@ -136,6 +136,19 @@ def test_what_the_map_has_a_name_for_is_not_asked_about() -> None:
     assert found.box_px[0] > 100
 
 
+def test_what_stands_on_a_named_thing_is_asked_about_all_the_same() -> None:
+    """The name is that of the thing."""
+    on_it = Candidate(np.array([20, 20, 59, 59]) - 0.5, Foreground(20, 20, np.ones((39, 39), bool)))
+    depth_m, named = wall_with(), np.ones((120, 160), bool)
+    none = np.zeros((0, 4)), [], np.zeros(0), depth_m, CAMERA, named
+    for kind, count in (("standing", 1), ("convex", 0), ("apart", 0), ("flat", 0)):
+        assert len(candidates(*none, [replace(on_it, kind=kind)], [], CONFIG)) == count
+    # but not once a box is drawn about it
+    box = on_it.box_px[None], ["cup"], np.array([0.9]), depth_m, CAMERA, named
+    (found,) = candidates(*box, [replace(on_it, kind="standing")], [], CONFIG)
+    assert found.number == 0
+
+
 def test_what_the_map_has_a_name_for_is_found_again_where_no_box_is() -> None:
     depth_m = wall_with(THING, (110, 40, 139, 79))
     is_labelled = np.zeros((120, 160), bool)
