@@ -64,6 +64,17 @@ class Foreground:
         return out
 
     @property
+    def box_px(self) -> np.ndarray:
+        """[4], x0 y0 x1 y1 around the whole mask, pixel centres at integers.
+
+        >>> Foreground(2, 1, np.ones((3, 4), bool)).box_px.tolist()
+        [0.5, 1.5, 4.5, 4.5]
+        """
+        height, width = self.mask.shape
+        corners = self.column, self.row, self.column + width, self.row + height
+        return np.array(corners) - 0.5
+
+    @property
     def packed(self) -> tuple[tuple[int, ...], np.ndarray]:
         """Row, column and shape, and the mask as bits: for a state."""
         return (self.row, self.column, *self.mask.shape), np.packbits(self.mask)

@@ -9,15 +9,16 @@ best. Most regions are no things but parts and shadows of them; so there is a bu
 most to show goes first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import Camera, se3
+from ldo_service.geometry import Camera
 
+from .known_regions import KnownRegions
 from .region_views import RegionView, ViewConfig, region_view
 from .regions import (
     Answer,
@@ -29,23 +30,23 @@ from .regions import (
     unpacked,
     with_vote,
 )
-from .same_region import Projected, projected, share_back
 from .trigger import Candidate
 
 
 @dataclass(frozen=True, slots=True)
 class RegionConfig:
-    views: int = 3  # the best, shown to the labeller
+    views: int = 5  # the best, shown to the labeller
     views_first: int = 2  # before it is asked at all: a single glimpse may be a flaw of depth
     patience: int = 3  # keyframes without a better view, before it is asked: one may yet come
     most_questions: int = 3  # about a region
-    per_keyframe: float = 1.5  # questions, of all that are due those with most to show: half are
-    # about no things. The paper asks on 10-25 % of the frames (IV.B.8); the flat, 0.8
+    per_keyframe: float = 2.5  # questions, of all that are due those with most to show: half are
+    # about no things. The paper asks on 10-25 % of the frames (IV.B.8); the flat, 1.0
     at_once: int = 4  # questions saved up while there was nothing to ask
     gain: float = 1.3  # of the views' summed quality, before it is asked again
     settled: float = 0.6  # of an answer that needs no second one
     answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's
     least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
+    least_carried: float = 0.5  # sure of its name, to be told where nothing sets a region apart
     overlap: float = 0.6  # of what two sightings show of each other, to be of the same region
     max_gap_m: float = 0.1  # of depth, from a point to what is seen there (delta_z, III.A)
     least_points: int = 12  # that one sees of the other
@@ -58,8 +59,8 @@ class RegionConfig:
             raise ConfigError(f"{self}: counts must be at least 1.")
         if self.patience < 0 or self.per_keyframe <= 0:
             raise ConfigError(f"{self}: patience at least 0, per_keyframe positive.")
-        if not (0 <= self.least_quality <= 1):
-            raise ConfigError(f"{self}: least_quality must be within 0..1.")
+        if not (0 <= self.least_quality <= 1 and 0 <= self.least_carried <= 1):
+            raise ConfigError(f"{self}: least_quality and least_carried must be within 0..1.")
         if self.views_first > self.views or not self.gain > 1:
             raise ConfigError(f"{self}: views_first at most views, gain over 1.")
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
@@ -126,9 +127,9 @@ class RegionsToName:
         those of earlier sightings, as they are now; `named`: objects that the map has a name for,
         of which nobody is asked.
         """
-        opinions: list[Opinion] = []
-        taken = set[int]()
-        known = self._known(keyframe, depth_m, camera, T_map_keyframe)
+        config, opinions, taken = self.config, list[Opinion](), set[int]()
+        regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
+        known = KnownRegions(regions, *place, config.max_gap_m, config.least_points)
         for candidate in found:
             sighting = sighting_of(keyframe, candidate, depth_m, camera)
             if sighting is None:
@@ -136,9 +137,9 @@ class RegionsToName:
             region = self._same(sighting, known, taken) or self._new(sighting)
             taken.add(region.id)
             region = seen_again(region, sighting)
-            if candidate.score < self.config.settled:
+            if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
-                region = self._with_view(region, sighting, region_view(*args, self.config.view))
+                region = self._with_view(region, sighting, region_view(*args, config.view))
             self._keep(region)
             opinions += self._said_of(region, candidate)
         for candidate in named:
@@ -150,9 +151,29 @@ class RegionsToName:
                     taken.add(region.id)
                     self._keep(seen_again(region, sighting))
                 opinions += said
+        opinions += self._carried(known, taken)
         questions = self._questions(keyframe, T_map_keyframe)
         self._forget()
         return Sightings(questions, opinions)
+
+    def _same(
+        self, sighting: Sighting, known: KnownRegions, taken: Collection[int]
+    ) -> Region | None:
+        same = known.same(sighting, self.config.overlap, taken)
+        return None if same is None else self._regions[same]
+
+    def _carried(self, known: KnownRegions, taken: Collection[int]) -> list[Opinion]:
+        """Names of regions that are seen, and were not set apart."""
+        opinions = []
+        for number in known.seen():
+            region = self._regions[number]
+            label, sure = self.name(region) if region.answer else ("", 0.0)
+            if number in taken or not label or sure < self.config.least_carried:
+                continue
+            part = known.carried(number)
+            if part is not None:
+                opinions.append(Opinion(Candidate(part.box_px, part), label, sure))
+        return opinions
 
     def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[Question]:
         """About the regions that are due, those with most to show first, as many as are allowed."""
@@ -202,33 +223,6 @@ class RegionsToName:
         self._regions[region] = known
         return self.name(known)[0]
 
-    def _same(self, sighting: Sighting, known: "_Known", taken: set[int]) -> Region | None:
-        """The region that it is most of, and that is most of it."""
-        shares = known.seen.shares_in(sighting.candidate.part)
-        shares[known.seen.counts < self.config.least_points] = 0
-        best, most = None, self.config.overlap
-        for i in np.flatnonzero(shares >= self.config.overlap):
-            region = known.regions[int(i)]
-            if region.id in taken:
-                continue
-            back = share_back(sighting, region, *known.place, self.config.least_points)
-            if min(back, shares[i]) >= most:
-                best, most = self._regions[region.id], min(back, float(shares[i]))
-        return best
-
-    def _known(
-        self,
-        keyframe: int,
-        depth_m: np.ndarray,
-        camera: Camera,
-        T_map_keyframe: Mapping[int, np.ndarray],
-    ) -> "_Known":
-        there = [r for r in self._regions.values() if r.shape.keyframe in T_map_keyframe]
-        T_camera_map = se3.inverse(T_map_keyframe[keyframe])
-        place = depth_m.shape, camera, T_map_keyframe
-        args = depth_m, camera, T_camera_map, T_map_keyframe, self.config.max_gap_m
-        return _Known(there, projected(there, *args), place)
-
     def _new(self, seen: Sighting) -> Region:
         self._next_id += 1
         return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen)
@@ -273,15 +267,6 @@ class RegionsToName:
         out._next_id, out._allowed = packed["next_id"], packed["allowed"]
         out._regions = {row["id"]: unpacked(row) for row in packed["regions"]}
         return out
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Known:
-    """Regions, what a keyframe sees of them, and where that is."""
-
-    regions: list[Region]
-    seen: Projected
-    place: tuple[tuple[int, ...], Camera, Mapping[int, np.ndarray]]
 
 
 def _worth(region: Region) -> float:

@@ -174,6 +174,45 @@ def test_what_was_said_of_a_region_is_told_where_it_is_seen_again() -> None:
     assert walk.regions.see(keyframe, [on_it], *at, named=[around_it]).opinions == []
 
 
+def test_a_sure_name_is_told_where_its_region_is_seen_and_nothing_sets_it_apart() -> None:
+    walk = Walk()
+    walk.see(thing())
+    walk.see(thing())
+    T, depth_m = walk.T_map_keyframe, np.full(SHAPE, 2.0, np.float32)
+    T[2], T[3] = moved(0.25), moved(4.0)
+
+    def opinions(keyframe: int, *found: Candidate, depth_m: np.ndarray = depth_m):
+        return walk.regions.see(keyframe, found, COLOR, depth_m, CAMERA, T).opinions
+
+    walk.answered("teapot", 0.49)
+    assert opinions(2) == [], "too little is known"
+    walk.answered("teapot", 0.8)
+    (told,) = opinions(2)
+    assert (told.label, told.sure, told.of.number) == ("teapot", 0.8, None)
+    # 0.25 m at 2 m and f = 120 px are 15 px
+    np.testing.assert_allclose(told.of.box_px, thing(left=45).box_px, atol=4)
+    # seen as a region of its own, it is told of that alone
+    again = thing(left=45)
+    assert [one.of for one in opinions(2, again)] == [again]
+    # out of sight, or something else is there
+    assert opinions(3) == []
+    assert opinions(2, depth_m=depth_m + 1) == []
+    # what boxes speak for too, and the more, is not told
+    for _ in range(9):
+        opinions(2, thing(left=45, label="kettle", score=0.55))
+    assert opinions(2) == []
+
+
+def test_a_region_of_a_few_pixels_is_not_looked_for() -> None:
+    walk = Walk(replace(CONFIG, least_quality=0))
+    assert [walk.see(thing(side=8)) for _ in range(2)] == [[], [0]]
+    walk.answered("cup", 0.9)
+    walk.T_map_keyframe[2] = moved()
+    at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, walk.T_map_keyframe
+    assert [one.label for one in walk.regions.see(2, [thing(side=8)], *at).opinions] == ["cup"]
+    assert walk.regions.see(2, [], *at).opinions == []
+
+
 def test_what_the_detector_is_sure_of_is_not_asked_about() -> None:
     walk = Walk()
     walk.see(thing(label="vase", score=0.7))
