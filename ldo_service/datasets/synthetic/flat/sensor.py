@@ -42,19 +42,8 @@ class Sensor:
         return gain * blurred + NOISE * normal(rng, blurred.shape)
 
     def depth_m(self, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
-        """Depth [H, W] as measured; 0 where nothing is.
-
-        Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step that
-        neighbours share, ragged edges, no measurement in the projector's shadow, on dark patches
-        and outside 0.4-5 m.
-        """
-        exact = rendering.depth_m
-        disparity = 1 / (_ragged(exact, rng) * DISPARITY_STEP_PER_M)
-        disparity = disparity + DISPARITY_SIGMA_STEPS * _matching_noise(rng, exact.shape)
-        measured = 1 / (np.maximum(np.floor(disparity + 0.5), 1.0) * DISPARITY_STEP_PER_M)
-        seen = (measured >= NEAREST_M) & (measured <= FARTHEST_M)
-        seen &= ~is_shadowed(exact, BASELINE_PX_M * self.camera.fx)
-        return np.where(seen & ~_is_too_dark(rendering.light, rng), measured, 0.0)
+        """Depth [H, W] as measured; 0 where nothing is."""
+        return measured_depth_m(rendering, self.camera.fx, rng)
 
     def motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far [H, W] the surface at each pixel moves in u and v while the shutter is open."""
@@ -72,6 +61,22 @@ class Sensor:
         knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
         drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
         return float(min(max(drift, -1.0), 1.0))
+
+
+def measured_depth_m(rendering: Rendering, focal_px: float, rng: np.random.Generator) -> np.ndarray:
+    """Depth [H, W] of a Kinect-like camera; 0 where it measures none.
+
+    Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step that
+    neighbours share, ragged edges, no measurement in the projector's shadow, on dark patches
+    and outside 0.4-5 m.
+    """
+    exact = rendering.depth_m
+    disparity = 1 / (_ragged(exact, rng) * DISPARITY_STEP_PER_M)
+    disparity = disparity + DISPARITY_SIGMA_STEPS * _matching_noise(rng, exact.shape)
+    measured = 1 / (np.maximum(np.floor(disparity + 0.5), 1.0) * DISPARITY_STEP_PER_M)
+    seen = (measured >= NEAREST_M) & (measured <= FARTHEST_M)
+    seen &= ~is_shadowed(exact, BASELINE_PX_M * focal_px)
+    return np.where(seen & ~_is_too_dark(rendering.light, rng), measured, 0.0)
 
 
 def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
