@@ -6,6 +6,7 @@ from pathlib import Path
 import cells
 import encoder
 import numpy as np
+from pair import NO_NAME, NO_THINGS
 from scores import Naming
 
 from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES, COCO_COUNT
@@ -39,6 +40,22 @@ def naming_report(naming: Naming, is_large: np.ndarray) -> dict:
     }
 
 
+def regions_report(naming: Naming) -> dict:
+    """What is said of regions; those that show no thing are right with any name of no thing."""
+    no_things = [k for k, name in enumerate((*encoder.NAMES, NO_NAME)) if name in NO_THINGS]
+    is_thing, is_named = naming.truth < len(encoder.NAMES), ~np.isin(naming.told, no_things)
+    is_right, is_sure = naming.told == naming.truth, is_named & (naming.confidence >= SURE)
+    return {
+        "regions": len(naming.truth),
+        "things": float(is_thing.mean()),
+        "things_right": float(is_right[is_thing].mean()),
+        "things_sure_right": float((is_right & is_sure)[is_thing].mean()),
+        "things_sure_wrong": float((~is_right & is_sure)[is_thing].mean()),
+        "no_things_unnamed": float((~is_named)[~is_thing].mean()),
+        "no_things_sure": float(is_sure[~is_thing].mean()),
+    }
+
+
 def written(report: dict, folder: Path) -> str:
     """The card in Markdown."""
     sizes = {
@@ -54,6 +71,7 @@ def written(report: dict, folder: Path) -> str:
         others=_filled(OTHERS),
         building=", ".join(BUILDING.split()),
         totals=_totals(report),
+        regions=_of_regions(report["held_out"]["regions"]),
         detected=_detected(report),
         named=_named(report),
         **report["steps"],
@@ -89,6 +107,19 @@ def _totals(report: dict) -> str:
     lines = [_row(label, *(one[key] for one in sets)) for key, label in rows.items()]
     lines += [_row(label, *(one["encoder"][key] for one in sets)) for key, label in named.items()]
     return "\n".join(lines)
+
+
+def _of_regions(regions: dict) -> str:
+    rows = {
+        "regions": "regions",
+        "things": "of which a thing, or a part of one",
+        "things_right": "things: named right",
+        "things_sure_right": f"things: named right, with {SURE:g} or more",
+        "things_sure_wrong": f"things: named wrong, with {SURE:g} or more",
+        "no_things_unnamed": "no things: told to be none",
+        "no_things_sure": f"no things: named with {SURE:g} or more",
+    }
+    return "\n".join(_row(label, regions[key]) for key, label in rows.items())
 
 
 def _detected(report: dict) -> str:
@@ -130,14 +161,14 @@ Apache-2.0, like the rest. Written by `python networks/train_demo.py`, which als
   catalogue of the synthetic scenes has, named in its metadata:
   {coco}.
 - `image_encoder.onnx`: the layout of CLIP. `pixel_values` [N, 3, 64, 64], RGB with CLIP's mean
-  and deviation: the object's box and a tenth of its sides around, in proportion, in the middle of
-  a square of CLIP's mean. `image_embeds` [N, D] of length 1, of the crop and its mirror image.
+  and deviation: a region's box and 0.15 of its sides around, in proportion, in the middle of a
+  square of CLIP's mean. `image_embeds` [N, D] of length 1, of the crop and its mirror image. It has
+  learned from regions as the service sets them apart, half of them no whole things.
 - `text_embeddings.npz`: `names` [T], `embeddings` [T, D] of length 1 and `logit_scale` (also in the
   encoder's metadata) of softmax(logit_scale * image . text) over all T names. It suits the regions
-  that a labeller is asked about, many of them no whole things; of whole things names are right
-  more often than they say. The names: those of the detector;
+  that a labeller is asked about. The names: those of the detector;
   {others};
-  and {building}, which say that there is no object.
+  and {building} and background, which say that there is no object.
 
 There is no text encoder. A name of the table can be added to a shorter list while the service runs
 (`ldo control add-label`), with its synonyms; any other name is refused.
@@ -149,7 +180,7 @@ was used for the scores below and for nothing else; but since its catalogue is t
 scores are those of known shapes in new arrangements and paints, not of new shapes.
 
 Rendering took {rendering} minutes of CPU time, {detector} steps of the detector's first look and
-{encoder} of the encoder {training}: two cores are done in half of that. Seed {seed}.
+{encoder} of the encoder {training}, the last half of these on regions too. Seed {seed}.
 
 ## Scores
 Of the files as shipped. `rooms`: rooms kept apart; `flat`: every 8th frame of `synthetic:flat`.
@@ -159,6 +190,12 @@ objects of at least 0.04 % that fill an eighth of their box.
 | | rooms | flat |
 |---|---|---|
 {totals}
+
+Regions of the rooms kept apart, as `semantics/segments.py` finds them:
+
+| | rooms |
+|---|---|
+{regions}
 
 Detector by class: objects, average precision at IoU 0.5, recall and precision of boxes with a
 score of at least 0.25.
@@ -185,7 +222,5 @@ Names of crops by true name: share named right, among all names.
 - Scores of the detector are not probabilities: sure boxes (0.6 or more) are right more often than
   that. Confidences of the names suit regions of rooms of the same kind, over the whole table, and
   mean nothing for pictures of anything else.
-- A region that is a piece of wall or of shadow is taken for a thing more often than not; few such
-  answers are confident.
 - Training is short, by intent: with more steps both networks still improve.
 """

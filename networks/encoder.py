@@ -5,6 +5,7 @@ in   pixel_values  [N, 3, 64, 64]   RGB with CLIP's mean and deviation; the crop
 out  image_embeds  [N, 96]          of length 1
 
 The names' vectors are a table, learned together with the image encoder: there is no text encoder.
+It is trained in `pair`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-import training
 from crops import DEVIATION, INPUT_PX, MARGIN, MEAN, crop, cut, enlarged, framed, resized
 from layers import Graph, Live, Statistics, Weights, residual
-from material import repainted, worsened
 from views import Seen, Views
+from wear import repainted, worsened
 
 from ldo_service.datasets.synthetic.flat.catalogue import CATALOGUE
 from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES
@@ -26,20 +26,27 @@ from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES
 DIMENSIONS = 96
 NAMES = tuple(name for name in CLASS_NAMES if name in CATALOGUE or name in BUILDING.split())
 
-MARGINS, JITTER = (0.0, 0.25), 0.08  # about a box, and how far each side may be off
 SIDE_MIN_PX, FILLED_MIN = 6, 0.12  # of a box that is learned from, and its share that is the object
-CUT_SHARE, CUT_MOST = 0.3, 0.5  # of boxes, without so much of one side
+CUT_MOST = 0.5  # of a box, without so much of one side
 OCCLUDED_SHARE, OCCLUDER = 0.3, (0.3, 0.7)  # of crops, by things of that share of their side
 BLUR_PX = 0.06  # of the crop's longer side
 
 BATCH, RATE = 32, 2e-3
-ROUND_SIDES_PX = (48, INPUT_PX)  # crops of the first round are smaller: half again as many a minute
 SCALE = 16.0  # of cosines while training; what is told is fitted afterwards
-# Of the scale that fits true boxes. A labeller is asked about parts of things and of walls, too:
-# over the regions that the service finds in the rooms for calibration, 0.7 of it is the likeliest,
-# and leaves a fifth more things without a confident name than all of it. This is between.
-ASKED_SHARE = 0.85
 SMOOTHING = 0.05  # of the right answer, over all names
+
+
+@dataclass(frozen=True, slots=True)
+class Framing:
+    """How a crop is taken about a box: margins, share of its sides; how far each side may be off;
+    share of crops that lack a part of one side."""
+
+    margins: tuple[float, float]
+    jitter: float
+    cut_share: float
+
+
+ABOUT_THINGS = Framing((0.0, 0.25), 0.08, 0.3)
 
 
 def network(net: Live | Graph, image) -> list:
@@ -56,11 +63,12 @@ def network(net: Live | Graph, image) -> list:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """Both encoders: the image encoder's weights, and a vector for each of NAMES [T, D]."""
+    """Both encoders: the image encoder's weights, and a vector for each name [T, D]."""
 
     weights: Weights
     statistics: Statistics
     texts: np.ndarray
+    names: tuple[str, ...]
 
     def images(self, crops: np.ndarray, with_mirror: bool = True) -> np.ndarray:
         """Vectors [N, D] of crops [N, 64, 64, 3] uint8, each seen from both sides of a mirror."""
@@ -105,19 +113,21 @@ def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) 
     odds /= odds.sum()
     while True:
         rows, others = rng.choice(len(names), (2, BATCH), p=odds)
-        shown = [_shown(material, seen, row, side_px, rng) for row in rows]
+        shown = [shown_in(material, seen, row, side_px, rng, ABOUT_THINGS) for row in rows]
         before = [
-            _shown(material, seen, row, round(rng.uniform(*OCCLUDER) * side_px), rng)
+            shown_in(
+                material, seen, row, round(rng.uniform(*OCCLUDER) * side_px), rng, ABOUT_THINGS
+            )
             if rng.random() < OCCLUDED_SHARE
             else None
             for row in others
         ]
-        crops = [_example(*pair, side_px, rng) for pair in zip(shown, before, strict=True)]
+        crops = [example(*pair, side_px, rng) for pair in zip(shown, before, strict=True)]
         yield np.array(crops), names[rows]
 
 
 @dataclass(frozen=True, slots=True)
-class _Shown:
+class Shown:
     """A box of a frame: color [h, w, 3], ids of objects [h, w], and that of the one it is about."""
 
     color: np.ndarray
@@ -125,25 +135,32 @@ class _Shown:
     instance: int
 
 
-def _shown(material: Views, seen: Seen, row: int, side_px: int, rng: np.random.Generator) -> _Shown:
+def shown_in(
+    material: Views,
+    seen: Seen,
+    row: int,
+    side_px: int,
+    rng: np.random.Generator,
+    framing: Framing,
+) -> Shown:
     """With its longer side so long; not quite about the object, and often without a side of it."""
     box_px = seen.boxes_px[row]
     sides = box_px[2:] - box_px[:2]
-    off = rng.uniform(-JITTER, JITTER, 4) * np.tile(sides, 2)
-    box_px = enlarged(box_px, rng.uniform(*MARGINS)) + off
-    if rng.random() < CUT_SHARE:
+    off = rng.uniform(-framing.jitter, framing.jitter, 4) * np.tile(sides, 2)
+    box_px = enlarged(box_px, rng.uniform(*framing.margins)) + off
+    if rng.random() < framing.cut_share:
         edge = int(rng.integers(4))
         box_px[edge] += (1 if edge < 2 else -1) * rng.uniform(0, CUT_MOST) * sides[edge % 2]
     color, plane = (part[seen.frames[row]] for part in (material.colors, material.instances))
-    return _Shown(
+    return Shown(
         resized(cut(color, box_px), side_px),
         resized(cut(plane, box_px), side_px, is_ids=True),
         int(seen.instances[row]),
     )
 
 
-def _example(
-    shown: _Shown, before: _Shown | None, side_px: int, rng: np.random.Generator
+def example(
+    shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
     color = repainted(shown.color, shown.plane, rng)
     if before is not None:
@@ -152,7 +169,7 @@ def _example(
     return taken[:, ::-1] if rng.random() < 0.5 else taken
 
 
-def _cover(color: np.ndarray, by: _Shown, rng: np.random.Generator) -> None:
+def _cover(color: np.ndarray, by: Shown, rng: np.random.Generator) -> None:
     """Put another object before a part of what is shown."""
     place = rng.integers(0, np.array(color.shape[:2])) - np.array(by.plane.shape) // 2
     low = np.maximum(place, 0)
@@ -163,22 +180,6 @@ def _cover(color: np.ndarray, by: _Shown, rng: np.random.Generator) -> None:
     color[there][is_it] = by.color[own][is_it]
 
 
-def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
-    """In rounds of so many steps: `training.ROUND_RATES`."""
-    rng = np.random.default_rng([seed, 2])
-    live = Live({}, rng=rng)
-    network(live, jnp.zeros((1, INPUT_PX, INPUT_PX, 3)))
-    texts = rng.standard_normal((len(NAMES), DIMENSIONS)).astype(np.float32)
-    start = live.weights | {"texts.kernel": texts}
-    sources = zip((rng, np.random.default_rng([seed, 7])), ROUND_SIDES_PX, strict=True)
-    rounds = [batches(material, source, side_px) for source, side_px in sources]
-    weights = training.fit_in_rounds(loss, start, rounds, steps, RATE)
-    rng = np.random.default_rng([seed, 5])
-    inputs = (np.asarray(normalised(batch[0])) for batch in batches(material, rng))
-    texts = np.asarray(unit(weights.pop("texts.kernel")))
-    return Pair(weights, training.statistics(network, weights, inputs), texts)
-
-
 def crops_of(seen: Seen, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Crops of what frames show, and their names' indices."""
     seen, names = learnable(seen)
@@ -186,15 +187,17 @@ def crops_of(seen: Seen, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.n
     return np.array([crop(colors[f], enlarged(box, MARGIN)) for f, box in rows]), names
 
 
-def fitted_scale(images: np.ndarray, texts: np.ndarray, names: np.ndarray) -> float:
-    """The scale of cosines whose softmax is least surprised by the truth: Guo et al., ICML 2017."""
+def fitted_scale(images: np.ndarray, texts: np.ndarray, is_right: np.ndarray) -> float:
+    """The scale of cosines whose softmax is least surprised by the truth, of N images one or more
+    of T names, is_right [N, T] bool: Guo et al., ICML 2017."""
     scales = np.geomspace(2, 200, 200)
     cosines = images @ texts.T
 
     def surprise(scale: float) -> float:
         logits = scale * (cosines - cosines.max(axis=1, keepdims=True))
-        told = logits - np.log(np.exp(logits).sum(axis=1, keepdims=True))
-        return -float(told[np.arange(len(names)), names].mean())
+        powers = np.exp(logits)
+        told = np.sum(powers * is_right, axis=1) / powers.sum(axis=1)
+        return -float(np.log(np.maximum(told, 1e-12)).mean())
 
     return float(min(scales, key=surprise))
 
@@ -222,7 +225,7 @@ def export(pair: Pair, scale: float, folder: Path) -> None:
     )
     np.savez(
         folder / "text_embeddings.npz",
-        names=np.array(NAMES),
+        names=np.array(pair.names),
         embeddings=pair.texts.astype(np.float32),
         logit_scale=np.float32(scale),
     )

@@ -6,8 +6,8 @@ from itertools import islice
 import cv2
 import numpy as np
 from cells import ID_COUNT, INPUT_PX, THINGS, told, visible
-from material import repainted, worsened
 from views import Seen, Views
+from wear import repainted, worsened
 
 from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES
 

@@ -16,6 +16,7 @@ import resource
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -30,19 +31,22 @@ import cv2
 import detector
 import encoder
 import numpy as np
+import pair
 import scores
 import second_look
 from detector import First
+from encoder import Pair
 from flat_frames import flat_frames
-from material import Rooms, render_all, worsened
+from material import Rooms, render_all
 from views import Seen, Views
+from wear import worsened
 
 TRAINING = Rooms(range(200, 520), 8)
 CALIBRATION = Rooms(range(160, 172), 12)
 HELD_OUT = Rooms(range(172, 190), 12)
 SEED = 0
 APART = 0.2  # of scores at most: the graph cuts its crops by other pixels
-DETECTOR_STEPS, ENCODER_STEPS = (2000, 1500), (9000, 7500)  # of two rounds each
+STEPS = {"detector": (2000, 1500), "encoder": (9000, 10000)}  # of two rounds each
 FLAT_STRIDE = 8  # of its frames that are scored
 SHIPPED = Path(__file__).parents[1] / "ldo_service" / "demo_networks"
 
@@ -59,12 +63,12 @@ def main() -> None:
     # networks, one process each
     steps = {
         name: [max(1, round(given.share * count)) for count in counts]
-        for name, counts in (("detector", DETECTOR_STEPS), ("encoder", ENCODER_STEPS))
+        for name, counts in STEPS.items()
     }
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         first = pool.submit(train_detector, given.work, steps["detector"])
-        pair = pool.submit(train_encoder, given.work, steps["encoder"])
-        export(first.result(), pair.result(), given.work, given.out)
+        both = pool.submit(train_encoder, given.work, steps["encoder"])
+        export(first.result(), both.result(), given.work, given.out)
     training_s = _children_s() - rendering_s
     # scores
     report = score(given.work, given.out)
@@ -105,30 +109,39 @@ def train_detector(work: Path, steps: Sequence[int]) -> First:
     return detector.train(TRAINING.load(work), steps, SEED)
 
 
-def train_encoder(work: Path, steps: Sequence[int]) -> encoder.Pair:
+def train_encoder(work: Path, steps: Sequence[int]) -> Pair:
     start_logging()
-    return encoder.train(TRAINING.load(work), steps, SEED)
+    return pair.train(TRAINING.load(work), steps, SEED)
 
 
-def export(first: First, pair: encoder.Pair, work: Path, out: Path) -> None:
+def export(first: First, both: Pair, work: Path, out: Path) -> None:
     """Calibrate, write the files, and require that they tell what was trained."""
     views = CALIBRATION.load(work)
     colors = _as_recorded(views)
+    _export_labeller(both, views, colors, out)
+    # a detector looks at things
+    things = replace(both, texts=both.texts[: len(encoder.NAMES)], names=encoder.NAMES)
     crops, names = encoder.crops_of(views.seen, colors)
-    images = pair.images(crops)
-    scale = encoder.fitted_scale(images, pair.texts, names)
-    encoder.export(pair, encoder.ASKED_SHARE * scale, out)
-    theirs = scores.embedded(scores.session(out / "image_encoder.onnx"), crops)
-    _require_equal("image_encoder.onnx", images, theirs, 2e-2)
-    second_look.export(first, pair, scale, out / "detector.onnx")
+    is_right = names[:, None] == np.arange(len(things.names))
+    scale = encoder.fitted_scale(things.images(crops), things.texts, is_right)
+    second_look.export(first, things, scale, out / "detector.onnx")
     network = scores.session(out / "detector.onnx")
     for canvas in map(scores.canvas, colors[:4]):
         theirs = scores.output(network, canvas)
-        mine = second_look.output(first, pair, scale, canvas, theirs[:, 4:].any(axis=1))
+        mine = second_look.output(first, things, scale, canvas, theirs[:, 4:].any(axis=1))
         sides = np.maximum(theirs[:, 2:4].max(axis=1, keepdims=True), cells.STRIDES_PX[-1])
         boxes = mine[:, :4] / sides, theirs[:, :4] / sides
         _require_equal("boxes of detector.onnx, by their sides", *boxes, 0.05)
         _require_equal("scores of detector.onnx", mine[:, 4:], theirs[:, 4:], APART)
+
+
+def _export_labeller(both: Pair, views: Views, colors: Sequence[np.ndarray], out: Path) -> None:
+    """Its confidences suit regions, those of the detector things."""
+    crops, names = pair.crops_of(views.regions, colors)
+    images = both.images(crops)
+    encoder.export(both, encoder.fitted_scale(images, both.texts, pair.is_right(names)), out)
+    theirs = scores.embedded(scores.session(out / "image_encoder.onnx"), crops)
+    _require_equal("image_encoder.onnx", images, theirs, 2e-2)
 
 
 def _require_equal(what: str, mine: np.ndarray, theirs: np.ndarray, tolerance: float) -> None:
@@ -143,7 +156,8 @@ def score(work: Path, out: Path) -> dict:
     held_out = HELD_OUT.load(work)
     colors, seen = flat_frames(FLAT_STRIDE)
     return {
-        "held_out": _scored(out, _as_recorded(held_out), held_out.seen),
+        "held_out": _scored(out, _as_recorded(held_out), held_out.seen)
+        | {"regions": _regions_scored(out, held_out)},
         "flat": _scored(out, colors, seen),
     }
 
@@ -169,6 +183,11 @@ def _scored(out: Path, colors: list[np.ndarray], seen: Seen) -> dict:
         "detector": {name: vars_of(one) for name, one in per_class.items()},
         "encoder": card.naming_report(scores.naming(out, crops, truth), is_large),
     }
+
+
+def _regions_scored(out: Path, views: Views) -> dict:
+    crops, truth = pair.crops_of(views.regions, _as_recorded(views))
+    return card.regions_report(scores.naming(out, crops, truth))
 
 
 def vars_of(one: scores.ClassScore) -> dict[str, float]:

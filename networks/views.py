@@ -1,11 +1,12 @@
 """Frames of rooms at the size of the networks' input, and the boxes of what is seen in them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import layout
 import numpy as np
+from regions import regions
 
 from ldo_service.datasets.synthetic.flat.labels import CEILING, FLOOR, WALL
 from ldo_service.datasets.synthetic.flat.render import FlatRenderer
@@ -14,6 +15,7 @@ from ldo_service.datasets.synthetic.flat.sequence import FOCAL_PER_WIDTH
 from ldo_service.datasets.synthetic.path import look_at
 from ldo_service.geometry import Camera
 
+VERSION = 2  # of what is kept of a room
 WIDTH_PX, HEIGHT_PX = 320, 240
 EYE_M = (1.2, 1.6)  # above the floor, as a hand holds a camera
 GAZE_SLOPE = (-0.45, 0.05)
@@ -68,11 +70,13 @@ class Views:
     """colors [F, H, W, 3] uint8 RGB, sharp and without noise, and what they show.
 
     instances  [F, H, W] uint8, 0 for the building
+    regions    those that the service would set apart, see `regions`
     """
 
     colors: np.ndarray
     instances: np.ndarray
     seen: Seen
+    regions: Seen
 
 
 def camera() -> Camera:
@@ -92,18 +96,30 @@ def render(seed: int, count: int) -> Views:
     planes = [(frame.class_ids, frame.instance_ids) for frame in frames]
     instances = np.array([frame.instance_ids for frame in frames])
     assert instances.max() < 256
-    return Views(colors, instances.astype(np.uint8), seen_in(planes, rng))
+    apart = [
+        (number, *row)
+        for number, frame in enumerate(frames)
+        for row in regions(frame, lens, np.random.default_rng([seed, 11, number]))
+    ]
+    return Views(colors, instances.astype(np.uint8), seen_in(planes, rng), _seen(apart))
 
 
 def cached(folder: Path, seed: int, count: int) -> Views:
     """As `render`, kept in a folder."""
-    file = folder / f"{layout.VERSION}-{seed}-{count}.npz"
+    file = folder / f"{VERSION}-{layout.VERSION}-{seed}-{count}.npz"
     if not file.exists():
         views = render(seed, count)
         folder.mkdir(parents=True, exist_ok=True)
-        np.savez(file, colors=views.colors, instances=views.instances, table=views.seen.table())
+        np.savez(
+            file,
+            colors=views.colors,
+            instances=views.instances,
+            seen=views.seen.table(),
+            regions=views.regions.table(),
+        )
     with np.load(file) as stored:
-        return Views(stored["colors"], stored["instances"], Seen.of(stored["table"]))
+        tables = (Seen.of(stored[name]) for name in ("seen", "regions"))
+        return Views(stored["colors"], stored["instances"], *tables)
 
 
 def seen_in(
@@ -118,6 +134,10 @@ def seen_in(
             *(_building(class_ids, rng) if rng is not None else ()),
         )
     ]
+    return _seen(rows)
+
+
+def _seen(rows: Sequence[tuple]) -> Seen:
     return Seen.of(np.array(rows, float).reshape(-1, 8))
 
 

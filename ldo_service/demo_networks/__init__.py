@@ -16,7 +16,7 @@ LICENCE = "Apache-2.0"
 DETECTOR = Path(__file__).with_name("detector.onnx")
 IMAGE_ENCODER = Path(__file__).with_name("image_encoder.onnx")
 TEXT_EMBEDDINGS = Path(__file__).with_name("text_embeddings.npz")
-NOTHING = ("wall", "floor", "ceiling")  # names of the table that are no objects
+NOTHING = ("wall", "floor", "ceiling", "background")  # names of the table that are no objects
 
 __all__ = [
     "DETECTOR",
@@ -35,7 +35,7 @@ def open_detector(config: NetworkConfig) -> OnnxDetector:
 
 
 def open_labeller(config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
-    """To choose from `names`, or from all of the table; bare walls are told by nothing.
+    """To choose from `names`, or from all of the table, but for those of NOTHING.
 
     Raises ConfigError for a name that is not in the table: there is no text encoder.
     """

@@ -19,7 +19,7 @@ def encoder(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     import encoder
 
     yield encoder
-    for name in ("encoder", "crops", "layers", "material", "training", "views", "layout"):
+    for name in ("encoder", "crops", "layers", "regions", "training", "views", "layout", "wear"):
         sys.modules.pop(name, None)
 
 
@@ -30,7 +30,7 @@ def drawn(encoder: ModuleType, shape: tuple[int, int], color: tuple, instance: i
     plane[height // 4 : -height // 4, width // 4 : -width // 4] = instance
     image = np.full((*shape, 3), GREY, np.uint8)
     image[plane > 0] = color
-    return encoder._Shown(image, plane, instance)
+    return encoder.Shown(image, plane, instance)
 
 
 def test_another_thing_covers_with_its_own_pixels_alone(encoder: ModuleType) -> None:

@@ -1,0 +1,99 @@
+"""The dual encoder's two rounds: on things, then on things and regions.
+
+A service asks about what geometry and colour set apart (`regions`): a third of that is no thing,
+and a third a part of one. So in the second round half of each batch are crops of such regions, and
+there is one name more, for what is no thing.
+"""
+
+from collections.abc import Iterator, Sequence
+
+import encoder
+import jax.numpy as jnp
+import numpy as np
+import training
+from crops import INPUT_PX, crop, enlarged
+from encoder import BATCH, DIMENSIONS, NAMES, RATE, Framing, Pair
+from layers import Live
+from regions import NO_THING
+from views import Seen, Views
+
+from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES
+
+NO_NAME = "background"  # of a region that is no thing
+NO_THINGS = (*BUILDING.split(), NO_NAME)
+FIRST_SIDE_PX = 48  # crops of the first round are smaller: half again as many a minute
+ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)  # many are cut off as they are
+REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35  # of a batch, and of these
+MARGIN = 0.15  # of a region's sides, that a labeller's crop has around it
+
+
+def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
+    """In rounds of so many steps, each with its share of the rate: see `training.fit_in_rounds`."""
+    rng = np.random.default_rng([seed, 2])
+    live = Live({}, rng=rng)
+    encoder.network(live, jnp.zeros((1, INPUT_PX, INPUT_PX, 3)))
+    texts = rng.standard_normal((len(NAMES), DIMENSIONS)).astype(np.float32)
+    weights = live.weights | {"texts.kernel": texts}
+    first, second = (share * RATE for share in training.ROUND_RATES)
+    # things
+    things = encoder.batches(material, rng, FIRST_SIDE_PX)
+    weights = training.fit(encoder.loss, weights, things, steps[0], first)
+    # and regions
+    weights |= {"texts.kernel": _with_no_name(weights["texts.kernel"])}
+    both = batches(material, np.random.default_rng([seed, 7]))
+    weights = training.fit(encoder.loss, weights, both, steps[1], second)
+    texts = np.asarray(encoder.unit(jnp.asarray(weights.pop("texts.kernel"))))
+    again = batches(material, np.random.default_rng([seed, 5]))
+    inputs = (np.asarray(encoder.normalised(crops)) for crops, _ in again)
+    statistics = training.statistics(encoder.network, weights, inputs)
+    return Pair(weights, statistics, texts, (*NAMES, NO_NAME))
+
+
+def _with_no_name(texts: np.ndarray) -> np.ndarray:
+    """[T + 1, D]: it begins between wall, floor and ceiling."""
+    building = [NAMES.index(name) for name in BUILDING.split()]
+    return np.concatenate([texts, texts[building].mean(axis=0, keepdims=True)])
+
+
+def batches(material: Views, rng: np.random.Generator) -> Iterator[tuple]:
+    """As those of `encoder`, with regions in place of a half."""
+    regions, names = named(material.regions)
+    odds, count = _odds(names), round(REGIONS_SHARE * BATCH)
+    for crops, told in encoder.batches(material, rng):
+        rows = rng.choice(len(names), count, p=odds)
+        for k, row in enumerate(rows):
+            shown = encoder.shown_in(material, regions, row, INPUT_PX, rng, ABOUT_REGIONS)
+            crops[k] = encoder.example(shown, None, INPUT_PX, rng)
+        told[:count] = names[rows]
+        yield crops, told
+
+
+def named(regions: Seen) -> tuple[Seen, np.ndarray]:
+    """Regions that have a name, and its index: after NAMES comes NO_NAME."""
+    own = {CLASS_NAMES.index(name): k for k, name in enumerate(NAMES)} | {NO_THING: len(NAMES)}
+    chosen = regions.chosen(np.array([k in own for k in regions.class_ids.tolist()], bool))
+    return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)
+
+
+def crops_of(regions: Seen, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Crops of regions as a labeller sees them, and their names' indices."""
+    regions, names = named(regions)
+    rows = zip(regions.frames, regions.boxes_px, strict=True)
+    return np.array([crop(colors[f], enlarged(box, MARGIN)) for f, box in rows]), names
+
+
+def is_right(names: np.ndarray) -> np.ndarray:
+    """[N, T + 1] bool, what regions with these names [N] may be called: any of NO_THINGS where they
+    are none."""
+    among = (*NAMES, NO_NAME)
+    right = np.arange(len(among)) == names[:, None]
+    right[names == len(NAMES)] = np.isin(among, NO_THINGS)
+    return right
+
+
+def _odds(names: np.ndarray) -> np.ndarray:
+    """[N] of regions: each name as often as the root of its number, and none as is set."""
+    odds, is_thing = 1 / np.sqrt(np.bincount(names)[names]), names < len(NAMES)
+    odds[is_thing] *= (1 - NO_THING_SHARE) / odds[is_thing].sum()
+    odds[~is_thing] *= NO_THING_SHARE / odds[~is_thing].sum()
+    return odds

@@ -1,0 +1,47 @@
+"""Frames as a worse camera takes them, and of things painted otherwise."""
+
+import cv2
+import numpy as np
+
+GAIN = (0.72, 1.3)  # of exposure; the flat's drifts by +-20 %
+TINT = (0.85, 1.18)  # of each channel
+SWAP_SHARE = 0.3  # of frames whose channels are permuted: paints have any hue
+BLUR_SHARE, BLUR_PX = 0.6, 6.0  # of frames, and at most in a frame of 320 pixels
+NOISE = (0.0, 5.0)  # grey levels
+REPAINTED_SHARE = 0.6  # of objects
+REPAINT, REPAINT_TINT, REPAINT_MOST = 0.35, 0.25, 2.5  # deviations of logarithms; largest factor
+
+
+def worsened(image: np.ndarray, rng: np.random.Generator, blur_px: float = BLUR_PX) -> np.ndarray:
+    """A frame [H, W, 3] uint8 of another exposure and tint, blurred by motion, with noise."""
+    values = image.astype(np.float32)
+    if rng.random() < SWAP_SHARE:
+        values = values[..., rng.permutation(3)]
+    values *= (rng.uniform(*GAIN) * rng.uniform(*TINT, 3)).astype(np.float32)
+    if rng.random() < BLUR_SHARE:
+        values = blurred(values, *(rng.uniform(-blur_px, blur_px, 2) / 1.4))
+    noise = rng.standard_normal(values.shape, np.float32) * np.float32(rng.uniform(*NOISE))
+    return np.clip(values + noise, 0, 255).astype(np.uint8)
+
+
+def repainted(image: np.ndarray, plane: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A frame [H, W, 3] uint8 whose objects, ids in `plane`, have other brightness and hue."""
+    factors = np.exp(
+        REPAINT * rng.standard_normal((256, 1)) + REPAINT_TINT * rng.standard_normal((256, 3))
+    )
+    factors = np.clip(factors, 1 / REPAINT_MOST, REPAINT_MOST).astype(np.float32)
+    factors[rng.random(256) >= REPAINTED_SHARE] = 1
+    factors[0] = 1
+    return np.minimum(image * factors[plane], 255).astype(np.uint8)
+
+
+def blurred(values: np.ndarray, du_px: float, dv_px: float) -> np.ndarray:
+    """The mean along a segment, by a kernel of its own."""
+    radius = int(np.ceil(max(abs(du_px), abs(dv_px)) / 2)) + 1
+    kernel = np.zeros((2 * radius + 1, 2 * radius + 1), np.float32)
+    for share in np.linspace(-0.5, 0.5, 9):
+        u, v = radius + share * du_px, radius + share * dv_px
+        for row in (int(v), int(v) + 1):
+            for column in (int(u), int(u) + 1):
+                kernel[row, column] += max(0, 1 - abs(u - column)) * max(0, 1 - abs(v - row))
+    return cv2.filter2D(values, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE)
