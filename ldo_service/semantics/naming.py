@@ -28,7 +28,7 @@ class NamingConfig:
     trigger: TriggerConfig = field(default_factory=TriggerConfig)
     regions: RegionConfig = field(default_factory=RegionConfig)
     reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
-    least_sure: float = 0.5  # of an answer: below, it is more likely another name
+    least_sure: float = 0.3  # of an answer: below, it is more likely another name
     structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")  # no objects, whoever
     # says so: they stay background
     most_open: int = 96  # questions without an answer, some 10 kB each: the labeller has 32 regions
