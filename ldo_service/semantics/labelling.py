@@ -12,7 +12,16 @@ from .assignment import UNMATCHED, Assigned, AssignmentConfig, Regions, assign
 from .consistency import ConsistencyConfig, Disagreement, agree
 from .foreground import Foreground, ForegroundConfig, foreground, surfaces
 from .fusion import FusionConfig, fused
-from .labels import MISS, NOT_SEEN, LabelConfig, Observations, observe, top_labels, without_misses
+from .labels import (
+    MISS,
+    NOT_SEEN,
+    LabelConfig,
+    Observations,
+    forget,
+    observe,
+    top_labels,
+    without_misses,
+)
 from .nesting import NestingConfig, without_nested
 
 
@@ -39,6 +48,7 @@ class Claims:
     labels, confidences    [M] of the detector; confidence 0: it says nothing
     open_labels, open_confidences [M] of the open-vocabulary labeller; 0: it was not invoked
     parts                  what of each box it is; None, or none at all: what is found in it
+    anew                   what their Gaussians were taken for before was said of another thing
     """
 
     boxes: np.ndarray
@@ -47,6 +57,7 @@ class Claims:
     open_labels: np.ndarray
     open_confidences: np.ndarray
     parts: tuple[Foreground | None, ...] = ()
+    anew: bool = False
 
     @classmethod
     def of_detector(
@@ -64,6 +75,7 @@ class Claims:
             self.open_labels[mask],
             self.open_confidences[mask],
             parts,
+            self.anew,
         )
 
     def scores(self) -> np.ndarray:
@@ -114,6 +126,8 @@ def label_keyframe(
         seen.labels[is_spared] = NOT_SEEN
         is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
         without_misses(labels, indices[is_named])
+    if claims.anew:
+        forget(labels, indices[seen.labels >= 0])
     observe(labels, seen, config.labels, threads=threads)
     # what their neighbours say
     touched = indices[seen.labels != NOT_SEEN]

@@ -144,6 +144,11 @@ def without_misses(labels: np.ndarray, indices: np.ndarray) -> None:
     rows["evidence"][indices] *= named
 
 
+def forget(labels: np.ndarray, indices: np.ndarray) -> None:
+    """Make rows `indices` [V] of labels [N, 32] as never seen, in place."""
+    labels[indices] = 0
+
+
 def background(labels: np.ndarray) -> np.ndarray:
     """[N] float32, the share of background."""
     return np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)

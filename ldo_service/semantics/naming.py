@@ -41,12 +41,14 @@ class NamingConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Asked:
-    """What a question was about: a part of a box in a keyframe, and the detector's word on it."""
+    """What a question was about: a part of a box in a keyframe, the detector's word on it, and the
+    kind of the region."""
 
     box_px: np.ndarray
     part: Foreground
     label: str
     score: float
+    kind: str = ""
 
 
 class Naming:
@@ -97,7 +99,7 @@ class Naming:
     def _remember(self, question: Question) -> None:
         region, of = question.region, question.candidate
         self._questions += 1
-        asked = Asked(of.box_px, of.part, of.label, of.score)
+        asked = Asked(of.box_px, of.part, of.label, of.score, of.kind)
         self._open[region.id, region.keyframe] = asked
         while len(self._open) > self.config.most_open:
             del self._open[next(iter(self._open))]
@@ -134,6 +136,8 @@ class Naming:
             np.array([said]),
             np.array([confidence], np.float32),
             (asked.part,),
+            # until now it was a part of what it stands on
+            anew=asked.kind == "standing" and confidence >= self.config.regions.settled,
         )
 
     # --- state ------------------------------------------------------------------------------------
@@ -223,7 +227,7 @@ def _area_px(box_px: np.ndarray) -> float:
 
 
 def _packed(asked: Asked) -> list[Any]:
-    return [asked.box_px, *asked.part.packed, asked.label, asked.score]
+    return [asked.box_px, *asked.part.packed, asked.label, asked.score, asked.kind]
 
 
 def _unpacked(box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any) -> Asked:

@@ -294,5 +294,5 @@ class SemanticMap:
 
 def _packed(claims: Claims | None) -> list[np.ndarray]:
     """Arrays of a detector's claims; none where nobody looked."""
-    names = [f.name for f in fields(Claims) if f.name != "parts"]
+    names = [f.name for f in fields(Claims) if f.name not in ("parts", "anew")]
     return [getattr(claims, name) for name in names] if claims else []
