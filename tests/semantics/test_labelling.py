@@ -69,6 +69,22 @@ def test_the_thing_gets_the_label_and_the_wall_in_its_box_does_not() -> None:
     assert np.count_nonzero(got & ~thing()) < 0.02 * np.count_nonzero(thing())
 
 
+def test_what_is_said_anew_stands_alone() -> None:
+    """Ten boxes of a chair, and an answer about what stands on it."""
+    before = [claims()] * 10
+    late = claims(0, 0.9)
+    for anew, label, share in ((False, CHAIR, 0.15), (True, LAMP, 1.0)):
+        _, labels = labelled(LabellingConfig(), *before, late=replace(late, anew=anew))
+        was = fields(labelled(LabellingConfig(), *before)[1])
+        of_thing = fields(labels)[thing().ravel()]
+        assert np.mean(top_labels(labels)[thing().ravel()] == label) > 0.95
+        shares = np.where(of_thing["ids"] == LAMP, of_thing["weights"], 0).sum(axis=1)
+        assert np.median(shares) == pytest.approx(share, abs=0.05)
+        # the wall keeps what it had
+        wall = ~thing().ravel() & (top_labels(labels) != LAMP)
+        assert np.array_equal(fields(labels)["weights"][wall], was["weights"][wall])
+
+
 def test_by_box_the_wall_becomes_chair_too() -> None:
     _, labels = labelled(LabellingConfig(region="box"), claims())
     got = (top_labels(labels) == CHAIR).reshape(64, 96)

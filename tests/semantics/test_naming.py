@@ -1,11 +1,12 @@
 """What boxes of a detector become beside the names of regions."""
 
 import numpy as np
+import pytest
 
 from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.labelling import Claims
-from ldo_service.semantics.naming import fitting_parts, with_opinions
-from ldo_service.semantics.regions_to_name import Opinion
+from ldo_service.semantics.naming import Naming, fitting_parts, with_opinions
+from ldo_service.semantics.regions_to_name import Opinion, RegionsToName
 from ldo_service.semantics.trigger import Candidate
 from ldo_service.semantics.vocabulary import Vocabulary
 
@@ -44,3 +45,26 @@ def test_a_region_without_a_box_is_a_claim_of_its_own() -> None:
     assert len(named.boxes) == 2
     assert (named.confidences[1], named.open_confidences[1]) == (0, np.float32(0.8))
     assert named.parts == (None, PART)
+
+
+@pytest.mark.parametrize(
+    ("kind", "sure", "is_anew"),
+    [("standing", 0.6, True), ("standing", 0.59, False), ("apart", 0.9, False)],
+)
+def test_what_stands_on_a_thing_was_taken_for_that_thing_before(
+    kind: str, sure: float, is_anew: bool
+) -> None:
+    """An answer that needs no second one tells it."""
+    asked = [7, 3, BOX, *PART.packed, "couch", 0.3, kind]
+    naming = Naming.unpacked({"regions": RegionsToName().packed, "open": [asked]})
+    assert naming.packed["open"][0][-3:] == ["couch", 0.3, kind]
+    vocabulary = Vocabulary(256)
+    claims = naming.answered(7, 3, "cushion", sure, vocabulary)
+    assert claims is not None
+    assert claims.anew == is_anew
+    assert claims.open_labels.tolist() == [vocabulary.index("cushion")]
+    (part,) = claims.parts
+    assert part is not None
+    assert np.array_equal(part.mask, PART.mask)
+    assert claims.where(np.array([True])).anew == is_anew
+    assert naming.answered(7, 3, "cushion", sure, vocabulary) is None, "nobody asks any more"
