@@ -18,13 +18,14 @@ from regions import NO_THING
 from views import Seen, Views
 
 from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES
+from ldo_service.semantics.region_views import ViewConfig
 
 NO_NAME = "background"  # of a region that is no thing
 NO_THINGS = (*BUILDING.split(), NO_NAME)
 FIRST_SIDE_PX = 48  # crops of the first round are smaller: half again as many a minute
 ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)  # many are cut off as they are
 REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35  # of a batch, and of these
-MARGIN = 0.15  # of a region's sides, that a labeller's crop has around it
+MARGIN = ViewConfig().context  # of a region's sides, that a labeller's crop has around it
 
 
 def train(material: Views, steps: Sequence[int], seed: int) -> Pair:

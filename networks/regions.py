@@ -33,6 +33,8 @@ def regions(frame: Rendering, lens: Camera, rng: np.random.Generator) -> Iterato
     visible_px = np.bincount(frame.instance_ids.ravel())
     for region in regions_of_image(shown, depth_m.shape, TRIGGER):
         own = frame.instance_ids[region.part.image(depth_m.shape)]
+        if len(own) == 0:
+            continue
         counts = np.bincount(own, minlength=len(visible_px))
         instance = 1 + int(counts[1:].argmax()) if len(counts) > 1 else 0
         box_px = (*(region.box_px + 0.5),)

@@ -15,7 +15,7 @@ from ldo_service.datasets.synthetic.flat.sequence import FOCAL_PER_WIDTH
 from ldo_service.datasets.synthetic.path import look_at
 from ldo_service.geometry import Camera
 
-VERSION = 2  # of what is kept of a room
+VERSION = 2  # of what is kept of a room: to be raised when `regions` or the segments change
 WIDTH_PX, HEIGHT_PX = 320, 240
 EYE_M = (1.2, 1.6)  # above the floor, as a hand holds a camera
 GAZE_SLOPE = (-0.45, 0.05)
@@ -32,10 +32,10 @@ class Seen:
     """B boxes in F frames.
 
     frames     [B] index of the frame
-    class_ids  [B] into CLASS_NAMES
-    instances  [B] id in the frame's plane of instances, 0 for the building
+    class_ids  [B] into CLASS_NAMES; of a region that shows no thing -1
+    instances  [B] id in the frame's plane of instances, 0 for the building and for no thing
     boxes_px   [B, 4] x0, y0, x1, y1 counted from the corner of the first pixel
-    pixels     [B] visible of the object
+    pixels     [B] visible of the object, within a region; of no thing, all of the region's
     """
 
     frames: np.ndarray

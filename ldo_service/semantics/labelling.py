@@ -126,7 +126,7 @@ def label_keyframe(
         seen.labels[is_spared] = NOT_SEEN
         is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
         without_misses(labels, indices[is_named])
-    if claims.anew:
+    if claims.anew and config.region == "foreground":
         forget(labels, indices[seen.labels >= 0])
     observe(labels, seen, config.labels, threads=threads)
     # what their neighbours say

@@ -90,8 +90,23 @@ def sighting_of(
     rows, columns = rows[is_known], columns[is_known]
     if len(rows) == 0:
         return None
-    few = np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int)
+    few = _spread(rows, columns)
     return Sighting(keyframe, candidate, _points(rows[few], columns[few], depth_m, camera))
+
+
+def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Which of these pixels [N] to keep, MOST_POINTS at most: those on a grid, or every so many of
+    what is too thin for it. Every so many of a rectangle would lie on a few lines."""
+    step = max(1, int(np.sqrt(len(rows) / MOST_POINTS)))
+    while True:
+        on_grid = (rows % step == step // 2) & (columns % step == step // 2)
+        if np.count_nonzero(on_grid) <= MOST_POINTS:
+            break
+        step += 1
+    most = min(len(rows), MOST_POINTS)
+    if 2 * np.count_nonzero(on_grid) >= most:
+        return np.flatnonzero(on_grid)
+    return np.linspace(0, len(rows) - 1, most).astype(int)
 
 
 def _points(

@@ -47,6 +47,7 @@ class RegionConfig:
     answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's
     least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
     least_carried: float = 0.5  # sure of its name, to be told where nothing sets a region apart
+    most_carried: int = 32  # names of a keyframe told so: as many as it has candidates
     overlap: float = 0.6  # of what two sightings show of each other, to be of the same region
     max_gap_m: float = 0.1  # of depth, from a point to what is seen there (delta_z, III.A)
     least_points: int = 12  # that one sees of the other
@@ -55,7 +56,8 @@ class RegionConfig:
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
-        if min(self.views, self.views_first, self.most_questions, self.most, self.at_once) < 1:
+        counts = self.views, self.views_first, self.most_questions, self.most, self.at_once
+        if min(*counts, self.most_carried) < 1:
             raise ConfigError(f"{self}: counts must be at least 1.")
         if self.patience < 0 or self.per_keyframe <= 0:
             raise ConfigError(f"{self}: patience at least 0, per_keyframe positive.")
@@ -164,14 +166,17 @@ class RegionsToName:
 
     def _carried(self, known: KnownRegions, taken: Collection[int]) -> list[Opinion]:
         """Names of regions that are seen, and were not set apart."""
-        opinions = []
+        opinions: list[Opinion] = []
         for number in known.seen():
             region = self._regions[number]
-            label, sure = self.name(region) if region.answer else ("", 0.0)
+            label, sure = self._told(region)
             if number in taken or not label or sure < self.config.least_carried:
                 continue
+            if len(opinions) == self.config.most_carried:
+                break
             part = known.carried(number)
             if part is not None:
+                self._keep(region)
                 opinions.append(Opinion(Candidate(part.box_px, part), label, sure))
         return opinions
 
@@ -201,8 +206,12 @@ class RegionsToName:
 
     def _said_of(self, region: Region, candidate: Candidate) -> list[Opinion]:
         """Its name, once it was asked about: boxes alone are told anyway, where they are."""
-        label, sure = self.name(region)
-        return [Opinion(candidate, label, sure)] if label and region.answer else []
+        label, sure = self._told(region)
+        return [Opinion(candidate, label, sure)] if label else []
+
+    def _told(self, region: Region) -> tuple[str, float]:
+        """Its name, where a labeller has given it one."""
+        return self.name(region) if region.answer and region.answer.label else ("", 0.0)
 
     def name(self, region: Region) -> tuple[str, float]:
         """What most speaks for, and how sure: as the surest was, by the share of all votes that are

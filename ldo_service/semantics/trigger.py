@@ -159,11 +159,12 @@ def named_objects(
     config: TriggerConfig,
 ) -> list[Candidate]:
     """Those of the regions `found` that the map has a reliable name for, is_labelled [H, W] bool,
-    and no box [M, 4] is drawn about."""
+    and no box [M, 4] is drawn about; but for what stands on a thing, which is a candidate."""
     return [
         one
         for one in found
-        if _share(is_labelled, one.part) >= config.explained
+        if one.kind != "standing"
+        and _share(is_labelled, one.part) >= config.explained
         and np.all(_ious(boxes_px, one.box_px) < config.same_iou)
     ]
 

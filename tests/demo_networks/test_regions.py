@@ -10,6 +10,7 @@ import pytest
 
 from ldo_service.datasets.synthetic.flat import CLASS_NAMES
 from ldo_service.datasets.synthetic.flat.render import Rendering
+from ldo_service.demo_networks import NOTHING
 
 pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --group train")
 
@@ -94,6 +95,10 @@ def test_names_of_regions(trainer: SimpleNamespace) -> None:
         {"wall", "floor", "ceiling", "background"},
         {"chair"},
     ]
+
+
+def test_what_is_told_by_nothing_is_what_was_learned_to_be_none(trainer: SimpleNamespace) -> None:
+    assert set(trainer.pair.NO_THINGS) == set(NOTHING)
 
 
 def test_no_things_are_as_often_as_is_set(trainer: SimpleNamespace) -> None:

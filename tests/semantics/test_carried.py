@@ -1,9 +1,10 @@
 """Masks carried over to a keyframe that set nothing apart there."""
 
 import numpy as np
+import pytest
 
 from ldo_service.geometry import Camera, se3
-from ldo_service.semantics.carried import LEAST, MARGIN_PX, STRIDE_PX, carried
+from ldo_service.semantics.carried import LEAST, STRIDE_PX, carried
 from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.regions import sighting_of
 from ldo_service.semantics.same_region import pixels
@@ -90,4 +91,17 @@ def test_it_ends_at_the_border_of_the_image() -> None:
     found = shown_from(0.45)
     assert found is not None
     assert found.column == 0
-    assert found.column + found.mask.shape[1] < 85 - 45 + MARGIN_PX
+    assert overlap(found, scene(0.45)[1]) > 0.7
+
+
+@pytest.mark.parametrize("rows", [24, 48, 95, 96])
+@pytest.mark.parametrize("columns", [24, 95, 96, 130])
+def test_a_rectangle_is_whole_whatever_its_sides(rows: int, columns: int) -> None:
+    """Its points must not lie on lines."""
+    depth_m, mask = np.full(SHAPE, WALL_M, np.float32), np.zeros(SHAPE, bool)
+    mask[12 : 12 + rows, 20 : 20 + columns] = True
+    part = Foreground(12, 20, mask[12 : 12 + rows, 20 : 20 + columns])
+    sighting = sighting_of(0, Candidate(part.box_px, part), depth_m, CAMERA)
+    assert sighting is not None
+    at, to, _ = pixels(sighting.p_camera, CAMERA, SHAPE)
+    assert overlap(carried(sighting, at, to, depth_m, CAMERA, np.eye(4), 1e-3), mask) > 0.85
