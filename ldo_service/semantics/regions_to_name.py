@@ -52,7 +52,8 @@ class RegionConfig:
     max_gap_m: float = 0.1  # of depth, from a point to what is seen there (delta_z, III.A)
     least_points: int = 12  # that one sees of the other
     least_quality: float = 0.02  # of a view: worse ones show a labeller nothing
-    most: int = 1024  # regions, some 10 kB each; the one not seen for longest is forgotten
+    most: int = 1024  # regions, some 50 kB each: five pictures of 5 kB, two masks of 12; the
+    # one not seen for longest is forgotten
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
