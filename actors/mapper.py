@@ -60,6 +60,7 @@ from ldo_service.schemas.topics import (
     MAP_VIEW,
     OBJECT_OBSERVATION,
 )
+from ldo_service.semantics.regions import Answer
 from ldo_service.semantics.semantic_map import Learnt, SemanticMap, SemanticMapConfig
 from ldo_service.wire import (
     claims_of,
@@ -256,8 +257,8 @@ class Mapper(Actor):
         yield from self._tell_learnt(learnt, message.stamp_ns)
 
     def _take_name(self, message: LabelOpen) -> Iterator[Output]:
-        about = message.region, message.keyframe
-        if self._semantics.answer(*about, message.label, message.confidence):
+        answer = Answer(message.label, message.confidence, message.others)
+        if self._semantics.answer(message.region, message.keyframe, answer):
             yield from self._objects()
 
     def _tell_learnt(self, learnt: Learnt | None, stamp_ns: int) -> Iterator[Output]:

@@ -23,7 +23,7 @@ from ldo_service.models import open_labeller
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.runtime.actor import State
 from ldo_service.schemas import LabelAdd, LabelNames, LabelOpen, LabelRequest
-from ldo_service.schemas.labels import MOST_NAMES
+from ldo_service.schemas.labels import MOST_NAMES, MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
 from ldo_service.semantics.class_names import read_names
 from ldo_service.semantics.labellers import Labeller, Opinion
@@ -90,7 +90,7 @@ class VlmLabeller(Actor):
 
     def _answer(self, request: LabelRequest) -> LabelOpen:
         opinions = self._opinions(request)
-        label, confidence = opinions[0] if opinions else ("", 0.0)
+        (label, confidence), *others = opinions or [("", 0.0)]
         self._named += bool(label)
         self._unnamed += not label
         return LabelOpen(
@@ -100,6 +100,7 @@ class VlmLabeller(Actor):
             label=label,
             confidence=min(confidence, 1.0) if label else 0.0,
             labeller=self._labeller.identity if self._labeller and opinions is not None else "",
+            others=tuple((name, min(sure, 1.0)) for name, sure in others[:MOST_OTHERS] if label),
         )
 
     def _opinions(self, request: LabelRequest) -> list[Opinion] | None:

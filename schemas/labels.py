@@ -5,6 +5,7 @@ from ldo_service.schemas.frames import Image
 from ldo_service.schemas.message import Message, require_count, require_finite
 
 MOST_CROPS = 8
+MOST_OTHERS = 8  # guesses beside the label
 MOST_CROP_PX = 1 << 20  # of one crop: networks look at 0.1 megapixels
 MOST_NAMES = 10_000
 Box = tuple[float, float, float, float]
@@ -43,6 +44,8 @@ class LabelOpen(Message, frozen=True, kw_only=True):
     label: str  # in lower case, single spaces; empty: it has no opinion, or could not look
     confidence: float  # 0..1; 0 without a label
     labeller: str = ""  # which one looked; empty: none could
+    others: tuple[tuple[str, float], ...] = ()  # what else it may be, and its confidence 0..1, the
+    # likelier first
 
     def check(self) -> None:
         require_count("region", self.region)
@@ -50,6 +53,10 @@ class LabelOpen(Message, frozen=True, kw_only=True):
         _require_opinion(self.label, self.confidence)
         if self.label and not self.labeller:
             raise ValueError("there is a label, and no labeller that gave it")
+        if len(self.others) > MOST_OTHERS or (self.others and not self.label):
+            raise ValueError(f"{len(self.others)} others: up to {MOST_OTHERS}, and beside a label")
+        for other in self.others:
+            _require_opinion(*other)
 
 
 class LabelAdd(Message, frozen=True, kw_only=True):

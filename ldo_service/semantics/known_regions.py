@@ -51,8 +51,26 @@ class KnownRegions:
 
     def seen(self) -> Iterator[int]:
         """The ids of those that it sees."""
-        for i in np.flatnonzero(self._seen.counts >= self._least):
-            yield self._regions[int(i)].id
+        for i, region in enumerate(self._regions):
+            if self._is_seen(i):
+                yield region.id
+
+    def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
+        """[M, M], intersection over union of what it shows of regions: of the points of each, the
+        share in the other's pixels. 1 of each with itself; 0 of what it sees too little of.
+
+        shown  [M] their ids, each once, and their pixels in it
+        """
+        places = {region.id: i for i, region in enumerate(self._regions)}
+        inside = np.zeros((len(shown), len(shown)))
+        columns = [k for k, (id_, _) in enumerate(shown) if self._is_seen(places.get(id_))]
+        of = [places[shown[k][0]] for k in columns]
+        for row, (_, part) in zip(inside, shown, strict=True):
+            row[columns] = self._seen.shares_in(part)[of]
+        both = inside * inside.T
+        iou = both / np.maximum(inside + inside.T - both, 1e-9)
+        np.fill_diagonal(iou, 1)
+        return iou
 
     def carried(self, region: int) -> Foreground | None:
         """The pixels of a region that it sees; see `carried`."""
@@ -68,3 +86,6 @@ class KnownRegions:
             se3.inverse(T_map_seen) @ T_map_now,
             self._max_gap_m,
         )
+
+    def _is_seen(self, place: int | None) -> bool:
+        return place is not None and bool(self._seen.counts[place] >= self._least)

@@ -108,7 +108,7 @@ class Naming:
 
     # --- answers ----------------------------------------------------------------------------------
     def answered(
-        self, region: int, keyframe: int, label: str, confidence: float, vocabulary: Vocabulary
+        self, region: int, keyframe: int, answer: Answer, vocabulary: Vocabulary
     ) -> Claims | None:
         """What the labeller claims of that keyframe, with what the detector said of the same part.
         None where it names nothing, or nobody asked."""
@@ -116,12 +116,10 @@ class Naming:
         if asked is None:
             self._unknown += 1
             return None
-        is_told = normalised(label) not in self.config.structure and (
-            confidence >= self.config.least_sure or bool(asked.label)
-        )
-        name = label if is_told else ""
+        answer = self._believed(answer, asked)
+        name, confidence = answer.label, answer.sure
         before = self._regions.get(region)
-        known_as = self._regions.answered(region, Answer(name, confidence))
+        known_as = self._regions.answered(region, answer)
         is_name = bool(name) and confidence > 0
         self._named += is_name
         self._unnamed += not is_name
@@ -143,6 +141,17 @@ class Naming:
             and confidence >= self.config.regions.settled
             and not (before and before.votes),
         )
+
+    def _believed(self, answer: Answer, asked: Asked) -> Answer:
+        """Without a label that is no object's, or is told too unsurely of what no box is about."""
+        others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
+        is_told = self._is_object(answer.label) and (
+            answer.sure >= self.config.least_sure or bool(asked.label)
+        )
+        return replace(answer, others=others) if is_told else Answer("", answer.sure)
+
+    def _is_object(self, name: str) -> bool:
+        return normalised(name) not in self.config.structure
 
     # --- state ------------------------------------------------------------------------------------
     @property

@@ -11,18 +11,20 @@ from ldo_service.geometry import Camera
 from .foreground import Foreground
 from .region_views import RegionView
 from .trigger import Candidate
+from .votes import Votes, with_vote
 
 Box = tuple[float, float, float, float]
-Votes = tuple[tuple[str, float, float], ...]  # name, sum of its votes, the surest of them
 MOST_POINTS = 96  # of a sighting, 12 bytes each
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """What a labeller takes a region for, 0..1 `sure`; no label: it is no object."""
+    """What a labeller takes a region for, 0..1 `sure`; no label: it is no object. `others`: what
+    else it may be, and how sure."""
 
     label: str
     sure: float
+    others: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -73,6 +75,11 @@ class Region:
     questions: int = 0
     quality: float = 0.0
     answer: Answer | None = None
+
+    @property
+    def is_standing(self) -> bool:
+        """On a thing, of which it is no part."""
+        return self.shape.candidate.kind == "standing"
 
     def gained(self) -> float:
         """How much better its views are than when it was asked about."""
@@ -132,22 +139,6 @@ def seen_again(region: Region, seen: Sighting) -> Region:
         votes=with_vote(region.votes, said.label, said.score),
         seen=region.seen + 1,
     )
-
-
-def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Votes:
-    """What is twice as sure counts four times. Of the demo's boxes that are 0.3 sure a third are
-    right, of those that are 0.6 sure all but few.
-
-    >>> votes = with_vote((("tv", 0.25, 0.5),), "tv", 0.6)
-    >>> with_vote(votes, "oven", 0.5, weight=4)
-    (('tv', 0.61, 0.6), ('oven', 1.0, 0.5))
-    """
-    if not name:
-        return votes
-    sums = {one: (total, most) for one, total, most in votes}
-    total, most = sums.get(name, (0.0, 0.0))
-    sums[name] = total + weight * sure**2, max(most, sure)
-    return tuple((one, *both) for one, both in sums.items())
 
 
 def packed(region: Region) -> dict[str, Any]:

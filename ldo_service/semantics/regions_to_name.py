@@ -2,7 +2,9 @@
 
 Two sightings are of the same region when most of what each shows of the other lies in it (see
 `same_region`). Each keeps its best views, and what was said of it: it has the name that most speaks
-for, be it the detector's boxes or the labeller's answers.
+for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one way, now
+in another; so what was said of a region counts for those that overlap it, by how much they do. What
+stands on a thing, and the thing, tell nothing of each other.
 
 A region is asked about once, when no better view of it has come for a while, and as it was at its
 best. Most regions are no things but parts and shadows of them; so there is a budget, and what has
@@ -28,9 +30,9 @@ from .regions import (
     seen_again,
     sighting_of,
     unpacked,
-    with_vote,
 )
 from .trigger import Candidate
+from .votes import Votes, favourite, with_vote, with_votes_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +132,7 @@ class RegionsToName:
         those of earlier sightings, as they are now; `named`: objects that the map has a name for,
         of which nobody is asked.
         """
-        config, opinions, taken = self.config, list[Opinion](), set[int]()
+        config, told, taken = self.config, list[tuple[int, Candidate]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
         known = KnownRegions(regions, *place, config.max_gap_m, config.least_points)
         for candidate in found:
@@ -144,17 +146,16 @@ class RegionsToName:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
                 region = self._with_view(region, sighting, region_view(*args, config.view))
             self._keep(region)
-            opinions += self._said_of(region, candidate)
+            told.append((region.id, candidate))
         for candidate in named:
             sighting = sighting_of(keyframe, candidate, depth_m, camera)
             region = sighting and self._same(sighting, known, taken)
-            if sighting and region:
-                said = self._said_of(region, candidate)
-                if said:
-                    taken.add(region.id)
-                    self._keep(seen_again(region, sighting))
-                opinions += said
-        opinions += self._carried(known, taken)
+            if sighting and region and self._told(region)[0]:
+                taken.add(region.id)
+                self._keep(seen_again(region, sighting))
+                told.append((region.id, candidate))
+        told += self._carried(known, taken)
+        opinions = self._opinions(told, known)
         questions = self._questions(keyframe, T_map_keyframe)
         self._forget()
         return Sightings(questions, opinions)
@@ -165,20 +166,38 @@ class RegionsToName:
         same = known.same(sighting, self.config.overlap, taken)
         return None if same is None else self._regions[same]
 
-    def _carried(self, known: KnownRegions, taken: Collection[int]) -> list[Opinion]:
-        """Names of regions that are seen, and were not set apart."""
-        opinions: list[Opinion] = []
+    def _carried(self, known: KnownRegions, taken: Collection[int]) -> list[tuple[int, Candidate]]:
+        """Regions that have a name and are seen, and were not set apart."""
+        found: list[tuple[int, Candidate]] = []
         for number in known.seen():
             region = self._regions[number]
             label, sure = self._told(region)
             if number in taken or not label or sure < self.config.least_carried:
                 continue
-            if len(opinions) == self.config.most_carried:
+            if len(found) == self.config.most_carried:
                 break
             part = known.carried(number)
             if part is not None:
                 self._keep(region)
-                opinions.append(Opinion(Candidate(part.box_px, part), label, sure))
+                found.append((number, Candidate(part.box_px, part)))
+        return found
+
+    def _opinions(
+        self, shown: Sequence[tuple[int, Candidate]], known: KnownRegions
+    ) -> list[Opinion]:
+        """What is to be said of those that a labeller has given a name: boxes alone are told
+        anyway, where they are."""
+        answered = [(self._regions[number], of) for number, of in shown]
+        answered = [(region, of) for region, of in answered if self._told(region)[0]]
+        overlaps = known.overlaps([(region.id, of.part) for region, of in answered])
+        opinions = []
+        for (region, of), row in zip(answered, overlaps, strict=True):
+            votes: Votes = ()
+            for (other, _), share in zip(answered, row.tolist(), strict=True):
+                if share > 0 and other.is_standing == region.is_standing:
+                    votes = with_votes_of(votes, other.votes, share)
+            label, sure = favourite(votes, self.config.least_votes)
+            opinions.append(Opinion(of, label, sure))
         return opinions
 
     def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[Question]:
@@ -205,29 +224,22 @@ class RegionsToName:
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
 
-    def _said_of(self, region: Region, candidate: Candidate) -> list[Opinion]:
-        """Its name, once it was asked about: boxes alone are told anyway, where they are."""
-        label, sure = self._told(region)
-        return [Opinion(candidate, label, sure)] if label else []
-
     def _told(self, region: Region) -> tuple[str, float]:
         """Its name, where a labeller has given it one."""
         return self.name(region) if region.answer and region.answer.label else ("", 0.0)
 
     def name(self, region: Region) -> tuple[str, float]:
-        """What most speaks for, and how sure: as the surest was, by the share of all votes that are
-        for it; nothing where little speaks for it."""
-        label, total, most = max(region.votes, key=lambda vote: vote[1], default=("", 0.0, 0.0))
-        if total == 0 or total < self.config.least_votes:
-            return "", 0.0
-        return label, most * total / sum(votes for _, votes, _ in region.votes)
+        """By its own votes, and how sure; nothing where little speaks for it."""
+        return favourite(region.votes, self.config.least_votes)
 
     def answered(self, region: int, answer: Answer) -> str:
         """The labeller has spoken of it; its name now. A confident answer needs no second one."""
         known = self._regions.get(region)
         if known is None:
             return answer.label
-        votes = with_vote(known.votes, answer.label, answer.sure, self.config.answer_weight)
+        votes = known.votes
+        for label, sure in ((answer.label, answer.sure), *answer.others):
+            votes = with_vote(votes, label, sure, self.config.answer_weight)
         is_surer = answer.sure > (known.answer.sure if known.answer else 0)
         known = replace(known, votes=votes, answer=answer if is_surer else known.answer)
         self._regions[region] = known

@@ -19,7 +19,7 @@ from .labels import BACKGROUND, MOST_LABELS, top_labels
 from .movable import Box, MovableConfig, movable_pixels
 from .naming import Naming, NamingConfig
 from .objects import Objects, ObjectsConfig, Observed
-from .regions_to_name import Region
+from .regions_to_name import Answer, Region
 from .vocabulary import Vocabulary
 
 
@@ -218,14 +218,12 @@ class SemanticMap:
         return MapView(*at, *known, indices, regions, boxes, view.depth_m)
 
     # --- answers ----------------------------------------------------------------------------------
-    def answer(self, region: int, keyframe: int, label: str, confidence: float) -> bool:
+    def answer(self, region: int, keyframe: int, answer: Answer) -> bool:
         """What a labeller takes a region for, as that keyframe showed it; whether it was folded in.
 
         Without the images of the keyframe nobody can tell which Gaussians are meant.
         """
-        claims = self.naming and self.naming.answered(
-            region, keyframe, label, confidence, self.vocabulary
-        )
+        claims = self.naming and self.naming.answered(region, keyframe, answer, self.vocabulary)
         if claims is None:
             return False
         if not self._map.views.is_readable(keyframe):

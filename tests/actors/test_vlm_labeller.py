@@ -21,6 +21,7 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.state_store import MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
+from ldo_service.schemas.labels import MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
 from ldo_service.semantics.labellers import Opinion
 from ldo_service.semantics.labellers.endpoint import EndpointConfig
@@ -112,6 +113,14 @@ def test_a_region_gets_its_name(pair: Path, names: Path) -> None:
     assert answer.labeller.startswith("colours ")
     facts = actor.facts()
     assert (facts["labellers"], facts["regions_named"], facts["names"]) == (1, 1, 2)
+
+
+def test_it_tells_what_else_a_region_may_be() -> None:
+    told = [("cup", 0.5), ("vase", 0.3), ("bowl", 0.1)]
+    answer = only(VlmLabeller(labeller=Scripted(told)).handle(request()))
+    assert (answer.label, answer.others) == ("cup", (("vase", 0.3), ("bowl", 0.1)))
+    many = [(f"name {k}", 0.01) for k in range(99)]
+    assert len(only(VlmLabeller(labeller=Scripted(many)).handle(request())).others) == MOST_OTHERS
 
 
 def test_without_a_labeller_it_idles_and_answers_at_once() -> None:

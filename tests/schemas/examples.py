@@ -107,6 +107,15 @@ EXAMPLES: dict[str, Message] = {
         confidence=0.8125,
         labeller="clip 0123456789ab",
     ),
+    "label_open_with_others": LabelOpen(
+        stamp_ns=1_700_000_000_000_000_032,
+        region=12,
+        keyframe=40,
+        label="samovar",
+        confidence=0.5,
+        labeller="clip 0123456789ab",
+        others=(("teapot", 0.25), ("vase", 0.125)),
+    ),
     "label_add": LabelAdd(stamp_ns=1_700_000_000_000_000_033, name="samovar"),
     "label_names": LabelNames(
         stamp_ns=1_700_000_000_000_000_033, names=("cup", "samovar"), refused="why not"

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from ldo_service.geometry import Camera
 from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.labelling import Claims
 from ldo_service.semantics.naming import Naming, fitting_parts, with_opinions
+from ldo_service.semantics.regions import Answer
 from ldo_service.semantics.regions_to_name import Opinion, RegionsToName
 from ldo_service.semantics.trigger import Candidate
 from ldo_service.semantics.vocabulary import Vocabulary
@@ -59,7 +61,7 @@ def test_what_stands_on_a_thing_was_taken_for_that_thing_before(
     naming = Naming.unpacked({"regions": RegionsToName().packed, "open": [asked]})
     assert naming.packed["open"][0][-3:] == ["couch", 0.3, kind]
     vocabulary = Vocabulary(256)
-    claims = naming.answered(7, 3, "cushion", sure, vocabulary)
+    claims = naming.answered(7, 3, Answer("cushion", sure), vocabulary)
     assert claims is not None
     assert claims.anew == is_anew
     assert claims.open_labels.tolist() == [vocabulary.index("cushion")]
@@ -67,4 +69,27 @@ def test_what_stands_on_a_thing_was_taken_for_that_thing_before(
     assert part is not None
     assert np.array_equal(part.mask, PART.mask)
     assert claims.where(np.array([True])).anew == is_anew
-    assert naming.answered(7, 3, "cushion", sure, vocabulary) is None, "nobody asks any more"
+    again = naming.answered(7, 3, Answer("cushion", sure), vocabulary)
+    assert again is None, "nobody asks any more"
+
+
+@pytest.mark.parametrize(
+    ("answer", "known"),
+    [
+        (Answer("clock", 0.5, (("wall", 0.3), ("fan", 0.2))), ("clock", "fan")),
+        (Answer("Wall", 0.9, (("fan", 0.1),)), ()),
+        (Answer("clock", 0.29, (("fan", 0.2),)), ()),
+    ],
+)
+def test_what_is_no_object_is_no_name_and_what_is_said_unsurely_neither(
+    answer: Answer, known: tuple[str, ...]
+) -> None:
+    vocabulary, camera = Vocabulary(256), Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+    regions, asked = RegionsToName(), [0, 3, BOX, *PART.packed, "", 0.0, "apart"]
+    color, depth_m = np.zeros((120, 160, 3), np.uint8), np.full((120, 160), 2.0, np.float32)
+    regions.see(3, [Candidate(BOX, PART)], color, depth_m, camera, {3: np.eye(4)})
+    one = Naming.unpacked({"regions": regions.packed, "open": [asked]})
+    claims = one.answered(0, 3, answer, vocabulary)
+    assert (claims is not None) == bool(known)
+    (region,) = one.packed["regions"]["regions"]
+    assert tuple(name for name, *_ in region["votes"]) == known

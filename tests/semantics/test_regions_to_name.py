@@ -238,6 +238,35 @@ def test_boxes_and_answers_vote_for_the_name_of_a_region() -> None:
     assert walk.regions.answered(0, Answer("cabinet", 0.5)) == "refrigerator"
 
 
+def test_what_else_an_answer_takes_it_for_counts() -> None:
+    """0.4 and 0.4 squared are 0.32, 0.5 squared is 0.25."""
+    walk = Walk()
+    walk.see(thing())
+    assert walk.regions.answered(0, Answer("clock", 0.5, (("radiator", 0.4),))) == "clock"
+    assert walk.regions.answered(0, Answer("speaker", 0.45, (("radiator", 0.4),))) == "radiator"
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"), [("apart", ["cabinet"] * 2), ("standing", ["cabinet", "oven"])]
+)
+def test_what_was_said_of_a_region_counts_for_one_that_overlaps_it(
+    kind: str, told: list[str]
+) -> None:
+    """But for what stands on a thing. Half of 0.8 squared is more than 0.5 squared."""
+    walk = Walk()
+    whole = thing(left=40, side=40)
+    part, box = Foreground(40, 40, np.ones((20, 40), bool)), np.array([39.5, 39.5, 79.5, 59.5])
+    half = Candidate(box, part, kind=kind)
+    for _ in range(2):
+        walk.see(whole, half)
+    walk.answered("cabinet", 0.8, region=0)
+    walk.answered("oven", 0.5, region=1)
+    walk.T_map_keyframe[2] = moved()
+    at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, walk.T_map_keyframe
+    opinions = walk.regions.see(2, [whole, half], *at).opinions
+    assert [opinion.label for opinion in opinions] == told
+
+
 def test_a_view_that_shows_nothing_is_not_shown() -> None:
     walk = Walk()
     flat = np.full_like(COLOR, 128)
