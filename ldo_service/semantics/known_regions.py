@@ -64,9 +64,9 @@ class KnownRegions:
         places = {region.id: i for i, region in enumerate(self._regions)}
         inside = np.zeros((len(shown), len(shown)))
         columns = [k for k, (id_, _) in enumerate(shown) if self._is_seen(places.get(id_))]
-        of = [places[shown[k][0]] for k in columns]
+        seen = self._seen.only([places[shown[k][0]] for k in columns])
         for row, (_, part) in zip(inside, shown, strict=True):
-            row[columns] = self._seen.shares_in(part)[of]
+            row[columns] = seen.shares_in(part)
         both = inside * inside.T
         iou = both / np.maximum(inside + inside.T - both, 1e-9)
         np.fill_diagonal(iou, 1)

@@ -65,6 +65,10 @@ class Claims:
     ) -> "Claims":
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
+    @classmethod
+    def none(cls) -> "Claims":
+        return cls.of_detector(np.zeros((0, 4), np.float32), *np.zeros((2, 0), np.float32))
+
     def where(self, mask: np.ndarray) -> "Claims":
         """Those of a mask [M]."""
         parts = tuple(part for part, is_in in zip(self.parts, mask, strict=False) if is_in)

@@ -142,6 +142,23 @@ class Naming:
             and not (before and before.votes),
         )
 
+    def shown_in(self, region: int) -> tuple[int, ...]:
+        """The keyframes whose views of a region the labeller was shown; see `RegionsToName`."""
+        return self._regions.shown_in(region)
+
+    def carried(
+        self,
+        region: int,
+        view: View,
+        vocabulary: Vocabulary,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> Claims | None:
+        """What a region is, as an earlier keyframe shows it; None where it has no name, or is not
+        seen."""
+        place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
+        opinion = self._regions.carried(region, *place)
+        return opinion and with_opinions(Claims.none(), [opinion], vocabulary)
+
     def _believed(self, answer: Answer, asked: Asked) -> Answer:
         """Without a label that is no object's, or is told too unsurely of what no box is about."""
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))

@@ -200,6 +200,30 @@ class RegionsToName:
             opinions.append(Opinion(of, label, sure))
         return opinions
 
+    def shown_in(self, region: int) -> tuple[int, ...]:
+        """The keyframes whose views of a region a labeller was shown, the best first."""
+        known = self._regions.get(region)
+        return tuple(view.keyframe for view in known.views) if known else ()
+
+    def carried(
+        self,
+        region: int,
+        keyframe: int,
+        depth_m: np.ndarray,
+        camera: Camera,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> Opinion | None:
+        """The name of a region, and what an earlier keyframe shows of it; None where it has none,
+        or is not seen. Arguments as for `see`."""
+        known, config = self._regions.get(region), self.config
+        label, sure = self._told(known) if known else ("", 0.0)
+        if known is None or not label:
+            return None
+        place = keyframe, depth_m, camera, T_map_keyframe
+        seen = KnownRegions([known], *place, config.max_gap_m, config.least_points)
+        part = seen.carried(region) if [*seen.seen()] else None
+        return part and Opinion(Candidate(part.box_px, part), label, sure)
+
     def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[Question]:
         """About the regions that are due, those with most to show first, as many as are allowed."""
         config = self.config

@@ -25,6 +25,15 @@ class Projected:
     of: np.ndarray
     counts: np.ndarray
 
+    def only(self, regions: Sequence[int]) -> "Projected":
+        """Those of some of the R regions, each once, numbered as they come."""
+        places = np.full(len(self.counts), -1)
+        places[regions] = np.arange(len(regions))
+        of = places[self.of]
+        is_theirs = of >= 0
+        points = self.rows[is_theirs], self.columns[is_theirs], of[is_theirs]
+        return Projected(*points, self.counts[regions])
+
     def shares_in(self, part: Foreground) -> np.ndarray:
         """[R] of the points of each region that it sees."""
         inside = is_in(part, self.rows, self.columns)

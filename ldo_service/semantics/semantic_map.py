@@ -54,9 +54,6 @@ class Learnt:
     asked: tuple[Region, ...] = ()
 
 
-NOTHING = Claims.of_detector(np.zeros((0, 4), np.float32), *np.zeros((2, 0), np.float32))
-
-
 class SemanticMap:
     """Labels the Gaussians of a MapBuilder, which keeps what each keyframe measured and where it
     is now, and finds objects among them. What is claimed of a keyframe is folded in once; what a
@@ -135,7 +132,7 @@ class SemanticMap:
         # who makes its image
         view, made_by = self._seen(keyframe)
         # what is said of it, and what is to be asked
-        claims, asked = self._with_names(view, made_by.top, found or NOTHING)
+        claims, asked = self._with_names(view, made_by.top, found or Claims.none())
         # what they are
         labelled = self._label(view, made_by.indices, claims, is_late=found is None)
         self._boxes += len(found.boxes) if found else 0
@@ -179,6 +176,10 @@ class SemanticMap:
             view, claims, self.vocabulary, is_labelled, T_map_keyframe
         )
         return claims, tuple(question.region for question in questions)
+
+    def _is_labellers(self, label: int) -> bool:
+        """Only the labeller gave it: of such things the detector says nothing."""
+        return label in self._by_labeller and label not in self._by_detector
 
     def _spared(self) -> np.ndarray | None:
         """[256] bool, labels that only the labeller gave: a detector cannot miss them."""
@@ -233,7 +234,22 @@ class SemanticMap:
         view, made_by = self._seen(keyframe)
         self._label(view, made_by.indices, claims, is_late=True)
         self.refresh(view)
+        if self._is_labellers(int(claims.open_labels[0])):
+            self._tell_where_shown(region, keyframe)
         return True
+
+    def _tell_where_shown(self, region: int, told: int) -> None:
+        """What a region is, in the other keyframes that the labeller was shown of it. Where it has
+        a name of the detector's, this has spoken of it there."""
+        assert self.naming is not None
+        for keyframe in self.naming.shown_in(region):
+            if keyframe == told or not self._map.views.is_readable(keyframe):
+                continue
+            view, made_by = self._seen(keyframe)
+            claims = self.naming.carried(region, view, self.vocabulary, self._map.views.poses)
+            if claims is not None:
+                self._label(view, made_by.indices, claims, is_late=True)
+                self.refresh(view)
 
     def refresh(self, view: View | None = None) -> None:
         """Make objects what has become of their Gaussians, or those that a keyframe may show."""

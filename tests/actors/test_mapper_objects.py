@@ -30,7 +30,7 @@ from ldo_service.schemas import (
     encode,
 )
 from ldo_service.semantics.labels import top_labels
-from ldo_service.semantics.naming import NamingConfig
+from ldo_service.semantics.naming import Naming, NamingConfig
 from ldo_service.semantics.regions_to_name import RegionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.semantics.trigger import TriggerConfig
@@ -283,6 +283,25 @@ def test_answers_land_on_the_gaussians_they_speak_of_however_late(late: int) -> 
         named = [one for one in last.objects if one.name == f"my {thing.name}"]
         assert len(named) <= sum(other.name == thing.name for other in THINGS), "one of each"
         assert min(np.linalg.norm(np.array(one.centroid) - center_m) for one in named) < 0.3
+
+
+def test_an_answer_speaks_of_all_views_that_were_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for what the detector knows: it has spoken of that where it saw it."""
+
+    def labelled(name: str) -> int:
+        mapper = Mapper(CONFIG, has_labeller=True)
+        made = walk(mapper, known=(COUCH,))
+        for request in of(LabelRequest, made):
+            if shown_in(request) == CHAIR:
+                made += mapper.handle(answer(request, name))
+        follower = followed([*made, *mapper.finish()])
+        said = np.array(follower.label_names)[top_labels(follower.map.labels)]
+        return int(np.count_nonzero(said == name))
+
+    beyond, of_the_detector = labelled("my chair"), labelled(COUCH.name)
+    monkeypatch.setattr(Naming, "shown_in", lambda *_: ())
+    assert beyond > 1.05 * labelled("my chair") > 0
+    assert of_the_detector == labelled(COUCH.name) > 0
 
 
 def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:
