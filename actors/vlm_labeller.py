@@ -100,7 +100,7 @@ class VlmLabeller(Actor):
             label=label,
             confidence=min(confidence, 1.0) if label else 0.0,
             labeller=self._labeller.identity if self._labeller and opinions is not None else "",
-            others=tuple((name, min(sure, 1.0)) for name, sure in others[:MOST_OTHERS] if label),
+            others=tuple((name, min(sure, 1.0)) for name, sure in others[:MOST_OTHERS]),
         )
 
     def _opinions(self, request: LabelRequest) -> list[Opinion] | None:

@@ -53,10 +53,13 @@ class LabelOpen(Message, frozen=True, kw_only=True):
         _require_opinion(self.label, self.confidence)
         if self.label and not self.labeller:
             raise ValueError("there is a label, and no labeller that gave it")
-        if len(self.others) > MOST_OTHERS or (self.others and not self.label):
-            raise ValueError(f"{len(self.others)} others: up to {MOST_OTHERS}, and beside a label")
+        if len(self.others) > MOST_OTHERS:
+            raise ValueError(f"{len(self.others)} others are over {MOST_OTHERS}")
         for other in self.others:
             _require_opinion(*other)
+        names = [self.label, *(name for name, _ in self.others)]
+        if self.others and (not all(names) or len(set(names)) < len(names)):
+            raise ValueError(f"label and others are {names}: each is told once, and none is empty")
 
 
 class LabelAdd(Message, frozen=True, kw_only=True):

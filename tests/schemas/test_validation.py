@@ -469,3 +469,22 @@ def test_objects_come_by_id_and_each_once() -> None:
     assert isinstance(message, MapObjects)
     with pytest.raises(ValueError, match="ascending"):
         changed("map_objects", objects=2 * message.objects)
+
+
+@pytest.mark.parametrize(
+    ("others", "complaint"),
+    [
+        ((("cup", 1.5),), "must be within 0..1"),
+        ((("cup", NAN),), "holds NaN"),
+        ((("x" * 101, 0.1),), "101 characters"),
+        ((("", 0.0),), "none is empty"),
+        ((("cup", 0.2), ("cup", 0.1)), "told once"),
+        ((("samovar", 0.1),), "told once"),
+        (tuple((f"name {k}", 0.1) for k in range(9)), "9 others are over 8"),
+    ],
+)
+def test_guesses_that_cannot_be_are_refused(others: tuple, complaint: str) -> None:
+    with pytest.raises(ValueError, match=complaint):
+        changed("label_open", others=others)
+    with pytest.raises(ValueError, match="none is empty"):
+        changed("label_open", label="", confidence=0.0, others=(("cup", 0.1),))
