@@ -163,7 +163,7 @@ Apache-2.0, like the rest. Written by `python networks/train_demo.py`, which als
 - `image_encoder.onnx`: the layout of CLIP. `pixel_values` [N, 3, 64, 64], RGB with CLIP's mean
   and deviation: a region's box and 0.15 of its sides around, in proportion, in the middle of a
   square of CLIP's mean. `image_embeds` [N, D] of length 1, of the crop and its mirror image. It has
-  learned from regions as the service sets them apart, half of them no whole things.
+  learned from regions as the service sets them apart, a third of them no thing, a third a part.
 - `text_embeddings.npz`: `names` [T], `embeddings` [T, D] of length 1 and `logit_scale` (also in the
   encoder's metadata) of softmax(logit_scale * image . text) over all T names. It suits the regions
   that a labeller is asked about. The names: those of the detector;
