@@ -17,7 +17,8 @@ from ldo_service.gaussians.views import View
 from .class_names import normalised
 from .foreground import Foreground
 from .labelling import Claims
-from .regions_to_name import Answer, Opinion, Question, RegionConfig, RegionsToName
+from .regions import Answer
+from .regions_to_name import Opinion, Question, RegionConfig, RegionsToName
 from .segments import segments
 from .trigger import Candidate, TriggerConfig, candidates, named_objects, regions_of_image
 from .vocabulary import Vocabulary
@@ -139,7 +140,8 @@ class Naming:
             # until now it was a part of what it stands on, for all that was said
             anew=asked.kind == "standing"
             and confidence >= self.config.regions.settled
-            and not (before and before.votes),
+            and before is not None
+            and not before.votes,
         )
 
     def shown_in(self, region: int) -> tuple[int, ...]:
@@ -162,10 +164,10 @@ class Naming:
     def _believed(self, answer: Answer, asked: Asked) -> Answer:
         """Without a label that is no object's, or is told too unsurely of what no box is about."""
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
-        is_told = self._is_object(answer.label) and (
-            answer.sure >= self.config.least_sure or bool(asked.label)
-        )
-        return replace(answer, others=others) if is_told else Answer("", answer.sure)
+        if not self._is_object(answer.label):
+            return Answer("", answer.sure)
+        is_sure = answer.sure >= self.config.least_sure or bool(asked.label)
+        return replace(answer, others=others) if is_sure else Answer("", 0.0)
 
     def _is_object(self, name: str) -> bool:
         return normalised(name) not in self.config.structure

@@ -11,7 +11,7 @@ from ldo_service.geometry import Camera
 from .foreground import Foreground
 from .region_views import RegionView
 from .trigger import Candidate
-from .votes import Votes, with_vote
+from .votes import Votes, with_box
 
 Box = tuple[float, float, float, float]
 MOST_POINTS = 96  # of a sighting, 12 bytes each
@@ -19,8 +19,8 @@ MOST_POINTS = 96  # of a sighting, 12 bytes each
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Answer:
-    """What a labeller takes a region for, 0..1 `sure`; no label: it is no object. `others`: what
-    else it may be, and how sure."""
+    """What a labeller takes a region for, 0..1 `sure`; no label: it is no object, or who knows.
+    `others`: what else it may be, and how sure."""
 
     label: str
     sure: float
@@ -59,7 +59,8 @@ class Region:
     label, score    of the surest detector so far
     votes           what speaks for each name
     questions       asked so far; `quality` of the views, summed, when it was asked last
-    answer          the surest
+    answer          the surest, without what else it may be
+    is_standing     on a thing, as a keyframe showed: it is no part of that
     """
 
     id: int
@@ -75,11 +76,7 @@ class Region:
     questions: int = 0
     quality: float = 0.0
     answer: Answer | None = None
-
-    @property
-    def is_standing(self) -> bool:
-        """On a thing, of which it is no part."""
-        return self.shape.candidate.kind == "standing"
+    is_standing: bool = False
 
     def gained(self) -> float:
         """How much better its views are than when it was asked about."""
@@ -124,8 +121,9 @@ def _points(
     return np.stack([x, y, z], axis=1).astype(np.float32)
 
 
-def seen_again(region: Region, seen: Sighting) -> Region:
-    """With what is new of it, and the surer of two opinions."""
+def seen_again(region: Region, seen: Sighting, most_boxes: float) -> Region:
+    """With what is new of it, and the surer of two opinions; `most_boxes` is what all boxes of a
+    name may speak for it."""
     said = seen.candidate
     surer = max(region, said, key=lambda one: one.score)
     is_larger = region.questions == 0 and seen.size_px > region.shape.size_px
@@ -136,8 +134,9 @@ def seen_again(region: Region, seen: Sighting) -> Region:
         shape=seen if is_larger else region.shape,
         label=surer.label,
         score=surer.score,
-        votes=with_vote(region.votes, said.label, said.score),
+        votes=with_box(region.votes, said.label, said.score, most_boxes),
         seen=region.seen + 1,
+        is_standing=region.is_standing or said.kind == "standing",
     )
 
 

@@ -3,8 +3,8 @@
 Two sightings are of the same region when most of what each shows of the other lies in it (see
 `same_region`). Each keeps its best views, and what was said of it: it has the name that most speaks
 for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one way, now
-in another; so what was said of a region counts for those that overlap it, by how much they do. What
-stands on a thing, and the thing, tell nothing of each other.
+in another; so of regions that have an answer, what speaks for the name of one counts for those that
+overlap it, by how much they do. What stands on a thing, and the thing, tell nothing of each other.
 
 A region is asked about once, when no better view of it has come for a while, and as it was at its
 best. Most regions are no things but parts and shadows of them; so there is a budget, and what has
@@ -34,6 +34,8 @@ from .regions import (
 from .trigger import Candidate
 from .votes import Votes, favourite, with_vote, with_votes_of
 
+MOST_VIEWS = 8  # of a region, that a request has room for
+
 
 @dataclass(frozen=True, slots=True)
 class RegionConfig:
@@ -46,7 +48,8 @@ class RegionConfig:
     at_once: int = 4  # questions saved up while there was nothing to ask
     gain: float = 1.3  # of the views' summed quality, before it is asked again
     settled: float = 0.6  # of an answer that needs no second one
-    answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's
+    answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's; all boxes
+    # of a name together count as one that is certain
     least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
     least_carried: float = 0.5  # sure of its name, to be told where nothing sets a region apart
     most_carried: int = 32  # names of a keyframe told so: as many as it has candidates
@@ -68,6 +71,8 @@ class RegionConfig:
             raise ConfigError(f"{self}: least_quality and least_carried must be within 0..1.")
         if self.views_first > self.views or not self.gain > 1:
             raise ConfigError(f"{self}: views_first at most views, gain over 1.")
+        if self.views > MOST_VIEWS:
+            raise ConfigError(f"views={self.views}: a labeller is shown up to {MOST_VIEWS}.")
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
             raise ConfigError(
                 f"{self}: overlap within 0..1, max_gap_m positive, least_points at least 1."
@@ -86,7 +91,7 @@ class Question:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Opinion:
-    """What a labeller said before of a region that is seen again, 0..1 `sure`."""
+    """What is known of a region that is seen again, after a labeller has spoken, 0..1 `sure`."""
 
     of: Candidate
     label: str
@@ -141,7 +146,7 @@ class RegionsToName:
                 continue
             region = self._same(sighting, known, taken) or self._new(sighting)
             taken.add(region.id)
-            region = seen_again(region, sighting)
+            region = seen_again(region, sighting, config.answer_weight)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
                 region = self._with_view(region, sighting, region_view(*args, config.view))
@@ -152,7 +157,7 @@ class RegionsToName:
             region = sighting and self._same(sighting, known, taken)
             if sighting and region and self._told(region)[0]:
                 taken.add(region.id)
-                self._keep(seen_again(region, sighting))
+                self._keep(seen_again(region, sighting, config.answer_weight))
                 told.append((region.id, candidate))
         told += self._carried(known, taken)
         opinions = self._opinions(told, known)
@@ -187,13 +192,13 @@ class RegionsToName:
     ) -> list[Opinion]:
         """What is to be said of those that a labeller has given a name: boxes alone are told
         anyway, where they are."""
-        answered = [(self._regions[number], of) for number, of in shown]
-        answered = [(region, of) for region, of in answered if self._told(region)[0]]
-        overlaps = known.overlaps([(region.id, of.part) for region, of in answered])
+        regions = [(self._regions[number], of) for number, of in shown]
+        named = [(region, of) for region, of in regions if self._told(region)[0]]
+        overlaps = known.overlaps([(region.id, of.part) for region, of in named])
         opinions = []
-        for (region, of), row in zip(answered, overlaps, strict=True):
+        for (region, of), row in zip(named, overlaps, strict=True):
             votes: Votes = ()
-            for (other, _), share in zip(answered, row.tolist(), strict=True):
+            for (other, _), share in zip(named, row.tolist(), strict=True):
                 if share > 0 and other.is_standing == region.is_standing:
                     votes = with_votes_of(votes, other.votes, share)
             label, sure = favourite(votes, self.config.least_votes)
@@ -265,7 +270,8 @@ class RegionsToName:
         for label, sure in ((answer.label, answer.sure), *answer.others):
             votes = with_vote(votes, label, sure, self.config.answer_weight)
         is_surer = answer.sure > (known.answer.sure if known.answer else 0)
-        known = replace(known, votes=votes, answer=answer if is_surer else known.answer)
+        surest = replace(answer, others=()) if is_surer else known.answer
+        known = replace(known, votes=votes, answer=surest)
         self._regions[region] = known
         return self.name(known)[0]
 

@@ -19,7 +19,7 @@ from .labels import BACKGROUND, MOST_LABELS, top_labels
 from .movable import Box, MovableConfig, movable_pixels
 from .naming import Naming, NamingConfig
 from .objects import Objects, ObjectsConfig, Observed
-from .regions_to_name import Answer, Region
+from .regions import Answer, Region
 from .vocabulary import Vocabulary
 
 
@@ -175,6 +175,8 @@ class SemanticMap:
         claims, questions = self.naming.see(
             view, claims, self.vocabulary, is_labelled, T_map_keyframe
         )
+        is_told = claims.open_confidences > 0
+        self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
         return claims, tuple(question.region for question in questions)
 
     def _is_labellers(self, label: int) -> bool:

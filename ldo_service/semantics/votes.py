@@ -18,6 +18,18 @@ def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Vote
     return _added(votes, ((name, weight * sure**2, sure),)) if name else votes
 
 
+def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
+    """As above, up to `most` in all: a box comes with every keyframe, and says the same again.
+
+    >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
+    (('tv', 0.4, 0.6),)
+    """
+    if not name:
+        return votes
+    had = next((total for one, total, _ in votes if one == name), 0.0)
+    return _added(votes, ((name, min(sure**2, max(most - had, 0.0)), sure),))
+
+
 def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
     """With those of another region, of which 0..1 this is a `share`.
 

@@ -341,6 +341,23 @@ def test_an_answer_about_a_forgotten_keyframe_labels_nothing() -> None:
     assert not top_labels(followed([*made, *mapper.finish()]).map.labels).any()
 
 
+def test_what_only_the_labeller_knows_the_detector_cannot_miss_however_it_came_to_be_known() -> (
+    None
+):
+    """Here where the answer's own keyframe is forgotten, and later ones show its region again."""
+    mapper = Mapper(CONFIG, has_labeller=True)
+    made = walk(mapper, np.tile(AHEAD, (5, 1, 1)), known=())
+    for request in of(LabelRequest, made):
+        mapper._map.views.store.keep_only([])
+        assert list(mapper.handle(answer(request, "samovar"))) == []
+    made += walk(mapper, AHEAD[None], first=5, known=(COUCH,))
+    names = followed(made).label_names
+    assert "samovar" in names
+    spared = mapper._semantics._spared()
+    assert spared is not None
+    assert np.flatnonzero(spared).tolist() == [names.index("samovar")]
+
+
 def test_the_map_looks_the_same_whoever_names_it() -> None:
     plain, asking = Mapper(CONFIG), Mapper(CONFIG, has_labeller=True)
     alone, made = walk(plain, WAY[:6], known=(BALL,)), walk(asking, WAY[:6], known=(BALL,))

@@ -1,5 +1,7 @@
 """What boxes of a detector become beside the names of regions."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,19 +51,35 @@ def test_a_region_without_a_box_is_a_claim_of_its_own() -> None:
     assert named.parts == (None, PART)
 
 
+def asked_about(region: Candidate, *, is_remembered: bool = True, boxes: int = 0) -> Naming:
+    """One question, of region 0 in keyframe 3, after a labeller was asked of it."""
+    regions, camera = RegionsToName(), Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+    color, depth_m = np.zeros((120, 160, 3), np.uint8), np.full((120, 160), 2.0, np.float32)
+    unboxed = replace(region, label="", score=0.0)
+    for one in (unboxed, *[region] * boxes)[: None if is_remembered else 0]:
+        regions.see(3, [one], color, depth_m, camera, {3: np.eye(4)})
+    asked = [0, 3, region.box_px, *PART.packed, region.label, region.score, region.kind]
+    naming = Naming.unpacked({"regions": regions.packed, "open": [asked]})
+    assert naming.packed["open"][0][-3:] == [region.label, region.score, region.kind]
+    return naming
+
+
 @pytest.mark.parametrize(
-    ("kind", "sure", "is_anew"),
-    [("standing", 0.6, True), ("standing", 0.59, False), ("apart", 0.9, False)],
+    ("kind", "sure", "of", "is_anew"),
+    [
+        ("standing", 0.6, {}, True),
+        ("standing", 0.59, {}, False),
+        ("apart", 0.9, {}, False),
+        ("standing", 0.9, {"boxes": 1}, False),
+        ("standing", 0.9, {"is_remembered": False}, False),
+    ],
 )
 def test_what_stands_on_a_thing_was_taken_for_that_thing_before(
-    kind: str, sure: float, is_anew: bool
+    kind: str, sure: float, of: dict, is_anew: bool
 ) -> None:
-    """An answer that needs no second one tells it."""
-    asked = [7, 3, BOX, *PART.packed, "couch", 0.3, kind]
-    naming = Naming.unpacked({"regions": RegionsToName().packed, "open": [asked]})
-    assert naming.packed["open"][0][-3:] == ["couch", 0.3, kind]
-    vocabulary = Vocabulary(256)
-    claims = naming.answered(7, 3, Answer("cushion", sure), vocabulary)
+    """An answer that needs no second one tells it, where nothing was said of it before."""
+    naming, vocabulary = asked_about(region(kind=kind), **of), Vocabulary(256)
+    claims = naming.answered(0, 3, Answer("cushion", sure), vocabulary)
     assert claims is not None
     assert claims.anew == is_anew
     assert claims.open_labels.tolist() == [vocabulary.index("cushion")]
@@ -69,7 +87,7 @@ def test_what_stands_on_a_thing_was_taken_for_that_thing_before(
     assert part is not None
     assert np.array_equal(part.mask, PART.mask)
     assert claims.where(np.array([True])).anew == is_anew
-    again = naming.answered(7, 3, Answer("cushion", sure), vocabulary)
+    again = naming.answered(0, 3, Answer("cushion", sure), vocabulary)
     assert again is None, "nobody asks any more"
 
 
@@ -84,12 +102,24 @@ def test_what_stands_on_a_thing_was_taken_for_that_thing_before(
 def test_what_is_no_object_is_no_name_and_what_is_said_unsurely_neither(
     answer: Answer, known: tuple[str, ...]
 ) -> None:
-    vocabulary, camera = Vocabulary(256), Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
-    regions, asked = RegionsToName(), [0, 3, BOX, *PART.packed, "", 0.0, "apart"]
-    color, depth_m = np.zeros((120, 160, 3), np.uint8), np.full((120, 160), 2.0, np.float32)
-    regions.see(3, [Candidate(BOX, PART)], color, depth_m, camera, {3: np.eye(4)})
-    one = Naming.unpacked({"regions": regions.packed, "open": [asked]})
-    claims = one.answered(0, 3, answer, vocabulary)
+    naming = asked_about(Candidate(BOX, PART))
+    claims = naming.answered(0, 3, answer, Vocabulary(256))
     assert (claims is not None) == bool(known)
-    (region,) = one.packed["regions"]["regions"]
-    assert tuple(name for name, *_ in region["votes"]) == known
+    (row,) = naming.packed["regions"]["regions"]
+    assert tuple(name for name, *_ in row["votes"]) == known
+
+
+@pytest.mark.parametrize(
+    ("second", "is_named"), [(Answer("clock", 0.29), True), (Answer("wall", 0.6), False)]
+)
+def test_an_unsure_answer_takes_no_name_away_and_that_it_is_no_object_does(
+    second: Answer, is_named: bool
+) -> None:
+    naming = asked_about(Candidate(BOX, PART))
+    asked, vocabulary = naming.packed["open"], Vocabulary(256)
+    naming.answered(0, 3, Answer("clock", 0.5), vocabulary)
+    naming = Naming.unpacked({**naming.packed, "open": asked})
+    naming.answered(0, 3, second, vocabulary)
+    (row,) = naming.packed["regions"]["regions"]
+    label, _, others = row["answer"]
+    assert (label == "clock", len(others)) == (is_named, 0)
