@@ -206,7 +206,7 @@ class RegionsToName:
         return opinions
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """The keyframes whose views of a region a labeller was shown, the best first."""
+        """The keyframes of the best views of a region, which a labeller is shown."""
         known = self._regions.get(region)
         return tuple(view.keyframe for view in known.views) if known else ()
 
