@@ -175,8 +175,6 @@ class SemanticMap:
         claims, questions = self.naming.see(
             view, claims, self.vocabulary, is_labelled, T_map_keyframe
         )
-        is_told = claims.open_confidences > 0
-        self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
         return claims, tuple(question.region for question in questions)
 
     def _is_labellers(self, label: int) -> bool:
@@ -187,12 +185,13 @@ class SemanticMap:
         """[256] bool, labels that only the labeller gave: a detector cannot miss them."""
         if not self._by_labeller:
             return None
-        labels = np.arange(MOST_LABELS)
-        return np.isin(labels, [*self._by_labeller]) & ~np.isin(labels, [*self._by_detector])
+        return np.array([self._is_labellers(label) for label in range(MOST_LABELS)])
 
     def _label(
         self, view: View, indices: np.ndarray, claims: Claims, *, is_late: bool = False
     ) -> Labelled:
+        is_told = claims.open_confidences > 0
+        self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
         gaussians = self._map.gaussians
         before = gaussians.labels[indices]
         labelled = label_keyframe(
@@ -232,7 +231,6 @@ class SemanticMap:
         if not self._map.views.is_readable(keyframe):
             self._answers_without_images += 1
             return False
-        self._by_labeller.update(claims.open_labels.tolist())
         view, made_by = self._seen(keyframe)
         self._label(view, made_by.indices, claims, is_late=True)
         self.refresh(view)
