@@ -1,5 +1,7 @@
 """Diffuse light of one ceiling lamp, and the soft shadows that furniture casts on the walls."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from .room import Room
@@ -58,24 +60,37 @@ def lit_share(
     point: Vector,
 ) -> np.ndarray:
     """The share [P] of a square lamp that is seen from each point past the solids."""
-    total = np.zeros(len(point[0]))
-    x, y, z = lamp_center_m
-    for k in range(LAMP_GRID**2):
-        row, column = divmod(k, LAMP_GRID)
-        dx, dy = (((i + 0.5) / LAMP_GRID - 0.5) * lamp_side_m for i in (column, row))
-        to_lamp = (x + dx - point[0], y + dy - point[1], z - point[2])
-        total += ~_is_blocked(solids, point, to_lamp)
-    return total / LAMP_GRID**2
-
-
-def _is_blocked(solids: tuple[Solid, ...], point: Vector, way: Vector) -> np.ndarray:
-    blocked = np.zeros(len(point[0]), bool)
+    lamps = _lamp_points(lamp_center_m, lamp_side_m)
+    is_hidden = np.zeros((LAMP_GRID**2, len(point[0])), bool)
     for solid in solids:
-        enter, leave = interval(
-            solid.shape, solid.point_to_local(point), solid.direction_to_local(way)
-        )
-        blocked |= (enter < leave) & (leave > 1e-4) & (enter < 0.999)
-    return blocked
+        # a ray to any point of the lamp passes the solid where that to its middle passes a larger
+        larger = _enlarged(solid, lamp_side_m)
+        near = np.flatnonzero(_is_between(larger, point, vector(lamp_center_m)))
+        x, y, z = (component[near] for component in point)
+        is_hidden[:, near] |= _is_between(solid, (x, y, z), lamps)
+    return (~is_hidden).sum(axis=0) / LAMP_GRID**2
+
+
+def _lamp_points(center_m: tuple[float, float, float], side_m: float) -> Vector:
+    """Each component [K, 1], to be broadcast against points."""
+    x, y, z = center_m
+    steps_m = np.array([((i + 0.5) / LAMP_GRID - 0.5) * side_m for i in range(LAMP_GRID)])
+    dy, dx = (offsets.reshape(-1, 1) for offsets in np.meshgrid(steps_m, steps_m, indexing="ij"))
+    return x + dx, y + dy, np.full(dx.shape, z)
+
+
+def _enlarged(solid: Solid, lamp_side_m: float) -> Solid:
+    """A box that holds the solid moved by half a lamp's diagonal any way level."""
+    x, y, z = solid.size_m
+    diagonal_m = 1.001 * np.sqrt(2) * lamp_side_m
+    return replace(solid, shape="box", size_m=(x + diagonal_m, y + diagonal_m, z + 1e-6))
+
+
+def _is_between(solid: Solid, point: Vector, lamp_m: Vector) -> np.ndarray:
+    """Which points [P] a solid hides from a point of a lamp, or [K, P] from each of K."""
+    way = (lamp_m[0] - point[0], lamp_m[1] - point[1], lamp_m[2] - point[2])
+    enter, leave = interval(solid.shape, solid.point_to_local(point), solid.direction_to_local(way))
+    return (enter < leave) & (leave > 1e-4) & (enter < 0.999)
 
 
 def interpolated(grid: np.ndarray, u_m: np.ndarray, v_m: np.ndarray) -> np.ndarray:
