@@ -1,10 +1,11 @@
 """What closing loops is worth where odometry drifts, and how long a correction keeps others.
 
-    python tests/bench/bench_drift.py [SOURCE] [--scale 0.01] [--turn 0.5] [--set KEY=VALUE ...]
+    python tests/bench/bench_drift.py [SOURCE] [--scale 0.01] [--aside 0] [--turn 0.5] [--only RUN]
+        [--set KEY=VALUE ...]
 
 The whole graph over SOURCE (synthetic:flat), every fifth frame held out: as it is; with odometry
-that drifts by --scale of the way and --turn degrees for each metre of it; and that without closing
-loops. `odometry` is the track by itself, `online` what was published at the time. Pauses: CPU ms of
+that drifts by --scale of the way along it, by --aside of it to one side of the world and by --turn
+degrees for each metre of it; and that without closing loops. `odometry` is the track by itself, `online` what was published at the time. Pauses: CPU ms of
 each actor over one correction, the worst of the run, beside the Gaussians in memory at its end.
 """
 
@@ -38,7 +39,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.runs.mistaken import Drift, DriftingTracker, standing_in
 
 NO_LOOPS = "loop_closer.is_on=false"
-NONE = Drift(scale=0.0, turn_rad_per_m=0.0)
+NONE = Drift(scale=0.0, aside=0.0, turn_rad_per_m=0.0)
 
 
 @dataclass
@@ -98,13 +99,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("source", nargs="?", default="synthetic:flat", metavar="SOURCE")
     parser.add_argument("--scale", type=float, default=0.01)
+    parser.add_argument("--aside", type=float, default=0.0)
+    parser.add_argument("--only", nargs="*", default=(), metavar="RUN")
     parser.add_argument("--turn", type=float, default=0.5, metavar="DEGREES")
     parser.add_argument("--set", nargs="*", default=(), metavar="KEY=VALUE")
     parser.add_argument("--hold-out", type=int, default=5)
     options = parser.parse_args()
     sequence = open_sequence(options.source)
     settings = (f"tracker.hold_out={options.hold_out}", *options.set)
-    drift = Drift(options.scale, np.radians(options.turn))
+    drift = Drift(options.scale, options.aside, np.radians(options.turn))
     runs = {
         "no drift": (settings, NONE),
         "drift": (settings, drift),
@@ -113,6 +116,8 @@ def main() -> None:
     print("| run | odometry cm | online cm | final cm | closures | PSNR dB held out ", end="")
     print("| pause ms tracker | loop closer | mapper | Gaussians |\n|" + "---|" * 10)
     for name, (chosen, drifting) in runs.items():
+        if options.only and name not in options.only:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             print(f"| {name} | ", end="", flush=True)
             print(row(sequence, load_config(settings=chosen), drifting, Path(folder)), flush=True)

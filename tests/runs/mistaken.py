@@ -21,6 +21,7 @@ from ldo_service.tracking.tracked import Tracked
 from ldo_service.wire import measured_message
 
 UP_ODOM = np.array([0.0, -1.0, 0.0])  # of a camera held level at the start
+ASIDE_ODOM = np.array([1.0, 0.0, 0.0])  # level
 SURE = np.diag(np.repeat([1e-3, 2e-3], 3) ** -2.0)  # rad and m: as images refine a true closure
 
 
@@ -28,13 +29,15 @@ SURE = np.diag(np.repeat([1e-3, 2e-3], 3) ** -2.0)  # rad and m: as images refin
 class Drift:
     """What is added to every motion between two frames."""
 
-    scale: float = 0.01  # share of the distance
+    scale: float = 0.01  # share of the distance, along the way
+    aside: float = 0.0  # share of the distance, always to one side of the world
     turn_rad_per_m: float = np.radians(0.5)  # about the vertical
 
     def of(self, T_odom_before: np.ndarray, T_before_now: np.ndarray) -> np.ndarray:
         """T_before_now [4, 4] as odometry that drifts says it."""
         T, way_m = T_before_now.copy(), np.linalg.norm(T_before_now[:3, 3])
         T[:3, 3] *= 1 + self.scale
+        T[:3, 3] += self.aside * way_m * (T_odom_before[:3, :3].T @ ASIDE_ODOM)
         up_now = (T_odom_before @ T_before_now)[:3, :3].T @ UP_ODOM
         return T @ se3.exp(np.r_[self.turn_rad_per_m * way_m * up_now, 0, 0, 0])
 

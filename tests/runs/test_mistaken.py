@@ -42,3 +42,15 @@ def test_each_step_is_longer_and_turns_by_as_much_as_was_asked(room: Sequence) -
     np.testing.assert_allclose(told_m, 1.1 * way_m, atol=1e-6)
     turned = [se3.rotation_angle(T) for T in se3.inverse(T_step) @ T_told]
     np.testing.assert_allclose(turned, 0.3 * way_m, atol=1e-6)
+
+
+def test_what_errs_aside_is_off_by_a_share_of_the_way_to_one_side(room: Sequence) -> None:
+    frames = [room[index] for index in range(0, 24, 2)]
+    right, _ = followed(Odometry(), frames)
+    drift = Drift(scale=0.0, aside=0.1, turn_rad_per_m=0.0)
+    drifted, _ = followed(DriftingOdometry(OdometryConfig(), drift), frames)
+    way_m = np.linalg.norm((se3.inverse(right[:-1]) @ right[1:])[:, :3, 3], axis=1).sum()
+    np.testing.assert_allclose(
+        drifted[-1, :3, 3] - right[-1, :3, 3], [0.1 * way_m, 0, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(drifted[-1, :3, :3], right[-1, :3, :3], atol=1e-9)
