@@ -124,7 +124,8 @@ class Tracker(Actor):
         self._poses = KeyframePoses()  # of the last keyframes and the one tracked against
         self._correction = b""  # the last, as a body: places all keyframes, old ones too
         self._joined: dict[int, int] = {}  # segments placed in an older one, as it says
-        self._made = self._without_room = 0
+        self._T_map: tuple[int, dict[int, np.ndarray]] = -1, {}  # of a version, once asked for
+        self._made = self._without_room = self._returns = 0
         self._prior = Prior()
         self._verdicts: Counter[Verdict] = Counter()  # on poses of the prior
         self._with_prior = self._without_prior = 0  # frames, since there is one
@@ -151,6 +152,8 @@ class Tracker(Actor):
             self._recall(tracked)
         if tracked.may_begin and self._may_map(frame):
             tracked = self._odometry.begin_segment(frame)
+        if tracked.wants_mapping and tracked.join is None and self._odometry.may_return:
+            tracked = self._returned(frame, tracked)
         is_wanted = tracked.wants_mapping and tracked.status is Status.OK
         is_mapped = is_wanted and self._may_map(frame)
         keyframe = self._make_keyframe(frame, tracked) if is_mapped else None
@@ -235,6 +238,19 @@ class Tracker(Actor):
             else (measured_message(tracked.join.measures(keyframe)),),
         )
 
+    def _returned(self, frame: RgbdFrame, tracked: Tracked) -> Tracked:
+        """Against a keyframe that the map has, where it may; else as it was."""
+        if tracked.keyframe is None or tracked.keyframe not in self._poses:
+            return tracked
+        T_map_camera = self._poses[tracked.keyframe] @ tracked.T_keyframe_camera
+        T_map = self._T_map_keyframe()
+        found = self._odometry.returned(frame, tracked, T_map, T_map_camera)
+        if found is None or found.keyframe is None:
+            return tracked
+        self._returns += 1
+        self._place(found, T_map[found.keyframe])
+        return found
+
     def _needed(self, newest: int, reference: int | None) -> Iterator[int]:
         """Those tracked against, before and from now on, and those that the optimizer may not have
         placed yet."""
@@ -253,12 +269,25 @@ class Tracker(Actor):
         keyframe = tracked.keyframe
         if keyframe is None or keyframe in self._poses:
             return
+        self._place(tracked, self._T_map_keyframe().get(keyframe))
+
+    def _place(self, tracked: Tracked, T_map_keyframe: np.ndarray | None) -> None:
+        """Know where the keyframe is that a frame was tracked against; None: by odometry."""
+        keyframe = tracked.keyframe
+        assert keyframe is not None
         T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_keyframe_camera)
+        newest = max(self._poses, default=keyframe)
         self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe, tracked.segment)
-        if self._correction:
+        if T_map_keyframe is not None:
+            self._poses.place(keyframe, T_map_keyframe)
+        self._poses.keep_only(self._needed(newest, keyframe))
+
+    def _T_map_keyframe(self) -> dict[int, np.ndarray]:
+        """[4, 4] by id, of all keyframes that the last correction places."""
+        if self._correction and self._T_map[0] != self._poses.version:
             correction = decode(self._correction, Correction)
-            T_map = keyframe_poses_of(correction, only=(keyframe,))
-            self._poses.place(keyframe, T_map.get(keyframe, self._poses[keyframe]))
+            self._T_map = correction.graph_version, keyframe_poses_of(correction)
+        return self._T_map[1]
 
     def _tracked_pose(
         self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None
@@ -343,6 +372,7 @@ class Tracker(Actor):
         return {
             "keyframes": self._made,
             "keyframes_without_room": self._without_room,
+            "keyframes_returned_to": self._returns,
             "frames_with_prior": self._with_prior,
             "frames_without_prior": self._without_prior,  # since the first pose of it
             "prior_refused": refused,

@@ -2,6 +2,8 @@
 
     for frame in frames:
         tracked = odometry.track(frame)
+        if tracked.wants_mapping and odometry.may_return:
+            tracked = odometry.returned(frame, tracked, *where_the_map_is) or tracked
         if tracked.wants_keyframe:
             odometry.make_keyframe(frame, tracked)
             measurements = odometry.window(tracked)  # of it, from keyframes before its reference
@@ -15,7 +17,7 @@ last. Conventions: `ldo_service.geometry`.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -27,7 +29,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.semantics.movable import Box, MovableConfig
 
 from .align import AlignConfig, Alignment
-from .candidates import Candidate, CandidateConfig
+from .candidates import Candidate, CandidateConfig, apart_rad, attempt
 from .equations import Appearance
 from .features import FeatureConfig
 from .guesses import Guesses
@@ -39,6 +41,7 @@ from .places import Place, Places, PlacesConfig, place_of, thumbnail_of
 from .prior import Anchor, PriorConfig, Reading
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
+from .returning import Nearby, ReturnConfig, nearby
 from .segments import Join, Look, SegmentConfig
 from .shape import ShapeConfig
 from .state import State, packed, unpacked
@@ -59,6 +62,7 @@ class OdometryConfig:
     window: WindowConfig = field(default_factory=WindowConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
     relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
+    returning: ReturnConfig = field(default_factory=ReturnConfig)
     segments: SegmentConfig = field(default_factory=SegmentConfig)
     judgement: JudgementConfig = field(default_factory=JudgementConfig)
     moving: MovingConfig = field(default_factory=MovingConfig)
@@ -159,10 +163,31 @@ class Odometry:
             supporting=None,
             frames_since_keyframe=0,
             next_id=before.next_id + 1,
+            is_returned=False,
             T_odom_mapped=tracked.T_odom_camera,
             suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
         )
         return keyframe.id
+
+    def returned(
+        self,
+        frame: RgbdFrame,
+        tracked: Tracked,
+        T_map_keyframe: Mapping[int, np.ndarray],
+        T_map_camera: np.ndarray,
+    ) -> Tracked | None:
+        """The frame just tracked, against a known keyframe from now on; None where none will do.
+
+        T_map_keyframe  [4, 4] by id, where the map has them; T_map_camera [4, 4] likewise
+        """
+        config = self.config.returning
+        known = nearby(self._state.places.all, T_map_keyframe, T_map_camera, self.config.keyframes)
+        known = [near for near in known if near[0].id != tracked.keyframe]
+        for near in known[: config.tries]:
+            candidate = self._seen_again(self._view(frame), near)
+            if candidate is not None:
+                return self._return_to(near[0], tracked, candidate)
+        return None
 
     def window(self, tracked: Tracked) -> list[RelativePose]:
         """The keyframe just made of a tracked frame, measured from others than its reference."""
@@ -205,6 +230,11 @@ class Odometry:
         """Id of the keyframe that the next frame is aligned to."""
         return None if self._state.keyframe is None else self._state.keyframe.id
 
+    @property
+    def may_return(self) -> bool:
+        """Whether so many keyframes were made that known ones will do."""
+        return 0 < self.config.returning.after <= self._state.next_id
+
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values.
 
@@ -217,6 +247,50 @@ class Odometry:
         self._state = unpacked(state, self.config.pyramid)
         self._viewed = None
         self._earlier = EarlierKeyframes(self.config.pyramid)
+
+    def _seen_again(self, view: Pyramid, near: Nearby) -> Candidate | None:
+        """A view's alignment to a place, if it is sure, and the camera has not left it."""
+        (place, T_place_camera), config = near, self.config.returning
+        keyframe = place.keyframe(self.config.pyramid)
+        candidate = attempt(keyframe, view, T_place_camera, "returned", self.config.align)
+        agrees = apart_rad(candidate, T_place_camera) < config.agreement_rad
+        history = place.history(self._state.history)
+        verdict = judge(
+            replace(candidate, second_agrees=agrees), history, Status.OK, self.config.judgement
+        )
+        seen = candidate.alignment
+        is_sure = verdict is Status.OK and seen.geometric_inliers >= config.min_geometric_inliers
+        has_left = is_due(
+            seen.T_reference_camera,
+            seen.overlap,
+            candidate.median_depth_m,
+            self.config.keyframes.min_frames,
+            self.config.keyframes,
+        )
+        return candidate if is_sure and not has_left else None
+
+    def _return_to(self, place: Place, tracked: Tracked, candidate: Candidate) -> Tracked:
+        """Odometry goes on where it is: the keyframe is elsewhere in it now, and of its segment."""
+        T_keyframe_camera = candidate.alignment.T_reference_camera
+        T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(T_keyframe_camera)
+        place = replace(
+            place,
+            segment=tracked.segment,
+            T_odom_keyframe=se3.orthonormalised(T_odom_keyframe),
+        )
+        keyframe, before = place.keyframe(self.config.pyramid), self._state
+        self._state = replace(
+            before,
+            places=before.places.returned_to(place),
+            keyframe=keyframe,
+            supporting=None,
+            frames_since_keyframe=0,
+            is_returned=True,
+            T_odom_mapped=tracked.T_odom_camera,
+            suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
+        )
+        alignment = candidate.alignment
+        return report(alignment, tracked.T_odom_camera, keyframe, Status.OK, candidate.method)
 
     def _view(self, frame: RgbdFrame) -> Pyramid:
         if self._viewed is None or self._viewed[0] is not frame:
@@ -366,7 +440,9 @@ class Odometry:
             config.keyframes,
         )
         T_mapped_camera = se3.inverse(self._state.T_odom_mapped) @ T_odom_camera
-        supports = is_worth_mapping(T_mapped_camera, candidate.median_depth_m, config.keyframes)
+        supports = not self._state.is_returned and is_worth_mapping(
+            T_mapped_camera, candidate.median_depth_m, config.keyframes
+        )
         is_sure = status is Status.OK
         return report(
             alignment,

@@ -206,6 +206,10 @@ class Places:
             kept = (*kept[:spare], *kept[spare + 1 :])
         return Places(kept)
 
+    def returned_to(self, place: Place) -> "Places":
+        """With a known one as the newest, where odometry has it now."""
+        return Places((*(other for other in self.all if other.id != place.id), place))
+
     def of(self, segment: int, without: Set[int] = frozenset()) -> tuple[Place, ...]:
         """Those of a segment but for some, by id."""
         return tuple(p for p in self.all if p.segment == segment and p.id not in without)

@@ -25,6 +25,7 @@ class State:
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
+    is_returned: bool = False  # the one tracked against was mapped long ago, with what it shows
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
     segments: Segments = field(default_factory=Segments)
@@ -45,6 +46,7 @@ def packed(state: State) -> dict[str, Any]:
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
+        "is_returned": state.is_returned,
         "trusted": state.trusted,
         "searches": state.searches,
         "segments": state.segments.packed,
@@ -68,6 +70,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
+        is_returned=values["is_returned"],
         trusted=values["trusted"],
         searches=values["searches"],
         segments=Segments.unpacked(values["segments"]),

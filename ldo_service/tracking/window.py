@@ -51,7 +51,8 @@ class EarlierKeyframes:
         ids = {place.id for place in last}
         self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
         for place in reversed(last):
-            if place.id not in self._rebuilt:
+            known = self._rebuilt.get(place.id)
+            if known is None or known.T_odom_keyframe is not place.T_odom_keyframe:
                 self._rebuilt[place.id] = place.keyframe(self._config)
             yield self._rebuilt[place.id]
 

@@ -9,9 +9,11 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.equations import Appearance
+from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.places import PlacesConfig, place_of
 from ldo_service.tracking.pyramid import build_pyramid
-from ldo_service.tracking.window import WindowConfig, measured_from
+from ldo_service.tracking.window import EarlierKeyframes, WindowConfig, measured_from
 
 USUAL = Appearance(intensity_sigma=1.0, depth_noise_scale=0.3)
 
@@ -52,6 +54,18 @@ def test_keyframes_that_show_another_place_are_passed_over(keyframes, room) -> N
         [elsewhere, *reversed(earlier)], newest, USUAL, AlignConfig(), WindowConfig()
     )
     assert [p.a for p in poses] == [5, 4, 3]
+
+
+def test_a_keyframe_that_odometry_has_elsewhere_now_is_not_the_one_that_was_kept(keyframes) -> None:
+    places = [place_of(keyframe, FeatureConfig(), PlacesConfig()) for keyframe in keyframes]
+    earlier, shift = EarlierKeyframes(PyramidConfig()), se3.exp(np.array([0, 0, 0, 0.5, 0, 0]))
+    first = list(earlier.newest_first(places, 3))
+    assert [k.id for k in first] == [6, 5, 4]
+    elsewhere = replace(places[5], T_odom_keyframe=shift @ places[5].T_odom_keyframe)
+    again = list(earlier.newest_first([*places[:5], places[6], elsewhere], 3))
+    assert [k.id for k in again] == [5, 6, 4]
+    assert again[1] is first[0]
+    np.testing.assert_array_equal(again[0].T_odom_keyframe, elsewhere.T_odom_keyframe)
 
 
 def test_a_poor_fit_is_left_out(keyframes) -> None:

@@ -1,0 +1,68 @@
+"""Tracking against known keyframes again, where the map has some. `ldo_service.geometry`.
+
+A camera that makes keyframes wherever it goes fills a map with time, not with rooms: a robot on
+its round would make the same ones every day. So once a map has many, a frame that has left its
+keyframe looks first for an older one that shows the same, and new ones are made where there is
+none. An older one counts only where the map already has the camera where the images put it: what
+has drifted must be mapped on, so that a loop can be closed and the map be mended.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+
+from .keyframes import KeyframeConfig
+from .places import Place
+
+Nearby = tuple[Place, np.ndarray]  # a place, and T_place_camera [4, 4] as the map has it
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnConfig:
+    after: int = 1500  # keyframes that were made: from then on known ones are looked for; 0: never.
+    # A new view makes a map better, and half an hour of them may; see docs/limits.md
+    tries: int = 2  # places per frame, the nearest first: 10 to 15 ms each
+    agreement_rad: float = 0.03  # rotation plus parallax between map and images: what closures
+    # leave in the kitchen; above, keyframes are made until a loop is closed
+    min_geometric_inliers: float = 0.85  # of the depths that meet a surface, as when relocalised
+
+    def __post_init__(self) -> None:
+        if self.after < 0 or self.tries < 1:
+            raise ConfigError(f"{self}: after must be at least 0, tries at least 1.")
+        if not (self.agreement_rad > 0 and 0 <= self.min_geometric_inliers <= 1):
+            raise ConfigError(
+                f"{self}: agreement_rad must be positive, min_geometric_inliers within 0..1."
+            )
+
+
+def nearby(
+    places: Sequence[Place],
+    T_map_keyframe: Mapping[int, np.ndarray],
+    T_map_camera: np.ndarray,
+    config: KeyframeConfig,
+) -> list[Nearby]:
+    """The places that a camera at T_map_camera [4, 4] has not left, the nearest first.
+
+    T_map_keyframe  [4, 4] by id; places that the map does not have are left out
+    """
+    known = [place for place in places if place.id in T_map_keyframe]
+    if not known:
+        return []
+    T_camera = np.array([se3.inverse(T_map_keyframe[place.id]) @ T_map_camera for place in known])
+    left = _share_left(T_camera, np.array([place.median_depth_m for place in known]), config)
+    order = np.argsort(left, kind="stable")
+    return [(known[k], T_camera[k]) for k in order if left[k] <= 1]
+
+
+def _share_left(
+    T_place_camera: np.ndarray, median_depth_m: np.ndarray, config: KeyframeConfig
+) -> np.ndarray:
+    """[N] of how far the camera may go before a keyframe is due: the larger of way and turn."""
+    way = np.linalg.norm(T_place_camera[:, :3, 3], axis=1) / median_depth_m
+    cosine = (np.einsum("nii->n", T_place_camera[:, :3, :3]) - 1) / 2
+    turn_rad = np.arccos(np.clip(cosine, -1, 1))
+    return np.maximum(way / config.max_translation, turn_rad / config.max_rotation_rad)
