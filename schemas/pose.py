@@ -56,7 +56,7 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     residual_depth: float = 0.0  # robust sigma over that of the sensor model
     overlap: float = 0.0  # share of the reference's surface that this frame sees
     iterations: int = 0
-    # the guess that won: direct, prior, features, shape, relocalised; first; none
+    # the guess that won: direct, prior, features, shape, relocalised, returned; first; none
     method: str = ""
     disagreement: float = 0.0  # between where several guesses led, rad of image motion
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera)

@@ -29,7 +29,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.semantics.movable import Box, MovableConfig
 
 from .align import AlignConfig, Alignment
-from .candidates import Candidate, CandidateConfig, apart_rad, attempt
+from .candidates import Candidate, CandidateConfig
 from .equations import Appearance
 from .features import FeatureConfig
 from .guesses import Guesses
@@ -41,7 +41,7 @@ from .places import Place, Places, PlacesConfig, place_of, thumbnail_of
 from .prior import Anchor, PriorConfig, Reading
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalisation import RelocalisationConfig, Relocaliser
-from .returning import Nearby, ReturnConfig, nearby
+from .returning import ReturnConfig, Returning, SeenAgain, nearby
 from .segments import Join, Look, SegmentConfig
 from .shape import ShapeConfig
 from .state import State, packed, unpacked
@@ -87,6 +87,13 @@ class Odometry:
             self.config.features,
             self.config.judgement,
             self.config.relocalisation,
+        )
+        self._returning = Returning(
+            self.config.pyramid,
+            self.config.align,
+            self.config.keyframes,
+            self.config.judgement,
+            self.config.returning,
         )
         self._guesses = Guesses(
             self.config.align,
@@ -180,14 +187,10 @@ class Odometry:
 
         T_map_keyframe  [4, 4] by id, where the map has them; T_map_camera [4, 4] likewise
         """
-        config = self.config.returning
-        known = nearby(self._state.places.all, T_map_keyframe, T_map_camera, self.config.keyframes)
-        known = [near for near in known if near[0].id != tracked.keyframe]
-        for near in known[: config.tries]:
-            candidate = self._seen_again(self._view(frame), near)
-            if candidate is not None:
-                return self._return_to(near[0], tracked, candidate)
-        return None
+        known = [place for place in self._state.places.all if place.id != tracked.keyframe]
+        near = nearby(known, T_map_keyframe, T_map_camera, self.config.keyframes)
+        seen = self._returning.find(self._view(frame), near, self._state.history)
+        return None if seen is None else self._return_to(seen, tracked)
 
     def window(self, tracked: Tracked) -> list[RelativePose]:
         """The keyframe just made of a tracked frame, measured from others than its reference."""
@@ -248,37 +251,14 @@ class Odometry:
         self._viewed = None
         self._earlier = EarlierKeyframes(self.config.pyramid)
 
-    def _seen_again(self, view: Pyramid, near: Nearby) -> Candidate | None:
-        """A view's alignment to a place, if it is sure, and the camera has not left it."""
-        (place, T_place_camera), config = near, self.config.returning
-        keyframe = place.keyframe(self.config.pyramid)
-        candidate = attempt(keyframe, view, T_place_camera, "returned", self.config.align)
-        agrees = apart_rad(candidate, T_place_camera) < config.agreement_rad
-        history = place.history(self._state.history)
-        verdict = judge(
-            replace(candidate, second_agrees=agrees), history, Status.OK, self.config.judgement
-        )
-        seen = candidate.alignment
-        is_sure = verdict is Status.OK and seen.geometric_inliers >= config.min_geometric_inliers
-        has_left = is_due(
-            seen.T_reference_camera,
-            seen.overlap,
-            candidate.median_depth_m,
-            self.config.keyframes.min_frames,
-            self.config.keyframes,
-        )
-        return candidate if is_sure and not has_left else None
-
-    def _return_to(self, place: Place, tracked: Tracked, candidate: Candidate) -> Tracked:
+    def _return_to(self, seen: SeenAgain, tracked: Tracked) -> Tracked:
         """Odometry goes on where it is: the keyframe is elsewhere in it now, and of its segment."""
-        T_keyframe_camera = candidate.alignment.T_reference_camera
-        T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(T_keyframe_camera)
-        place = replace(
-            place,
-            segment=tracked.segment,
-            T_odom_keyframe=se3.orthonormalised(T_odom_keyframe),
+        alignment, before = seen.candidate.alignment, self._state
+        T_odom_keyframe = se3.orthonormalised(
+            tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
         )
-        keyframe, before = place.keyframe(self.config.pyramid), self._state
+        here = {"T_odom_keyframe": T_odom_keyframe, "segment": tracked.segment}
+        place, keyframe = replace(seen.place, **here), replace(seen.keyframe, **here)
         self._state = replace(
             before,
             places=before.places.returned_to(place),
@@ -289,8 +269,8 @@ class Odometry:
             T_odom_mapped=tracked.T_odom_camera,
             suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
         )
-        alignment = candidate.alignment
-        return report(alignment, tracked.T_odom_camera, keyframe, Status.OK, candidate.method)
+        method = seen.candidate.method
+        return report(alignment, tracked.T_odom_camera, keyframe, Status.OK, method)
 
     def _view(self, frame: RgbdFrame) -> Pyramid:
         if self._viewed is None or self._viewed[0] is not frame:

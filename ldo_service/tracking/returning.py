@@ -8,15 +8,19 @@ has drifted must be mapped on, so that a loop can be closed and the map be mende
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
-from .keyframes import KeyframeConfig
+from .align import AlignConfig
+from .candidates import Candidate, apart_rad, attempt
+from .judgement import History, JudgementConfig, Status, judge
+from .keyframes import Keyframe, KeyframeConfig, is_due
 from .places import Place
+from .pyramid import Pyramid, PyramidConfig
 
 Nearby = tuple[Place, np.ndarray]  # a place, and T_place_camera [4, 4] as the map has it
 
@@ -37,6 +41,55 @@ class ReturnConfig:
             raise ConfigError(
                 f"{self}: agreement_rad must be positive, min_geometric_inliers within 0..1."
             )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SeenAgain:
+    """A place, the keyframe that it was, and the alignment of a view to that."""
+
+    place: Place
+    keyframe: Keyframe
+    candidate: Candidate
+
+
+@dataclass(frozen=True, slots=True)
+class Returning:
+    """How a known keyframe is found to go on against; knows nothing from frame to frame."""
+
+    pyramid: PyramidConfig
+    align: AlignConfig
+    keyframes: KeyframeConfig
+    judgement: JudgementConfig
+    config: ReturnConfig
+
+    def find(self, view: Pyramid, near: Sequence[Nearby], history: History) -> SeenAgain | None:
+        """The first that a view surely shows, from where the map has the camera, and has not left.
+
+        history  what a view is judged by at a place whose own noise is not known
+        """
+        for place, T_place_camera in near[: self.config.tries]:
+            keyframe = place.keyframe(self.pyramid)
+            candidate = attempt(keyframe, view, T_place_camera, "returned", self.align)
+            if self._is_sure(candidate, T_place_camera, place.history(history)):
+                return SeenAgain(place, keyframe, candidate)
+        return None
+
+    def _is_sure(self, candidate: Candidate, T_place_camera: np.ndarray, history: History) -> bool:
+        seen = candidate.alignment
+        has_left = is_due(
+            seen.T_reference_camera,
+            seen.overlap,
+            candidate.median_depth_m,
+            self.keyframes.min_frames,
+            self.keyframes,
+        )
+        agrees = apart_rad(candidate, T_place_camera) < self.config.agreement_rad
+        witnessed = replace(candidate, second_agrees=agrees)
+        return (
+            not has_left
+            and seen.geometric_inliers >= self.config.min_geometric_inliers
+            and judge(witnessed, history, Status.OK, self.judgement) is Status.OK
+        )
 
 
 def nearby(

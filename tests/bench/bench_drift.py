@@ -5,8 +5,9 @@
 
 The whole graph over SOURCE (synthetic:flat), every fifth frame held out: as it is; with odometry
 that drifts by --scale of the way along it, by --aside of it to one side of the world and by --turn
-degrees for each metre of it; and that without closing loops. `odometry` is the track by itself, `online` what was published at the time. Pauses: CPU ms of
-each actor over one correction, the worst of the run, beside the Gaussians in memory at its end.
+degrees for each metre of it; and that without closing loops. `odometry` is the track by itself,
+`online` what was published at the time. Pauses: CPU ms of each actor over one correction, the worst
+of the run, beside the Gaussians in memory at its end.
 """
 
 import argparse

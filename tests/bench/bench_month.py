@@ -1,12 +1,14 @@
 """What grows with keyframes, and whose it is: a camera that goes to and fro in a room, without end.
 
-    python -m tests.bench.bench_month [--keyframes 3000] [--csv FILE] [--set actor.field=value ...]
+    python -m tests.bench.bench_month [--keyframes 3000] [--laps 1000] [--csv FILE]
+        [--set actor.field=value ...]
     python -m tests.bench.bench_month --plot PNG --beside OLD.csv NEW.csv
 
 All actors on the logical clock at 160x120. After each to and fro each actor is walked through,
-attribute by attribute, and its state is encoded as it is saved. Told are bytes per keyframe over
-the second half, when caches are full: a line for what grows, and sums. `unseen` is what the process
-grew by beyond what was found: gtsam, allocators, fragments.
+attribute by attribute, and its state is encoded as it is saved. Told are bytes per keyframe (per
+lap, where the camera tracks against known ones alone) over the second half, when caches are full: a
+line for what grows, and sums. `unseen` is what the process grew by beyond what was found: gtsam,
+allocators, fragments.
 """
 
 import argparse
@@ -115,7 +117,7 @@ def _referents(one: object) -> list[object]:
 
 
 # --- the journey ----------------------------------------------------------------------------------
-def journey(keyframes: int, settings: list[str]) -> Iterator[Sample]:
+def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sample]:
     config, scene = load_config(settings=[*LIGHT, *settings]), frames()
     actors, made, laps = make_actors(config), 0, 0
 
@@ -126,7 +128,7 @@ def journey(keyframes: int, settings: list[str]) -> Iterator[Sample]:
     for actor in actors:
         keep_state(actor)
     with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
-        while made < keyframes:
+        while made < keyframes and laps < most_laps:
             for _tick in clock.run(lap(scene, laps)):
                 pass
             laps += 1
@@ -159,18 +161,22 @@ def allocated() -> tuple[int, int]:
     return told.in_use + told.mapped, told.free
 
 
-def growth(samples: list[Sample]) -> tuple[dict[str, float], dict[str, float], float]:
-    """Bytes per keyframe over the second half: by path, of saved states by actor, resident."""
-    first, last = samples[len(samples) // 2 - 1], samples[-1]
+def growth(samples: list[Sample]) -> tuple[str, dict[str, float], dict[str, float], float]:
+    """Bytes per keyframe, or where none was made, per lap, over the second half: what it is per,
+    by path, of saved states by actor, resident."""
+    half = len(samples) // 2 - 1
+    first, last = samples[half], samples[-1]
     n = last.keyframes - first.keyframes
+    unit = "keyframe" if n else "lap"
+    n = n or len(samples) - 1 - half
     held = {path: (size - first.held.get(path, 0)) / n for path, size in last.held.items()}
     saved = {actor: (size - first.saved[actor]) / n for actor, size in last.saved.items()}
-    return held, saved, (last.resident - first.resident) / n
+    return unit, held, saved, (last.resident - first.resident) / n
 
 
 def report(samples: list[Sample]) -> None:
-    held, saved, resident = growth(samples)
-    print("| held by | bytes per keyframe | kB now |\n|---|---|---|")
+    unit, held, saved, resident = growth(samples)
+    print(f"| held by | bytes per {unit} | kB now |\n|---|---|---|")
     for path, slope in sorted(held.items(), key=lambda item: -item[1]):
         if slope >= LEAST_BYTES:
             print(f"| {path} | {slope:.0f} | {samples[-1].held[path] / 1e3:.0f} |")
@@ -218,6 +224,7 @@ def write(
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--keyframes", type=int, default=3000)
+    parser.add_argument("--laps", type=int, default=1000, help="at most, to and fro")
     parser.add_argument("--set", nargs="+", default=[], help="as `ldo serve` has it")
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--plot", type=Path)
@@ -227,7 +234,7 @@ def main() -> None:
         cv2.imwrite(str(arguments.plot), plot(arguments.beside)[..., ::-1])
         return
     samples: list[Sample] = []
-    for one in journey(arguments.keyframes, arguments.set):
+    for one in journey(arguments.keyframes, arguments.laps, arguments.set):
         samples.append(one)
         total = sum(one.held.values())
         print(
