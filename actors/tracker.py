@@ -13,7 +13,6 @@ import logging
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -46,6 +45,7 @@ from ldo_service.semantics.movable import Box
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.prior import Prior, Reading, Verdict
+from ldo_service.tracking.returning import SeenAgain
 from ldo_service.tracking.tracked import Tracked
 from ldo_service.wire import (
     camera_message,
@@ -124,7 +124,7 @@ class Tracker(Actor):
         self._poses = KeyframePoses()  # of the last keyframes and the one tracked against
         self._correction = b""  # the last, as a body: places all keyframes, old ones too
         self._joined: dict[int, int] = {}  # segments placed in an older one, as it says
-        self._T_map: tuple[int, dict[int, np.ndarray]] = -1, {}  # of a version, once asked for
+        self._T_map: dict[int, np.ndarray] | None = None  # what it says, once that is asked for
         self._made = self._without_room = self._returns = 0
         self._prior = Prior()
         self._verdicts: Counter[Verdict] = Counter()  # on poses of the prior
@@ -152,11 +152,12 @@ class Tracker(Actor):
             self._recall(tracked)
         if tracked.may_begin and self._may_map(frame):
             tracked = self._odometry.begin_segment(frame)
-        if tracked.wants_mapping and tracked.join is None and self._odometry.may_return:
-            tracked = self._returned(frame, tracked)
+        seen = self._seen_again(frame, tracked)
+        if seen is not None and self._odometry.is_tied:
+            tracked, seen = self._return_to(seen, tracked), None
         is_wanted = tracked.wants_mapping and tracked.status is Status.OK
         is_mapped = is_wanted and self._may_map(frame)
-        keyframe = self._make_keyframe(frame, tracked) if is_mapped else None
+        keyframe = self._make_keyframe(frame, tracked, seen) if is_mapped else None
         if keyframe is not None:
             yield keyframe
         elif tracked.method == "first":
@@ -201,10 +202,19 @@ class Tracker(Actor):
         self._without_room += not has_room
         return has_room
 
-    def _make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> Keyframe:
-        """A new reference for tracking, or one that supports the map between two of these."""
+    def _make_keyframe(
+        self, frame: RgbdFrame, tracked: Tracked, seen: SeenAgain | None
+    ) -> Keyframe:
+        """A new reference for tracking, or one that supports the map between two of these.
+
+        seen  a known keyframe that the camera may go back to, once the graph knows of it
+        """
         window: list[RelativePose] = []
-        if tracked.wants_keyframe:
+        if seen is not None:
+            keyframe = self._odometry.make_keyframe(frame, tracked, is_tied=True)
+            others = self._odometry.window(tracked)
+            window = [seen.measures(keyframe), *(m for m in others if m.a != seen.place.id)]
+        elif tracked.wants_keyframe:
             keyframe = self._odometry.make_keyframe(frame, tracked)
             window = self._odometry.window(tracked)
         else:
@@ -238,18 +248,19 @@ class Tracker(Actor):
             else (measured_message(tracked.join.measures(keyframe)),),
         )
 
-    def _returned(self, frame: RgbdFrame, tracked: Tracked) -> Tracked:
-        """Against a keyframe that the map has, where it may; else as it was."""
-        if tracked.keyframe is None or tracked.keyframe not in self._poses:
-            return tracked
+    def _seen_again(self, frame: RgbdFrame, tracked: Tracked) -> SeenAgain | None:
+        """A keyframe that the map has already, where the frame would be mapped otherwise."""
+        is_wanted = tracked.wants_mapping and tracked.join is None and self._odometry.may_return
+        if not is_wanted or tracked.keyframe is None or tracked.keyframe not in self._poses:
+            return None
         T_map_camera = self._poses[tracked.keyframe] @ tracked.T_keyframe_camera
-        T_map = self._T_map_keyframe()
-        found = self._odometry.returned(frame, tracked, T_map, T_map_camera)
-        if found is None or found.keyframe is None:
-            return tracked
+        return self._odometry.seen_again(frame, tracked, self._T_map_keyframe(), T_map_camera)
+
+    def _return_to(self, seen: SeenAgain, tracked: Tracked) -> Tracked:
         self._returns += 1
-        self._place(found, T_map[found.keyframe])
-        return found
+        returned = self._odometry.return_to(seen, tracked)
+        self._place(seen.place.id, returned, self._T_map_keyframe()[seen.place.id])
+        return returned
 
     def _needed(self, newest: int, reference: int | None) -> Iterator[int]:
         """Those tracked against, before and from now on, and those that the optimizer may not have
@@ -261,6 +272,7 @@ class Tracker(Actor):
     def _correct(self, message: Correction) -> None:
         if message.graph_version > self._poses.version:
             self._correction, self._joined = encode(message), dict(message.joined)
+            self._T_map = None
         T_map = keyframe_poses_of(message, only=self._poses)
         self._poses.correct(message.graph_version, T_map)
 
@@ -269,12 +281,10 @@ class Tracker(Actor):
         keyframe = tracked.keyframe
         if keyframe is None or keyframe in self._poses:
             return
-        self._place(tracked, self._T_map_keyframe().get(keyframe))
+        self._place(keyframe, tracked, self._T_map_keyframe().get(keyframe))
 
-    def _place(self, tracked: Tracked, T_map_keyframe: np.ndarray | None) -> None:
-        """Know where the keyframe is that a frame was tracked against; None: by odometry."""
-        keyframe = tracked.keyframe
-        assert keyframe is not None
+    def _place(self, keyframe: int, tracked: Tracked, T_map_keyframe: np.ndarray | None) -> None:
+        """Know where a keyframe is that a frame was tracked against; None: by odometry."""
         T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_keyframe_camera)
         newest = max(self._poses, default=keyframe)
         self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe, tracked.segment)
@@ -284,10 +294,10 @@ class Tracker(Actor):
 
     def _T_map_keyframe(self) -> dict[int, np.ndarray]:
         """[4, 4] by id, of all keyframes that the last correction places."""
-        if self._correction and self._T_map[0] != self._poses.version:
-            correction = decode(self._correction, Correction)
-            self._T_map = correction.graph_version, keyframe_poses_of(correction)
-        return self._T_map[1]
+        if self._T_map is None:
+            correction = decode(self._correction, Correction) if self._correction else None
+            self._T_map = {} if correction is None else keyframe_poses_of(correction)
+        return self._T_map
 
     def _tracked_pose(
         self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None
@@ -343,9 +353,10 @@ class Tracker(Actor):
     def _tracked_parts(self) -> dict[str, Any]:
         """All that does not change with each pose of a prior."""
         state = self._odometry.state()
-        places = {f"place_{place['id']}": place for place in state.pop("places")}
+        places = {f"place_{place['id']}": place for place in state["places"]}
         views = {name: state.pop(name) for name in VIEWS}
         localise = self.config.localise
+        state["order"] = [place["id"] for place in state.pop("places")]
         now = {"odometry": state, "poses": self._poses.snapshot(), "localise": localise}
         return {**places, **views, "correction": self._correction, "now": now}
 
@@ -356,13 +367,12 @@ class Tracker(Actor):
                 f"the saved state is of --localise {now['localise'] or '(none)'}, this service of "
                 f"{self.config.localise or '(none)'}. Choose another folder with --state."
             )
-        places = [part for name, part in state.items() if name.startswith("place_")]
+        places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
         views = {name: state[name] for name in VIEWS}
-        by_id = sorted(places, key=itemgetter("id"))
-        self._odometry.restore({**now["odometry"], **views, "places": by_id})
+        self._odometry.restore({**now["odometry"], **views, "places": places})
         self._prior, self._parts = Prior.unpacked(state["prior"]), None
         self._poses.restore(now["poses"])
-        self._correction = state["correction"]
+        self._correction, self._T_map = state["correction"], None
         if self._correction:
             self._joined = dict(decode(self._correction, Correction).joined)
 

@@ -17,7 +17,7 @@ from ldo_service.tracking.pyramid import PyramidConfig
 from .landmarks import Sightings, landmarks_of, layout_of
 from .memory import Likeness, Memory, RetrievalConfig, Stages
 from .plausibility import Plausibility, PlausibilityConfig
-from .subgraph import Subgraph, SubgraphConfig, View, is_whole, spread
+from .subgraph import Subgraph, SubgraphConfig, View, follows, is_whole, spread
 from .verification import Check, Proposal, VerificationConfig, Verifier
 from .visual_words import VisualWords, VisualWordsConfig
 
@@ -95,7 +95,7 @@ class Recogniser:
         poses       T_map_keyframe of the keyframes kept; those that are not known are not judged by
         joined      segments, each with the older one whose frame it is in
         """
-        if self._open and self._open[-1].place.segment != place.segment:
+        if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
             self._open = []  # too few for a subgraph, and nothing places them by what follows
         self._open.append(self._view(place, frame, stamp_ns, sightings))
         if not is_whole(self._open, self._config.subgraphs):

@@ -21,6 +21,8 @@ class SubgraphConfig:
     most: int = 5  # keyframes (III.C)
     turned_rad: float = 0.5  # rotation plus parallax from first to last, after which `least` are
     # enough: half of what a depth camera sees is new then
+    gap_rad: float = 1.5  # likewise, from one to the next, after which a new one begins: keyframes
+    # that follow each other share half of what they show, and turn by 0.3 at most
     kept_views: int = (
         2  # of each: 0.13 MB a view at 640x480. More found no more on flat and kitchen
     )
@@ -28,8 +30,8 @@ class SubgraphConfig:
     def __post_init__(self) -> None:
         if not 1 <= self.kept_views <= self.most or not 1 <= self.least <= self.most:
             raise ConfigError(f"{self}: 1 <= least <= most and 1 <= kept_views <= most are needed.")
-        if not self.turned_rad > 0:
-            raise ConfigError(f"turned_rad={self.turned_rad:g} must be positive.")
+        if not (self.turned_rad > 0 and self.gap_rad > 0):
+            raise ConfigError(f"{self}: turned_rad and gap_rad must be positive.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +105,14 @@ class Subgraph:
             "landmarks": Landmarks(**kept["landmarks"]),
         }
         return Subgraph(**{**kept, **changed})
+
+
+def follows(before: Place, place: Place, config: SubgraphConfig) -> bool:
+    """Whether a keyframe goes on where the one before was made: others may lie between that were
+    made long ago."""
+    moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
+    is_near = extent(moved, before.median_depth_m) <= config.gap_rad
+    return is_near and before.segment == place.segment
 
 
 def is_whole(views: Sequence[View], config: SubgraphConfig) -> bool:

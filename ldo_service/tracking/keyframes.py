@@ -120,11 +120,20 @@ def is_due(
     rotation_rad = se3.rotation_angle(T_keyframe_camera)
     if max(translation, rotation_rad) < config.still_motion and overlap > config.still_overlap:
         return False  # a robot that waits must not fill its map
+    return frames >= config.max_frames or has_left(
+        T_keyframe_camera, overlap, median_depth_m, config
+    )
+
+
+def has_left(
+    T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
+) -> bool:
+    """Whether a view is elsewhere than its keyframe, or shows too little of it."""
+    translation = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / median_depth_m
     return bool(
-        frames >= config.max_frames
-        or overlap < config.min_overlap
+        overlap < config.min_overlap
         or translation > config.max_translation
-        or rotation_rad > config.max_rotation_rad
+        or se3.rotation_angle(T_keyframe_camera) > config.max_rotation_rad
     )
 
 

@@ -3,7 +3,9 @@
     for frame in frames:
         tracked = odometry.track(frame)
         if tracked.wants_mapping and odometry.may_return:
-            tracked = odometry.returned(frame, tracked, *where_the_map_is) or tracked
+            seen = odometry.seen_again(frame, tracked, *where_the_map_is)
+            if seen and odometry.is_tied:
+                tracked = odometry.return_to(seen, tracked)
         if tracked.wants_keyframe:
             odometry.make_keyframe(frame, tracked)
             measurements = odometry.window(tracked)  # of it, from keyframes before its reference
@@ -126,7 +128,9 @@ class Odometry:
                 return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
             # noise is another elsewhere, and what has gone is of another keyframe
-            self._state = replace(self._state, history=History(), suspicion=None)
+            self._state = replace(
+                self._state, history=History(), suspicion=None, is_returned=self.may_return
+            )
         tracked = self._accepted(frame, keyframe, candidate, status)
         return self._joining(tracked, keyframe, view)
 
@@ -149,9 +153,10 @@ class Odometry:
         found = self._found(self._view(frame), places, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
 
-    def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
+    def make_keyframe(self, frame: RgbdFrame, tracked: Tracked, *, is_tied: bool = False) -> int:
         """Track against this frame, the one just tracked, from now on; its id as a keyframe.
 
+        is_tied  it is measured from a known one too, so the camera may go back to these
         Raises ValueError for a LOST frame, whose pose is unknown.
         """
         if tracked.status is Status.LOST:
@@ -171,26 +176,57 @@ class Odometry:
             frames_since_keyframe=0,
             next_id=before.next_id + 1,
             is_returned=False,
+            is_tied=is_tied,
             T_odom_mapped=tracked.T_odom_camera,
             suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
         )
         return keyframe.id
 
-    def returned(
+    def seen_again(
         self,
         frame: RgbdFrame,
         tracked: Tracked,
         T_map_keyframe: Mapping[int, np.ndarray],
         T_map_camera: np.ndarray,
-    ) -> Tracked | None:
-        """The frame just tracked, against a known keyframe from now on; None where none will do.
+    ) -> SeenAgain | None:
+        """A known keyframe that shows what the frame just tracked does; None where none will do.
 
         T_map_keyframe  [4, 4] by id, where the map has them; T_map_camera [4, 4] likewise
         """
-        known = [place for place in self._state.places.all if place.id != tracked.keyframe]
+        joined = self._state.segments.are_joined
+        known = [
+            place
+            for place in self._state.places.all
+            if place.id != tracked.keyframe and joined(place.segment, tracked.segment)
+        ]
         near = nearby(known, T_map_keyframe, T_map_camera, self.config.keyframes)
-        seen = self._returning.find(self._view(frame), near, self._state.history)
-        return None if seen is None else self._return_to(seen, tracked)
+        return self._returning.find(self._view(frame), near, self._state.history)
+
+    def return_to(self, seen: SeenAgain, tracked: Tracked) -> Tracked:
+        """Track against a known keyframe from now on; the frame just tracked, against that.
+
+        Odometry goes on where it is: the keyframe is elsewhere in it now, and of its segment.
+        """
+        alignment, before = seen.candidate.alignment, self._state
+        T_odom_keyframe = se3.orthonormalised(
+            tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
+        )
+        here = {"T_odom_keyframe": T_odom_keyframe, "segment": tracked.segment}
+        place, keyframe = replace(seen.place, **here), replace(seen.keyframe, **here)
+        self._state = replace(
+            before,
+            places=before.places.returned_to(place),
+            keyframe=keyframe,
+            supporting=None,
+            frames_since_keyframe=0,
+            is_returned=True,
+            is_tied=False,
+            is_moving=None,
+            T_odom_mapped=tracked.T_odom_camera,
+            suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
+        )
+        method = seen.candidate.method
+        return report(alignment, tracked.T_odom_camera, keyframe, Status.OK, method)
 
     def window(self, tracked: Tracked) -> list[RelativePose]:
         """The keyframe just made of a tracked frame, measured from others than its reference."""
@@ -212,7 +248,12 @@ class Odometry:
             return
         mask = movable_in(current.view, boxes, self.config.movable)
         if mask.any():
-            self._state = replace(self._state, keyframe=replace(current, movable=mask))
+            places = self._state.places
+            for place in places.all:
+                if place.id == keyframe:
+                    places = places.with_changed(place.without(mask))
+            without = replace(current, movable=mask)
+            self._state = replace(self._state, keyframe=without, places=places)
 
     def make_supporting(self, frame: RgbdFrame, tracked: Tracked) -> int:
         """Go on against the same keyframe; the id of this frame as one that is only mapped.
@@ -238,6 +279,11 @@ class Odometry:
         """Whether so many keyframes were made that known ones will do."""
         return 0 < self.config.returning.after <= self._state.next_id
 
+    @property
+    def is_tied(self) -> bool:
+        """Whether the keyframe tracked against is a known one, or was measured from one."""
+        return self._state.is_returned or self._state.is_tied
+
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values.
 
@@ -250,27 +296,6 @@ class Odometry:
         self._state = unpacked(state, self.config.pyramid)
         self._viewed = None
         self._earlier = EarlierKeyframes(self.config.pyramid)
-
-    def _return_to(self, seen: SeenAgain, tracked: Tracked) -> Tracked:
-        """Odometry goes on where it is: the keyframe is elsewhere in it now, and of its segment."""
-        alignment, before = seen.candidate.alignment, self._state
-        T_odom_keyframe = se3.orthonormalised(
-            tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
-        )
-        here = {"T_odom_keyframe": T_odom_keyframe, "segment": tracked.segment}
-        place, keyframe = replace(seen.place, **here), replace(seen.keyframe, **here)
-        self._state = replace(
-            before,
-            places=before.places.returned_to(place),
-            keyframe=keyframe,
-            supporting=None,
-            frames_since_keyframe=0,
-            is_returned=True,
-            T_odom_mapped=tracked.T_odom_camera,
-            suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
-        )
-        method = seen.candidate.method
-        return report(alignment, tracked.T_odom_camera, keyframe, Status.OK, method)
 
     def _view(self, frame: RgbdFrame) -> Pyramid:
         if self._viewed is None or self._viewed[0] is not frame:
@@ -412,11 +437,16 @@ class Odometry:
         is_moving = None  # where a pose is unsure, surfaces contradict for that
         if status is Status.OK:
             is_moving = self._watched(keyframe, self._view(frame), alignment)
+        frames = self._state.frames_since_keyframe
+        if self._state.is_returned:
+            # what was put there since then does not move, and an old keyframe does for any time
+            is_moving, frames = None, min(frames, config.keyframes.max_frames - 1)
+            self._state = replace(self._state, is_moving=None)
         due = is_due(
             alignment.T_reference_camera,
             alignment.overlap,
             candidate.median_depth_m,
-            self._state.frames_since_keyframe,
+            frames,
             config.keyframes,
         )
         T_mapped_camera = se3.inverse(self._state.T_odom_mapped) @ T_odom_camera

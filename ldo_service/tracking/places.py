@@ -210,6 +210,10 @@ class Places:
         """With a known one as the newest, where odometry has it now."""
         return Places((*(other for other in self.all if other.id != place.id), place))
 
+    def with_changed(self, place: Place) -> "Places":
+        """With another version of a known one in its stead."""
+        return Places(tuple(place if other.id == place.id else other for other in self.all))
+
     def of(self, segment: int, without: Set[int] = frozenset()) -> tuple[Place, ...]:
         """Those of a segment but for some, by id."""
         return tuple(p for p in self.all if p.segment == segment and p.id not in without)

@@ -1,10 +1,11 @@
 """Tracking against known keyframes again, where the map has some. `ldo_service.geometry`.
 
 A camera that makes keyframes wherever it goes fills a map with time, not with rooms: a robot on
-its round would make the same ones every day. So once a map has many, a frame that has left its
-keyframe looks first for an older one that shows the same, and new ones are made where there is
-none. An older one counts only where the map already has the camera where the images put it: what
-has drifted must be mapped on, so that a loop can be closed and the map be mended.
+its round would make the same ones every day. So once a map has many, a frame that is worth mapping
+looks first for a known keyframe that shows the same, and new ones are made where there is none. A
+known one counts only where the map already has the camera where the images put it: what has drifted
+must be mapped on, so that a loop can be closed and the map be mended. A camera that comes from what
+it has just mapped makes one keyframe more, measured from the known one: so the graph knows too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,11 +15,12 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
+from ldo_service.geometry.relative_pose import RelativePose
 
 from .align import AlignConfig
 from .candidates import Candidate, apart_rad, attempt
 from .judgement import History, JudgementConfig, Status, judge
-from .keyframes import Keyframe, KeyframeConfig, is_due
+from .keyframes import Keyframe, KeyframeConfig, has_left
 from .places import Place
 from .pyramid import Pyramid, PyramidConfig
 
@@ -27,8 +29,8 @@ Nearby = tuple[Place, np.ndarray]  # a place, and T_place_camera [4, 4] as the m
 
 @dataclass(frozen=True, slots=True)
 class ReturnConfig:
-    after: int = 1500  # keyframes that were made: from then on known ones are looked for; 0: never.
-    # A new view makes a map better, and half an hour of them may; see docs/limits.md
+    after: int = 1500  # keyframes, supporting ones too: from then on known ones are looked for; 0:
+    # never. Until then the map gains more by new views than they take, a few kB each
     tries: int = 2  # places per frame, the nearest first: 10 to 15 ms each
     agreement_rad: float = 0.03  # rotation plus parallax between map and images: what closures
     # leave in the kitchen; above, keyframes are made until a loop is closed
@@ -51,6 +53,11 @@ class SeenAgain:
     keyframe: Keyframe
     candidate: Candidate
 
+    def measures(self, keyframe: int) -> RelativePose:
+        """The pose of the keyframe that the view was made."""
+        seen = self.candidate.alignment
+        return RelativePose(self.place.id, keyframe, seen.T_reference_camera, seen.information)
+
 
 @dataclass(frozen=True, slots=True)
 class Returning:
@@ -65,30 +72,29 @@ class Returning:
     def find(self, view: Pyramid, near: Sequence[Nearby], history: History) -> SeenAgain | None:
         """The first that a view surely shows, from where the map has the camera, and has not left.
 
-        history  what a view is judged by at a place whose own noise is not known
+        history  noise of the frames before: the next ones are judged by it too
         """
         for place, T_place_camera in near[: self.config.tries]:
             keyframe = place.keyframe(self.pyramid)
             candidate = attempt(keyframe, view, T_place_camera, "returned", self.align)
-            if self._is_sure(candidate, T_place_camera, place.history(history)):
+            histories = history, place.history(history)
+            if self._is_sure(candidate, T_place_camera, histories):
                 return SeenAgain(place, keyframe, candidate)
         return None
 
-    def _is_sure(self, candidate: Candidate, T_place_camera: np.ndarray, history: History) -> bool:
-        seen = candidate.alignment
-        has_left = is_due(
-            seen.T_reference_camera,
-            seen.overlap,
-            candidate.median_depth_m,
-            self.keyframes.min_frames,
-            self.keyframes,
-        )
+    def _is_sure(
+        self, candidate: Candidate, T_place_camera: np.ndarray, histories: Sequence[History]
+    ) -> bool:
+        seen, T = candidate.alignment, candidate.alignment.T_reference_camera
         agrees = apart_rad(candidate, T_place_camera) < self.config.agreement_rad
         witnessed = replace(candidate, second_agrees=agrees)
         return (
-            not has_left
+            not has_left(T, seen.overlap, candidate.median_depth_m, self.keyframes)
             and seen.geometric_inliers >= self.config.min_geometric_inliers
-            and judge(witnessed, history, Status.OK, self.judgement) is Status.OK
+            and all(
+                judge(witnessed, history, Status.OK, self.judgement) is Status.OK
+                for history in histories
+            )
         )
 
 
@@ -105,7 +111,7 @@ def nearby(
     known = [place for place in places if place.id in T_map_keyframe]
     if not known:
         return []
-    T_camera = np.array([se3.inverse(T_map_keyframe[place.id]) @ T_map_camera for place in known])
+    T_camera = se3.inverse(np.array([T_map_keyframe[p.id] for p in known])) @ T_map_camera
     left = _share_left(T_camera, np.array([place.median_depth_m for place in known]), config)
     order = np.argsort(left, kind="stable")
     return [(known[k], T_camera[k]) for k in order if left[k] <= 1]

@@ -25,7 +25,8 @@ class State:
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
-    is_returned: bool = False  # the one tracked against was mapped long ago, with what it shows
+    is_returned: bool = False  # the one tracked against was mapped before, with what it shows
+    is_tied: bool = False  # or was measured from one that was
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
     segments: Segments = field(default_factory=Segments)
@@ -47,6 +48,7 @@ def packed(state: State) -> dict[str, Any]:
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
         "is_returned": state.is_returned,
+        "is_tied": state.is_tied,
         "trusted": state.trusted,
         "searches": state.searches,
         "segments": state.segments.packed,
@@ -71,6 +73,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
         is_returned=values["is_returned"],
+        is_tied=values["is_tied"],
         trusted=values["trusted"],
         searches=values["searches"],
         segments=Segments.unpacked(values["segments"]),

@@ -43,7 +43,7 @@ class EarlierKeyframes:
 
     def __init__(self, config: PyramidConfig) -> None:
         self._config = config
-        self._rebuilt: dict[int, Keyframe] = {}
+        self._rebuilt: dict[int, tuple[Place, Keyframe]] = {}
 
     def newest_first(self, places: Sequence[Place], reach: int) -> Iterator[Keyframe]:
         """The last `reach` of places, which come oldest first."""
@@ -52,9 +52,9 @@ class EarlierKeyframes:
         self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
         for place in reversed(last):
             known = self._rebuilt.get(place.id)
-            if known is None or known.T_odom_keyframe is not place.T_odom_keyframe:
-                self._rebuilt[place.id] = place.keyframe(self._config)
-            yield self._rebuilt[place.id]
+            if known is None or known[0] is not place:
+                known = self._rebuilt[place.id] = place, place.keyframe(self._config)
+            yield known[1]
 
 
 def measured_from(

@@ -9,8 +9,10 @@ import pytest
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import se3
+from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import FrameRgbd, Keyframe, TrackedPose
+from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.returning import ReturnConfig
 from ldo_service.wire import correction_message, transform
@@ -38,9 +40,10 @@ def round_trip(
     back: Many[FrameRgbd],
     bend: np.ndarray | None = None,
     restarts: bool = False,
+    forgets_at: int | None = None,
 ) -> tuple[Tracker, list[TrackedPose], list[Keyframe]]:
     """What is said on the way back, in a map that has the keyframes of the way there; with `bend`
-    [4, 4] the first half of them elsewhere."""
+    [4, 4] the first half of them elsewhere; from one frame on it has but the last."""
     tracker = Tracker(configured(after))
     there = [out for frame in frames for out in tracker.handle(frame)]
     T_map = {k.keyframe: transform(k.T_odom_keyframe) for k in there if isinstance(k, Keyframe)}
@@ -53,19 +56,31 @@ def round_trip(
             state, tracker = tracker.snapshot(), Tracker(configured(after))
             tracker.restore(decode_state(encode_state(state)))
         said += tracker.handle(frame)
+        if frame.frame == forgets_at:
+            newest = max(T_map)
+            list(tracker.handle(correction_message(0, 8, {newest: T_map[newest]})))
     poses = [out for out in said if isinstance(out, TrackedPose)]
     return tracker, poses, [out for out in said if isinstance(out, Keyframe)]
 
 
-def test_on_the_way_back_no_keyframe_is_made(room: Sequence, frames, back) -> None:
+def test_on_the_way_back_one_keyframe_ties_the_new_to_the_known_and_no_more_are_made(
+    room: Sequence, frames, keyframes, back
+) -> None:
     _, _, otherwise = round_trip(0, frames, back)
     tracker, poses, made = round_trip(1, frames, back)
     assert len(otherwise) > 4
-    assert made == []
+    (tie,) = made
     assert tracker.facts()["keyframes_returned_to"] > 2
+    T_odom = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
+    known = [m for m in tie.window if m.reference < (tie.reference or 0)]
+    assert known
+    for measured in known:
+        T_true = se3.inverse(T_odom[measured.reference]) @ transform(tie.T_odom_keyframe)
+        np.testing.assert_allclose(transform(measured.T_reference_keyframe), T_true, atol=3e-3)
     references = [pose.reference for pose in poses]
-    assert references == sorted(references, reverse=True)
-    assert len(set(references)) > 3
+    since = references[references.index(tie.keyframe) + 1 :]
+    assert max(since) == tie.keyframe
+    assert len(set(since)) > 3
     truth = room.truth()
     assert truth is not None
     T_map_world = se3.inverse(truth.T_world_camera[0])
@@ -91,12 +106,23 @@ def test_odometry_does_not_jump_where_the_camera_returns(room: Sequence, frames,
 
 def test_a_pose_hangs_on_the_keyframe_that_the_map_has(frames, keyframes, back) -> None:
     """So a later correction moves what was tracked with it."""
-    _, poses, _ = round_trip(1, frames, back)
-    T_map = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
+    tracker, poses, made = round_trip(1, frames, back[:-2])
+    T_odom = {k.keyframe: transform(k.T_odom_keyframe) for k in (*keyframes, *made)}
+    assert_hang_on_keyframes(poses, T_odom)
+    shift = se3.exp(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
+    T_map = {number: shift @ T for number, T in T_odom.items()}
+    assert list(tracker.handle(correction_message(0, 8, T_map))) == []
+    after = [out for frame in back[-2:] for out in tracker.handle(frame)]
+    assert all(isinstance(out, TrackedPose) for out in after)
+    assert_hang_on_keyframes(after, T_map)
+
+
+def assert_hang_on_keyframes(poses: Many[TrackedPose], T_map: dict[int, np.ndarray]) -> None:
     for pose in poses:
+        assert pose.reference is not None
         T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
         expected = T_map[pose.reference] @ transform(pose.T_reference_camera)
-        np.testing.assert_allclose(T_map_camera, expected, atol=1e-9)
+        np.testing.assert_allclose(T_map_camera, expected, atol=1e-6)
 
 
 def test_where_the_map_is_bent_keyframes_are_made_so_that_a_loop_can_be_closed(
@@ -108,10 +134,26 @@ def test_where_the_map_is_bent_keyframes_are_made_so_that_a_loop_can_be_closed(
 
 
 def test_a_restart_after_each_frame_changes_nothing(frames, back) -> None:
-    _, poses, _ = round_trip(1, frames, back[:20])
-    _, again, _ = round_trip(1, frames, back[:20], restarts=True)
+    """Nor what a keyframe is measured from that is made after returns, where the map has none."""
+    then = back[18].frame
+    _, poses, made = round_trip(1, frames, back, forgets_at=then)
+    _, again, remade = round_trip(1, frames, back, restarts=True, forgets_at=then)
+    assert len(made) > 2
+    assert made[-1].window
     encode = msgspec.msgpack.encode
     assert [encode(pose) for pose in poses] == [encode(pose) for pose in again]
+    assert [encode(keyframe) for keyframe in made] == [encode(keyframe) for keyframe in remade]
+
+
+def test_without_room_nobody_is_tied_and_nobody_returns(frames, back) -> None:
+    tracker = Tracker(configured(1))
+    there = [out for frame in frames for out in tracker.handle(frame)]
+    T_map = {k.keyframe: transform(k.T_odom_keyframe) for k in there if isinstance(k, Keyframe)}
+    list(tracker.handle(correction_message(0, 7, T_map)))
+    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    poses = [out for frame in back[:12] for out in tracker.handle(frame)]
+    assert all(isinstance(pose, TrackedPose) and pose.status == "OK" for pose in poses)
+    assert tracker.facts()["keyframes_returned_to"] == 0
 
 
 def test_without_a_map_nobody_returns(frames, back) -> None:
@@ -126,5 +168,5 @@ def test_what_is_remembered_does_not_grow_while_no_keyframe_is_made(
 ) -> None:
     monkeypatch.setattr("ldo_service.actors.tracker.RECENT_KEYFRAMES", 2)
     tracker, _, made = round_trip(1, frames, back)
-    assert made == []
+    assert len(made) == 1
     assert len(tracker._poses) <= 4

@@ -1,13 +1,15 @@
 """Which known keyframes a camera may go on against, and what becomes of odometry then."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import se3
+from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.semantics.movable import Box
 from ldo_service.tracking import (
     Odometry,
     OdometryConfig,
@@ -31,6 +33,17 @@ def moved(x_m: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
 def place_at(room, number: int) -> Place:
     keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number)
     return replace(place_of(keyframe, FeatureConfig(), PlacesConfig()), median_depth_m=2.0)
+
+
+def returned_at(
+    odometry: Odometry,
+    frame: RgbdFrame,
+    tracked: Tracked,
+    T_map_keyframe: Mapping[int, np.ndarray],
+    T_map_camera: np.ndarray,
+) -> Tracked | None:
+    seen = odometry.seen_again(frame, tracked, T_map_keyframe, T_map_camera)
+    return None if seen is None else odometry.return_to(seen, tracked)
 
 
 def followed(odometry: Odometry, room, poses: list[np.ndarray]) -> tuple[list[Tracked], dict]:
@@ -63,18 +76,26 @@ def test_places_that_the_map_does_not_have_are_left_out(room) -> None:
     assert nearby(places, {}, np.eye(4), KeyframeConfig()) == []
 
 
+def due_on_the_way_back(
+    odometry: Odometry, room, there: list[np.ndarray]
+) -> tuple[RgbdFrame, Tracked, np.ndarray]:
+    """The first frame that wants a keyframe, and its true pose."""
+    for T in reversed(there[:-1]):
+        frame = room.view(T)
+        tracked = odometry.track(frame)
+        if tracked.wants_keyframe:
+            return frame, tracked, T
+    raise AssertionError("no keyframe was due")
+
+
 # --- odometry -------------------------------------------------------------------------------------
 def left_and_back(room, make_walk, T_error: np.ndarray) -> tuple[Odometry, Tracked | None, Tracked]:
     """There and back to where a keyframe is due, then asked to return in a map off by T_error."""
     odometry, there = Odometry(SOON), make_walk(20)
     _, T_map = followed(odometry, room, there)
-    for T in reversed(there[:-1]):
-        frame = room.view(T)
-        tracked = odometry.track(frame)
-        if tracked.wants_keyframe:
-            break
+    frame, tracked, T = due_on_the_way_back(odometry, room, there)
     known = {number: T for number, T in T_map.items() if number != tracked.keyframe}
-    return odometry, odometry.returned(frame, tracked, known, T @ T_error), tracked
+    return odometry, returned_at(odometry, frame, tracked, known, T @ T_error), tracked
 
 
 def test_odometry_goes_on_where_it_is_against_the_known_keyframe(room, make_walk) -> None:
@@ -112,9 +133,10 @@ def test_nobody_returns_where_map_and_images_disagree(room, make_walk) -> None:
 def test_nobody_returns_to_what_looks_otherwise_now(room, make_walk) -> None:
     odometry, there = Odometry(SOON), make_walk(20)
     _, T_map = followed(odometry, room, there)
-    dark = room.blank()
-    tracked = odometry.track(room.view(there[-1]))
-    assert odometry.returned(dark, tracked, T_map, there[3]) is None
+    _, tracked, T = due_on_the_way_back(odometry, room, there)
+    known = {number: T for number, T in T_map.items() if number != tracked.keyframe}
+    assert returned_at(odometry, room.blank(), tracked, known, T) is None
+    assert returned_at(odometry, room.view(T), tracked, known, T) is not None
 
 
 def test_the_next_frames_after_a_return_survive_a_restart_bit_for_bit(room, make_walk) -> None:
@@ -141,7 +163,7 @@ def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room,
         frame = room.view(T)
         tracked = odometry.track(frame)
         if tracked.wants_keyframe:
-            returned = odometry.returned(frame, tracked, T_map, T)
+            returned = returned_at(odometry, frame, tracked, T_map, T)
             assert returned is not None
             seen.append(returned.keyframe)
     assert len(seen) > 2
@@ -166,6 +188,64 @@ def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room,
 def test_settings_that_cannot_be_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         ReturnConfig(**wrong)
+
+
+def test_a_camera_that_moves_slowly_stays_with_the_keyframe_it_returned_to(room, make_walk) -> None:
+    """A new one is due after so many frames; an old one shows the same after a year."""
+    odometry, returned, _ = left_and_back(room, make_walk, np.eye(4))
+    assert returned is not None
+    steps = [returned.T_odom_camera @ moved(5e-4 * k, 2e-3 * (k % 2)) for k in range(40)]
+    results, made = followed(odometry, room, steps)
+    assert made == {}
+    assert {result.keyframe for result in results} == {returned.keyframe}
+
+
+def test_what_was_put_there_since_then_is_not_taken_for_something_that_moves(
+    room, make_walk
+) -> None:
+    odometry, returned, _ = left_and_back(room, make_walk, np.eye(4))
+    assert returned is not None
+    tracked = odometry.track(with_a_box(room.view(returned.T_odom_camera)))
+    assert tracked.status is Status.OK
+    assert tracked.keyframe == returned.keyframe
+    assert tracked.is_moving is None
+
+
+def test_of_a_new_keyframe_something_that_comes_is_taken_to_move(room) -> None:
+    odometry = Odometry(SOON)
+    first = room.view(np.eye(4))
+    odometry.make_keyframe(first, odometry.track(first))
+    tracked = odometry.track(with_a_box(room.view(np.eye(4))))
+    assert tracked.is_moving is not None
+    assert tracked.is_moving[55, 75]
+
+
+def with_a_box(frame: RgbdFrame) -> RgbdFrame:
+    color, depth_m = frame.color.copy(), frame.depth_m.copy()
+    color[40:70, 60:90] = np.random.default_rng(0).integers(60, 200, (30, 30, 1))
+    depth_m[40:70, 60:90] = 1.0
+    return replace(frame, color=color, depth_m=depth_m)
+
+
+def test_whom_a_detector_found_is_not_in_the_place_either(room) -> None:
+    odometry = Odometry(SOON)
+    frame = room.view(np.eye(4))
+    number = odometry.make_keyframe(frame, odometry.track(frame))
+    before = odometry._state.places.all[0]
+    odometry.leave_out(number, [Box("person", 40.0, 30.0, 90.0, 100.0)])
+    (after,) = odometry._state.places.all
+    assert np.count_nonzero(before.depth_m[50:80, 50:80]) > 800
+    assert np.count_nonzero(after.depth_m[50:80, 50:80]) < 300
+
+
+def test_a_lost_camera_that_is_found_again_maps_nothing_anew(room, make_walk) -> None:
+    odometry, there = Odometry(SOON), make_walk(60)
+    followed(odometry, room, there)
+    odometry.track(room.blank())
+    found = odometry.track(room.view(there[2]))
+    assert (found.status, found.method) == (Status.OK, "relocalised")
+    assert not found.wants_mapping or found.wants_keyframe
+    assert odometry.is_tied
 
 
 @pytest.mark.parametrize(("after", "may"), [(0, False), (3, False), (2, True)])
