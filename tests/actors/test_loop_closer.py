@@ -307,6 +307,18 @@ def test_what_a_walk_ends_with_is_compared_though_no_keyframe_follows(there, bac
     assert not list(actor.finish()), "once"
 
 
+def test_keyframes_that_do_not_follow_each_other_are_no_subgraph(room) -> None:
+    """Between them the camera may have gone a long way past keyframes that it knew."""
+    elsewhere = se3.exp(np.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0]))
+    here = keyframes_of(room, range(0, 4, 2), 0, 0)
+    there = keyframes_of(room, range(0, 20, 2), 2, LONG_AFTER, elsewhere)
+    closer = LoopCloser()
+    handled(closer, told([*here, *there]))
+    together = [{k < 2 for k in subgraph.keyframes} for subgraph in closer.recogniser.subgraphs]
+    assert len(together) > 1
+    assert all(old == {False} for old in together)
+
+
 def test_memory_is_bounded(there, back) -> None:
     config = LoopCloserConfig(loops=LoopsConfig(retrieval=RetrievalConfig(count=3)))
     actor = LoopCloser(config)
