@@ -1,0 +1,52 @@
+"""A robot on its round, by all actors: a map that has what it needs stays as it is."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from ldo_service.datasets import Sequence
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.geometry import Trajectory
+from ldo_service.runs.over_file import run_over_file
+
+from .jobs import Rearranged, job
+
+THERE = range(0, 60, 3)
+BACK = range(57, 0, -3)
+ROUND = len(THERE) + len(BACK)
+
+
+@pytest.fixture(scope="module")
+def rounds(room: Sequence) -> Rearranged:
+    return Rearranged(room, [*THERE, *BACK] * 3)
+
+
+@pytest.fixture(scope="module")
+def finished(rounds: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("rounds") / "out"
+    run_over_file(job(rounds, folder, "tracker.odometry.returning.after=8"), lambda _: None)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def rows(finished: Path) -> list[dict[str, str]]:
+    with (finished / "frames.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_after_the_first_round_no_keyframe_is_made(rows) -> None:
+    made = [
+        sum(row["keyframe"] != "" for row in rows[n * ROUND : (n + 1) * ROUND]) for n in range(3)
+    ]
+    assert made[0] >= 8
+    assert made[1:] == [0, 0]
+    assert {row["status"] for row in rows} == {"OK"}
+    assert sum(row["method"] == "returned" for row in rows[ROUND:]) > 4
+
+
+def test_poses_are_right_online_and_in_the_end(finished: Path, rounds: Rearranged) -> None:
+    for name in ("trajectory.txt", "trajectory_online.txt"):
+        track = Trajectory.load(finished / name)
+        assert len(track) == len(rounds)
+        assert evaluate_trajectory(track, rounds.truth()).ate_m.max < 5e-3
