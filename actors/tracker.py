@@ -353,12 +353,13 @@ class Tracker(Actor):
     def _tracked_parts(self) -> dict[str, Any]:
         """All that does not change with each pose of a prior."""
         state = self._odometry.state()
-        places = {f"place_{place['id']}": place for place in state["places"]}
+        places = {place["id"]: place for place in state.pop("places")}
+        state["order"] = [*places]  # as they were come by last
         views = {name: state.pop(name) for name in VIEWS}
         localise = self.config.localise
-        state["order"] = [place["id"] for place in state.pop("places")]
         now = {"odometry": state, "poses": self._poses.snapshot(), "localise": localise}
-        return {**places, **views, "correction": self._correction, "now": now}
+        parts = {f"place_{number}": place for number, place in places.items()}
+        return {**parts, **views, "correction": self._correction, "now": now}
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         now = state["now"]

@@ -22,7 +22,7 @@ class SubgraphConfig:
     turned_rad: float = 0.5  # rotation plus parallax from first to last, after which `least` are
     # enough: half of what a depth camera sees is new then
     gap_rad: float = 1.5  # likewise, from one to the next, after which a new one begins: keyframes
-    # that follow each other share half of what they show, and turn by 0.3 at most
+    # that follow each other are 0.35 apart, unless frames were dropped
     kept_views: int = (
         2  # of each: 0.13 MB a view at 640x480. More found no more on flat and kitchen
     )

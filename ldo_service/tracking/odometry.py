@@ -248,12 +248,11 @@ class Odometry:
             return
         mask = movable_in(current.view, boxes, self.config.movable)
         if mask.any():
-            places = self._state.places
-            for place in places.all:
-                if place.id == keyframe:
-                    places = places.with_changed(place.without(mask))
-            without = replace(current, movable=mask)
-            self._state = replace(self._state, keyframe=without, places=places)
+            self._state = replace(
+                self._state,
+                keyframe=replace(current, movable=mask),
+                places=self._state.places.without(mask, keyframe),
+            )
 
     def make_supporting(self, frame: RgbdFrame, tracked: Tracked) -> int:
         """Go on against the same keyframe; the id of this frame as one that is only mapped.

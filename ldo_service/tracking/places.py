@@ -210,9 +210,10 @@ class Places:
         """With a known one as the newest, where odometry has it now."""
         return Places((*(other for other in self.all if other.id != place.id), place))
 
-    def with_changed(self, place: Place) -> "Places":
-        """With another version of a known one in its stead."""
-        return Places(tuple(place if other.id == place.id else other for other in self.all))
+    def without(self, left_out: np.ndarray, keyframe: int) -> "Places":
+        """With nothing known of pixels [H, W] bool of one of them: see `Place.without`."""
+        places = (p.without(left_out) if p.id == keyframe else p for p in self.all)
+        return Places(tuple(places))
 
     def of(self, segment: int, without: Set[int] = frozenset()) -> tuple[Place, ...]:
         """Those of a segment but for some, by id."""
