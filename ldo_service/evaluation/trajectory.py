@@ -71,7 +71,7 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
         ErrorStatistics.of(np.linalg.norm(aligned - T_truth[:, :3, 3], axis=1)),
         interval,
         ErrorStatistics.of(np.linalg.norm(relative[:, :3, 3], axis=1)) if len(relative) else None,
-        ErrorStatistics.of(np.rad2deg(_angles(relative))) if len(relative) else None,
+        ErrorStatistics.of(np.rad2deg(se3.rotation_angles(relative))) if len(relative) else None,
         T_truth_estimate,
     )
 
@@ -93,10 +93,6 @@ def _relative_errors(T_estimate: np.ndarray, T_truth: np.ndarray, interval: int)
     motion_estimate = se3.inverse(T_estimate[:-interval]) @ T_estimate[interval:]
     motion_truth = se3.inverse(T_truth[:-interval]) @ T_truth[interval:]
     return se3.inverse(motion_truth) @ motion_estimate
-
-
-def _angles(T: np.ndarray) -> np.ndarray:
-    return np.array([se3.rotation_angle(T_k) for T_k in T])
 
 
 def _poses_per_interval(stamps_s: np.ndarray) -> int:

@@ -73,9 +73,21 @@ def adjoint(T: Array) -> Array:
 
 def rotation_angle(T: Array) -> float:
     """Angle of the rotation of T [4, 4] in radians, 0..pi."""
-    R = T[:3, :3]
-    sin = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(np.arctan2(sin, 0.5 * (np.trace(R) - 1.0)))
+    return float(rotation_angles(T))
+
+
+def rotation_angles(T: Array) -> Array:
+    """Those [...] of many T [..., 4, 4]."""
+    R = T[..., :3, :3]
+    pairs = ((2, 1), (0, 2), (1, 0))
+    twice_sin = np.stack([R[..., i, j] - R[..., j, i] for i, j in pairs], axis=-1)
+    twice_cos = np.trace(R, axis1=-2, axis2=-1) - 1.0
+    return np.arctan2(np.linalg.norm(twice_sin, axis=-1), twice_cos)
+
+
+def distances(T: Array) -> Array:
+    """Lengths [...] of the translations of T [..., 4, 4]."""
+    return np.linalg.norm(T[..., :3, 3], axis=-1)
 
 
 def transform(T: Array, points: Array) -> Array:

@@ -34,8 +34,11 @@ class KeyframeConfig:
     def __post_init__(self) -> None:
         if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
             raise ConfigError("still_overlap must be within 0..1, still_motion at least 0.")
-        if not self.supporting > 0:
-            raise ConfigError(f"supporting={self.supporting:g} must be positive.")
+        if not min(self.max_rotation_rad, self.max_translation, self.supporting) > 0:
+            raise ConfigError(
+                f"max_rotation_rad={self.max_rotation_rad:g}, max_translation="
+                f"{self.max_translation:g} and supporting={self.supporting:g} must be positive."
+            )
         if not 0 <= self.min_overlap <= 1:
             raise ConfigError(f"min_overlap={self.min_overlap:g} must be within 0..1.")
         if not 1 <= self.min_frames <= self.max_frames:
@@ -116,7 +119,7 @@ def is_due(
     """Whether a view has left its keyframe far enough, `frames` frames after it."""
     if frames < config.min_frames:
         return False
-    translation = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / median_depth_m
+    translation = se3.distances(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angle(T_keyframe_camera)
     if max(translation, rotation_rad) < config.still_motion and overlap > config.still_overlap:
         return False  # a robot that waits must not fill its map
@@ -129,27 +132,26 @@ def has_left(
     T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
     """Whether a view is elsewhere than its keyframe, or shows too little of it."""
-    translation = float(np.linalg.norm(T_keyframe_camera[:3, 3])) / median_depth_m
-    return bool(
-        overlap < config.min_overlap
-        or translation > config.max_translation
-        or se3.rotation_angle(T_keyframe_camera) > config.max_rotation_rad
-    )
+    is_elsewhere = bool(shares_left(T_keyframe_camera, median_depth_m, config) > 1)
+    return is_elsewhere or overlap < config.min_overlap
 
 
 def is_worth_mapping(
     T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
     """Whether a view has left the last one that was mapped far enough to support it."""
-    translation = float(np.linalg.norm(T_mapped_camera[:3, 3])) / median_depth_m
-    rotation_rad = se3.rotation_angle(T_mapped_camera)
-    return bool(
-        config.supporting <= 1
-        and (
-            translation > config.supporting * config.max_translation
-            or rotation_rad > config.supporting * config.max_rotation_rad
-        )
-    )
+    left = float(shares_left(T_mapped_camera, median_depth_m, config))
+    return left > config.supporting and config.supporting <= 1
+
+
+def shares_left(
+    T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray | float, config: KeyframeConfig
+) -> np.ndarray:
+    """[...] how far cameras have gone of what they may before a keyframe is due: the larger share
+    of way and turn. T_keyframe_camera [..., 4, 4], median_depth_m [...]."""
+    way = se3.distances(T_keyframe_camera) / median_depth_m
+    turn_rad = se3.rotation_angles(T_keyframe_camera)
+    return np.maximum(way / config.max_translation, turn_rad / config.max_rotation_rad)
 
 
 def movable_in(view: Pyramid, boxes: Sequence[Box], config: MovableConfig) -> np.ndarray:

@@ -39,4 +39,9 @@ class Motion:
 
 def extent(T: np.ndarray, median_depth_m: float) -> float:
     """How far T [4, 4] shifts the image of a scene at the median depth, in rad."""
-    return se3.rotation_angle(T) + float(np.linalg.norm(T[:3, 3])) / median_depth_m
+    return float(extents(T, median_depth_m))
+
+
+def extents(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:
+    """That of many [...]: T [..., 4, 4], median_depth_m [...]."""
+    return se3.rotation_angles(T) + se3.distances(T) / median_depth_m

@@ -46,7 +46,7 @@ from .relocalisation import RelocalisationConfig, Relocaliser
 from .returning import ReturnConfig, Returning, SeenAgain, nearby
 from .segments import Join, Look, SegmentConfig
 from .shape import ShapeConfig
-from .state import State, packed, unpacked
+from .state import Footing, State, packed, unpacked
 from .tracked import Tracked, report
 from .window import EarlierKeyframes, WindowConfig, measured_from
 
@@ -128,9 +128,8 @@ class Odometry:
                 return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
             # noise is another elsewhere, and what has gone is of another keyframe
-            self._state = replace(
-                self._state, history=History(), suspicion=None, is_returned=self.may_return
-            )
+            footing = Footing.KNOWN if self.may_return else Footing.NEW
+            self._state = replace(self._state, history=History(), suspicion=None, footing=footing)
         tracked = self._accepted(frame, keyframe, candidate, status)
         return self._joining(tracked, keyframe, view)
 
@@ -166,20 +165,9 @@ class Odometry:
         if tracked.join is not None:
             segments = self._state.segments.joined(tracked.segment, tracked.join.segment)
             self._state = replace(self._state, segments=segments)
-        before = self._state
         keyframe = self._keyframe_of(frame, tracked)
-        self._state = replace(
-            before,
-            places=before.places.added(self._place_of(keyframe), self.config.places),
-            keyframe=keyframe,
-            supporting=None,
-            frames_since_keyframe=0,
-            next_id=before.next_id + 1,
-            is_returned=False,
-            is_tied=is_tied,
-            T_odom_mapped=tracked.T_odom_camera,
-            suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
-        )
+        place = self._place_of(keyframe)
+        self._state = self._state.with_new(keyframe, place, self.config.places, is_tied=is_tied)
         return keyframe.id
 
     def seen_again(
@@ -207,24 +195,13 @@ class Odometry:
 
         Odometry goes on where it is: the keyframe is elsewhere in it now, and of its segment.
         """
-        alignment, before = seen.candidate.alignment, self._state
+        alignment = seen.candidate.alignment
         T_odom_keyframe = se3.orthonormalised(
             tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
         )
         here = {"T_odom_keyframe": T_odom_keyframe, "segment": tracked.segment}
         place, keyframe = replace(seen.place, **here), replace(seen.keyframe, **here)
-        self._state = replace(
-            before,
-            places=before.places.returned_to(place),
-            keyframe=keyframe,
-            supporting=None,
-            frames_since_keyframe=0,
-            is_returned=True,
-            is_tied=False,
-            is_moving=None,
-            T_odom_mapped=tracked.T_odom_camera,
-            suspicion=before.suspicion and before.suspicion.of_new_keyframe(),
-        )
+        self._state = self._state.with_known(keyframe, place, tracked.T_odom_camera)
         method = seen.candidate.method
         return report(alignment, tracked.T_odom_camera, keyframe, Status.OK, method)
 
@@ -281,7 +258,7 @@ class Odometry:
     @property
     def is_tied(self) -> bool:
         """Whether the keyframe tracked against is a known one, or was measured from one."""
-        return self._state.is_returned or self._state.is_tied
+        return self._state.footing is not Footing.NEW
 
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values.
@@ -437,7 +414,8 @@ class Odometry:
         if status is Status.OK:
             is_moving = self._watched(keyframe, self._view(frame), alignment)
         frames = self._state.frames_since_keyframe
-        if self._state.is_returned:
+        is_known = self._state.footing is Footing.KNOWN
+        if is_known:
             # what was put there since then does not move, and an old keyframe does for any time
             is_moving, frames = None, min(frames, config.keyframes.max_frames - 1)
             self._state = replace(self._state, is_moving=None)
@@ -449,7 +427,7 @@ class Odometry:
             config.keyframes,
         )
         T_mapped_camera = se3.inverse(self._state.T_odom_mapped) @ T_odom_camera
-        supports = not self._state.is_returned and is_worth_mapping(
+        supports = not is_known and is_worth_mapping(
             T_mapped_camera, candidate.median_depth_m, config.keyframes
         )
         is_sure = status is Status.OK

@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry import Camera, codecs
+from ldo_service.geometry import Camera, codecs, se3
 
 from .features import FeatureConfig, Features, detect, detect_across_scales
 from .judgement import History
 from .keyframes import Keyframe
+from .motion import extents
 from .moving import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
 
@@ -224,9 +225,9 @@ class Places:
         older = self.all[: max(0, len(self.all) - config.recent)]
         if not older:
             return self.all
-        extents = _extents(older, place)
-        nearest = int(np.argmin(extents))
-        if extents[nearest] >= config.same:
+        apart = _apart(older, place)
+        nearest = int(np.argmin(apart))
+        if apart[nearest] >= config.same:
             return self.all
         return (*self.all[:nearest], *self.all[nearest + 1 :])
 
@@ -249,25 +250,17 @@ def gaps(path: Sequence[Place]) -> np.ndarray:
     Infinite where they are of two segments.
     """
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
-    extents = _extent(_poses(path[:-2]), _poses(path[2:]), median_depth_m)
+    apart = extents(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
     segment = np.array([place.segment for place in path])
-    return np.where(segment[:-2] == segment[2:], extents, np.inf)
+    return np.where(segment[:-2] == segment[2:], apart, np.inf)
 
 
-def _extents(places: tuple[Place, ...], other: Place) -> np.ndarray:
+def _apart(places: tuple[Place, ...], other: Place) -> np.ndarray:
     """[N] rad: how far each is from another one, as `motion.extent`; infinite in other segments."""
-    T = np.broadcast_to(other.T_odom_keyframe, (len(places), 4, 4))
-    extents = _extent(_poses(places), T, np.array(other.median_depth_m))
+    moved = se3.inverse(_poses(places)) @ other.T_odom_keyframe
     segment = np.array([place.segment for place in places])
-    return np.where(segment == other.segment, extents, np.inf)
+    return np.where(segment == other.segment, extents(moved, other.median_depth_m), np.inf)
 
 
 def _poses(places: Sequence[Place]) -> np.ndarray:
     return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
-
-
-def _extent(T_a: np.ndarray, T_b: np.ndarray, median_depth_m: np.ndarray) -> np.ndarray:
-    """`motion.extent` between poses [N, 4, 4], two by two."""
-    cosine = (np.einsum("nij,nij->n", T_a[:, :3, :3], T_b[:, :3, :3]) - 1.0) / 2.0
-    shift_m = np.linalg.norm(T_b[:, :3, 3] - T_a[:, :3, 3], axis=1)
-    return np.arccos(np.clip(cosine, -1.0, 1.0)) + shift_m / median_depth_m

@@ -20,7 +20,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from .align import AlignConfig
 from .candidates import Candidate, apart_rad, attempt
 from .judgement import History, JudgementConfig, Status, judge
-from .keyframes import Keyframe, KeyframeConfig, has_left
+from .keyframes import Keyframe, KeyframeConfig, has_left, shares_left
 from .places import Place
 from .pyramid import Pyramid, PyramidConfig
 
@@ -114,16 +114,6 @@ def nearby(
     if not known:
         return []
     T_camera = se3.inverse(np.array([T_map_keyframe[p.id] for p in known])) @ T_map_camera
-    left = _share_left(T_camera, np.array([place.median_depth_m for place in known]), config)
+    left = shares_left(T_camera, np.array([place.median_depth_m for place in known]), config)
     order = np.argsort(left, kind="stable")
     return [(known[k], T_camera[k]) for k in order if left[k] <= 1]
-
-
-def _share_left(
-    T_place_camera: np.ndarray, median_depth_m: np.ndarray, config: KeyframeConfig
-) -> np.ndarray:
-    """[N] of how far the camera may go before a keyframe is due: the larger of way and turn."""
-    way = np.linalg.norm(T_place_camera[:, :3, 3], axis=1) / median_depth_m
-    cosine = (np.einsum("nii->n", T_place_camera[:, :3, :3]) - 1) / 2
-    turn_rad = np.arccos(np.clip(cosine, -1, 1))
-    return np.maximum(way / config.max_translation, turn_rad / config.max_rotation_rad)

@@ -1,6 +1,7 @@
 """What the odometry remembers from frame to frame, and its form on disk."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,18 @@ from .judgement import History, Status
 from .keyframes import Keyframe
 from .motion import Motion
 from .moving import Suspicion
-from .places import Place, Places
+from .places import Place, Places, PlacesConfig
 from .prior import Anchor
 from .pyramid import PyramidConfig
 from .segments import Segments
+
+
+class Footing(StrEnum):
+    """What a map that holds many keyframes knows of the one tracked against."""
+
+    NEW = "new"
+    TIED = "tied"  # new, and measured from a known one
+    KNOWN = "known"  # made long before, with all that it shows
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +34,7 @@ class State:
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
-    is_returned: bool = False  # the one tracked against was mapped before, with what it shows
-    is_tied: bool = False  # or was measured from one that was
+    footing: Footing = Footing.NEW
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
     segments: Segments = field(default_factory=Segments)
@@ -34,6 +42,36 @@ class State:
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
     suspicion: Suspicion | None = None
     anchor: Anchor | None = None  # the last OK frame, where a prior says where it was too
+
+    def with_new(
+        self, keyframe: Keyframe, place: Place, config: PlacesConfig, *, is_tied: bool
+    ) -> "State":
+        """Tracking against the frame just tracked, which is a keyframe and a place from now on."""
+        return replace(
+            self._against(keyframe, keyframe.T_odom_keyframe),
+            places=self.places.added(place, config),
+            next_id=keyframe.id + 1,
+            footing=Footing.TIED if is_tied else Footing.NEW,
+        )
+
+    def with_known(self, keyframe: Keyframe, place: Place, T_odom_camera: np.ndarray) -> "State":
+        """Tracking against a keyframe of old, seen from T_odom_camera [4, 4] by the last frame."""
+        return replace(
+            self._against(keyframe, T_odom_camera),
+            places=self.places.returned_to(place),
+            footing=Footing.KNOWN,
+            is_moving=None,
+        )
+
+    def _against(self, keyframe: Keyframe, T_odom_mapped: np.ndarray) -> "State":
+        return replace(
+            self,
+            keyframe=keyframe,
+            supporting=None,
+            frames_since_keyframe=0,
+            T_odom_mapped=T_odom_mapped,
+            suspicion=self.suspicion and self.suspicion.of_new_keyframe(),
+        )
 
 
 def packed(state: State) -> dict[str, Any]:
@@ -47,8 +85,7 @@ def packed(state: State) -> dict[str, Any]:
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
-        "is_returned": state.is_returned,
-        "is_tied": state.is_tied,
+        "footing": state.footing.value,
         "trusted": state.trusted,
         "searches": state.searches,
         "segments": state.segments.packed,
@@ -72,8 +109,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
-        is_returned=values["is_returned"],
-        is_tied=values["is_tied"],
+        footing=Footing(values["footing"]),
         trusted=values["trusted"],
         searches=values["searches"],
         segments=Segments.unpacked(values["segments"]),
