@@ -31,6 +31,7 @@ from ldo_service.certificates import (
     read_key,
 )
 from ldo_service.errors import ConfigError
+from ldo_service.plain_yaml import plain_text
 from ldo_service.runtime.access import EVERY_ROBOT, Grantee, Role, read_access
 from ldo_service.runtime.keys import ACCESS, CA, CERTIFICATE, KEY
 from ldo_service.runtime.network import require_robot
@@ -152,7 +153,7 @@ class Authority:
     def _grant(self, access: dict[str, Grantee]) -> None:
         """Write the list, here and for every service."""
         self._access = access
-        text = HEAD + msgspec.yaml.encode(access).decode()
+        text = HEAD + plain_text(msgspec.to_builtins(access))
         services = {entry.name for entry in self.entries if entry.grantee.role == "service"}
         for folder in (self.folder, *(self.folder / name for name in sorted(services))):
             if folder.is_dir():  # a service's may have been moved away

@@ -35,7 +35,7 @@ from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
 from ldo_service.metrics import LOOPBACK
-from ldo_service.plain_yaml import plain_values
+from ldo_service.plain_yaml import plain_text, plain_values
 from ldo_service.runtime.network import MAX_MESSAGE_MB
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.stage import StageConfig
@@ -158,7 +158,7 @@ def config_of(tree: dict[str, Any]) -> Config:
 
 def config_yaml(config: Config) -> str:
     """The whole configuration; reads back as the same."""
-    return yaml.safe_dump(msgspec.to_builtins(config), sort_keys=False)
+    return plain_text(msgspec.to_builtins(config))
 
 
 def explained_yaml(config: Config) -> str:
@@ -237,7 +237,7 @@ def _explain(config: Any, depth: int) -> list[str]:
             lines += [f"{indent}{entry.name}:", *_explain(value, depth + 1)]
         else:
             plain = msgspec.to_builtins(value)
-            text = yaml.safe_dump(plain, default_flow_style=True, width=inf).splitlines()[0]
+            text = plain_text(plain, flow=True, width=inf).splitlines()[0]
             comment = f"  # {comments[entry.name]}" if entry.name in comments else ""
             lines.append(f"{indent}{entry.name}: {text}{comment}")
     return lines or ["  " * depth + "{}"]

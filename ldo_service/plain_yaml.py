@@ -1,8 +1,26 @@
-"""Plain values out of YAML that somebody wrote."""
+"""Plain values out of YAML that somebody wrote, and back.
 
+Numbers are those of YAML 1.2: in 1.1, which PyYAML reads, `2e-4` is text for want of a point.
+"""
+
+import re
 from typing import Any
 
 import yaml
+
+
+class _Loader(yaml.SafeLoader): ...
+
+
+class _Dumper(yaml.SafeDumper): ...
+
+
+for _one in (_Loader, _Dumper):
+    _one.add_implicit_resolver(
+        "tag:yaml.org,2002:float",
+        re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)[eE][-+]?[0-9]+$"),
+        list("-+.0123456789"),
+    )
 
 
 def plain_values(text: str | bytes) -> Any:
@@ -12,8 +30,17 @@ def plain_values(text: str | bytes) -> Any:
     Parsed in Python: libyaml, in C, overflows its stack where brackets are nested deeply.
     """
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _Loader)
     except RecursionError:
         raise yaml.YAMLError("it is nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2027-13-01
         raise yaml.YAMLError(" ".join(str(error).split())) from error
+
+
+def plain_text(values: Any, *, flow: bool | None = False, width: float = 80) -> str:
+    """YAML that `plain_values` reads as the same.
+
+    flow  all on one line; None: only what is innermost
+    """
+    form = {"default_flow_style": flow, "width": width, "sort_keys": False}
+    return yaml.dump(values, Dumper=_Dumper, **form)

@@ -34,6 +34,19 @@ def test_settings_change_what_the_file_left(tmp_path: Path) -> None:
     assert (config.tracker.hold_out, config.mapper.threads) == (5, 2)
 
 
+@pytest.mark.parametrize("written", ["2e-1", "2E-1", ".2e0", "+2.e-1", "0.2", "200e-3"])
+def test_numbers_are_those_of_yaml_1_2(written: str) -> None:
+    assert load_config(settings=[f"stage.heartbeat_s={written}"]).stage.heartbeat_s == 0.2
+
+
+def test_a_name_like_a_number_reads_back_as_the_name(tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text('tracker:\n  localise: "1e5"\n')
+    config = load_config(tmp_path / "mine.yaml")
+    (tmp_path / "again.yaml").write_text(config_yaml(config))
+    assert load_config(tmp_path / "again.yaml") == config
+    assert config.tracker.localise == "1e5"
+
+
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty.yaml").write_text("")
     assert load_config(tmp_path / "empty.yaml") == Config()

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-import yaml
 from rich.console import Console
 from rich.table import Table
 
+from ldo_service.plain_yaml import plain_text
 from ldo_service.runtime.access import EVERY_ROBOT, Access, Role, read_access
 from ldo_service.runtime.keys import ACCESS, router_settings
 from ldo_service.runtime.network import CLOSED, MAX_MESSAGE_MB
@@ -150,7 +150,7 @@ def router_yaml(access: Access, folder: Path, port: int) -> str:
         for name in sections:
             section = section.setdefault(name, {})
         section[last] = value
-    return yaml.safe_dump(file, sort_keys=False, default_flow_style=None, width=100)
+    return plain_text(file, flow=None, width=100)
 
 
 def _table(authority: Any) -> Table:
