@@ -1,15 +1,22 @@
-"""`ldo serve --metrics PORT`: the actors' health messages for Prometheus, by default on loopback.
+"""`ldo serve --metrics PORT`: the actors' health for those who watch over them, by default on
+loopback.
 
-Counters restart from 0 with their actor's process, as Prometheus expects of counters.
+/metrics  what health messages say, for Prometheus. Counters restart from 0 with their actor's
+          process, as Prometheus expects of counters
+/healthz  200 while every actor reports, else 503 and who does not: what was is forgotten
 """
 
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from threading import Lock
+from socketserver import ThreadingMixIn
+from threading import Lock, Thread
+from typing import Any
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 import msgspec
-from prometheus_client import CollectorRegistry, start_http_server
+from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -18,6 +25,7 @@ from ldo_service.schemas import Health, InputCount, OutputCount, decode
 
 LOOPBACK = "127.0.0.1"  # anyone who may read them may also see where the robot is at work
 MOST_ACTORS = 64  # that are kept; a name is what a message says
+SILENT_S = 15.0  # after service.silent_after_s an actor is killed, and back some seconds later
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
@@ -49,9 +57,10 @@ OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
 
 
 class HealthCollector(Collector):
-    """Keeps the last heartbeat of each actor; decoded when somebody asks."""
+    """Keeps the last heartbeat of each actor of a robot."""
 
-    def __init__(self) -> None:
+    def __init__(self, robot: str, actors: Iterable[str] = ()) -> None:
+        self._robot, self._actors = robot, tuple(actors)
         self._lock = Lock()
         self._last: dict[str, tuple[float, Health]] = {}  # by actor: when it was heard
 
@@ -69,20 +78,33 @@ class HealthCollector(Collector):
         with self._lock:
             last = dict(sorted(self._last.items()))
         actors = [health for _, health in last.values()]
-        yield self._ages(last)
-        yield _step_seconds(actors)
-        yield _facts(actors)
-        yield from _table(OF_ACTOR, ["actor"], (([h.actor], h) for h in actors))
-        yield from _table(
-            OF_INPUT,
-            ["actor", "topic"],
-            (([h.actor, i.topic], i) for h in actors for i in h.inputs),
-        )
-        yield from _table(
-            OF_OUTPUT,
-            ["actor", "topic"],
-            (([h.actor, o.topic], o) for h in actors for o in h.outputs),
-        )
+        for metric in (
+            self._ages(last),
+            _step_seconds(actors),
+            _facts(actors),
+            *_table(OF_ACTOR, ["actor"], (([h.actor], h) for h in actors)),
+            *_table(
+                OF_INPUT,
+                ["actor", "topic"],
+                (([h.actor, i.topic], i) for h in actors for i in h.inputs),
+            ),
+            *_table(
+                OF_OUTPUT,
+                ["actor", "topic"],
+                (([h.actor, o.topic], o) for h in actors for o in h.outputs),
+            ),
+        ):
+            for sample in metric.samples:
+                sample.labels["robot"] = self._robot
+            yield metric
+
+    def silent(self) -> list[str]:
+        """Actors that do not report; all of them before the first heartbeat."""
+        since_s = time.monotonic() - SILENT_S
+        with self._lock:
+            known = {*self._actors, *self._last}
+            heard = {actor for actor, (at_s, _) in self._last.items() if at_s > since_s}
+        return sorted(known - heard)
 
     @staticmethod
     def _ages(last: dict[str, tuple[float, Health]]) -> Metric:
@@ -121,9 +143,18 @@ def _facts(actors: list[Health]) -> Metric:
     return metric
 
 
+class _Server(ThreadingMixIn, WSGIServer):
+    daemon_threads = True
+
+
+class _Quiet(WSGIRequestHandler):
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nobody wants a line for each scrape."""
+
+
 @contextmanager
 def exported(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
-    """Serve http://ADDRESS:PORT/metrics inside the block.
+    """Serve http://ADDRESS:PORT/metrics and /healthz inside the block.
 
     Raises ConfigError when the port or the address cannot be had.
     """
@@ -131,16 +162,34 @@ def exported(collector: HealthCollector, port: int, address: str = LOOPBACK) -> 
         raise ConfigError(f"--metrics {port}: a port is a number in 1..65535.")
     registry = CollectorRegistry()
     registry.register(collector)
+    metrics = make_wsgi_app(registry)
+
+    def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
+        if environ["PATH_INFO"] == "/healthz":
+            return _how_it_is(collector.silent(), start_response)
+        return metrics(environ, start_response)
+
     try:
-        server, thread = start_http_server(port, address, registry)
+        family = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)[0][0]
+        kind = type("Server", (_Server,), {"address_family": family})
+        server = make_server(address, port, answer, kind, _Quiet)
     except OSError as error:
         raise ConfigError(
             f"--metrics {port}: cannot listen on {address}:{port} ({error.strerror}). Is another "
             "service exporting there? Choose another port, or service.metrics_address."
         ) from error
+    thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread.start()
     try:
         yield
     finally:
         server.shutdown()
         server.server_close()
         thread.join()
+
+
+def _how_it_is(silent: list[str], start_response: Any) -> list[bytes]:
+    status = "503 Service Unavailable" if silent else "200 OK"
+    start_response(status, [("Content-Type", "text/plain; charset=utf-8")])
+    says = f"no heartbeat: {', '.join(silent)}" if silent else "every actor reports"
+    return [f"{says}\n".encode()]

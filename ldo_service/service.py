@@ -69,7 +69,7 @@ class Service:
         check_graph(GRAPH)
         self._require_known(self.only)
         self._require_known(self.config.service.spawned)
-        health = HealthCollector()
+        health = HealthCollector(self.network.robot, [box.name for box in GRAPH])
         if self.recording and not self.only:
             prepare_recording(self.recording)
         with ExitStack() as stack:

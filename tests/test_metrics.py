@@ -2,14 +2,17 @@
 
 import re
 import socket
+import time
+import urllib.error
 import urllib.request
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from ldo_service.errors import ConfigError
-from ldo_service.metrics import HealthCollector, exported
+from ldo_service.metrics import SILENT_S, HealthCollector, exported
 from ldo_service.schemas import encode
 from tests.runtime.conftest import free_port
 from tests.schemas.examples import EXAMPLES
@@ -18,7 +21,7 @@ from tests.schemas.examples import EXAMPLES
 @pytest.fixture
 def port() -> Iterator[int]:
     """Where the example's health is exported."""
-    collector, port = HealthCollector(), free_port()
+    collector, port = HealthCollector("mule", ["mapper"]), free_port()
     collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
     collector.heard(b"", memoryview(b"\xc1 no health message"))
     with exported(collector, port):
@@ -36,35 +39,63 @@ def scraped(port: int) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
     }
 
 
+def labels(*own: tuple[str, str]) -> tuple[tuple[str, str], ...]:
+    return tuple(sorted((("robot", "mule"), *own)))
+
+
+def asked(port: int) -> tuple[int, str]:
+    """Status and text of /healthz."""
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as reply:
+            return reply.status, reply.read().decode().strip()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read().decode().strip()
+
+
+def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) -> None:
+    collector, port = HealthCollector("mule", ["mapper", "tracker"]), free_port()
+    mapper = EXAMPLES["health"]  # it has failed and was restarted, which is past
+    with exported(collector, port):
+        assert asked(port) == (503, "no heartbeat: mapper, tracker")
+        collector.heard(b"", memoryview(encode(mapper)))
+        assert asked(port) == (503, "no heartbeat: tracker")
+        tracker = msgspec.structs.replace(mapper, actor="tracker")
+        collector.heard(b"", memoryview(encode(tracker)))
+        assert asked(port) == (200, "every actor reports")
+        later_s = time.monotonic() + 2 * SILENT_S
+        monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
+        assert asked(port) == (503, "no heartbeat: mapper, tracker")
+
+
 def test_every_number_of_a_health_message_is_exported(port: int) -> None:
     values = scraped(port)
     mapper = ("actor", "mapper")
     keyframes, view = ("topic", "keyframe/new"), ("topic", "map/view")
     expected = {
-        ("ldo_steps_total", (mapper,)): 100,
-        ("ldo_failures_total", (mapper,)): 2,
-        ("ldo_restarts_total", (mapper,)): 2,
-        ("ldo_set_aside_total", (mapper,)): 1,
-        ("ldo_step_age_seconds", (mapper,)): 0.25,
-        ("ldo_busy_seconds", (mapper,)): 0.125,
-        ("ldo_step_seconds", (mapper, ("quantile", "0.5"))): 0.02,
-        ("ldo_step_seconds", (mapper, ("quantile", "0.95"))): 0.0315,
-        ("ldo_resident_bytes", (mapper,)): 512.5e6,
-        ("ldo_held", (mapper,)): 0,
-        ("ldo_input_delivered_total", (mapper, keyframes)): 90,
-        ("ldo_input_dropped_total", (mapper, keyframes)): 0,
-        ("ldo_input_rejected_total", (mapper, keyframes)): 1,
-        ("ldo_input_paused_total", (mapper, keyframes)): 0,
-        ("ldo_input_lost_total", (mapper, keyframes)): 0,
-        ("ldo_input_gaps_total", (mapper, keyframes)): 2,
-        ("ldo_input_waiting", (mapper, keyframes)): 3,
-        ("ldo_output_sent_total", (mapper, view)): 90,
-        ("ldo_output_waited_total", (mapper, view)): 4,
-        ("ldo_output_evicted_total", (mapper, view)): 1,
-        ("ldo_output_repeated_total", (mapper, view)): 3,
-        ("ldo_fact", (mapper, ("fact", "gaussians"))): 1000,
+        ("ldo_steps_total", labels(mapper)): 100,
+        ("ldo_failures_total", labels(mapper)): 2,
+        ("ldo_restarts_total", labels(mapper)): 2,
+        ("ldo_set_aside_total", labels(mapper)): 1,
+        ("ldo_step_age_seconds", labels(mapper)): 0.25,
+        ("ldo_busy_seconds", labels(mapper)): 0.125,
+        ("ldo_step_seconds", labels(mapper, ("quantile", "0.5"))): 0.02,
+        ("ldo_step_seconds", labels(mapper, ("quantile", "0.95"))): 0.0315,
+        ("ldo_resident_bytes", labels(mapper)): 512.5e6,
+        ("ldo_held", labels(mapper)): 0,
+        ("ldo_input_delivered_total", labels(mapper, keyframes)): 90,
+        ("ldo_input_dropped_total", labels(mapper, keyframes)): 0,
+        ("ldo_input_rejected_total", labels(mapper, keyframes)): 1,
+        ("ldo_input_paused_total", labels(mapper, keyframes)): 0,
+        ("ldo_input_lost_total", labels(mapper, keyframes)): 0,
+        ("ldo_input_gaps_total", labels(mapper, keyframes)): 2,
+        ("ldo_input_waiting", labels(mapper, keyframes)): 3,
+        ("ldo_output_sent_total", labels(mapper, view)): 90,
+        ("ldo_output_waited_total", labels(mapper, view)): 4,
+        ("ldo_output_evicted_total", labels(mapper, view)): 1,
+        ("ldo_output_repeated_total", labels(mapper, view)): 3,
+        ("ldo_fact", labels(mapper, ("fact", "gaussians"))): 1000,
     }
-    age = values.pop(("ldo_heartbeat_age_seconds", (mapper,)))
+    age = values.pop(("ldo_heartbeat_age_seconds", labels(mapper)))
     assert age >= 0
     assert values == pytest.approx(expected)
 
@@ -91,16 +122,16 @@ def _own_address() -> str:
 def test_a_taken_port_is_said_and_can_be_had_again_afterwards(port: int) -> None:
     with (
         pytest.raises(ConfigError, match=re.escape(f"cannot listen on 127.0.0.1:{port}")),
-        exported(HealthCollector(), port),
+        exported(HealthCollector("mule"), port),
     ):
         pass
     other = free_port()
     for _ in range(2):
-        with exported(HealthCollector(), other):
+        with exported(HealthCollector("mule"), other):
             assert scraped(other) == {}
 
 
 @pytest.mark.parametrize("port_", [0, -1, 65536])
 def test_an_impossible_port_is_refused(port_: int) -> None:
-    with pytest.raises(ConfigError), exported(HealthCollector(), port_):
+    with pytest.raises(ConfigError), exported(HealthCollector("mule"), port_):
         pass

@@ -20,6 +20,7 @@ from ldo_service.authority import Authority
 from ldo_service.client import connect
 from ldo_service.commands.keys import router_yaml
 from ldo_service.metrics import HealthCollector
+from ldo_service.metrics import exported as exporting
 from ldo_service.runtime.access import read_access, rules_of
 from ldo_service.schemas import encode
 from ldo_service.schemas.pose import IDENTITY
@@ -41,6 +42,11 @@ def needs(tool: str) -> str:
     if path is None:
         pytest.skip(f"needs {tool} on the PATH")
     return path
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port()
 
 
 # --- the router -----------------------------------------------------------------------------------
@@ -94,7 +100,7 @@ def follow(desk: Any, wheels: Any) -> Iterator[Any]:
 # --- metrics --------------------------------------------------------------------------------------
 def exported() -> dict[str, set[str]]:
     """Labels of each sample that Prometheus gets, by its name."""
-    collector = HealthCollector()
+    collector = HealthCollector("mule")
     collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
     samples = [sample for family in collector.collect() for sample in family.samples]
     return {sample.name: set(sample.labels) for sample in samples}
@@ -110,7 +116,7 @@ def test_the_dashboard_shows_every_metric_by_labels_that_it_has() -> None:
     for expression in shown():
         ((name, selector),) = re.findall(r"(ldo_\w+)\{([^}]*)\}", expression)
         used.add(name)
-        labels = set(re.findall(r"(\w+)=", selector)) - {"robot"}  # robot: Prometheus' own
+        labels = set(re.findall(r"(\w+)=", selector))
         assert labels <= known[name], expression
     assert used == set(known) - {"ldo_held", "ldo_input_delivered_total", "ldo_input_gaps_total"}
 
@@ -128,11 +134,9 @@ def commands() -> Iterator[list[str]]:
     for service in compose["services"].values():
         if service["image"] == "ldo-slam" and "entrypoint" not in service:
             yield service["command"]
-        if "healthcheck" in service:
-            yield service["healthcheck"]["test"][2:]
     for document in documents("kubernetes.yaml"):
         for container in containers(document):
-            if container["image"] == "ldo-slam":
+            if container["image"].startswith("ldo-slam:"):
                 yield container["args"]
     (line,) = re.findall(r"^ExecStart=\S+/ldo (.*)$", UNIT.read_text(), re.MULTILINE)
     yield line.split()
@@ -155,6 +159,42 @@ def test_commands_name_verbs_and_options_that_there_are(
         cli.main([verb, "--help"])
     known = set(re.findall(r"--[\w-]+", capsys.readouterr().out))
     assert {word.partition("=")[0] for word in arguments if word.startswith("--")} <= known
+
+
+def test_containers_are_asked_for_their_health_where_they_tell_it(port: int) -> None:
+    """The test of compose.yaml itself, against a collector whose actors are silent or not."""
+    (compose,) = documents("compose.yaml")
+    service = compose["services"]["service"]
+    (metrics,) = [w.partition("=")[2] for w in service["command"] if w.startswith("--metrics=")]
+    *_, program = service["healthcheck"]["test"]
+    assert f":{metrics}/" in program
+    program = program.replace(f":{metrics}/", f":{port}/")
+    collector = HealthCollector("mule", ["mapper"])
+    with exporting(collector, port):
+        assert subprocess.run([sys.executable, "-c", program], capture_output=True).returncode
+        collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
+        subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_each_pod_of_the_fleet_sees_the_keys_of_its_own_robot(tmp_path: Path) -> None:
+    authority = Authority.new(tmp_path / "keys", days=2)
+    authority.add("robot-0", "service", "robot-0", days=1)
+    made = {path.name for path in (authority.folder / "robot-0").iterdir()}
+    (fleet,) = [d for d in documents("kubernetes.yaml") if d["kind"] == "StatefulSet"]
+    spec = fleet["spec"]["template"]["spec"]
+    (keys,) = [volume for volume in spec["volumes"] if volume["name"] == "keys"]
+    sources = [source["secret"] for source in keys["projected"]["sources"]]
+    assert len(sources) == fleet["spec"]["replicas"]
+    for number, secret in enumerate(sources):
+        robot = f"{fleet['metadata']['name']}-{number}"
+        assert secret["name"] == f"ldo-{robot}"
+        paths = {item["key"]: item["path"] for item in secret["items"]}
+        assert paths == {name: f"{robot}/{name}" for name in made}
+    ((mount,),) = [
+        [m for m in container["volumeMounts"] if m["name"] == "keys"]
+        for container in spec["containers"]
+    ]
+    assert mount["subPathExpr"] == "$(ROBOT)"
 
 
 def test_the_router_is_of_the_version_that_the_client_is() -> None:
@@ -182,11 +222,21 @@ def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     assert (done.returncode, ours) == (0, [])
 
 
+def compose_commands() -> Iterator[list[str]]:
+    """Of version 2, which reads the specification that files without a version have."""
+    for command in (["docker", "compose"], ["docker-compose"]):
+        if shutil.which(command[0]):
+            done = subprocess.run([*command, "version"], capture_output=True, text=True)
+            if done.returncode == 0 and " 1." not in done.stdout.splitlines()[0]:
+                yield command
+
+
 def test_compose_takes_the_file() -> None:
-    command = [needs("docker"), "compose", "--file", str(DEPLOY / "compose.yaml"), "config"]
-    if subprocess.run([*command[:2], "version"], capture_output=True).returncode != 0:
-        pytest.skip("needs the plug-in `docker compose`")
-    done = subprocess.run([*command, "--quiet"], capture_output=True, text=True)
+    command = next(compose_commands(), None)
+    if command is None:
+        pytest.skip("needs docker-compose, or docker with its plug-in `compose`")
+    file = ["--file", str(DEPLOY / "compose.yaml")]
+    done = subprocess.run([*command, *file, "config", "--quiet"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -197,6 +247,12 @@ def test_kustomize_takes_the_fleet(tmp_path: Path) -> None:
     done = subprocess.run([tool, "kustomize", str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert len(list(yaml.safe_load_all(done.stdout))) == len(documents("kubernetes.yaml"))
+
+
+def test_kubernetes_knows_every_field_of_the_fleet() -> None:
+    schemas = pytest.importorskip("kubernetes_validate", reason="pip install kubernetes-validate")
+    for document in documents("kubernetes.yaml"):
+        schemas.validate(document, schemas.latest_version(), strict=True)
 
 
 def test_what_the_fleet_mounts_is_there() -> None:
