@@ -3,23 +3,40 @@
 from collections.abc import Callable
 from dataclasses import replace
 from threading import Event, Thread
+from typing import Any
 
 import msgspec
+import numpy as np
 
 from ldo_service.client import Client
-from ldo_service.datasets import open_sequence
+from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import Camera
 from ldo_service.geometry.rectify import RawFrame
 from ldo_service.schemas import CameraRgbd
 from ldo_service.wire import camera_rgbd_message
 
-STRIDE, PERIOD_NS = 2, 100_000_000
+STRIDE, PERIOD_NS, FIRST_NS = 2, 100_000_000, 1_000_000_000
 
 
 def frames() -> list[CameraRgbd]:
     """There and back, without a jump where it begins again."""
     room = open_sequence("synthetic:room")
-    there = [camera_rgbd_message(_smaller(room.read(i))) for i in range(0, len(room), STRIDE)]
+    return _and_back([camera_rgbd_message(_smaller(room.read(i))) for i in _indices(room)])
+
+
+def true_poses() -> list[np.ndarray]:
+    """T_world_camera [4, 4] of each of `frames`."""
+    room = open_sequence("synthetic:room")
+    truth = room.truth()
+    assert truth is not None
+    return _and_back([truth.T_world_camera[i] for i in _indices(room)])
+
+
+def _indices(room: Sequence) -> range:
+    return range(0, len(room), STRIDE)
+
+
+def _and_back(there: list[Any]) -> list[Any]:
     return there + there[-2:0:-1]
 
 
@@ -27,6 +44,11 @@ def _smaller(raw: RawFrame) -> RawFrame:
     big = raw.camera
     camera = Camera(big.width // 2, big.height // 2, big.fx / 2, big.fy / 2, big.cx / 2, big.cy / 2)
     return replace(raw, camera=camera, color=raw.color[::2, ::2], depth=raw.depth[::2, ::2])
+
+
+def number_of(stamp_ns: int) -> int:
+    """How many frames were sent before the one with this stamp."""
+    return (stamp_ns - FIRST_NS) // PERIOD_NS
 
 
 class Streaming:
@@ -53,7 +75,7 @@ class Streaming:
     @property
     def stamp_ns(self) -> int:
         """Of the next frame."""
-        return 1_000_000_000 + self.sent * PERIOD_NS
+        return FIRST_NS + self.sent * PERIOD_NS
 
     def _stream(self, send: Callable[[CameraRgbd], None]) -> None:
         while not self._stop.wait(self._period_s):

@@ -24,11 +24,13 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from ldo_service.geometry import se3
 from ldo_service.map_follower import MapFollower
-from ldo_service.schemas import CameraRgbd, Health
+from ldo_service.schemas import CameraRgbd, Correction, Health, encode
 from ldo_service.schemas.topics import MAP_SNAPSHOT
+from ldo_service.wire import transform
 
-from .camera import Streaming, frames
+from .camera import Streaming, frames, number_of, true_poses
 from .life import (
     ACTORS,
     ALL_APART,
@@ -37,12 +39,16 @@ from .life import (
     Shown,
     arrays_of,
     difference,
+    objects_difference,
     saved_objects,
 )
 from .witness import TAKERS, Witness
 
 RATE_HZ = 5.0
 ON_ITS_WAY_S = 0.5  # a health of before, when what it tells of has been read
+AGAIN_SHARE = 0.3  # of faults: another comes before all have recovered
+UNJUDGED_SHARE = 0.3  # of faults: nothing waits for rest or is saved before the next
+OFF_MOST_M, OFF_MOST_RAD = 0.05, 0.05  # of a pose in the map: beyond, it was found elsewhere
 KEPT = ("tracker", *TAKERS)  # have something to lose
 
 # by placement: kinds, and how often each comes
@@ -60,6 +66,8 @@ class Outcome:
     recovered_s: float = 0.0  # and until everybody reports and has handled a new keyframe
     keyframes: int = 0
     objects: int = 0
+    compared: int = 0  # maps and graphs, to the bit
+    off_m: float = 0.0  # of the last pose, from the truth
     violations: list[str] = field(default_factory=list)
 
 
@@ -71,7 +79,8 @@ class Batch:
         settings = (ALL_APART,) if self.kinds is APART else ()
         self.life = Life(folder, self.witness, settings)
         self.camera = Streaming(scene, RATE_HZ)
-        self.compared = 0  # maps of followers with the mapper's
+        self.truth = true_poses()
+        self.compared, self.off_m = 0, 0.0
         self.objects = 0  # in the map
         self._killed: set[int] = set()  # processes
         self._now()
@@ -90,18 +99,25 @@ class Batch:
 
     def _meet(self, number: int) -> Outcome:
         self._killed.clear()
+        self.compared = 0
         (kind,) = self.rng.choices(list(self.kinds), list(self.kinds.values()))
         outcome = Outcome(self.number, number, kind)
         time.sleep(self.rng.uniform(0.0, 1.5))
         try:
             self._faults[kind](self, outcome)
+            if self.rng.random() < AGAIN_SHARE:
+                self._again(outcome)
             outcome.recovered_s = round(self._recovered(), 2)
             outcome.pose_s = round(self._pose_s, 2)
-            self._judge()
+            if self.rng.random() < UNJUDGED_SHARE:
+                outcome.what += ", not judged"
+            else:
+                self._judge()
         except NotRecovered as error:
             self.witness.violations.append(f"{error}\n{self.life.tail()}")
             self._begin_again()
         outcome.keyframes, outcome.objects = len(self.witness.made), self.objects
+        outcome.compared, outcome.off_m = self.compared, round(self.off_m, 4)
         outcome.violations, self.witness.violations = self.witness.violations, []
         return outcome
 
@@ -132,6 +148,19 @@ class Batch:
     def _end(self, actor: str, how: signal.Signals) -> None:
         self._killed.add(self._pid(actor))
         os.kill(self._pid(actor), how)
+
+    def _again(self, outcome: Outcome) -> None:
+        """A kill while they recover."""
+        time.sleep(self.rng.uniform(0.0, 3.0))
+        if self.kinds is APART and self.witness.health:
+            actor = self.rng.choice(sorted(self.witness.health))
+            outcome.what += f", then {actor}"
+            with suppress(ProcessLookupError):  # it is gone already
+                self._end(actor, signal.SIGKILL)
+            self._now()
+        else:
+            outcome.what += ", then all"
+            self._service(outcome)
 
     def _stop(self, outcome: Outcome) -> None:
         """A process that lives and does nothing: it is silent, and killed."""
@@ -203,6 +232,10 @@ class Batch:
         if self.life.process.poll() is None:
             self.life.kill()
         self.life.close()
+        if self.rng.random() < AGAIN_SHARE:  # as it comes back
+            self.life.start()
+            time.sleep(self.rng.uniform(0.0, 2.0))
+            self.life.kill()
         expected = self.life.expected()
         self.camera.skip(self.rng.randrange(8))
         self.life.start()
@@ -239,8 +272,13 @@ class Batch:
         return time.monotonic() - self._met_s
 
     def _is_tracked(self) -> bool:
+        """In the map, not in a segment that is not joined to it."""
         pose = self.witness.pose
-        return pose is not None and pose.stamp_ns >= self._stamp_ns and pose.status == "OK"
+        return (
+            pose is not None
+            and pose.stamp_ns >= self._stamp_ns
+            and (pose.status, pose.segment) == ("OK", 0)
+        )
 
     def _all_report(self) -> bool:
         heard = self.witness.health
@@ -255,6 +293,7 @@ class Batch:
         life.wait("all keyframes are handled by all", witness.is_caught_up)
         life.wait("the graph has them all", lambda: set(witness.made) <= witness.placed)
         witness.violations += witness.repeated()
+        self._is_where_it_is()
         saved = self._saved_and_told()
         self._same_keyframes("the mapper", saved["map"]["views"]["placed"].tolist())
         self._same_objects(saved)
@@ -262,6 +301,24 @@ class Batch:
         self._same_map("who joined late", saved, witness.late)
         witness.join_late(life.client.last(MAP_SNAPSHOT, 10))
         self.camera.start(life.client)
+
+    def _is_where_it_is(self) -> None:
+        """The last pose in the map is the true one, as far as tracking goes."""
+        pose, first_ns = self.witness.pose, self.witness.first_stamp_ns
+        if pose is None or first_ns is None or (pose.status, pose.segment) != ("OK", 0):
+            return
+        count = len(self.truth)
+        T_true = (
+            se3.inverse(self.truth[number_of(first_ns) % count])
+            @ self.truth[number_of(pose.stamp_ns) % count]
+        )
+        T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+        T_off = se3.inverse(T_true) @ T_map_camera
+        self.off_m, off_rad = float(se3.distances(T_off)), se3.rotation_angle(T_off)
+        if self.off_m > OFF_MOST_M or off_rad > OFF_MOST_RAD:
+            self.witness.violations.append(
+                f"the pose is {self.off_m:.2f} m and {off_rad:.2f} rad off"
+            )
 
     def _wait_until_still(self) -> None:
         """Until everybody has said, and said again, that nothing waits or is under way."""
@@ -315,15 +372,39 @@ class Batch:
         if what := difference(arrays_of(expected.map), arrays_of(shown.map)):
             self.witness.violations.append(f"the map after the restart has other {what}")
         if expected.objects != shown.objects and not self._has_gone_on():
-            self.witness.violations.append("the map after the restart has other objects")
+            what = objects_difference(expected.objects, shown.objects)
+            self.witness.violations.append(f"the map after the restart has other objects: {what}")
+        self.compared += 1
+        self._must_place(expected.graph)
+
+    def _must_place(self, expected: Correction | None) -> None:
+        """The graph after a restart has the poses that its state on the disk leads to; what mapper
+        and loop closer send again may have moved it on by now."""
+        if expected is None:
+            return
+        version = expected.graph_version
+        self.life.wait("the graph is told", lambda: self._graph_version() >= version)
+        told = self.life.told()
+        if told is not None and told.graph is not None and told.graph.graph_version == version:
+            self.compared += 1
+            if encode(told.graph) != encode(expected):
+                self.witness.violations.append("the graph after the restart has other poses")
+
+    def _graph_version(self) -> int:
+        told = self.life.told()
+        return -1 if told is None or told.graph is None else told.graph.graph_version
 
     def _has_gone_on(self) -> bool:
         """Whether the mapper has taken anything since it began: its first objects are then not its
         last. What it tells once all is quiet is compared with what it saves."""
         sure_s = time.monotonic() + ON_ITS_WAY_S
-        heard = self.witness.health
-        self.life.wait("its health", lambda: "mapper" in heard and heard["mapper"][0] > sure_s)
-        return any(count.delivered for count in heard["mapper"][1].inputs)
+
+        def has_ended_a_step() -> bool:
+            at_s, mapper = self.witness.health.get("mapper", (0.0, None))
+            return mapper is not None and at_s > sure_s and mapper.busy_s == 0
+
+        self.life.wait("the mapper at rest", has_ended_a_step)
+        return any(count.delivered for count in self.witness.health["mapper"][1].inputs)
 
     def _is_shown(self, expected: Shown) -> bool:
         """Objects are told after the map."""
@@ -394,7 +475,8 @@ def summary_of(outcome: Outcome) -> str:
     return (
         f"batch {outcome.batch} fault {outcome.number:2d}  {outcome.kind:13s} {outcome.what:28s} "
         f"pose {outcome.pose_s:5.1f} s, all {outcome.recovered_s:5.1f} s, "
-        f"{outcome.keyframes} keyframes, {outcome.objects} objects  {said}"
+        f"{outcome.keyframes} keyframes, {outcome.objects} objects, {outcome.compared} compared, "
+        f"{100 * outcome.off_m:.1f} cm off  {said}"
     )
 
 
@@ -410,6 +492,8 @@ def table(outcomes: list[Outcome]) -> str:
             f"| {kind} | {len(of)} | {pose[0]:.1f} / {pose[1]:.1f} | "
             f"{whole[0]:.1f} / {whole[1]:.1f} | {broken} |"
         )
+    compared, off_m = sum(o.compared for o in outcomes), max(o.off_m for o in outcomes)
+    lines += ["", f"{compared} maps and graphs compared, poses at most {100 * off_m:.1f} cm off"]
     return "\n".join(lines)
 
 

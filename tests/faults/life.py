@@ -19,6 +19,7 @@ import numpy as np
 
 from ldo_service.actors.graph import GRAPH
 from ldo_service.actors.mapper import Mapper
+from ldo_service.actors.optimizer import Optimizer
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
@@ -28,8 +29,8 @@ from ldo_service.runtime.ledger import Past, successor
 from ldo_service.runtime.network import Network
 from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.zenoh_transport import open_session
-from ldo_service.schemas import MapObject, MapObjects, MapSnapshot
-from ldo_service.schemas.topics import MAP_OBJECTS, MAP_SNAPSHOT
+from ldo_service.schemas import Correction, MapObject, MapObjects, MapSnapshot
+from ldo_service.schemas.topics import GRAPH_CORRECTION, MAP_OBJECTS, MAP_SNAPSHOT
 from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.wire import map_objects
 
@@ -52,21 +53,25 @@ class NotRecovered(Exception):
 
 @dataclass(frozen=True)
 class Shown:
-    """What a service shows of its map."""
+    """What a service shows of its map and its graph."""
 
     map: MapFollower
     objects: tuple[MapObject, ...]
+    graph: Correction | None
 
     @classmethod
     def of(cls, messages: Iterable[Any]) -> "Shown | None":
         """None where there is no map."""
-        follower, objects = MapFollower(), ()
+        follower, objects, graph = MapFollower(), (), None
         for message in messages:
-            if isinstance(message, MapObjects):
-                objects = message.objects
-            else:
-                follower.take(message)
-        return cls(follower, objects) if follower.version else None
+            match message:
+                case MapObjects():
+                    objects = message.objects
+                case Correction():
+                    graph = message
+                case _:
+                    follower.take(message)
+        return cls(follower, objects, graph) if follower.version else None
 
 
 class Life:
@@ -162,13 +167,14 @@ class Life:
 
     def told(self) -> Shown | None:
         """What who joins now is told."""
-        topics = MAP_SNAPSHOT, MAP_OBJECTS
+        topics = MAP_SNAPSHOT, MAP_OBJECTS, GRAPH_CORRECTION
         return Shown.of(message for topic in topics for message in self.client.last(topic, 10))
 
     def expected(self) -> Shown | None:
         """What a service must show that goes on from the state on the disk: its checkpoint, with
         what was taken since handled again in this process. None before the first keyframe."""
-        past = Past.of(FolderStore(self.state / "state").load("mapper"))
+        store = FolderStore(self.state / "state")
+        past, of_graph = Past.of(store.load("mapper")), Past.of(store.load("optimizer"))
         if not past.of_actor:
             return None
         copy = self.folder / "copy"
@@ -176,11 +182,17 @@ class Life:
         shutil.copytree(self.state / "map", copy)
         config = load_config(settings=self.settings).with_map_folder(copy)
 
-        def make() -> Mapper:
+        def mapper() -> Mapper:
             return Mapper(config.mapper)
 
-        said = successor(make(), past, make).resumed()
-        return Shown.of(m for m in said if isinstance(m, MapSnapshot | MapObjects))
+        def optimizer() -> Optimizer:
+            return Optimizer(config.optimizer)
+
+        said = [
+            *successor(mapper(), past, mapper).resumed(),
+            *successor(optimizer(), of_graph, optimizer).resumed(),
+        ]
+        return Shown.of(m for m in said if isinstance(m, MapSnapshot | MapObjects | Correction))
 
 
 def saved_objects(state: Mapping[str, Any]) -> tuple[MapObject, ...]:
@@ -205,6 +217,19 @@ def difference(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -
             anchors = sorted(set(one["anchors"][others].tolist()))
             return f"{name}: {len(others)} of {len(a)}, of keyframes {anchors}"
     return ""
+
+
+def objects_difference(one: Iterable[MapObject], other: Iterable[MapObject]) -> str:
+    """Of objects, by id: which are in one alone, and what else is not the same."""
+    a, b = ({thing.id: thing for thing in things} for things in (one, other))
+    fields = [
+        f"{name} of {k}: {before} and {now}"
+        for k in sorted(a.keys() & b.keys())
+        for name in a[k].__struct_fields__
+        if (before := getattr(a[k], name)) != (now := getattr(b[k], name))
+    ]
+    alone = [f"only in one: {sorted(a.keys() ^ b.keys())}"] if a.keys() != b.keys() else []
+    return "; ".join([*alone, *fields])[:400]
 
 
 def children_of(pid: int) -> set[int]:

@@ -31,6 +31,7 @@ def test_after_each_fault_nothing_is_lost_or_doubled(
     Batch(batch, 7, tmp_path, scene).run(faults=12, tell=outcomes.append)
     assert len(outcomes) == 12
     assert [outcome for outcome in outcomes if outcome.violations] == []
+    assert sum(outcome.compared for outcome in outcomes) > len(outcomes) // 2
 
 
 # --- the judge ------------------------------------------------------------------------------------
@@ -91,10 +92,13 @@ def test_a_campaign_goes_on_where_it_was_interrupted(tmp_path: Path) -> None:
 
 def test_the_table_has_a_row_for_each_kind() -> None:
     outcomes = [
-        Outcome(0, 0, "kill", pose_s=1.0, recovered_s=2.0),
-        Outcome(0, 1, "disk", pose_s=3.0, recovered_s=4.0, violations=["broken"]),
+        Outcome(0, 0, "kill", pose_s=1.0, recovered_s=2.0, compared=3, off_m=0.01),
+        Outcome(
+            0, 1, "disk", pose_s=3.0, recovered_s=4.0, compared=2, off_m=0.02, violations=["broken"]
+        ),
     ]
-    kill, whole = table(outcomes).splitlines()[3:]
+    kill, whole, _, said = table(outcomes).splitlines()[3:]
     assert kill == "| kill | 1 | 1.0 / 1.0 | 2.0 / 2.0 | 0 |"
     assert whole.startswith("| all | 2 |")
     assert whole.endswith("| 1 |")
+    assert said == "5 maps and graphs compared, poses at most 2.0 cm off"

@@ -48,6 +48,7 @@ class Witness:
     map_version: int = 0
     last_delta: tuple[int, int] = (0, -1)  # epoch and number
     pose: TrackedPose | None = None
+    first_stamp_ns: int | None = None  # of keyframe 0, whose frame the map's is
     health: dict[str, tuple[float, Health]] = field(default_factory=dict)
     follower: MapFollower = field(default_factory=MapFollower)  # from the first message on
     late: MapFollower = field(default_factory=MapFollower)  # from the last fault on
@@ -116,6 +117,8 @@ class Witness:
 
     # --- judging ----------------------------------------------------------------------------------
     def _made(self, message: Keyframe, header: Header, digest: bytes) -> None:
+        if message.keyframe == 0:
+            self.first_stamp_ns = message.stamp_ns
         known = self.made.setdefault(message.keyframe, digest)
         if known != digest:
             self.violations.append(f"keyframe {message.keyframe} was made twice")
