@@ -240,7 +240,7 @@ def oversized(lab: Lab) -> str:
 
 
 @attempt(
-    f"a camera puts {FLOOD} frames at once on an input that keeps 4", "4 wait, rest is counted"
+    f"a client puts {FLOOD} messages at once on an input that keeps 4", "4 wait, rest is counted"
 )
 def flood(lab: Lab) -> str:
     """What arrives is counted beside the input, on the same session."""
