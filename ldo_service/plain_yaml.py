@@ -30,11 +30,19 @@ def plain_values(text: str | bytes) -> Any:
     Parsed in Python: libyaml, in C, overflows its stack where brackets are nested deeply.
     """
     try:
-        return yaml.load(text, _Loader)
+        return _loaded(text)
     except RecursionError:
         raise yaml.YAMLError("it is nested too deeply") from None
     except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2027-13-01
         raise yaml.YAMLError(" ".join(str(error).split())) from error
+
+
+def _loaded(text: str | bytes) -> Any:
+    loader = _Loader(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
 
 
 def plain_text(values: Any, *, flow: bool | None = False, width: float = 80) -> str:

@@ -45,7 +45,7 @@ from .life import (
 from .witness import TAKERS, Witness
 
 RATE_HZ = 5.0
-ON_ITS_WAY_S = 0.5  # a health of before, when what it tells of has been read
+BEATS = 6  # of a heart that say the same: 1.5 s, longer than one is on its way
 AGAIN_SHARE = 0.3  # of faults: another comes before all have recovered
 UNJUDGED_SHARE = 0.3  # of faults: nothing waits for rest or is saved before the next
 OFF_MOST_M, OFF_MOST_RAD = 0.05, 0.05  # of a pose in the map: beyond, it was found elsewhere
@@ -397,14 +397,21 @@ class Batch:
     def _has_gone_on(self) -> bool:
         """Whether the mapper has taken anything since it began: its first objects are then not its
         last. What it tells once all is quiet is compared with what it saves."""
-        sure_s = time.monotonic() + ON_ITS_WAY_S
+        heard: list[tuple[float, Health]] = []  # heartbeats of the mapper from now on
 
-        def has_ended_a_step() -> bool:
-            at_s, mapper = self.witness.health.get("mapper", (0.0, None))
-            return mapper is not None and at_s > sure_s and mapper.busy_s == 0
+        def is_at_rest() -> bool:
+            beat = self.witness.health.get("mapper")
+            if beat is not None and beat not in heard[-1:]:
+                heard.append(beat)
+            last = [health for _, health in heard[-BEATS:]]
+            return (
+                len(last) == BEATS
+                and len({h.steps for h in last}) == 1
+                and all(map(_is_idle, last))
+            )
 
-        self.life.wait("the mapper at rest", has_ended_a_step)
-        return any(count.delivered for count in self.witness.health["mapper"][1].inputs)
+        self.life.wait("the mapper at rest", is_at_rest)
+        return any(count.delivered for count in heard[-1][1].inputs)
 
     def _is_shown(self, expected: Shown) -> bool:
         """Objects are told after the map."""
