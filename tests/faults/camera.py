@@ -7,6 +7,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import zenoh
 
 from ldo_service.client import Client
 from ldo_service.datasets import Sequence, open_sequence
@@ -80,5 +81,8 @@ class Streaming:
     def _stream(self, send: Callable[[CameraRgbd], None]) -> None:
         while not self._stop.wait(self._period_s):
             frame = self._scene[self.sent % len(self._scene)]
-            send(msgspec.structs.replace(frame, frame=self.sent, stamp_ns=self.stamp_ns))
+            try:
+                send(msgspec.structs.replace(frame, frame=self.sent, stamp_ns=self.stamp_ns))
+            except zenoh.ZError:
+                return  # the service has ended, and its session with it
             self.sent += 1
