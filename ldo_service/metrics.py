@@ -99,12 +99,11 @@ class HealthCollector(Collector):
             yield metric
 
     def silent(self) -> list[str]:
-        """Actors that do not report; all of them before the first heartbeat."""
+        """Those of the actors that do not report; all of them before the first heartbeat."""
         since_s = time.monotonic() - SILENT_S
         with self._lock:
-            known = {*self._actors, *self._last}
             heard = {actor for actor, (at_s, _) in self._last.items() if at_s > since_s}
-        return sorted(known - heard)
+        return sorted({*self._actors} - heard)
 
     @staticmethod
     def _ages(last: dict[str, tuple[float, Health]]) -> Metric:

@@ -1,6 +1,7 @@
 """Plain values out of YAML that somebody wrote, and back.
 
-Numbers are those of YAML 1.2: in 1.1, which PyYAML reads, `2e-4` is text for want of a point.
+Numbers with an exponent are those of YAML 1.2: in 1.1, which PyYAML reads, `2e-4` is text for want
+of a point.
 """
 
 import re

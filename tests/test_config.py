@@ -35,7 +35,7 @@ def test_settings_change_what_the_file_left(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("written", ["2e-1", "2E-1", ".2e0", "+2.e-1", "0.2", "200e-3"])
-def test_numbers_are_those_of_yaml_1_2(written: str) -> None:
+def test_exponents_are_those_of_yaml_1_2(written: str) -> None:
     assert load_config(settings=[f"stage.heartbeat_s={written}"]).stage.heartbeat_s == 0.2
 
 

@@ -6,6 +6,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
+from contextlib import suppress
 
 import msgspec
 import pytest
@@ -65,6 +66,17 @@ def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) ->
         later_s = time.monotonic() + 2 * SILENT_S
         monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
         assert asked(port) == (503, "no heartbeat: mapper, tracker")
+
+
+@pytest.mark.parametrize("address", ["localhost", "127.0.0.1", "::1"])
+def test_any_address_of_this_machine_will_do(address: str) -> None:
+    port = free_port()
+    with suppress(ConfigError), exported(HealthCollector("mule"), port, address):  # no IPv6 here
+        url = f"http://{f'[{address}]' if ':' in address else address}:{port}/healthz"
+        with urllib.request.urlopen(url, timeout=5) as reply:
+            assert reply.status == 200
+            return
+    assert address == "::1", "only IPv6 may be missing"
 
 
 def test_every_number_of_a_health_message_is_exported(port: int) -> None:

@@ -77,7 +77,7 @@ def rotation_angle(T: Array) -> float:
 
 
 def rotation_angles(T: Array) -> Array:
-    """Those [...] of many T [..., 4, 4]."""
+    """Angles [...] of the rotations of T [..., 4, 4] in radians, 0..pi."""
     R = T[..., :3, :3]
     pairs = ((2, 1), (0, 2), (1, 0))
     twice_sin = np.stack([R[..., i, j] - R[..., j, i] for i, j in pairs], axis=-1)

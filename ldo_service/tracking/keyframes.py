@@ -132,7 +132,7 @@ def has_left(
     T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
     """Whether a view is elsewhere than its keyframe, or shows too little of it."""
-    is_elsewhere = bool(shares_left(T_keyframe_camera, median_depth_m, config) > 1)
+    is_elsewhere = bool(shares_of_limits(T_keyframe_camera, median_depth_m, config) > 1)
     return is_elsewhere or overlap < config.min_overlap
 
 
@@ -140,18 +140,18 @@ def is_worth_mapping(
     T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
     """Whether a view has left the last one that was mapped far enough to support it."""
-    left = float(shares_left(T_mapped_camera, median_depth_m, config))
+    left = float(shares_of_limits(T_mapped_camera, median_depth_m, config))
     return left > config.supporting and config.supporting <= 1
 
 
-def shares_left(
+def shares_of_limits(
     T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray | float, config: KeyframeConfig
 ) -> np.ndarray:
-    """[...] how far cameras have gone of what they may before a keyframe is due: the larger share
-    of way and turn. T_keyframe_camera [..., 4, 4], median_depth_m [...]."""
-    way = se3.distances(T_keyframe_camera) / median_depth_m
-    turn_rad = se3.rotation_angles(T_keyframe_camera)
-    return np.maximum(way / config.max_translation, turn_rad / config.max_rotation_rad)
+    """[...] of how far a camera may go before a keyframe is due, the larger share of translation
+    and rotation. T_keyframe_camera [..., 4, 4], median_depth_m [...]."""
+    translation = se3.distances(T_keyframe_camera) / median_depth_m
+    rotation_rad = se3.rotation_angles(T_keyframe_camera)
+    return np.maximum(translation / config.max_translation, rotation_rad / config.max_rotation_rad)
 
 
 def movable_in(view: Pyramid, boxes: Sequence[Box], config: MovableConfig) -> np.ndarray:

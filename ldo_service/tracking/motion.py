@@ -43,5 +43,5 @@ def extent(T: np.ndarray, median_depth_m: float) -> float:
 
 
 def extents(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:
-    """That of many [...]: T [..., 4, 4], median_depth_m [...]."""
+    """Shifts [...] in rad of T [..., 4, 4] at median_depth_m [...]."""
     return se3.rotation_angles(T) + se3.distances(T) / median_depth_m

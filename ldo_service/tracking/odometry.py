@@ -46,7 +46,7 @@ from .relocalisation import RelocalisationConfig, Relocaliser
 from .returning import ReturnConfig, Returning, SeenAgain, nearby
 from .segments import Join, Look, SegmentConfig
 from .shape import ShapeConfig
-from .state import Footing, State, packed, unpacked
+from .state import Origin, State, packed, unpacked
 from .tracked import Tracked, report
 from .window import EarlierKeyframes, WindowConfig, measured_from
 
@@ -128,8 +128,8 @@ class Odometry:
                 return self._lost(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, Status.OK
             # noise is another elsewhere, and what has gone is of another keyframe
-            footing = Footing.KNOWN if self.may_return else Footing.NEW
-            self._state = replace(self._state, history=History(), suspicion=None, footing=footing)
+            origin = Origin.KNOWN if self.may_return else Origin.NEW
+            self._state = replace(self._state, history=History(), suspicion=None, origin=origin)
         tracked = self._accepted(frame, keyframe, candidate, status)
         return self._joining(tracked, keyframe, view)
 
@@ -258,7 +258,7 @@ class Odometry:
     @property
     def is_tied(self) -> bool:
         """Whether the keyframe tracked against is a known one, or was measured from one."""
-        return self._state.footing is not Footing.NEW
+        return self._state.origin is not Origin.NEW
 
     def state(self) -> dict[str, Any]:
         """All that the next frames depend on, in arrays and plain values.
@@ -414,7 +414,7 @@ class Odometry:
         if status is Status.OK:
             is_moving = self._watched(keyframe, self._view(frame), alignment)
         frames = self._state.frames_since_keyframe
-        is_known = self._state.footing is Footing.KNOWN
+        is_known = self._state.origin is Origin.KNOWN
         if is_known:
             # what was put there since then does not move, and an old keyframe does for any time
             is_moving, frames = None, min(frames, config.keyframes.max_frames - 1)

@@ -20,7 +20,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from .align import AlignConfig
 from .candidates import Candidate, apart_rad, attempt
 from .judgement import History, JudgementConfig, Status, judge
-from .keyframes import Keyframe, KeyframeConfig, has_left, shares_left
+from .keyframes import Keyframe, KeyframeConfig, has_left, shares_of_limits
 from .places import Place
 from .pyramid import Pyramid, PyramidConfig
 
@@ -114,6 +114,6 @@ def nearby(
     if not known:
         return []
     T_camera = se3.inverse(np.array([T_map_keyframe[p.id] for p in known])) @ T_map_camera
-    left = shares_left(T_camera, np.array([place.median_depth_m for place in known]), config)
+    left = shares_of_limits(T_camera, np.array([place.median_depth_m for place in known]), config)
     order = np.argsort(left, kind="stable")
     return [(known[k], T_camera[k]) for k in order if left[k] <= 1]

@@ -16,8 +16,8 @@ from .pyramid import PyramidConfig
 from .segments import Segments
 
 
-class Footing(StrEnum):
-    """What a map that holds many keyframes knows of the one tracked against."""
+class Origin(StrEnum):
+    """Of the keyframe tracked against, where a map holds many."""
 
     NEW = "new"
     TIED = "tied"  # new, and measured from a known one
@@ -34,7 +34,7 @@ class State:
     status: Status = Status.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
-    footing: Footing = Footing.NEW
+    origin: Origin = Origin.NEW
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
     segments: Segments = field(default_factory=Segments)
@@ -51,7 +51,7 @@ class State:
             self._against(keyframe, keyframe.T_odom_keyframe),
             places=self.places.added(place, config),
             next_id=keyframe.id + 1,
-            footing=Footing.TIED if is_tied else Footing.NEW,
+            origin=Origin.TIED if is_tied else Origin.NEW,
         )
 
     def with_known(self, keyframe: Keyframe, place: Place, T_odom_camera: np.ndarray) -> "State":
@@ -59,7 +59,7 @@ class State:
         return replace(
             self._against(keyframe, T_odom_camera),
             places=self.places.returned_to(place),
-            footing=Footing.KNOWN,
+            origin=Origin.KNOWN,
             is_moving=None,
         )
 
@@ -85,7 +85,7 @@ def packed(state: State) -> dict[str, Any]:
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
-        "footing": state.footing.value,
+        "origin": state.origin.value,
         "trusted": state.trusted,
         "searches": state.searches,
         "segments": state.segments.packed,
@@ -109,7 +109,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         status=Status(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
-        footing=Footing(values["footing"]),
+        origin=Origin(values["origin"]),
         trusted=values["trusted"],
         searches=values["searches"],
         segments=Segments.unpacked(values["segments"]),

@@ -45,3 +45,5 @@ def test_features_are_detected_once(room) -> None:
 def test_limits_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ConfigError, match="min_frames"):
         KeyframeConfig(min_frames=31)
+    with pytest.raises(ConfigError, match="max_translation=0"):
+        KeyframeConfig(max_translation=0)
