@@ -49,9 +49,14 @@ def test_prometheus_sees_every_actor_count(tmp_path: Path) -> None:
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as reply:
                 return reply.read().decode()
 
-        wait_until(lambda: _value(text(), 'ldo_steps_total{actor="mapper"}') > 0, 10, "steps")
+        def value(name: str, actor: str) -> float:
+            return _value(text(), f'{name}{{actor="{actor}",robot="robot"}}')
+
+        wait_until(lambda: value("ldo_steps_total", "mapper") > 0, 10, "steps")
         for actor in (box.name for box in GRAPH):
-            assert _value(text(), f'ldo_resident_bytes{{actor="{actor}"}}') > 1e6
+            assert value("ldo_resident_bytes", actor) > 1e6
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as reply:
+            assert reply.read() == b"every actor reports\n"
         assert publisher.wait(20) == 0
         second = subprocess.run(
             [*LDO, "serve", "--endpoint", f"tcp/127.0.0.1:{free_port()}", "--metrics", str(port)],
