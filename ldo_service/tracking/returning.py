@@ -32,10 +32,8 @@ class ReturnConfig:
     after: int = 1500  # keyframes, supporting ones too: from then on known ones are looked for; 0:
     # never. Until then the map gains more by new views than they take, a few kB each
     tries: int = 2  # places per frame, the nearest first: 8 ms each at 640x480
-    agreement_rad: float = (
-        0.03  # rotation plus parallax between map and images: 1.7 degrees, or 3 %
-    )
-    # of the median depth; above, keyframes are made until a loop is closed
+    agreement_rad: float = 0.03  # rotation plus parallax between map and images, 3 % of the median
+    # depth; above, keyframes are made until a loop is closed
     min_geometric_inliers: float = 0.85  # of the depths that meet a surface, as when relocalised
 
     def __post_init__(self) -> None:

@@ -56,13 +56,13 @@ class Shown:
     """What a service shows of its map and its graph."""
 
     map: MapFollower
-    objects: tuple[MapObject, ...]
+    objects: tuple[MapObject, ...] | None  # None before any were told, or where nobody looked
     graph: Correction | None
 
     @classmethod
     def of(cls, messages: Iterable[Any]) -> "Shown | None":
         """None where there is no map."""
-        follower, objects, graph = MapFollower(), (), None
+        follower, objects, graph = MapFollower(), None, None
         for message in messages:
             match message:
                 case MapObjects():
