@@ -69,7 +69,8 @@ class Service:
         check_graph(GRAPH)
         self._require_known(self.only)
         self._require_known(self.config.service.spawned)
-        health = HealthCollector(self.network.robot, [box.name for box in GRAPH])
+        names, silent_after_s = [box.name for box in GRAPH], self.config.service.silent_after_s
+        health = HealthCollector(self.network.robot, names, silent_after_s)
         if self.recording and not self.only:
             prepare_recording(self.recording)
         with ExitStack() as stack:
@@ -224,7 +225,8 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
     """Keep the folder to this service, and see that the states in it belong together.
 
     Keyframe ids and versions run through all of them: going on from a part would join keyframes of
-    two different journeys. Raises ConfigError.
+    two different journeys. Raises ConfigError, and DataError where the disk does not let them be
+    read.
     """
     lock = stack.enter_context((folder / "lock").open("w"))
     try:

@@ -5,6 +5,7 @@ sees what was meant or is told that it is damaged. Not synced to the disk, so a 
 the last ones.
 """
 
+import errno
 import logging
 import shutil
 import struct
@@ -19,6 +20,7 @@ log = logging.getLogger(__name__)
 
 _HEADER = struct.Struct("<4sI")  # magic, CRC-32 of the rest
 _MAGIC = b"LDO1"
+_OF_PROCESS = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # limits that say nothing of a file
 _UNFINISHED = ".new"  # added to the name while a file is written
 
 
@@ -67,11 +69,14 @@ class SealedFolder:
         return True
 
     def read(self, number: int) -> memoryview:
-        """What was written. Raises DataError for a file that is not what was written."""
+        """What was written. Raises DataError for a file that is not what was written, and OSError
+        where this process can open no more."""
         path = self._path(number)
         try:
             data = memoryview(path.read_bytes())
         except OSError as error:
+            if error.errno in _OF_PROCESS:
+                raise
             raise DataError(f"{path} cannot be read: {error}") from error
         body = data[_HEADER.size :]
         if bytes(data[: _HEADER.size]) != _HEADER.pack(_MAGIC, zlib.crc32(body)):

@@ -8,11 +8,14 @@ import logging
 import os
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
 import numpy as np
+
+from ldo_service.errors import DataError
 
 from .actor import State
 
@@ -69,15 +72,13 @@ class FolderStore:
         if not state:
             return
         folder = self._folder / actor
-        is_new = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
-        if is_new and self._syncs:
-            sync(self._folder)
-        saved = self._saved.get(actor, {})
-        if actor not in self._files:
+        if actor not in self._saved:
+            if self._syncs:
+                sync(self._folder)
             self._files[actor] = _read_contents_or_nothing(folder)
             _sweep(folder, self._files[actor])
-        old = self._files[actor]
+        saved, old = self._saved.get(actor, {}), self._files[actor]
         new = dict(old)
         for part, value in state.items():
             if part not in saved or saved[part] is not value:
@@ -85,17 +86,15 @@ class FolderStore:
                 self._write(folder / new[part], encode_state(value))
         new = {part: new[part] for part in state}
         if new != old:
-            self._write_contents(folder, new)
+            temporary = folder / f"{CONTENTS}.new"
+            self._write(temporary, msgspec.msgpack.encode(new))
+            self._saved.pop(actor, None)  # these files may be named from now on, whatever fails
+            temporary.rename(folder / CONTENTS)
+            if self._syncs:
+                sync(folder)
         for file in set(old.values()) - set(new.values()):
-            (folder / file).unlink(missing_ok=True)
+            _remove(folder / file)
         self._saved[actor], self._files[actor] = dict(state), new
-
-    def _write_contents(self, folder: Path, files: Mapping[str, str]) -> None:
-        temporary = folder / f"{CONTENTS}.new"
-        self._write(temporary, msgspec.msgpack.encode(files))
-        temporary.rename(folder / CONTENTS)
-        if self._syncs:
-            sync(folder)
 
     def _write(self, path: Path, body: bytes) -> None:
         path.write_bytes(body)
@@ -103,27 +102,34 @@ class FolderStore:
             sync(path)
 
     def load(self, actor: str) -> State | None:
-        """None when nothing was saved, or what was saved cannot be read: said in the log, and
-        kept beside it, the last time it happened, for whoever can make something of it."""
+        """None when nothing was saved, or what was saved makes no sense: said in the log, and
+        kept beside it, the last time it happened, for whoever can make something of it.
+
+        Raises DataError where there is something and the disk, or a limit, does not let it be read.
+        """
         folder = self._folder / actor
         try:
             files = _read_contents(folder)
             parts = {
                 part: decode_state((folder / file).read_bytes()) for part, file in files.items()
             }
-        except (OSError, ValueError) as error:  # a name may hold a null byte
+        except (FileNotFoundError, ValueError) as error:  # a name may hold a null byte
             log.error("%s: its saved state cannot be read and is left out: %s", actor, error)
             _set_aside(folder)
             return None
+        except OSError as error:
+            raise DataError(
+                f"the state of {actor} in {folder} cannot be read: {error.strerror}. It is as it "
+                "was: mend the disk, or raise the limit that was met, and start again."
+            ) from error
         return parts or None
 
     def forget(self, actor: str) -> None:
         folder = self._folder / actor
+        self._saved.pop(actor, None)
         (folder / CONTENTS).unlink(missing_ok=True)  # first: what it does not name is not read
         for file in folder.glob("*"):
-            file.unlink()
-        self._saved.pop(actor, None)
-        self._files.pop(actor, None)
+            _remove(file)
 
 
 def _set_aside(folder: Path) -> None:
@@ -139,12 +145,21 @@ def _sweep(folder: Path, files: Mapping[str, str]) -> None:
     """Remove what a killed process wrote and did not name, or no longer named."""
     for file in folder.glob("*"):
         if file.name not in (CONTENTS, *files.values()):
-            file.unlink()
+            _remove(file)
+
+
+def _remove(file: Path) -> None:
+    """One that nothing names: if it stays, it costs space until the next process sweeps."""
+    with suppress(OSError):
+        file.unlink()
 
 
 def _read_contents(folder: Path) -> dict[str, str]:
-    path = folder / CONTENTS
-    return msgspec.msgpack.decode(path.read_bytes(), type=dict[str, str]) if path.exists() else {}
+    try:
+        body = (folder / CONTENTS).read_bytes()
+    except FileNotFoundError:
+        return {}
+    return msgspec.msgpack.decode(body, type=dict[str, str])
 
 
 def _read_contents_or_nothing(folder: Path) -> dict[str, str]:

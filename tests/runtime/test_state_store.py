@@ -1,9 +1,13 @@
+import errno
+import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ldo_service.errors import DataError
 from ldo_service.runtime import state_store
 from ldo_service.runtime.state_store import FolderStore, MemoryStore
 
@@ -95,6 +99,107 @@ def break_off(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
         return write(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", write_half)
+
+
+def test_files_that_are_named_are_not_written_to_when_what_came_after_their_naming_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next save may be cut off in the middle by a kill, as `break_off` does."""
+    store, folder, same = FolderStore(tmp_path, syncs=True), tmp_path / "mapper", [0]
+    store.save("mapper", {"same": same, "step": [1], "old": [1]})
+    sync = state_store.sync
+
+    def fail(path: Path) -> None:
+        if path == folder:
+            raise OSError("fsync failed")
+        sync(path)
+
+    monkeypatch.setattr(state_store, "sync", fail)
+    with pytest.raises(OSError, match="fsync failed"):
+        store.save("mapper", {"same": same, "step": [2]})
+    monkeypatch.undo()
+    break_off(monkeypatch, "step")
+    with pytest.raises(OSError, match="disk full"):
+        store.save("mapper", {"same": same, "step": [3]})
+    assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
+    monkeypatch.undo()
+    store.save("mapper", {"same": same, "step": [4]})
+    assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [4]}
+    assert len(list(folder.iterdir())) == 3, "what was to be removed is"
+
+
+@pytest.mark.parametrize("call", ["rename", "unlink"])
+def test_what_the_disk_may_have_done_all_the_same_is_looked_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    """As on a network, where the answer is lost and not the request."""
+    store, same = FolderStore(tmp_path), [0]
+    store.save("mapper", {"same": same, "step": [1], "old": [1]})
+    do = getattr(os, call)
+
+    def do_and_fail(*arguments: object, **options: object) -> None:
+        do(*arguments, **options)
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, call, do_and_fail)
+    with suppress(OSError):
+        store.save("mapper", {"same": same, "step": [2]})
+    monkeypatch.undo()
+    break_off(monkeypatch, "step")
+    with pytest.raises(OSError, match="disk full"):
+        store.save("mapper", {"same": same, "step": [3]})
+    assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
+
+
+def test_what_cannot_be_removed_stops_no_save(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    FolderStore(tmp_path).save("mapper", {"step": [0]})
+    (tmp_path / "mapper" / "left.a").write_bytes(b"")
+    monkeypatch.setattr(os, "unlink", refuse)
+    store = FolderStore(tmp_path)
+    for step in (1, 2):
+        store.save("mapper", {"step": [step]})
+    assert FolderStore(tmp_path).load("mapper") == {"step": [2]}
+
+
+def test_what_was_forgotten_on_a_bad_disk_is_written_whole_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, same = FolderStore(tmp_path), [0]
+    store.save("mapper", {"same": same})
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "unlink", refuse)
+    with suppress(OSError):
+        store.forget("mapper")
+    monkeypatch.undo()
+    store.save("mapper", {"same": same, "step": [1]})
+    assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [1]}
+    store.forget("mapper")
+    assert FolderStore(tmp_path).load("mapper") is None
+    store.save("mapper", {"same": same})
+    assert FolderStore(tmp_path).load("mapper") == {"same": [0]}
+
+
+def test_a_disk_that_does_not_answer_is_no_reason_to_begin_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    FolderStore(tmp_path).save("mapper", {"step": [1]})
+
+    def fail(_: Path) -> bytes:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(Path, "read_bytes", fail)
+    with pytest.raises(DataError, match=r"Too many open files\. It is as it was"):
+        FolderStore(tmp_path).load("mapper")
+    monkeypatch.undo()
+    assert FolderStore(tmp_path).load("mapper") == {"step": [1]}
 
 
 def test_a_part_that_is_gone_is_gone_from_the_folder(tmp_path: Path) -> None:

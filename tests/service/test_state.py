@@ -8,8 +8,8 @@ import pytest
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
-from ldo_service.errors import ConfigError
-from ldo_service.runtime.state_store import FolderStore
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.runtime.state_store import CONTENTS, FolderStore
 from ldo_service.service import claim_state
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}
@@ -43,6 +43,19 @@ def test_one_that_lost_a_part_of_a_journey_is_refused(tmp_path: Path, missing: s
     saved(tmp_path, 5, *(name for name in ACTORS if name != missing))
     with pytest.raises(ConfigError, match=f"no readable state of {missing} beside"):
         claim(tmp_path)
+
+
+def test_one_that_the_disk_does_not_let_be_read_is_left_as_it_is(tmp_path: Path) -> None:
+    saved(tmp_path, 5, *ACTORS)
+    contents = tmp_path / "state" / "mapper" / CONTENTS
+    body = contents.read_bytes()
+    contents.unlink()
+    contents.mkdir()  # which fails to be read, whoever asks
+    with pytest.raises(DataError, match=r"the state of mapper in .* cannot be read"):
+        claim(tmp_path)
+    contents.rmdir()
+    contents.write_bytes(body)
+    claim(tmp_path)
 
 
 def test_one_whose_tracker_is_of_an_older_copy_is_refused(tmp_path: Path) -> None:
