@@ -25,14 +25,20 @@ from ldo_service.schemas import Health, InputCount, OutputCount, decode
 
 LOOPBACK = "127.0.0.1"  # anyone who may read them may also see where the robot is at work
 MOST_ACTORS = 64  # that are kept; a name is what a message says
-SILENT_S = 15.0  # after service.silent_after_s an actor is killed, and back some seconds later
+COMES_BACK_S = 5.0  # an actor, once it was killed for its silence
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
 OF_ACTOR: dict[Row, Callable[[Health], float]] = {
     (CounterMetricFamily, "steps", "messages handled"): lambda h: h.steps,
-    (CounterMetricFamily, "failures", "exceptions in the handler"): lambda h: h.failures,
-    (CounterMetricFamily, "restarts", "times the actor was rebuilt"): lambda h: h.restarts,
+    (
+        CounterMetricFamily,
+        "failures",
+        "handlers, successors or last words that raised, and first of saves that failed",
+    ): lambda h: h.failures,
+    (CounterMetricFamily, "restarts", "times the actor was rebuilt within its process"): lambda h: (
+        h.restarts
+    ),
     (CounterMetricFamily, "set_aside", "messages that failed twice"): lambda h: h.set_aside,
     (GaugeMetricFamily, "step_age_seconds", "since the last step ended"): lambda h: h.step_age_s,
     (GaugeMetricFamily, "busy_seconds", "age of the step under way"): lambda h: h.busy_s,
@@ -59,8 +65,12 @@ OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
 class HealthCollector(Collector):
     """Keeps the last heartbeat of each actor of a robot."""
 
-    def __init__(self, robot: str, actors: Iterable[str] = ()) -> None:
+    def __init__(
+        self, robot: str, actors: Iterable[str] = (), silent_after_s: float = 10.0
+    ) -> None:
+        """`silent_after_s`: until then an actor may say nothing, see `service`."""
         self._robot, self._actors = robot, tuple(actors)
+        self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
         self._last: dict[str, tuple[float, Health]] = {}  # by actor: when it was heard
 
@@ -100,7 +110,7 @@ class HealthCollector(Collector):
 
     def silent(self) -> list[str]:
         """Those of the actors that do not report; all of them before the first heartbeat."""
-        since_s = time.monotonic() - SILENT_S
+        since_s = time.monotonic() - self._silent_after_s
         with self._lock:
             heard = {actor for actor, (at_s, _) in self._last.items() if at_s > since_s}
         return sorted({*self._actors} - heard)

@@ -13,7 +13,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from ldo_service.errors import ConfigError
-from ldo_service.metrics import SILENT_S, HealthCollector, exported
+from ldo_service.metrics import COMES_BACK_S, HealthCollector, exported
 from ldo_service.schemas import encode
 from tests.runtime.conftest import free_port
 from tests.schemas.examples import EXAMPLES
@@ -63,9 +63,18 @@ def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) ->
         tracker = msgspec.structs.replace(mapper, actor="tracker")
         collector.heard(b"", memoryview(encode(tracker)))
         assert asked(port) == (200, "every actor reports")
-        later_s = time.monotonic() + 2 * SILENT_S
+        later_s = time.monotonic() + 2 * (10 + COMES_BACK_S)
         monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
         assert asked(port) == (503, "no heartbeat: mapper, tracker")
+
+
+def test_who_may_be_silent_for_long_is_not_missed_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    patient, hasty = (HealthCollector("mule", ["mapper"], silent_s) for silent_s in (60, 5))
+    for collector in (patient, hasty):
+        collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
+    later_s = time.monotonic() + 30
+    monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
+    assert (patient.silent(), hasty.silent()) == ([], ["mapper"])
 
 
 @pytest.mark.parametrize("address", ["localhost", "127.0.0.1", "::1"])
