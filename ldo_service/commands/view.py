@@ -75,5 +75,5 @@ def serve_window(source: Source, config: ViewerConfig, title: str) -> None:
     with open_window(source, config, title) as window:
         Console(stderr=True, highlight=False).print(f"{title} on {window.url}")
         while True:
-            window.show(source.update())
+            window.show(source.update(is_watched=window.is_watched))
             time.sleep(config.update_s)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 
 from ldo_service.client import Client
-from ldo_service.schemas import Keyframe
+from ldo_service.schemas import Health, Keyframe
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
@@ -38,10 +38,17 @@ KEPT: dict[
 STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)  # what a late joiner asks for
 
 
+ANEW = ("tracker", "mapper")  # both began anew: so did the map, or it is told again
+TOGETHER_S = 30.0  # from one to the other of a service that starts; apart, each went on by itself
+
+
 class Live:
     """Made by `live`."""
 
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
+        self._service = service
+        self._epochs: dict[str, int] = {}  # of those in ANEW
+        self._began_s: dict[str, float] = {}  # when another one was first heard of
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
             stack.enter_context(service.listen(_name(topic), topic.message, keep))
@@ -50,21 +57,41 @@ class Live:
         self._until_camera = stack.enter_context(ExitStack())
         listen = service.listen(KEYFRAME_NEW.name, Keyframe, keep=1)
         self._keyframes: Callable[[], list[Keyframe]] = self._until_camera.enter_context(listen)
+        self._ask()
+
+    def _ask(self) -> None:
+        """For what was said before."""
         for topic in STATES:
-            for message in service.last(topic):
+            for message in self._service.last(topic):
                 self._live.take(message)
 
     @property
     def scene(self) -> Scene:
         return self._live.scene
 
-    def update(self) -> set[Layer]:
+    def update(self, *, is_watched: bool = True) -> set[Layer]:
         for inbox in self._inboxes:
             for message in inbox():
                 self._live.take(message)
+                if isinstance(message, Health):
+                    self._note_epoch(message)
         if not self._live.has_camera:
             self._learn_camera()
-        return self._live.update()
+        return self._live.update() if is_watched else set()
+
+    def _note_epoch(self, health: Health) -> None:
+        """A service that was started again, or was told to reset, may count from the beginning:
+        its versions say nothing beside those of before."""
+        if health.actor not in ANEW:
+            return
+        if self._epochs.setdefault(health.actor, health.epoch) != health.epoch:
+            self._epochs[health.actor] = health.epoch
+            self._began_s[health.actor] = time.monotonic()
+        began_s = self._began_s.values()
+        if len(began_s) == len(ANEW) and max(began_s) - min(began_s) < TOGETHER_S:
+            self._began_s.clear()
+            self._live.begin_anew()
+            self._ask()
 
     def _learn_camera(self) -> None:
         """From one keyframe: these are large, and all of one camera."""

@@ -23,7 +23,7 @@ from .config import ViewerConfig
 from .known_gaussians import KnownGaussians
 from .lines import MOST_SIGHTS
 from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
-from .scene import Layer, Scene, Sight
+from .scene import Layer, Scene, Sight, sights_of
 
 MOST_ACTORS = 64  # whose health is told; a name is what a message says
 MOST_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with
@@ -38,17 +38,17 @@ class LiveScene:
         self._heard: dict[str, panel.Heard] = {}
         self._pose_rate, self._poses = panel.Rate(), 0
         self._told_s = -FACTS_EVERY_S
-        self._gaussians = KnownGaussians(config.most_gaussians)
         self.scene = Scene()
-        self._begin()
+        self.begin_anew()
 
-    def _begin(self) -> None:
-        """The map is empty."""
+    def begin_anew(self) -> None:
+        """The map is empty, and what comes is of another one."""
+        self._gaussians = KnownGaussians(self._config.most_gaussians)
         self.scene = Scene(camera=self.scene.camera)
         self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
         self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
         self._correction: Correction | None = None
-        self._pose: TrackedPose | None = None
+        self._pose: panel.HeardPose | None = None
         self._changed: set[Layer] = set(get_args(Layer)) - {"facts"}
 
     @property
@@ -69,17 +69,15 @@ class LiveScene:
             case MapDelta() | MapSnapshot():
                 self._take_map(message)
             case MapObjects():
-                self.scene.objects = message
-                self._changed.add("objects")
+                self._take_objects(message)
             case LoopClosure():
-                self._loops[message.pose.reference, message.pose.keyframe] = None
-                self._changed.add("loops")
+                self._take_loop(message)
             case Health():
                 self._take_health(message)
 
     def _take_pose(self, pose: TrackedPose) -> None:
         self._poses += 1
-        self._pose = pose
+        self._pose = panel.HeardPose(pose, self._clock())
         if pose.status == "LOST":
             return
         self.scene.T_map_camera = T_map_camera_of(pose)
@@ -96,6 +94,15 @@ class LiveScene:
         self._keyframes.correct(correction)
         self._changed |= {"keyframes", "final", "loops"}
 
+    def _take_objects(self, objects: MapObjects) -> None:
+        if self.scene.objects is None:  # what was seen before anybody listened
+            sights = sights_of(objects)
+            newest = sorted(sights)[-self._config.most_keyframes :]
+            self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
+            self._changed.add("keyframes")
+        self.scene.objects = objects
+        self._changed.add("objects")
+
     def _take_boxes(self, boxes: DetectionBoxes) -> None:
         found = (Sight(one.label, one.box_px) for one in islice(boxes.detections, MOST_SIGHTS))
         sights = self.scene.sights
@@ -104,9 +111,15 @@ class LiveScene:
             del sights[next(iter(sights))]
         self._changed.add("keyframes")
 
+    def _take_loop(self, loop: LoopClosure) -> None:
+        self._loops[loop.pose.reference, loop.pose.keyframe] = None
+        while len(self._loops) > MOST_LOOPS:
+            del self._loops[next(iter(self._loops))]
+        self._changed.add("loops")
+
     def _take_map(self, message: MapDelta | MapSnapshot) -> None:
         if isinstance(message, MapDelta) and message.since == 0 and self._gaussians.version:
-            self._begin()  # on request, see `ldo control reset`
+            self.begin_anew()  # on request, see `ldo control reset`
         if self._gaussians.take(message):
             self._changed.add("gaussians")
 
@@ -142,8 +155,6 @@ class LiveScene:
 
     def _agreed_loops(self) -> tuple[tuple[int, int], ...]:
         """Heard of or in the newest correction, but for those that it does not believe."""
-        while len(self._loops) > MOST_LOOPS:
-            del self._loops[next(iter(self._loops))]
         if self._correction is None:
             return tuple(self._loops)
         named = dict.fromkeys((*self._loops, *self._correction.closures))
@@ -160,7 +171,7 @@ class LiveScene:
         )
         return "\n\n".join(
             (
-                panel.of_pose(self._pose, self._pose_rate),
+                panel.of_pose(self._pose, self._pose_rate, self._clock()),
                 counts,
                 panel.of_health(self._heard.values(), self._clock()),
             )

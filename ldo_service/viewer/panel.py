@@ -84,10 +84,22 @@ class Heard:
     rate: Rate
 
 
-def of_pose(pose: TrackedPose | None, poses: Rate) -> str:
-    if pose is None:
+@dataclass(slots=True)
+class HeardPose:
+    """The last one."""
+
+    pose: TrackedPose
+    at_s: float
+
+
+def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
+    if heard is None:
         return "no pose yet"
+    pose, silent_s = heard.pose, now_s - heard.at_s
     where = f", segment {pose.segment} not joined" if pose.segment else ""
+    if silent_s > SILENT_AFTER_S:
+        silent = f"**no pose for {silent_s:.0f} s**"
+        return f"{silent}; the last was {pose.status} at frame {pose.frame:,}{where}"
     return f"**{pose.status}** at frame {pose.frame:,}, {poses.hz:.1f} poses/s{where}"
 
 

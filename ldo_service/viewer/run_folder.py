@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from ldo_service.runs.objects_file import OBJECTS, read_objects
 
 from . import panel
 from .config import ViewerConfig
-from .scene import Layer, Scene, Sight, thinned
+from .scene import Layer, Scene, sights_of, thinned
 from .splats import weightiest
 
 Signature = tuple[int, int]  # time of the last change, ns, and size, bytes
@@ -31,20 +31,29 @@ class RunFolder:
         """Raises DataError for a folder that is none, or that no run wrote to."""
         if not folder.is_dir():
             raise DataError(f"{folder} is not a folder: name that of an `ldo run`, or `live`.")
-        self.scene = Scene()
         self._folder, self._config = folder, config
-        self._seen: dict[str, tuple[Path, Signature]] = {}
-        self._problems: dict[str, str] = {}  # by file
-        self._summary: dict[str, Any] | None = None
-        self._frames = self._gaussians = 0
+        self._begin()
         if not any(_signature(folder / name) for name in ("config.yaml", *PARTS)):
             raise DataError(
                 f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt: "
                 "name the folder that was its --out."
             )
 
-    def update(self) -> set[Layer]:
+    def _begin(self) -> None:
+        """Nothing is read yet."""
+        self.scene = Scene()
+        self._seen: dict[str, tuple[Path, Signature]] = {}
+        self._problems: dict[str, str] = {}  # by file
+        self._summary: dict[str, Any] | None = None
+        self._frames = self._gaussians = 0
+
+    def update(self, *, is_watched: bool = True) -> set[Layer]:
+        if not is_watched:
+            return set()
         changed: set[Layer] = set()
+        if any(_signature(self._path(name)) is None for name in self._seen):
+            self._begin()  # another run writes here now
+            changed |= set(get_args(Layer))
         for name, (layers, read) in PARTS.items():
             if self._is_news(name):
                 self._read(name, read)
@@ -122,12 +131,7 @@ class RunFolder:
     def read_objects(self, path: Path) -> None:
         """Their views are the detections that a run keeps."""
         self.scene.objects = read_objects(path.parent)
-        sights: dict[int, tuple[Sight, ...]] = {}
-        for one in self.scene.objects.objects:
-            for view in one.views:
-                others = sights.get(view.keyframe, ())
-                sights[view.keyframe] = (*others, Sight(one.name, view.box_px))
-        self.scene.sights = sights
+        self.scene.sights = sights_of(self.scene.objects)
 
     def read_loops(self, path: Path) -> None:
         found = read_loops(path.parent)

@@ -46,9 +46,19 @@ class Source(Protocol):
     @property
     def scene(self) -> Scene: ...
 
-    def update(self) -> set[Layer]:
-        """Take what is new; says what changed."""
+    def update(self, *, is_watched: bool = True) -> set[Layer]:
+        """Take what is new; says what changed. Where nobody watches that waits."""
         ...
+
+
+def sights_of(objects: MapObjects) -> dict[int, tuple[Sight, ...]]:
+    """Those that it names as the views of its objects, by keyframe."""
+    sights: dict[int, tuple[Sight, ...]] = {}
+    for one in objects.objects:
+        for view in one.views:
+            others = sights.get(view.keyframe, ())
+            sights[view.keyframe] = (*others, Sight(one.name, view.box_px))
+    return sights
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:

@@ -3,6 +3,7 @@
 import io
 import logging
 import math
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -12,7 +13,8 @@ import numpy as np
 import viser
 
 from ldo_service.answers import Answer, answer
-from ldo_service.errors import LdoError
+from ldo_service.errors import ConfigError, LdoError
+from ldo_service.metrics import LOOPBACK
 from ldo_service.schemas import MapObject
 
 from .config import ViewerConfig
@@ -69,16 +71,26 @@ class Window:
         self._clock = clock
         self._due: set[Layer] = set()  # changed, and not shown yet
         self._drawn_s: dict[Layer, float] = {}
-        self._has_view = False
+        self._begin()
         self._nodes: dict[str, Any] = {}  # of viser, by name
         self._names: dict[int, Any] = {}  # labels, by object
         server.scene.set_up_direction(up_of({}))
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._build_panel(title)
 
+    def _begin(self) -> None:
+        """With another map."""
+        self._shown = self._scene
+        self._leveled_by = 0  # keyframes; 0: nobody has a view yet
+        self._found: int | None = None  # the object that was asked for
+
     @property
     def url(self) -> str:
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    @property
+    def is_watched(self) -> bool:
+        return bool(self._server.get_clients())
 
     @property
     def _scene(self) -> Scene:
@@ -111,8 +123,10 @@ class Window:
     def show(self, changed: set[Layer]) -> None:
         """Draw what changed, but no layer more often than it may be. While no browser is there
         nothing is drawn, and all of it is due."""
+        if self._scene is not self._shown:
+            self._begin()
         self._due |= changed
-        if not self._server.get_clients():
+        if not self.is_watched:
             return
         now_s = self._clock()
         with self._server.atomic():
@@ -147,8 +161,8 @@ class Window:
         T_map_camera = self._scene.T_map_camera
         here = () if T_map_camera is None else (T_map_camera,)
         self._draw_lines("camera", keyframe_lines(here, self._scene.camera, ONLINE))
-        if T_map_camera is not None and not self._has_view:
-            self._has_view = True
+        if T_map_camera is not None and not self._leveled_by:
+            self._level()
             self._look_along(T_map_camera)
 
     def _draw_online(self) -> None:
@@ -164,6 +178,8 @@ class Window:
         self._draw_lines("keyframes", keyframe_lines(keyframes.values(), scene.camera))
         self._draw_lines("sights", sight_lines(keyframes, scene.camera, scene.sights))
         self._draw_loops()
+        if self._leveled_by and len(scene.keyframes) >= 2 * self._leveled_by:
+            self._level()
 
     def _draw_loops(self) -> None:
         lines = loop_lines(self._scene.loops, self._scene.keyframes)
@@ -176,6 +192,12 @@ class Window:
             self._names.pop(gone).remove()
         for one in objects:
             self._draw_name(one)
+        self._draw_found()
+
+    def _draw_found(self) -> None:
+        there = self._scene.objects.objects if self._scene.objects else ()
+        found = [one for one in there if one.id == self._found]
+        self._draw_lines("found", box_lines(found, FOUND), VERY_THICK_PX)
 
     def _shown_objects(self) -> list[MapObject]:
         found = self._scene.objects
@@ -223,10 +245,14 @@ class Window:
             )
 
     # --- camera of the browser --------------------------------------------------------------------
+    def _level(self) -> None:
+        """By the keyframes so far: the first one alone may be tilted."""
+        self._leveled_by = max(1, len(self._scene.keyframes))
+        self._server.scene.set_up_direction(up_of(self._scene.keyframes))
+
     def _look_along(self, T_map_camera: np.ndarray) -> None:
         """For all browsers that are there and will be; from then on the view is theirs."""
         view = overview(T_map_camera)
-        self._server.scene.set_up_direction(up_of(self._scene.keyframes))
         initial = self._server.initial_camera
         initial.position, initial.look_at = view.position, view.look_at
         for client in self._server.get_clients().values():
@@ -254,8 +280,11 @@ class Window:
             return
         self._answers.content = "\n".join(map(_line, answers[:MOST_ANSWERS]))
         (best,) = (one for one in found.objects if one.id == answers[0].id)
-        self._draw_lines("found", box_lines([best], FOUND), VERY_THICK_PX)
+        self._found = best.id
+        self._due.add("objects")
         for view in flight(start, view_of(best, keyframes, start.position), FLIGHT_STEPS):
+            if client.client_id not in self._server.get_clients():
+                return  # it was closed
             _set_view(client, view)
             time.sleep(FLIGHT_STEP_S)
 
@@ -271,9 +300,24 @@ def _line(one: Answer) -> str:
     return f"- **{escaped(one.name)}** {one.id}: {one.score:.2f}{away}"
 
 
+def _require_own(address: str) -> None:
+    """viser would try port after port for ever."""
+    try:
+        ((family, *_, where), *_) = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)
+        with socket.socket(family, socket.SOCK_STREAM) as listener:
+            listener.bind(where)
+    except OSError as error:
+        raise ConfigError(
+            f"viewer.address={address}: {error.strerror}. It must be this machine's own, such as "
+            f"{LOOPBACK}, or 0.0.0.0 for all of them."
+        ) from error
+
+
 @contextmanager
 def open_window(source: Source, config: ViewerConfig, title: str) -> Iterator[Window]:
-    """Serve a window on `config.address`, on the first free port from `config.port` on."""
+    """Serve a window on `config.address`, on the first free port from `config.port` on. Raises
+    ConfigError for an address that this machine does not have."""
+    _require_own(config.address)
     logging.getLogger("websockets.server").setLevel(logging.WARNING)  # else a line per browser
     with redirect_stdout(io.StringIO()):  # viser introduces itself
         server = Server(host=config.address, port=config.port, label=title, verbose=False)

@@ -57,7 +57,7 @@ def look(endpoint: str, wanted: Event, is_ready: Event) -> None:
         ):
             is_ready.set()
             while wanted.is_set():
-                window.show(source.update())
+                window.show(source.update(is_watched=window.is_watched))
                 time.sleep(CONFIG.update_s)
         is_ready.clear()
 

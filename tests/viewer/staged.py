@@ -22,7 +22,7 @@ class Staged:
         self.scene = scene
         self.changed: set[Layer] = set(EVERY_LAYER)
 
-    def update(self) -> set[Layer]:
+    def update(self, *, is_watched: bool = True) -> set[Layer]:  # noqa: ARG002
         changed, self.changed = self.changed, set()
         return changed
 

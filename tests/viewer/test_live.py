@@ -1,9 +1,11 @@
 """A service on the network as a source of a scene, over TLS with a viewer's keys."""
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import zenoh
@@ -12,7 +14,7 @@ from ldo_service.authority import Authority
 from ldo_service.client import connect
 from ldo_service.runtime.keys import Keys
 from ldo_service.runtime.zenoh_transport import Network, open_session
-from ldo_service.schemas import Message, encode
+from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
@@ -130,6 +132,64 @@ def test_who_comes_late_is_told_what_there_is(
         robot.says(MAP_DELTA, changing.delta())
         wait_until(lambda: "gaussians" in source.update(), 10, "the next change")
         np.testing.assert_array_equal(source.scene.rows, changing.map.rows)
+
+
+@pytest.mark.parametrize("first", [1, 4], ids=["from its beginning", "from later on"])
+def test_a_service_that_is_started_again_with_an_empty_map_is_followed(
+    robot: Robot, source: Live, first: int
+) -> None:
+    """Its versions begin at 0, and what is heard first may be any of them."""
+    old, new = ChangingMap(1), ChangingMap(2)
+    for _ in range(5):
+        robot.says(MAP_DELTA, old.delta())
+    robot.says(GRAPH_CORRECTION, EXAMPLES["correction"])
+    lives(robot, epoch=1)
+    wait_until(lambda: shows(source, old) and bool(source.scene.keyframes), 10, "the old map")
+    deltas = [new.delta() for _ in range(6)][first - 1 : 4]
+    robot.says(MAP_DELTA, *deltas[:1])
+    told = new.snapshot(parts=2)
+    with robot.answers(MAP_SNAPSHOT, *told):
+        lives(robot, epoch=2)
+        wait_until(lambda: shows(source, new), 10, "the new map")
+    assert not source.scene.keyframes, "those of the old one are gone"
+
+
+def test_an_actor_that_was_started_again_alone_goes_on_with_the_map(
+    robot: Robot, source: Live
+) -> None:
+    old = ChangingMap(1)
+    robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
+    robot.says(MAP_DELTA, old.delta(), old.delta())
+    lives(robot, epoch=1)
+    wait_until(lambda: shows(source, old), 10, "the map")
+    lives(robot, epoch=2, actors=("mapper",))
+    robot.says(MAP_DELTA, old.delta())
+    wait_until(lambda: shows(source, old), 10, "it goes on")
+    assert len(source.scene.online) == 1, "and the path is kept"
+
+
+def lives(robot: Robot, epoch: int, actors: tuple[str, ...] = ("tracker", "mapper")) -> None:
+    health = EXAMPLES["health"]
+    assert isinstance(health, Health)
+    for actor in actors:
+        beat = msgspec.structs.replace(health, actor=actor, epoch=epoch)
+        robot.says(HEALTH, beat, below=f"/{actor}")
+
+
+def shows(source: Live, changing: ChangingMap) -> bool:
+    source.update()
+    return np.array_equal(source.scene.rows, changing.map.rows)
+
+
+def test_what_nobody_watches_is_not_worked_out_and_not_lost(robot: Robot, source: Live) -> None:
+    changing = ChangingMap()
+    robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
+    robot.says(MAP_DELTA, changing.delta())
+    for _ in range(20):
+        assert source.update(is_watched=False) == set()
+        time.sleep(0.05)
+    assert len(source.scene.online) == 0
+    wait_until(lambda: shows(source, changing) and len(source.scene.online) == 1, 10, "all of it")
 
 
 def test_only_one_keyframe_is_fetched_for_its_lens(robot: Robot, source: Live) -> None:

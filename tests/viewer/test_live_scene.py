@@ -14,6 +14,7 @@ from ldo_service.schemas import (
     LoopClosure,
     MapObjects,
     Message,
+    ObjectView,
     TrackedPose,
 )
 from ldo_service.viewer.config import ViewerConfig
@@ -174,6 +175,26 @@ def test_detections_belong_to_their_keyframe_and_the_oldest_go(clock: Clock) -> 
     assert (sight.name, sight.box_px) == ("cup", (1.0, 2.0, 3.0, 4.0))
 
 
+def test_who_comes_late_sees_what_objects_were_seen_in(live: LiveScene) -> None:
+    cup = Detection(label="cup", score=0.9, box_px=(1.0, 2.0, 3.0, 4.0))
+    boxes = DetectionBoxes(
+        stamp_ns=0, keyframe=1, width=64, height=48, detections=(cup,), network="n"
+    )
+    assert "keyframes" in taken(live, boxes, seen_in(1, 5))
+    assert [sight.name for sight in live.scene.sights[1]] == ["cup"], "of what came itself"
+    (sight,) = live.scene.sights[5]
+    assert sight.box_px == (5.0, 6.0, 7.0, 8.0)
+    assert "keyframes" not in taken(live, seen_in(9)), "from now on boxes come"
+
+
+def seen_in(*keyframes: int) -> MapObjects:
+    found = EXAMPLES["map_objects"]
+    assert isinstance(found, MapObjects)
+    views = tuple(ObjectView(keyframe=k, box_px=(5.0, 6.0, 7.0, 8.0)) for k in keyframes)
+    one = msgspec.structs.replace(found.objects[0], views=views)
+    return msgspec.structs.replace(found, objects=(one,))
+
+
 def test_loops_are_those_that_the_optimizer_believes(live: LiveScene) -> None:
     taken(live, closure(1, 8), closure(2, 9))
     assert live.scene.loops == ((1, 8), (2, 9))
@@ -217,7 +238,8 @@ def test_health_and_rates_are_told(live: LiveScene, clock: Clock) -> None:
         clock.now_s += 1
         taken(live)
     assert "**silent 7 s**" in live.scene.facts
-    assert "0.0 poses/s" in live.scene.facts
+    assert "**no pose for 7 s**; the last was OK at frame 10" in live.scene.facts
+    assert "poses/s" not in live.scene.facts
 
 
 def test_words_change_no_faster_than_they_can_be_read(live: LiveScene, clock: Clock) -> None:

@@ -105,6 +105,30 @@ def test_a_map_that_changes_is_read_again(run: Path) -> None:
     np.testing.assert_array_equal(folder.scene.rows[:, 0:6], rows[:, 0:6])
 
 
+def test_a_run_that_is_written_anew_leaves_nothing_of_the_old_one(run: Path) -> None:
+    """As `ldo run --overwrite` does it, one file after the other; there are no objects yet."""
+    write_objects(run, FOUND)
+    folder = RunFolder(run, CONFIG)
+    folder.update()
+    assert folder.scene.objects is not None
+    for name in PARTS:
+        (run / name).unlink(missing_ok=True)
+        folder.update()
+    shutil.copy(run / "config.yaml", run / "frames.csv")
+    folder.update()
+    scene = folder.scene
+    assert scene.objects is None
+    assert len(scene.rows) == len(scene.online) == len(scene.final) == len(scene.keyframes) == 0
+    assert "under way" in scene.facts
+
+
+def test_a_folder_is_not_read_while_nobody_watches(run: Path) -> None:
+    folder = RunFolder(run, CONFIG)
+    assert folder.update(is_watched=False) == set()
+    assert len(folder.scene.rows) == 0
+    assert "gaussians" in folder.update()
+
+
 def test_what_was_refined_is_shown_in_place_of_the_runs_own(run: Path) -> None:
     folder = RunFolder(run, CONFIG)
     folder.update()
