@@ -67,8 +67,10 @@ OFF_MOST_M, OFF_MOST_RAD = 0.05, 0.05  # of a pose in the map: beyond, it was fo
 KEPT = ("tracker", *TAKERS)  # have something to lose
 
 # by placement: kinds, and how often each comes
-APART = {"kill": 10, "stop": 1, "hang": 2, "disk": 3, "network": 3, "service": 1}
-TOGETHER = {"service": 10, "optimizer": 2, "disk": 3, "network": 3, "hang in main": 1}
+DISK_AND_NETWORK = {"full disk": 3, "bad disk": 3, "network": 3}
+APART = {"kill": 10, "stop": 1, "hang": 2, "service": 1, **DISK_AND_NETWORK}
+TOGETHER = {"service": 10, "optimizer": 2, "hang in main": 1, **DISK_AND_NETWORK}
+SYNCED = "service.sync_state=true"
 
 
 @dataclass
@@ -78,7 +80,7 @@ class Outcome:
     kind: str
     what: str = ""
     pose_s: float = 0.0  # from the fault until a pose is OK
-    recovered_s: float = 0.0  # and until everybody reports and has handled a new keyframe
+    recovered_s: float = 0.0  # and until everybody reports and a new keyframe was made
     keyframes: int = 0
     objects: int = 0
     maps: int = 0  # compared, to the bit
@@ -92,8 +94,9 @@ class Batch:
         self.number, self.rng = number, Random(f"{seed}-{number}")
         self.kinds = APART if number % 2 == 0 else TOGETHER
         self.witness = Witness()
-        settings = (ALL_APART,) if self.kinds is APART else ()
-        self.life = Life(folder, self.witness, settings)
+        apart = (ALL_APART,) if self.kinds is APART else ()
+        synced = (SYNCED,) if number % 4 in (1, 2) else ()  # some of either kind
+        self.life = Life(folder, self.witness, (*apart, *synced))
         self.camera = Streaming(scene, RATE_HZ)
         self.truth = true_poses()
         self.objects = 0  # in the map
@@ -170,9 +173,9 @@ class Batch:
         time.sleep(self.rng.uniform(0.0, 3.0))
         if self.kinds is APART and self.witness.health:
             actor = self.rng.choice(sorted(self.witness.health))
-            outcome.what += f", then {actor}"
             with suppress(ProcessLookupError):  # it is gone already
                 self._end(actor, signal.SIGKILL)
+                outcome.what += f", then {actor}"
             self._now()
         else:
             outcome.what += ", then all"
@@ -204,7 +207,7 @@ class Batch:
         self._now()
         return old
 
-    def _disk(self, outcome: Outcome) -> None:
+    def _full_disk(self, outcome: Outcome) -> None:
         """No file may grow beyond a limit: short ones may, or none. Sometimes a kill comes too."""
         limit = self.rng.choice([0, 20_000])
         actor = self.rng.choice(KEPT)
@@ -224,6 +227,21 @@ class Batch:
             with suppress(ProcessLookupError):
                 hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)[1]
                 resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, hard))
+
+    def _bad_disk(self, outcome: Outcome) -> None:
+        """Files can be written and often neither renamed, removed nor synced, and folders not be
+        made, for a while; perhaps a kill in between, and who comes back meets the same."""
+        flag, refusals = (self.life.folder / name for name in ("bad_disk", "refusals"))
+        refusals.unlink(missing_ok=True)
+        flag.touch()
+        self.life.wait("the disk refuses something", refusals.exists)
+        time.sleep(self.rng.uniform(1.0, 3.0))
+        if self.kinds is APART and self.rng.random() < 0.5:
+            self._kill(outcome)
+            time.sleep(self.rng.uniform(0.5, 2.0))
+        flag.unlink()
+        outcome.what += f" {refusals.stat().st_size} refusals"
+        self._now()
 
     def _network(self, outcome: Outcome) -> None:
         """Messages are lost, late and out of order, for a while; perhaps a kill in between."""
@@ -265,7 +283,8 @@ class Batch:
         "stop": _stop,
         "hang": _hang,
         "hang in main": _hang_in_main,
-        "disk": _disk,
+        "full disk": _full_disk,
+        "bad disk": _bad_disk,
         "network": _network,
         "service": _service,
     }

@@ -1,9 +1,12 @@
 """`ldo` on bad ground: arguments of `ldo`, and in the environment
 
 FAULT_FOLDER   a file `hang-ACTOR` there makes that actor's next step hang, once, and is removed;
-               while `bad_network` is there, messages to it are lost, late and out of order
+               while `bad_network` is there, messages to it are lost, late and out of order;
+               while `bad_disk` is there, files are often not renamed, removed or synced, nor
+               folders made; `refusals` gets a byte for each
 """
 
+import errno
 import os
 import sys
 import time
@@ -20,8 +23,11 @@ from ldo_service.runtime.transport import OnMessage
 from ldo_service.runtime.zenoh_transport import ZenohTransport
 
 FOLDER = Path(os.environ["FAULT_FOLDER"])
-BAD_NETWORK = FOLDER / "bad_network"
+BAD_NETWORK, BAD_DISK = FOLDER / "bad_network", FOLDER / "bad_disk"
 LOST, LATE, LATEST_S = 0.15, 0.4, 0.3  # shares of the messages; and so late at most
+REFUSED, REASONS = 0.5, (errno.ENOSPC, errno.EIO, errno.EROFS)  # share of the calls, and why
+REFUSALS = "refusals"
+DISK_CALLS = ("rename", "replace", "unlink", "fsync", "mkdir")  # of `os`, which pathlib asks
 
 
 def hanging(actor: Actor) -> Actor:
@@ -61,7 +67,24 @@ class BadTransport(ZenohTransport):
         super().subscribe(key, maybe)
 
 
+def refused_at_times(name: str) -> Callable[..., Any]:
+    """A function of `os`."""
+    call, rng = getattr(os, name), Random(f"{name}-{os.getpid()}")
+
+    def call_or_refuse(*arguments: Any, **options: Any) -> Any:
+        if BAD_DISK.exists() and rng.random() < REFUSED:
+            with (FOLDER / REFUSALS).open("ab") as refusals:
+                refusals.write(b".")
+            reason = rng.choice(REASONS)
+            raise OSError(reason, os.strerror(reason), f"{name} of {arguments[0]}")
+        return call(*arguments, **options)
+
+    return call_or_refuse
+
+
 if __name__ == "__main__":
+    for name in DISK_CALLS:
+        setattr(os, name, refused_at_times(name))
     service.Stage = FaultyStage
     service.ZenohTransport = BadTransport
     service.python_command = lambda *arguments: [sys.executable, __file__, *arguments]
