@@ -2,7 +2,8 @@
 loopback.
 
 /metrics  what health messages say, for Prometheus. Counters restart from 0 with their actor's
-          process, as Prometheus expects of counters
+          process, as Prometheus expects of counters; of an actor that is silent for too long they
+          are all that is told, beside the age of its last heartbeat
 /healthz  200 while every actor reports, else 503 and who does not: what was is forgotten
 """
 
@@ -73,6 +74,7 @@ class HealthCollector(Collector):
         self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
         self._last: dict[str, tuple[float, Health]] = {}  # by actor: when it was heard
+        self._begun_anew: dict[str, int] = {}  # by actor: how often it came in another process
 
     def heard(self, _header: bytes, body: memoryview) -> None:
         """On any thread; bytes that are no health message are left alone."""
@@ -81,27 +83,32 @@ class HealthCollector(Collector):
         except msgspec.DecodeError:
             return
         with self._lock:
-            if health.actor in self._last or len(self._last) < MOST_ACTORS:
-                self._last[health.actor] = (time.monotonic(), health)
+            if health.actor not in self._last and len(self._last) >= MOST_ACTORS:
+                return
+            _, before = self._last.get(health.actor, (0.0, health))
+            self._begun_anew.setdefault(health.actor, 0)
+            self._begun_anew[health.actor] += health.pid != before.pid
+            self._last[health.actor] = (time.monotonic(), health)
 
     def collect(self) -> Iterator[Metric]:
         with self._lock:
-            last = dict(sorted(self._last.items()))
-        actors = [health for _, health in last.values()]
+            last, anew = dict(sorted(self._last.items())), dict(sorted(self._begun_anew.items()))
+        since_s = time.monotonic() - self._silent_after_s
+        known = [health for _, health in last.values()]
+        now = [health for at_s, health in last.values() if at_s > since_s]
         for metric in (
             self._ages(last),
-            _step_seconds(actors),
-            _facts(actors),
-            *_table(OF_ACTOR, ["actor"], (([h.actor], h) for h in actors)),
+            _processes(anew),
+            _step_seconds(now),
+            _facts(now),
+            *_table(OF_ACTOR, ["actor"], known, now, lambda h: [([h.actor], h)]),
             *_table(
-                OF_INPUT,
-                ["actor", "topic"],
-                (([h.actor, i.topic], i) for h in actors for i in h.inputs),
+                *(OF_INPUT, ["actor", "topic"], known, now),
+                lambda h: [([h.actor, i.topic], i) for i in h.inputs],
             ),
             *_table(
-                OF_OUTPUT,
-                ["actor", "topic"],
-                (([h.actor, o.topic], o) for h in actors for o in h.outputs),
+                *(OF_OUTPUT, ["actor", "topic"], known, now),
+                lambda h: [([h.actor, o.topic], o) for o in h.outputs],
             ),
         ):
             for sample in metric.samples:
@@ -125,13 +132,28 @@ class HealthCollector(Collector):
         return ages
 
 
-def _table(rows: dict[Row, Callable], labels: list[str], items: Iterable) -> Iterator[Metric]:
-    items = list(items)
+def _table(
+    rows: dict[Row, Callable],
+    labels: list[str],
+    known: list[Health],
+    now: list[Health],
+    items_of: Callable[[Health], list[tuple[list[str], Any]]],
+) -> Iterator[Metric]:
+    """Counters of all that are known, gauges of those that report now."""
     for (family, name, says), value in rows.items():
         metric = family(f"ldo_{name}", says, labels=labels)
-        for of_labels, item in items:
-            metric.add_metric(of_labels, float(value(item)))
+        for health in known if family is CounterMetricFamily else now:
+            for of_labels, item in items_of(health):
+                metric.add_metric(of_labels, float(value(item)))
         yield metric
+
+
+def _processes(begun_anew: dict[str, int]) -> Metric:
+    says = "times that it came back in another process, since this exporter began"
+    metric = CounterMetricFamily("ldo_process_restarts", says, labels=["actor"])
+    for actor, count in begun_anew.items():
+        metric.add_metric([actor], count)
+    return metric
 
 
 def _step_seconds(actors: list[Health]) -> Metric:

@@ -96,6 +96,7 @@ def test_every_number_of_a_health_message_is_exported(port: int) -> None:
         ("ldo_steps_total", labels(mapper)): 100,
         ("ldo_failures_total", labels(mapper)): 2,
         ("ldo_restarts_total", labels(mapper)): 2,
+        ("ldo_process_restarts_total", labels(mapper)): 0,
         ("ldo_set_aside_total", labels(mapper)): 1,
         ("ldo_step_age_seconds", labels(mapper)): 0.25,
         ("ldo_busy_seconds", labels(mapper)): 0.125,
@@ -119,6 +120,24 @@ def test_every_number_of_a_health_message_is_exported(port: int) -> None:
     age = values.pop(("ldo_heartbeat_age_seconds", labels(mapper)))
     assert age >= 0
     assert values == pytest.approx(expected)
+
+
+def test_an_actor_that_was_killed_is_counted_and_its_gauges_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    collector, health = HealthCollector("mule"), EXAMPLES["health"]
+    for pid in (7, 7, 8, 8, 9):
+        again = msgspec.structs.replace(health, pid=pid)
+        collector.heard(b"", memoryview(encode(again)))
+    samples = {s.name: s.value for family in collector.collect() for s in family.samples}
+    assert samples["ldo_process_restarts_total"] == 2
+    assert "ldo_resident_bytes" in samples
+    later_s = time.monotonic() + 60
+    monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
+    samples = {s.name: s.value for family in collector.collect() for s in family.samples}
+    assert samples["ldo_heartbeat_age_seconds"] > 30
+    assert all(name.endswith("_total") for name in samples if name != "ldo_heartbeat_age_seconds")
+    assert samples["ldo_steps_total"] == 100
 
 
 def test_only_this_machine_can_read_them(port: int) -> None:
