@@ -36,7 +36,9 @@ class LoopRecord:
     def observe(self, message: LoopCandidate | LoopClosure | Correction, step_ms: float) -> None:
         match message:
             case Correction():
-                self._not_believed = set(message.not_believed)
+                # a correction names the newest of them, and all that came to be believed again
+                self._not_believed |= set(message.not_believed)
+                self._not_believed -= set(message.closures)
             case LoopClosure():
                 self._closures.append(message)
             case LoopCandidate():

@@ -91,6 +91,8 @@ class LiveScene:
         if self._correction and correction.graph_version <= self._correction.graph_version:
             return
         self._correction = correction
+        for loop in correction.not_believed:  # the newest of them: older ones are gone already
+            self._loops.pop(loop, None)
         self._keyframes.correct(correction)
         self._changed |= {"keyframes", "final", "loops"}
 

@@ -60,8 +60,15 @@ def test_a_closure_that_the_graph_does_not_believe_is_no_accepted_one(tmp_path: 
     record, closure = LoopRecord(), EXAMPLES["loop_closure"]
     record.observe(closure, 60.0)
     pair = closure.pose.reference, closure.pose.keyframe
-    for not_believed, accepted in (((pair,), 0), ((), 1), ((pair,), 0)):
-        correction = msgspec.structs.replace(EXAMPLES["correction"], not_believed=not_believed)
+    others = ((900, 901),)  # a correction has room for the newest alone
+    for not_believed, closures, accepted in (
+        *(((pair,), (), 0), (others, (), 0)),
+        *(((), (pair,), 1), ((), (), 1)),
+        ((pair,), (), 0),
+    ):
+        correction = msgspec.structs.replace(
+            EXAMPLES["correction"], not_believed=not_believed, closures=closures
+        )
         record.observe(correction, 1.0)
         assert (record.accepted, record.rejected) == (accepted, 1 - accepted)
     record.save(tmp_path)

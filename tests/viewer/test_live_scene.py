@@ -201,6 +201,8 @@ def test_loops_are_those_that_the_optimizer_believes(live: LiveScene) -> None:
     agreed = correction(1, {0: 0.0}, closures=((0, 7), (1, 8)), not_believed=((2, 9),))
     assert "loops" in taken(live, agreed)
     assert set(live.scene.loops) == {(1, 8), (0, 7)}
+    taken(live, correction(2, {0: 0.0}, closures=((0, 7), (1, 8)), not_believed=((3, 10),)))
+    assert set(live.scene.loops) == {(1, 8), (0, 7)}, "a correction names the newest refused ones"
 
 
 def test_the_map_grows_and_a_reset_leaves_nothing_of_it(live: LiveScene) -> None:
