@@ -25,12 +25,17 @@ class Answer:
 def answer(
     text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
 ) -> list[Answer]:
-    """Objects that answer to `text`, the best and of equals the nearest to `eye` [3] first.
+    """Objects that answer to `text`, the best and of equals the nearest to `eye` [3] first. Only
+    where none does by its name or another word for it, `encode` is asked which mean nearly the
+    same.
 
     Raises DataError when there is none.
     """
     objects = found.objects
-    hits = search(text, [dict(one.distribution) for one in objects], encode)
+    named = [dict(one.distribution) for one in objects]
+    hits = search(text, named)
+    if not hits and encode is not None:
+        hits = search(text, named, encode)
     if not hits:
         raise DataError(_nothing(text, [one.name for one in objects]))
     answers = []

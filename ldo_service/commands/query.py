@@ -1,6 +1,7 @@
 """ldo query"""
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -12,11 +13,16 @@ from rich.table import Table
 
 from ldo_service.answers import Answer, answer
 from ldo_service.client import connect
+from ldo_service.config import load_config
+from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
+from ldo_service.models import open_labeller
 from ldo_service.runs.objects_file import read_objects
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
+from ldo_service.semantics.labellers.dual_encoder import DualEncoder, DualEncoderConfig
+from ldo_service.semantics.search import Encode
 from ldo_service.wire import transform
 
 from .options import Endpoint, Json, KeysFolder, Robot
@@ -34,19 +40,29 @@ def query(
     robot: Robot = "robot",
     endpoint: Endpoint = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
+    model: Annotated[
+        str,
+        tyro.conf.arg(
+            metavar="NAME",
+            help="pair of encoders that compares words where none in the map says the same; of a "
+            "run, the labeller that it had",
+        ),
+    ] = "",
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
     """Tell where things are: boxes in the map, the likeliest first.
 
-    Other words for the same are understood, and kinds of it: "sofa" finds couches.
+    Other words for the same are understood, and kinds of it: "sofa" finds couches. What no table
+    of words knows is compared by the texts of an image-text model, where there is one.
 
       ldo query DIR "potted plant"
       ldo query live chair --json
+      ldo query live "something to sit on" --model mobileclip
     """
-    found, eye = (
-        _live(robot, endpoint, keys) if where == LIVE else _of_run(Path(where).expanduser())
-    )
-    answers = answer(text, found, eye)
+    is_live = where == LIVE
+    found, eye = _live(robot, endpoint, keys) if is_live else _of_run(Path(where).expanduser())
+    encode = _texts_of(model, Path(where).expanduser()) if model or not is_live else None
+    answers = answer(text, found, eye, encode)
     if json_:
         print(json.dumps([_plain(one) for one in answers]))
     else:
@@ -69,6 +85,31 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
         assert isinstance(pose, TrackedPose)
         eye = (transform(pose.T_map_odom) @ transform(pose.T_odom_camera))[:3, 3]
     return found, eye
+
+
+def _texts_of(model: str, run: Path) -> Encode:
+    """Of a pair, or where none is named of the labeller that a run had. It is opened when it is
+    asked: a name that cannot be opened is a ConfigError then; a run's labeller may be gone, and
+    nothing is like anything."""
+
+    def encode(texts: Sequence[str]) -> np.ndarray:
+        try:
+            return _opened(model, run).texts.encode(texts)
+        except ConfigError:
+            if model:
+                raise
+            return np.zeros((len(texts), 1))
+
+    return encode
+
+
+def _opened(model: str, run: Path) -> DualEncoder:
+    if model:
+        return open_labeller(model, DualEncoderConfig())
+    config = load_config(run / "config.yaml").vlm_labeller
+    if not config.model:
+        raise ConfigError(f"{run} had no pair of encoders.")
+    return open_labeller(config.model, config.dual_encoder)
 
 
 def _plain(one: Answer) -> dict[str, object]:

@@ -1,6 +1,7 @@
 """ldo query, of a run and of a running service."""
 
 import json
+import shutil
 from pathlib import Path
 
 import msgspec
@@ -9,6 +10,7 @@ import pytest
 import zenoh
 
 from ldo_service.client import connect
+from ldo_service.demo_networks import IMAGE_ENCODER
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
@@ -123,6 +125,50 @@ def test_a_folder_that_is_not_there_is_bad_data(capsys, tmp_path: Path) -> None:
     assert code == 3
     assert_one_paragraph(err)
     assert "is not a folder" in err
+
+
+# --- by what words mean ---------------------------------------------------------------------------
+@pytest.fixture
+def pair(tmp_path: Path) -> Path:
+    """A pair in whose space a throne is nearly a chair, and a piano nothing of the kind."""
+    folder = tmp_path / "pair"
+    folder.mkdir()
+    shutil.copy(IMAGE_ENCODER, folder)
+    rows = np.zeros((4, 96))
+    rows[0, 0] = rows[2, 1] = rows[3, 2] = 1
+    rows[1, :2] = 0.95, np.sqrt(1 - 0.95**2)
+    names = np.array(["chair", "throne", "couch", "piano"])
+    np.savez(folder / "embeddings.npz", names=names, embeddings=rows)
+    return folder
+
+
+def test_what_no_table_knows_is_found_by_what_it_means(capsys, folder: Path, pair: Path) -> None:
+    assert ldo(capsys, "query", folder, "throne")[0] == 3
+    code, out, _ = ldo(capsys, "query", folder, "throne", "--model", pair, "--json")
+    assert code == 0
+    answers = json.loads(out)
+    assert [one["id"] for one in answers] == [9, 5, 1]
+    assert answers[0]["score"] == pytest.approx(0.95 * 0.95, abs=1e-3)
+    for word in ("piano", "unicorn"):
+        code, _, err = ldo(capsys, "query", folder, word, "--model", pair)
+        assert (code, "none of 4 objects" in err) == (3, True)
+
+
+def test_a_run_is_asked_by_the_labeller_that_it_had(capsys, folder: Path, pair: Path) -> None:
+    (folder / "config.yaml").write_text(f"vlm_labeller: {{model: {pair}}}\n")
+    code, out, _ = ldo(capsys, "query", folder, "throne", "--json")
+    assert (code, [one["id"] for one in json.loads(out)]) == (0, [9, 5, 1])
+    shutil.rmtree(pair)
+    code, _, err = ldo(capsys, "query", folder, "throne")
+    assert (code, "none of 4 objects" in err) == (3, True)
+    assert ldo(capsys, "query", folder, "sofa")[0] == 0
+
+
+def test_a_pair_that_cannot_be_opened_is_a_configuration_error(capsys, folder: Path) -> None:
+    assert ldo(capsys, "query", folder, "chair", "--model", "absent")[0] == 0, "words will do"
+    code, _, err = ldo(capsys, "query", folder, "throne", "--model", "absent")
+    assert code == 2
+    assert_one_paragraph(err)
 
 
 # --- live -----------------------------------------------------------------------------------------

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 
 from ldo_service.errors import ConfigError, ModelError
-from ldo_service.semantics.class_names import COCO, LONGEST, is_name, normalised
+from ldo_service.semantics.class_names import COCO, LONGEST, is_name
 from ldo_service.semantics.network import Network, sha256
 from ldo_service.semantics.synonyms import canonical
 
 from . import Opinion, fused_over_views
 from .byte_pairs import BytePairs
-from .text_space import CachedEmbeddings, TextEncoder, only_embedding, unit
+from .text_space import CachedEmbeddings, TextEncoder, Texts, only_embedding, unit
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of RGB in 0..1; Radford et al., their code
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
@@ -99,11 +99,11 @@ class DualEncoder:
         what = name or str(pair.image)
         try:
             self._image = ImageEncoder(pair.image, self.config)
-            self._cached = CachedEmbeddings(pair.embeddings) if pair.embeddings else None
-            self._text = _text_encoder(pair, self.config)
+            cached = CachedEmbeddings(pair.embeddings) if pair.embeddings else None
+            self.texts = Texts(cached, _text_encoder(pair, self.config))
         except ModelError as error:
             raise ModelError(f"{what} cannot be used as a labeller: {error}") from error
-        for space in (self._text, self._cached):
+        for space in (self.texts.encoder, self.texts.cached):
             if space and space.dimensions != self._image.dimensions:
                 raise ModelError(
                     f"{what} cannot be used as a labeller: its images have "
@@ -116,7 +116,7 @@ class DualEncoder:
         self._listed: dict[str, str] = {}  # the same, and the word that it was first given in
         for entry in (*(names or self._own_names()), *self.config.nothing):
             self._listed.setdefault(canonical(entry), entry)
-        if self._text is None:
+        if self.texts.encoder is None:
             self._place_listed()
 
     @property
@@ -165,22 +165,20 @@ class DualEncoder:
 
     def _place(self, name: str) -> np.ndarray:
         """[D] float32 of length 1, from the file where it is there."""
-        row = self._cached.find(name) if self._cached else None
+        row = self.texts.find(name)
         if row is not None:
             return row
-        if self._text is not None:
-            return self._text.embed(normalised(name))
         raise ConfigError(
             f"{name!r} is not among the names whose embeddings {self.identity} has, and there is "
             "no text encoder to place it: register the pair with --text and --vocabulary."
         )
 
     def _own_names(self) -> tuple[str, ...]:
-        return self._cached.names if self._cached else COCO
+        return self.texts.cached.names if self.texts.cached else COCO
 
     def _logit_scale(self) -> float:
         carried = self._image.metadata_numbers("logit_scale", 1)
-        cached = self._cached.logit_scale if self._cached else None
+        cached = self.texts.cached.logit_scale if self.texts.cached else None
         return self.config.logit_scale or cached or (carried[0] if carried else CLIP_SCALE)
 
 

@@ -78,6 +78,27 @@ class CachedEmbeddings:
         return None if row is None else unit(row)
 
 
+class Texts:
+    """The text half of a pair: what is in the file is read, anything else is computed."""
+
+    def __init__(self, cached: CachedEmbeddings | None, encoder: TextEncoder | None) -> None:
+        self.cached, self.encoder = cached, encoder
+
+    def find(self, text: str) -> np.ndarray | None:
+        """[D] float32 of length 1; None where it is not in the file and there is no encoder."""
+        row = self.cached.find(text) if self.cached else None
+        if row is None and self.encoder is not None:
+            row = self.encoder.embed(normalised(text))
+        return row
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """[T, D]; zeros, which are like nothing, where `find` finds nothing."""
+        rows = [self.find(text) for text in texts]
+        (dimensions,) = {space.dimensions for space in (self.cached, self.encoder) if space}
+        nowhere = np.zeros(dimensions, np.float32)
+        return np.array([nowhere if row is None else row for row in rows])
+
+
 def unit(vector: np.ndarray) -> np.ndarray:
     """Raises ModelError for one of no length."""
     length = np.linalg.norm(vector)
