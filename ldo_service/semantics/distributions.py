@@ -18,6 +18,14 @@ def pooled(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
     labels [K, M, 32] uint8, rows of `labels`; weights [K, M], 0 where a group has fewer.
     All on background where all weights are 0. Paper, III.C (landmarks).
+
+    One that is wholly label 2 and weighs 3, and one that is half of it and weighs 1:
+
+    >>> from ldo_service.semantics.labels import new_labels
+    >>> labels = new_labels(2)
+    >>> fields(labels)["ids"][:, 0], fields(labels)["weights"][:, 0] = 2, (1, 0.5)
+    >>> pooled(labels[None], np.array([[3.0, 1.0]]))[0, :3].tolist()  # (3 + 0.5) / 4
+    [0.125, 0.0, 0.875]
     """
     groups, each = weights.shape
     rows = labels.reshape(groups * each, labels.shape[-1])

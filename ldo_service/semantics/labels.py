@@ -107,6 +107,14 @@ def observe(
     >>> see(2, 0.6, LabelConfig(ema="paper", hold_back=0))  # 0.9 p + 0.1
     [0.225, 0.0, 0.464, 0.31]
 
+    Held back, of a Gaussian that is settled, H = 0: 0.5 counts as 0.5 (1 - (1 - 0.5)).
+
+    >>> labels = new_labels(1)
+    >>> see(2, 0.6, LabelConfig())  # nothing to hold on to: W = 0.6
+    [0.0, 0.0, 1.0, 0.0]
+    >>> see(3, 0.5, LabelConfig())  # w = 0.25, W = 0.54 + 0.25, a = 0.316
+    [0.0, 0.0, 0.684, 0.316]
+
     Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads.
     Paper, III.A; ALGORITHMS, Semantics on Gaussians.
     """
