@@ -96,7 +96,8 @@ class Naming:
         for question in sightings.questions:
             self._remember(question)
         claims = replace(claims, parts=fitting_parts(len(claims.boxes), doubtful))
-        return with_opinions(claims, sightings.opinions, vocabulary), sightings.questions
+        told = with_opinions(claims, sightings.opinions, vocabulary, self._boxes_vote)
+        return told, sightings.questions
 
     def _remember(self, question: Question) -> None:
         region, of = question.region, question.candidate
@@ -159,7 +160,7 @@ class Naming:
         seen."""
         place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
         opinion = self._regions.carried(region, *place)
-        return opinion and with_opinions(Claims.none(), [opinion], vocabulary)
+        return opinion and with_opinions(Claims.none(), [opinion], vocabulary, self._boxes_vote)
 
     def _believed(self, answer: Answer, asked: Asked) -> Answer:
         """Without a label that is no object's, or is told too unsurely of what no box is about."""
@@ -168,6 +169,10 @@ class Naming:
             return Answer("", answer.sure)
         is_sure = answer.sure >= self.config.least_sure or bool(asked.label)
         return replace(answer, others=others) if is_sure else Answer("", 0.0)
+
+    @property
+    def _boxes_vote(self) -> bool:
+        return self.config.regions.boxes_vote
 
     def _is_object(self, name: str) -> bool:
         return normalised(name) not in self.config.structure
@@ -215,15 +220,18 @@ def fitting_parts(boxes: int, found: Sequence[Candidate]) -> tuple[Foreground | 
     return tuple(parts)
 
 
-def with_opinions(claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocabulary) -> Claims:
-    """Claims of a detector with the names of the same regions: of a box of the detector in place of
-    its label, which has a vote in the name, of other regions alone."""
+def with_opinions(
+    claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocabulary, boxes_vote: bool
+) -> Claims:
+    """Claims of a detector with the names of the same regions: of other regions alone, of a box of
+    the detector beside its label, or in place of it where it has a vote in the name."""
     labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
     by_detector, parts = claims.confidences.copy(), claims.parts or (None,) * len(claims.boxes)
     for opinion in opinions:
         if (number := opinion.of.number) is not None:
             labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
-            by_detector[number] = 0  # its word is a part of the opinion
+            if boxes_vote:
+                by_detector[number] = 0  # its word is a part of the opinion
     alone = [
         opinion
         for opinion in opinions

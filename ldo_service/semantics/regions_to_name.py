@@ -50,6 +50,8 @@ class RegionConfig:
     settled: float = 0.6  # of an answer that needs no second one
     answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's; all boxes
     # of a name together count as one that is certain
+    boxes_vote: bool = True  # or what boxes say is weighed Gaussian by Gaussian (III.B), and a
+    # region is what the labeller says alone
     least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
     least_carried: float = 0.5  # sure of its name, to be told where nothing sets a region apart
     most_carried: int = 32  # names of a keyframe told so: as many as it has candidates
@@ -79,6 +81,11 @@ class RegionConfig:
             )
         if not (self.answer_weight > 0 and self.least_votes >= 0):
             raise ConfigError(f"{self}: answer_weight positive, least_votes not negative.")
+
+    @property
+    def most_boxes(self) -> float:
+        """What all boxes of a name may speak for it, at most."""
+        return self.answer_weight if self.boxes_vote else 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,7 +153,7 @@ class RegionsToName:
                 continue
             region = self._same(sighting, known, taken) or self._new(sighting)
             taken.add(region.id)
-            region = seen_again(region, sighting, config.answer_weight)
+            region = seen_again(region, sighting, config.most_boxes)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
                 region = self._with_view(region, sighting, region_view(*args, config.view))
@@ -157,7 +164,7 @@ class RegionsToName:
             region = sighting and self._same(sighting, known, taken)
             if sighting and region and self._told(region)[0]:
                 taken.add(region.id)
-                self._keep(seen_again(region, sighting, config.answer_weight))
+                self._keep(seen_again(region, sighting, config.most_boxes))
                 told.append((region.id, candidate))
         told += self._carried(known, taken)
         opinions = self._opinions(told, known)

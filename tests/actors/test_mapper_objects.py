@@ -4,6 +4,7 @@ import shutil
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -29,6 +30,8 @@ from ldo_service.schemas import (
     ObjectObservation,
     encode,
 )
+from ldo_service.semantics.fusion import FusionConfig
+from ldo_service.semantics.labelling import LabellingConfig
 from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.naming import Naming, NamingConfig
 from ldo_service.semantics.regions_to_name import RegionConfig
@@ -302,6 +305,38 @@ def test_an_answer_speaks_of_all_views_that_were_shown(monkeypatch: pytest.Monke
     monkeypatch.setattr(Naming, "shown_in", lambda *_: ())
     assert beyond > 1.05 * labelled("my chair") > 0
     assert of_the_detector == labelled(COUCH.name) > 0
+
+
+@pytest.mark.parametrize(
+    ("rule", "boxes_vote", "sure", "named"),
+    [
+        ("adaptive", False, 0.7, "samovar"),  # 0.7 beside at most 0.5: alpha 0.34
+        ("adaptive", False, 0.35, "couch"),  # 0.35 beside 0.5, where a splat lies inside: 0.67
+        ("fixed", False, 0.55, "samovar"),  # half of 0.55 beside half of 0.5
+        ("detector", True, 0.95, "couch"),
+        ("detector", False, 0.95, "couch"),
+    ],
+)
+def test_a_box_and_an_answer_are_weighed_as_printed_or_the_box_alone_counts(
+    rule: Literal["adaptive", "fixed", "detector"], boxes_vote: bool, sure: float, named: str
+) -> None:
+    regions = replace(REGIONS, boxes_vote=boxes_vote, least_votes=0)
+    labelling = LabellingConfig(fusion=FusionConfig(rule=rule))
+    naming = NamingConfig(trigger=TRIGGER, regions=regions)
+    semantics = SemanticMapConfig(labelling=labelling, naming=naming)
+    mapper, made = Mapper(replace(CONFIG, semantics=semantics), has_labeller=True), []
+    for number, T in enumerate(np.tile(WAY, (2, 1, 1))):
+        new = walk(mapper, T[None], first=number, known=(COUCH,), score=0.5)
+        about_it = [one for one in of(LabelRequest, new) if shown_in(one) == COUCH]
+        made += [
+            *new,
+            *(m for one in about_it for m in mapper.handle(answer(one, "samovar", sure))),
+        ]
+    assert mapper.facts()["answers_named"] > 0
+    follower = followed([*made, *mapper.finish()])
+    top, truth = top_labels(follower.map.labels), true_things(follower.map.means, THINGS, WAY)
+    said = np.array(follower.label_names)[top]
+    assert np.mean(said[truth == THINGS.index(COUCH)] == named) > 0.6
 
 
 def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:

@@ -36,16 +36,25 @@ def test_a_box_is_the_thing_that_fits_it() -> None:
 
 def test_the_name_of_a_region_stands_in_place_of_a_box_s_label() -> None:
     claims, vocabulary = boxed("tv", "chair")
-    named = with_opinions(claims, [Opinion(region(0), "microwave", 0.9)], vocabulary)
+    named = with_opinions(claims, [Opinion(region(0), "microwave", 0.9)], vocabulary, True)
     assert named.confidences.tolist() == [0, 0.5]
     assert named.open_labels[0] == vocabulary.index("microwave")
     assert named.open_confidences.tolist() == [np.float32(0.9), 0]
     assert claims.confidences.tolist() == [0.5, 0.5], "as it was"
 
 
+def test_where_boxes_have_no_vote_both_words_are_weighed() -> None:
+    claims, vocabulary = boxed("tv", "chair")
+    named = with_opinions(claims, [Opinion(region(0), "microwave", 0.9)], vocabulary, False)
+    assert named.confidences.tolist() == [0.5, 0.5]
+    assert named.labels.tolist() == claims.labels.tolist()
+    assert named.open_labels[0] == vocabulary.index("microwave")
+    assert named.open_confidences.tolist() == [np.float32(0.9), 0]
+
+
 def test_a_region_without_a_box_is_a_claim_of_its_own() -> None:
     claims, vocabulary = boxed("chair")
-    named = with_opinions(claims, [Opinion(region(), "globe", 0.8)], vocabulary)
+    named = with_opinions(claims, [Opinion(region(), "globe", 0.8)], vocabulary, True)
     assert len(named.boxes) == 2
     assert (named.confidences[1], named.open_confidences[1]) == (0, np.float32(0.8))
     assert named.parts == (None, PART)
