@@ -2,11 +2,14 @@
 
     LDO_WEIGHTS=... python tests/bench/bench_labels.py SOURCE [--only TEXT] [--pictures DIR]
                                                        [--fusion P] [--background NAME ...]
+    python tests/bench/bench_labels.py synthetic:flat --detectors demo --painted
 
 SOURCE: labelled, with true poses. Every second frame is a keyframe, where it really was; labels are
 fused as the map grows and judged at the end, on all frames, as `ldo eval` judges them: background
 and the classes of COCO, those that have 0.2 % of the pixels, in brackets all that occur.
-`--background` names classes that count as background whatever the synonyms say.
+`--background` names classes that count as background whatever the synonyms say. `--detectors` are
+names or files, as `detector.model`, in place of those in LDO_WEIGHTS; with `--painted` there is no
+map.
 
 "true boxes" are those of the true objects that cover 0.5 % of the pixels, each of score 1.
 
@@ -33,9 +36,10 @@ from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelJud
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.render import Rendering
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.models import open_detector
 from ldo_service.recordings.sequence import open_source
 from ldo_service.semantics.assignment import AssignmentConfig
-from ldo_service.semantics.detectors import OnnxDetector
+from ldo_service.semantics.detectors import NetworkConfig
 from ldo_service.semantics.foreground import (
     ForegroundConfig,
     Surfaces,
@@ -87,8 +91,8 @@ class Scene:
 
 
 # --- what is claimed ------------------------------------------------------------------------------
-def detected(scene: Scene, weights: Path) -> list[Claims]:
-    network = OnnxDetector(weights)
+def detected(scene: Scene, model: str) -> list[Claims]:
+    network = open_detector(model, NetworkConfig())
     index = np.array([scene.vocabulary.index(name) for name in network.labels])
     found = [network.find(frame.color) for frame in scene.frames]
     return [
@@ -303,16 +307,17 @@ def main() -> None:
     parser.add_argument("--only", default="", help="rules whose name holds this")
     parser.add_argument("--fusion", type=float, metavar="P")
     parser.add_argument("--background", nargs="+", default=(), metavar="NAME")
+    parser.add_argument("--detectors", nargs="+", default=(), metavar="MODEL")
+    parser.add_argument("--painted", action="store_true", help="frame by frame alone")
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--iterations", type=int, default=6)
     arguments = parser.parse_args()
-    weights = Path(os.environ["LDO_WEIGHTS"])
+    models = {name: name for name in arguments.detectors} or {
+        name: str(Path(os.environ["LDO_WEIGHTS"]) / file) for name, file in NETWORKS.items()
+    }
     scene = Scene.of(arguments.source, arguments.max_frames, arguments.background)
-    claims = {name: detected(scene, weights / file) for name, file in NETWORKS.items()}
+    claims = {name: detected(scene, model) for name, model in models.items()}
     claims[TRUE_BOXES] = true_boxes(scene)
-    runs = list(followers(scene, claims, arguments.only, arguments.fusion))
-    builder = grown(scene, runs, arguments.iterations)
-    print(f"{len(scene.frames)} frames, {len(builder.gaussians)} Gaussians")
     report = Report(scene, arguments.pictures)
     for name, said in claims.items():
         for area in ("foreground", "box"):
@@ -322,6 +327,11 @@ def main() -> None:
                 lambda k, s=said, a=area: painted(s[k], scene.frames[k], a),
                 "",
             )
+    if arguments.painted:
+        return
+    runs = list(followers(scene, claims, arguments.only, arguments.fusion))
+    builder = grown(scene, runs, arguments.iterations)
+    print(f"{len(scene.frames)} frames, {len(builder.gaussians)} Gaussians in the map")
     judge_all(scene, runs, builder, report)
 
 
