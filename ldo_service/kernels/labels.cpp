@@ -49,7 +49,7 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
                    const ConsistencyRule& rule, int threads) {
   constexpr int64_t kJobVoxels = 256;
   const Voxels voxels(rows, indices, v, 2.0f * rule.sigma_m);
-  std::vector<LabelRow> before(v);
+  Buffer<LabelRow> before(v);
   for (int64_t i = 0; i < v; ++i) before[i] = labels[indices[i]];
   // Elsewhere all is background, and agrees.
   const auto active = voxels.about([&](uint32_t place) { return before[place].weights[0] > 0.0f; });
@@ -61,8 +61,10 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
       uint32_t places[kLanes];
       const int count = voxels.around(active[a], places);
       const Neighbours16 around(rows, indices, before.data(), places, count);
+      const bool is_bare = around.labels() == 1;
       for (int64_t k = 0; k < voxels.count(active[a]); ++k) {
         const uint32_t i = voxels.begin(active[a])[k];
+        if (is_bare && before[i].weights[0] == 0.0f) continue;  // all is background
         const float* mean = rows + static_cast<int64_t>(indices[i]) * kRowFloats;
         step(around, around.weights(mean, i, rule), before[i], labels[indices[i]], sums[job]);
       }
