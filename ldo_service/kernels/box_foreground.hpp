@@ -29,9 +29,8 @@ class Plane {
 // The commonest depth, in bins of a share of it, each smoothed with its neighbours.
 class DepthMode {
  public:
-  DepthMode(double bin_share, size_t most_pixels) : bin_share_(bin_share) {
-    bins_.reserve(most_pixels);
-  }
+  DepthMode(double bin_share, size_t most_pixels)
+      : bin_share_(bin_share), bins_(most_pixels + kLanes) {}
 
   void add(const float* depth_m, int n) {
     const float per_log2 = static_cast<float>(kLn2 / bin_share_);
@@ -40,25 +39,26 @@ class DepthMode {
       const Floats z = Floats::load_first(depth_m + i, count);
       alignas(64) float at[kLanes];
       (log2(max(z, std::numeric_limits<float>::min())) * per_log2).store(at);
-      for (uint32_t rest = bits((Floats(0.0f) < z) & (z < kInfinity)); rest != 0; rest &= rest - 1) {
-        const float x = at[__builtin_ctz(rest)];
-        const int bin = static_cast<int>(x);
-        bins_.push_back(bin - (x < static_cast<float>(bin)));
+      const uint32_t is_measured = bits((Floats(0.0f) < z) & (z < kInfinity));
+      for (int k = 0; k < kLanes; ++k) {
+        bins_[size_] = rounded_down(at[k]);
+        size_ += is_measured >> k & 1;
       }
     }
   }
 
   // Metres; 0 of none.
   double value() const {
-    if (bins_.empty()) return 0.0;
-    const auto [low, high] = std::minmax_element(bins_.begin(), bins_.end());
-    std::vector<int64_t> counts(*high - *low + 3, 0);  // and an empty one on each side
-    for (int bin : bins_) ++counts[bin - *low + 1];
+    if (size_ == 0) return 0.0;
+    const int *begin = bins_.data(), *end = begin + size_;
+    const int low = *std::min_element(begin, end), high = *std::max_element(begin, end);
+    std::vector<int64_t> counts(high - low + 3, 0);  // and an empty one on each side
+    for (const int* bin = begin; bin < end; ++bin) ++counts[*bin - low + 1];
     int64_t most = 0;
     int best = 0;
     for (size_t k = 1; k + 1 < counts.size(); ++k) {
       const int64_t smoothed = counts[k - 1] + 2 * counts[k] + counts[k + 1];
-      if (smoothed > most) most = smoothed, best = static_cast<int>(k) - 1 + *low;
+      if (smoothed > most) most = smoothed, best = static_cast<int>(k) - 1 + low;
     }
     return std::exp((best + 0.5) * bin_share_);
   }
@@ -66,8 +66,15 @@ class DepthMode {
  private:
   static constexpr float kInfinity = std::numeric_limits<float>::infinity();
   static constexpr double kLn2 = 0.69314718055994531;
+
+  static int rounded_down(float x) {
+    const int towards_0 = static_cast<int>(x);
+    return towards_0 - (x < static_cast<float>(towards_0));
+  }
+
   const double bin_share_;
-  std::vector<int> bins_;
+  Buffer<int> bins_;  // of the depths that are measured
+  size_t size_ = 0;
 };
 
 class BoxForeground {
@@ -82,15 +89,16 @@ class BoxForeground {
         belongs_(window.width, window.height),
         mask_(window.width, window.height) {}
 
-  // Writes `mask` [height, width] of the window, 0 or 1.
-  void write(uint8_t* mask) {
+  // Writes `mask` [height, width] of the window, 0 or 1. False for labels that have no size.
+  bool write(uint8_t* mask) {
     std::fill_n(mask, static_cast<int64_t>(window_.height) * window_.width, uint8_t{0});
-    if (!find_mode()) return;
-    find_what_belongs();
-    if (!keep_what_hangs_together()) return;
+    if (!find_mode()) return true;
+    if (!find_what_belongs()) return false;
+    if (!keep_what_hangs_together()) return true;
     for (int k = 0; k < rule_.grow_px; ++k) grow();
     for (int y = 0; y < window_.height; ++y)
       for (int x = 0; x < window_.width; ++x) *mask++ = mask_.row(y)[x] > 0.0f;
+    return true;
   }
 
  private:
@@ -109,39 +117,47 @@ class BoxForeground {
     return mode_m_ > 0.0;
   }
 
-  // f(begin, end, label) of the pixels of equal label in a row of the window.
-  template <class F>
-  void each_run(int y, F f) const {
-    const int32_t* labels = found_.labels + at(y);
-    for (int begin = 0, end; begin < window_.width; begin = end) {
-      for (end = begin + 1; end < window_.width && labels[end] == labels[begin];) ++end;
-      f(begin, end, labels[begin]);
+  struct Run {  // pixels of equal label
+    int row, begin, end;
+    int32_t label;
+  };
+
+  std::vector<Run> runs() const {
+    std::vector<Run> out;
+    for (int y = 0; y < window_.height; ++y) {
+      const int32_t* labels = found_.labels + at(y);
+      for (int begin = 0, end; begin < window_.width; begin = end) {
+        for (end = begin + 1; end < window_.width && labels[end] == labels[begin];) ++end;
+        out.push_back({y, begin, end, labels[begin]});
+      }
     }
+    return out;
   }
 
   // The depth of what lies on surfaces that are mostly inside, or on edges, not too far from the
-  // mode: no further than the box is wide.
-  void find_what_belongs() {
+  // mode: no further than the box is wide. False for labels that have no size.
+  bool find_what_belongs() {
+    const std::vector<Run> all = runs();
     std::vector<int64_t> inside(found_.count, 0);
-    for (int y = 0; y < window_.height; ++y)
-      each_run(y, [&](int begin, int end, int32_t label) { inside[label] += end - begin; });
+    for (const Run& run : all) {
+      if (run.label < 0 || run.label >= found_.count) return false;
+      inside[run.label] += run.end - run.begin;
+    }
     const double wide_m = std::max(window_.width, window_.height) * mode_m_ / focal_px_;
     const float mode_m = static_cast<float>(mode_m_),
                 reach_m = static_cast<float>(std::max(wide_m, rule_.near_mode * mode_m_));
-    for (int y = 0; y < window_.height; ++y) {
-      const float* depth_m = image_.depth_m + at(y);
-      float* belongs = belongs_.row(y);
-      each_run(y, [&](int begin, int end, int32_t label) {
-        const bool is_inside = static_cast<double>(inside[label]) >=
-                               rule_.min_inside * static_cast<double>(found_.sizes[label]);
-        if (label != 0 && !is_inside) return;
-        for (int x = begin; x < end; ++x) {
-          const bool is_near =
-              (depth_m[x] > 0.0f) & (std::fabs(depth_m[x] - mode_m) < reach_m);
-          belongs[x] = is_near ? depth_m[x] : 0.0f;
-        }
-      });
+    for (const Run& run : all) {
+      const bool is_inside = static_cast<double>(inside[run.label]) >=
+                             rule_.min_inside * static_cast<double>(found_.sizes[run.label]);
+      if (run.label != 0 && !is_inside) continue;
+      const float* depth_m = image_.depth_m + at(run.row);
+      float* belongs = belongs_.row(run.row);
+      for (int x = run.begin; x < run.end; ++x) {
+        const bool is_near = (depth_m[x] > 0.0f) & (std::fabs(depth_m[x] - mode_m) < reach_m);
+        belongs[x] = is_near ? depth_m[x] : 0.0f;
+      }
     }
+    return true;
   }
 
   // Of what belongs, without steps: the parts that have a tenth or more of the pixels about the
@@ -186,8 +202,7 @@ class BoxForeground {
     const float* depth_m = belongs_.row(y);
     const float mode_m = static_cast<float>(mode_m_), near = static_cast<float>(rule_.near_mode);
     int count = 0;
-    for (int x = begin; x < end; ++x)
-      count += std::fabs(depth_m[x] / mode_m - 1.0f) < near;
+    for (int x = begin; x < end; ++x) count += std::fabs(depth_m[x] / mode_m - 1.0f) < near;
     return count;
   }
 
@@ -199,12 +214,13 @@ class BoxForeground {
       const float *above = mask_.row(y - 1), *here = mask_.row(y), *below = mask_.row(y + 1);
       each_vector(window_.width, [&](int i) {
         const auto largest = [i](const float* row) {
-          return max(max(Floats::load(row + i - 1), Floats::load(row + i)), Floats::load(row + i + 1));
+          return max(max(Floats::load(row + i - 1), Floats::load(row + i)),
+                     Floats::load(row + i + 1));
         };
         const Floats beside = max(max(largest(above), largest(here)), largest(below));
         const Floats belongs = Floats::load(belongs_.row(y) + i), zero = 0.0f;
-        const Mask joins = (zero < belongs) & (zero < beside) &
-                           (abs(belongs - beside) < beside * near);
+        const Mask joins =
+            (zero < belongs) & (zero < beside) & (abs(belongs - beside) < beside * near);
         select(joins, belongs, Floats::load(here + i)).store(grown.row(y) + i);
       });
     }

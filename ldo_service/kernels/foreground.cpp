@@ -26,9 +26,9 @@ std::vector<int64_t> surfaces(const DepthImage& image, const Pinhole& camera,
   return sizes;
 }
 
-void foreground(const DepthImage& image, double focal_px, const SurfaceLabels& found,
+bool foreground(const DepthImage& image, double focal_px, const SurfaceLabels& found,
                 const Window& window, const ForegroundRule& rule, uint8_t* mask) {
-  BoxForeground(image, focal_px, found, window, rule).write(mask);
+  return BoxForeground(image, focal_px, found, window, rule).write(mask);
 }
 
 }  // namespace ldo::LDO_ISA

@@ -39,12 +39,13 @@ struct ForegroundRule {
   int grow_px;
 };
 
-#define LDO_DECLARE_FOREGROUND(isa)                                                   \
-  namespace isa {                                                                     \
-  std::vector<int64_t> surfaces(const DepthImage& image, const Pinhole& camera,       \
-                                const SurfaceRule& rule, int32_t* labels);            \
-  void foreground(const DepthImage& image, double focal_px, const SurfaceLabels& found, \
-                  const Window& window, const ForegroundRule& rule, uint8_t* mask);   \
+#define LDO_DECLARE_FOREGROUND(isa)                                                     \
+  namespace isa {                                                                       \
+  std::vector<int64_t> surfaces(const DepthImage& image, const Pinhole& camera,         \
+                                const SurfaceRule& rule, int32_t* labels);              \
+  /* False for labels that have no size. */                                             \
+  bool foreground(const DepthImage& image, double focal_px, const SurfaceLabels& found, \
+                  const Window& window, const ForegroundRule& rule, uint8_t* mask);     \
   }
 LDO_DECLARE_FOREGROUND(baseline)
 LDO_DECLARE_FOREGROUND(avx2)

@@ -64,16 +64,6 @@ Sizes surfaces(const Array& depth_m, double fx, double fy, double cx, double cy,
   return Sizes(sizes.release(), {count}, owner);
 }
 
-void require_labels(const SurfaceLabels& found, const Window& window, int width) {
-  bool known = true;
-  for (int y = window.row; y < window.row + window.height; ++y)
-    for (int x = window.column; x < window.column + window.width; ++x) {
-      const int32_t label = found.labels[static_cast<int64_t>(y) * width + x];
-      known = known & (label >= 0) & (label < found.count);
-    }
-  require(known, "labels must be those that sizes has.");
-}
-
 void foreground(const Array& depth_m, double focal_px, const Array& labels, const Array& sizes,
                 int row, int column, double min_inside, double max_gap, double depth_bin,
                 double near_mode, int grow_px, const WritableArray& mask) {
@@ -90,15 +80,18 @@ void foreground(const Array& depth_m, double focal_px, const Array& labels, cons
                             static_cast<int64_t>(sizes.shape(0))};
   const Window window{row, column, static_cast<int>(mask.shape(0)),
                       static_cast<int>(mask.shape(1))};
-  require_labels(found, window, image.width);
   require(min_inside >= 0 && min_inside <= 1, "min_inside must lie in 0..1.");
   require(depth_bin >= 1e-4 && std::isfinite(depth_bin), "depth_bin must be at least 1e-4.");
   require(near_mode >= 0 && grow_px >= 0, "near_mode and grow_px must not be negative.");
   const ForegroundRule rule{min_inside, ratio_of(max_gap, "max_gap"), depth_bin, near_mode,
                             grow_px};
   uint8_t* out = values_of<uint8_t>(mask, "mask");
-  nb::gil_scoped_release release;
-  kernels.foreground(image, focal_px, found, window, rule, out);
+  bool is_known;
+  {
+    nb::gil_scoped_release release;
+    is_known = kernels.foreground(image, focal_px, found, window, rule, out);
+  }
+  require(is_known, "labels must be those that sizes has.");
 }
 
 }  // namespace
@@ -109,8 +102,8 @@ NB_MODULE(_foreground, m) {
   m.def("surfaces", &surfaces, "depth_m"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a, "max_step"_a,
         "min_cosine"_a, "labels"_a);
   m.def("foreground", &foreground, "depth_m"_a, "focal_px"_a, "labels"_a, "sizes"_a, "row"_a,
-        "column"_a, "min_inside"_a, "max_gap"_a, "depth_bin"_a, "near_mode"_a,
-        "grow_px"_a, "mask"_a);
+        "column"_a, "min_inside"_a, "max_gap"_a, "depth_bin"_a, "near_mode"_a, "grow_px"_a,
+        "mask"_a);
 }
 
 }  // namespace ldo

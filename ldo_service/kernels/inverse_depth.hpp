@@ -36,7 +36,9 @@ template <class F>
 class RowsOfImages {
  public:
   RowsOfImages(int images, int width, int height)
-      : stride_(padded(width)), height_(height), rows_(static_cast<size_t>(images) * kKept * stride_) {
+      : stride_(padded(width)),
+        height_(height),
+        rows_(static_cast<size_t>(images) * kKept * stride_) {
     std::fill_n(rows_.data(), rows_.size(), 0.0f);
   }
   float* row(int image, int y) {

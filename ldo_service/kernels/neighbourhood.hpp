@@ -39,7 +39,8 @@ class Voxels {
     for (int64_t begin = 0; begin < v; begin += 64) {
       const int64_t n = std::min<int64_t>(64, v - begin);
       for (int64_t i = 0; i < n; ++i)
-        keys[i] = key_of(rows + static_cast<int64_t>(indices[begin + i]) * kRowFloats, 1.0f / edge_m);
+        keys[i] =
+            key_of(rows + static_cast<int64_t>(indices[begin + i]) * kRowFloats, 1.0f / edge_m);
       for (int64_t i = 0; i < n; ++i) cell_of_[begin + i] = enter(keys[i]);
     }
     sort_members(v);
