@@ -18,8 +18,7 @@ void each_job(int64_t v, int threads, const F& f) {
 void assign(const float* rows, const uint32_t* indices, int64_t v, const View& view,
             const float* depth_m, const Regions& regions, const AssignmentRule& rule,
             const Assignments& out, int threads) {
-  std::vector<Region> candidates;
-  for (int64_t j = 0; j < regions.m; ++j) candidates.emplace_back(regions, j);
+  const Candidates candidates(regions);
   const SplatBoxer boxes_of(view, depth_m, rule.max_depth_gap_m);
   each_job(v, threads, [&](int64_t begin, int64_t end) {
     for (int64_t first = begin; first < end; first += kLanes) {
@@ -27,8 +26,8 @@ void assign(const float* rows, const uint32_t* indices, int64_t v, const View& v
       SplatBoxes splats;
       boxes_of(rows, indices + first, count, splats);
       Contest contest(splats.expected);
-      for (int64_t j = 0; j < regions.m; ++j)
-        contest.enter(static_cast<int32_t>(j), candidates[j], splats, rule);
+      candidates.each_near(
+          splats, [&](int32_t j, const Region& region) { contest.enter(j, region, splats, rule); });
       std::copy_n(contest.region, count, out.region + first);
       std::copy_n(contest.overlap, count, out.overlap + first);
       std::copy_n(splats.z, count, out.z + first);

@@ -260,6 +260,20 @@ inline float sum(Floats x) {
 #endif
 }
 
+inline float lowest(Floats x) {  // of the lanes
+#if defined(__AVX512F__)
+  return _mm512_reduce_min_ps(x.v[0]);
+#else
+  alignas(64) float lanes[kLanes];
+  x.store(lanes);
+  for (int half = kLanes / 2; half > 0; half /= 2)
+    for (int i = 0; i < half; ++i)
+      lanes[i] = lanes[i + half] < lanes[i] ? lanes[i + half] : lanes[i];
+  return lanes[0];
+#endif
+}
+inline float highest(Floats x) { return -lowest(Floats(0.0f) - x); }
+
 // 1 / x for normal x, relative error below 1e-6.
 inline Floats reciprocal(Floats x) {
 #if defined(__AVX512F__)
