@@ -13,9 +13,7 @@ BLUR_PX = 1.5  # before normals are taken: `kernels/smoothness.hpp` says why
 _3X3 = np.ones((3, 3), np.uint8)
 
 
-def surfaces_reference(
-    depth_m: np.ndarray, camera: Camera, config: ForegroundConfig
-) -> Surfaces:
+def surfaces_reference(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> Surfaces:
     """Pieces of depth [H, W] without steps and creases, connected by their sides."""
     inverse = _inverse(depth_m)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)

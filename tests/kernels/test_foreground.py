@@ -8,7 +8,7 @@ import pytest
 
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
-from ldo_service.semantics.foreground import Foreground, ForegroundConfig, Surfaces
+from ldo_service.semantics.foreground import ForegroundConfig, Surfaces
 from ldo_service.semantics.foreground_reference import foreground_reference, surfaces_reference
 
 CONFIG = ForegroundConfig()

@@ -120,7 +120,7 @@ def test_kernel_does_on_real_frames_what_its_twin_does(data: Path, name: str) ->
         assert np.mean((ours.labels > 0) != (plain.labels > 0)) < 1e-5  # cosines at the threshold
         np.testing.assert_array_equal(ours.labels, components(ours.labels > 0))
         for low in np.random.default_rng(index).uniform(-20, [width, height], (20, 2)):
-            box = np.concatenate([low, low + [0.3 * width, 0.3 * height]])
+            box = np.concatenate([low, low + 0.3 * np.array([width, height])])
             told = box, frame.depth_m, plain, frame.camera, CONFIG
             wanted = twin.foreground_reference(*told).mask
             np.testing.assert_array_equal(foreground(*told).mask, wanted)
