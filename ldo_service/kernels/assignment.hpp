@@ -1,6 +1,8 @@
 // Which region of an image each Gaussian belongs to.
 #pragma once
 #include <cmath>
+#include <limits>
+#include <vector>
 
 #include "labels.hpp"
 #include "projection.hpp"
@@ -145,6 +147,40 @@ class Region {
   const int32_t* const rect_;
   const int32_t* sums_;
   double area_;
+};
+
+// All regions, and which of them sixteen splats may meet.
+class Candidates {
+ public:
+  explicit Candidates(const Regions& regions) {
+    const int64_t padded = (regions.m + kLanes - 1) / kLanes * kLanes;
+    // Nothing meets those that only fill up a vector.
+    for (auto& bound : bounds_) bound.assign(padded, std::numeric_limits<float>::quiet_NaN());
+    for (int64_t j = 0; j < regions.m; ++j) {
+      regions_.emplace_back(regions, j);
+      for (int k = 0; k < 4; ++k) bounds_[k][j] = regions_[j].bound[k];
+    }
+  }
+
+  // f(number, region) of those that meet the box about all of the splats, in order.
+  template <class F>
+  void each_near(const SplatBoxes& s, F f) const {
+    if (s.expected == 0) return;
+    const Floats x0 = lowest(Floats::load(s.x0)), y0 = lowest(Floats::load(s.y0)),
+                 x1 = highest(Floats::load(s.x1)), y1 = highest(Floats::load(s.y1));
+    for (size_t first = 0; first < bounds_[0].size(); first += kLanes) {
+      const auto bound = [&](int k) { return Floats::load(bounds_[k].data() + first); };
+      const Mask meet = (x0 < bound(2)) & (bound(0) < x1) & (y0 < bound(3)) & (bound(1) < y1);
+      for (uint32_t rest = bits(meet); rest != 0; rest &= rest - 1) {
+        const size_t j = first + __builtin_ctz(rest);
+        f(static_cast<int32_t>(j), regions_[j]);
+      }
+    }
+  }
+
+ private:
+  std::vector<Region> regions_;
+  std::vector<float> bounds_[4];  // as of each region
 };
 
 // Of sixteen splats the region whose reliability, overlap times score, is largest: the first of

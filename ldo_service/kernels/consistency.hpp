@@ -32,7 +32,7 @@ class Neighbours16 {
     }
   }
 
-  int labels() const { return n_labels_; }
+  int labels() const { return n_labels_; }  // background included
   uint8_t label(int l) const { return label_[l]; }
   float share(int l, Floats weights) const { return sum(weights * Floats::load(share_[l])); }
   float differing(uint8_t top, Floats weights) const {

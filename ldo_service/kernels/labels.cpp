@@ -18,8 +18,7 @@ void each_job(int64_t v, int threads, const F& f) {
 void assign(const float* rows, const uint32_t* indices, int64_t v, const View& view,
             const float* depth_m, const Regions& regions, const AssignmentRule& rule,
             const Assignments& out, int threads) {
-  std::vector<Region> candidates;
-  for (int64_t j = 0; j < regions.m; ++j) candidates.emplace_back(regions, j);
+  const Candidates candidates(regions);
   const SplatBoxer boxes_of(view, depth_m, rule.max_depth_gap_m);
   each_job(v, threads, [&](int64_t begin, int64_t end) {
     for (int64_t first = begin; first < end; first += kLanes) {
@@ -27,8 +26,8 @@ void assign(const float* rows, const uint32_t* indices, int64_t v, const View& v
       SplatBoxes splats;
       boxes_of(rows, indices + first, count, splats);
       Contest contest(splats.expected);
-      for (int64_t j = 0; j < regions.m; ++j)
-        contest.enter(static_cast<int32_t>(j), candidates[j], splats, rule);
+      candidates.each_near(
+          splats, [&](int32_t j, const Region& region) { contest.enter(j, region, splats, rule); });
       std::copy_n(contest.region, count, out.region + first);
       std::copy_n(contest.overlap, count, out.overlap + first);
       std::copy_n(splats.z, count, out.z + first);
@@ -49,7 +48,7 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
                    const ConsistencyRule& rule, int threads) {
   constexpr int64_t kJobVoxels = 256;
   const Voxels voxels(rows, indices, v, 2.0f * rule.sigma_m);
-  std::vector<LabelRow> before(v);
+  Buffer<LabelRow> before(v);
   for (int64_t i = 0; i < v; ++i) before[i] = labels[indices[i]];
   // Elsewhere all is background, and agrees.
   const auto active = voxels.about([&](uint32_t place) { return before[place].weights[0] > 0.0f; });
@@ -61,8 +60,10 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
       uint32_t places[kLanes];
       const int count = voxels.around(active[a], places);
       const Neighbours16 around(rows, indices, before.data(), places, count);
+      const bool is_bare = around.labels() == 1;
       for (int64_t k = 0; k < voxels.count(active[a]); ++k) {
         const uint32_t i = voxels.begin(active[a])[k];
+        if (is_bare && before[i].weights[0] == 0.0f) continue;  // all is background
         const float* mean = rows + static_cast<int64_t>(indices[i]) * kRowFloats;
         step(around, around.weights(mean, i, rule), before[i], labels[indices[i]], sums[job]);
       }

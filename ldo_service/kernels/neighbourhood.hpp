@@ -33,10 +33,16 @@ class Voxels {
   // Of the rows that `indices` [v] name: their places in that list, by voxel, in order. Voxels are
   // numbered as they appear. Rows that are not finite are in none.
   Voxels(const float* rows, const uint32_t* indices, int64_t v, float edge_m)
-      : table_(table_size(v)), cell_of_(v), members_(v) {
-    std::fill_n(table_.data(), table_.size(), -1);
-    for (int64_t i = 0; i < v; ++i)
-      cell_of_[i] = enter(rows + static_cast<int64_t>(indices[i]) * kRowFloats, 1.0f / edge_m);
+      : table_(size_t{1} << table_bits_, -1), cell_of_(v), members_(v) {
+    // In blocks: no key waits for a row that another branches on.
+    uint64_t keys[64];
+    for (int64_t begin = 0; begin < v; begin += 64) {
+      const int64_t n = std::min<int64_t>(64, v - begin);
+      for (int64_t i = 0; i < n; ++i)
+        keys[i] =
+            key_of(rows + static_cast<int64_t>(indices[begin + i]) * kRowFloats, 1.0f / edge_m);
+      for (int64_t i = 0; i < n; ++i) cell_of_[begin + i] = enter(keys[i]);
+    }
     sort_members(v);
   }
 
@@ -47,9 +53,11 @@ class Voxels {
   // The voxels, ascending, that hold a member of which `is_one` is true, or touch one that does.
   template <class F>
   std::vector<int64_t> about(const F& is_one) const {
-    std::vector<uint8_t> is_about(keys_.size(), 0);
+    std::vector<uint8_t> has_one(keys_.size(), 0), is_about(keys_.size(), 0);
+    for (size_t i = 0; i < cell_of_.size(); ++i)  // in the order of memory, not of voxels
+      if (cell_of_[i] >= 0 && is_one(static_cast<uint32_t>(i))) has_one[cell_of_[i]] = 1;
     for (int64_t cell = 0; cell < size(); ++cell) {
-      if (!std::any_of(begin(cell), begin(cell) + count(cell), is_one)) continue;
+      if (!has_one[cell]) continue;
       for (const auto& step : kStencil.step) {
         const int64_t other = find(shifted(keys_[cell], step));
         if (other >= 0) is_about[other] = 1;
@@ -81,12 +89,8 @@ class Voxels {
 
  private:
   static constexpr int64_t kHalf = int64_t{1} << 20, kMask = (kHalf << 1) - 1;  // 21 bits an axis
+  static constexpr uint64_t kNowhere = ~uint64_t{0};
 
-  static size_t table_size(int64_t v) {
-    size_t size = 64;
-    while (size < 2 * static_cast<size_t>(v)) size *= 2;
-    return size;
-  }
   static uint64_t packed(int64_t x, int64_t y, int64_t z) {
     return static_cast<uint64_t>((x & kMask) << 42 | (y & kMask) << 21 | (z & kMask));
   }
@@ -94,31 +98,50 @@ class Voxels {
     const auto axis = [&](int shift) { return static_cast<int64_t>(key >> shift) & kMask; };
     return packed(axis(42) + step[0], axis(21) + step[1], axis(0) + step[2]);
   }
+  // By the highest bits of the product, as the others know nothing of x.
   size_t slot_of(uint64_t key) const {
-    return static_cast<size_t>(key * 0x9e3779b97f4a7c15u >> 20) & (table_.size() - 1);
+    return static_cast<size_t>(key * 0x9e3779b97f4a7c15u >> (64 - table_bits_));
   }
 
-  int32_t enter(const float* mean, float per_m) {
+  static uint64_t key_of(const float* mean, float per_m) {
     int64_t at[3];
+    bool is_near = true;
     for (int k = 0; k < 3; ++k) {
       const float cell = std::floor(mean[k] * per_m);
-      if (!(std::fabs(cell) < static_cast<float>(kHalf))) return -1;
-      at[k] = static_cast<int64_t>(cell) + kHalf;
+      const bool is_in = std::fabs(cell) < static_cast<float>(kHalf);
+      at[k] = static_cast<int64_t>(is_in ? cell : 0.0f) + kHalf;
+      is_near = is_near & is_in;
     }
-    const uint64_t key = packed(at[0], at[1], at[2]);
-    size_t slot = slot_of(key);
-    for (; table_[slot] >= 0; slot = (slot + 1) & (table_.size() - 1))
-      if (keys_[table_[slot]] == key) return table_[slot];
-    table_[slot] = static_cast<int32_t>(keys_.size());
-    keys_.push_back(key);
-    return table_[slot];
+    return is_near ? packed(at[0], at[1], at[2]) : kNowhere;
   }
 
-  int64_t find(uint64_t key) const {
-    for (size_t slot = slot_of(key); table_[slot] >= 0; slot = (slot + 1) & (table_.size() - 1))
-      if (keys_[table_[slot]] == key) return table_[slot];
-    return -1;
+  int32_t enter(uint64_t key) {
+    if (key == kNowhere) return -1;
+    const size_t slot = slot_for(key);
+    return table_[slot] >= 0 ? table_[slot] : added(key, slot);
   }
+
+  // The table goes by voxels, not by Gaussians: it stays in the cache. Three of four slots are
+  // empty, so that most are right at once: a wrong guess of the processor costs more.
+  int32_t added(uint64_t key, size_t slot) {
+    const int32_t cell = static_cast<int32_t>(keys_.size());
+    keys_.push_back(key);
+    table_[slot] = cell;
+    if (4 * keys_.size() > table_.size()) {
+      table_.assign(size_t{1} << ++table_bits_, -1);
+      for (size_t k = 0; k < keys_.size(); ++k)
+        table_[slot_for(keys_[k])] = static_cast<int32_t>(k);
+    }
+    return cell;
+  }
+
+  // Where the voxel is in the table, or where it would be.
+  size_t slot_for(uint64_t key) const {
+    size_t slot = slot_of(key);
+    while (table_[slot] >= 0 && keys_[table_[slot]] != key) slot = (slot + 1) & (table_.size() - 1);
+    return slot;
+  }
+  int64_t find(uint64_t key) const { return table_[slot_for(key)]; }
 
   void sort_members(int64_t v) {
     starts_.assign(keys_.size() + 1, 0);
@@ -130,7 +153,9 @@ class Voxels {
       if (cell_of_[i] >= 0) members_[next[cell_of_[i]]++] = static_cast<uint32_t>(i);
   }
 
-  Buffer<int32_t> table_, cell_of_;
+  int table_bits_ = 6;
+  std::vector<int32_t> table_;  // of voxels by key, -1 where it is empty
+  Buffer<int32_t> cell_of_;
   Buffer<uint32_t> members_;
   std::vector<uint64_t> keys_;
   std::vector<int64_t> starts_;

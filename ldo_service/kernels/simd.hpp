@@ -244,14 +244,35 @@ inline Floats sqrt(Floats x) {
   return out;
 }
 
-// Sum of the lanes, in an order that is the same on every machine.
+// Sum of the lanes, in an order that is the same on every machine: the lower half takes what the
+// upper half has, again and again. In halves of registers no compiler joins it with a product.
 inline float sum(Floats x) {
+#if defined(__AVX512F__)
+  const __m256 eight = _mm512_castps512_ps256(x.v[0]) + _mm512_extractf32x8_ps(x.v[0], 1);
+  const __m128 four = _mm256_castps256_ps128(eight) + _mm256_extractf128_ps(eight, 1);
+  return (four[0] + four[2]) + (four[1] + four[3]);
+#else
   alignas(64) float lanes[kLanes];
   x.store(lanes);
   for (int half = kLanes / 2; half > 0; half /= 2)
     for (int i = 0; i < half; ++i) lanes[i] += lanes[i + half];
   return lanes[0];
+#endif
 }
+
+inline float lowest(Floats x) {  // of the lanes
+#if defined(__AVX512F__)
+  return _mm512_reduce_min_ps(x.v[0]);
+#else
+  alignas(64) float lanes[kLanes];
+  x.store(lanes);
+  for (int half = kLanes / 2; half > 0; half /= 2)
+    for (int i = 0; i < half; ++i)
+      lanes[i] = lanes[i + half] < lanes[i] ? lanes[i + half] : lanes[i];
+  return lanes[0];
+#endif
+}
+inline float highest(Floats x) { return -lowest(Floats(0.0f) - x); }
 
 // 1 / x for normal x, relative error below 1e-6.
 inline Floats reciprocal(Floats x) {

@@ -60,7 +60,7 @@ class Regions:
         """Of each box only that part; one without any pixel keeps no Gaussian."""
         shown = [f if f.mask.size else _NOWHERE for f in foregrounds]
         rects = [(f.column, f.row, f.mask.shape[1], f.mask.shape[0]) for f in shown]
-        sums = [cv2.integral(f.mask.astype(np.uint8)).ravel() for f in shown]
+        sums = [cv2.integral(f.mask.view(np.uint8)).ravel() for f in shown]
         rects = np.array(rects, np.int32).reshape(-1, 4)
         return cls(*_float32(boxes, scores), rects, np.concatenate([_NO_SUMS, *sums]))
 

@@ -175,11 +175,11 @@ def observations(
     sides_px = np.full(len(indices), config.labels.least_px, np.float32)
     of = where.regions[hit]
     both = fused(
-        claims.labels[of],
-        claims.confidences[of],
+        claims.labels.take(of),
+        claims.confidences.take(of),
         where.overlaps[hit],
-        claims.open_labels[of],
-        claims.open_confidences[of],
+        claims.open_labels.take(of),
+        claims.open_confidences.take(of),
         config.fusion,
     )
     labels[hit] = np.where(both.confidences > 0, both.labels, NOT_SEEN)
@@ -187,6 +187,8 @@ def observations(
     if is_late:
         labels[np.flatnonzero(hit)[2 * both.by_detector >= both.confidences]] = NOT_SEEN
     corners = np.reshape(claims.boxes, (-1, 2, 2))
-    sides_px[hit] = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))[of]
-    m_per_px = np.maximum(where.depths_m, 0) / np.float32(np.sqrt(camera.fx * camera.fy))
-    return Observations(indices, labels, confidences, sides_px * m_per_px)
+    sides_px[hit] = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1)).take(of)
+    extents_m = np.maximum(where.depths_m, 0)
+    extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))
+    extents_m *= sides_px
+    return Observations(indices, labels, confidences, extents_m)

@@ -1,15 +1,19 @@
 import doctest
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.semantics import foreground as foreground_module
+from ldo_service.semantics import foreground_reference as twin
 from ldo_service.semantics.foreground import (
     ForegroundConfig,
+    Surfaces,
     foreground,
-    mode_of,
     pixels_of,
     surfaces,
 )
@@ -42,6 +46,7 @@ def thing() -> np.ndarray:
 
 def test_examples_in_the_docstrings_hold() -> None:
     assert doctest.testmod(foreground_module).failed == 0
+    assert doctest.testmod(twin).failed == 0
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
@@ -73,11 +78,53 @@ def test_a_box_has_the_pixels_whose_centres_lie_in_it() -> None:
     assert pixels_of(np.array([9, 9, 12, 12]), (4, 6)) == (slice(4, 4), slice(6, 6))
 
 
-def test_mode_prefers_the_many_to_the_near() -> None:
-    depth_m = np.array([0.8] * 5 + [2.0] * 20 + [2.1] * 15 + [0.0] * 90)
-    assert mode_of(depth_m, 0.05) == pytest.approx(2.0, rel=0.06)
+def test_the_many_pixels_in_the_middle_are_the_thing_and_not_the_near_ones() -> None:
+    depth_m, near = room(), (slice(64, 76), slice(74, 86))
+    depth_m[near] = 0.8
+    told = np.array([60, 50, 99, 89]), depth_m, one_piece(depth_m), CAMERA, CONFIG
+    found = foreground(*told).image(depth_m.shape)
+    assert not found[near].any()
+    assert np.mean(found[CUBE]) > 0.8
 
 
-def test_settings_beyond_their_range_are_refused() -> None:
+def one_piece(depth_m: np.ndarray) -> Surfaces:
+    """All on edges."""
+    return Surfaces(np.zeros(depth_m.shape, np.int32), np.array([depth_m.size]))
+
+
+@pytest.mark.parametrize("settings", [{"min_cosine": 1.5}, {"depth_bin": 0}, {"grow_px": -1}])
+def test_settings_beyond_their_range_are_refused(settings) -> None:
     with pytest.raises(ConfigError):
-        ForegroundConfig(min_cosine=1.5)
+        ForegroundConfig(**settings)
+
+
+def test_surfaces_and_images_that_do_not_fit_are_refused() -> None:
+    depth_m, box = room(), np.array([5, 5, 40, 40])
+    with pytest.raises(ValueError, match="shape"):
+        surfaces(depth_m[:-1], CAMERA, CONFIG)
+    with pytest.raises(ValueError, match="shape"):
+        foreground(box, depth_m[:-1], one_piece(depth_m), CAMERA, CONFIG)
+    unknown = Surfaces(np.full(depth_m.shape, 7, np.int32), np.array([depth_m.size]))
+    with pytest.raises(ValueError, match="labels"):
+        foreground(box, depth_m, unknown, CAMERA, CONFIG)
+
+
+@pytest.mark.parametrize("name", ["tum/kitchen", "replica/apartment_floor1"])
+def test_kernel_does_on_real_frames_what_its_twin_does(data: Path, name: str) -> None:
+    sequence = open_sequence(str(data / name))
+    for index in (0, 40, 80):
+        frame = sequence[index]
+        height, width = frame.depth_m.shape
+        ours = surfaces(frame.depth_m, frame.camera, CONFIG)
+        plain = twin.surfaces_reference(frame.depth_m, frame.camera, CONFIG)
+        assert np.mean((ours.labels > 0) != (plain.labels > 0)) < 1e-4  # cosines at the threshold
+        np.testing.assert_array_equal(ours.labels, components(ours.labels > 0))
+        for low in np.random.default_rng(index).uniform(-20, [width, height], (20, 2)):
+            box = np.concatenate([low, low + 0.3 * np.array([width, height])])
+            told = box, frame.depth_m, plain, frame.camera, CONFIG
+            wanted = twin.foreground_reference(*told).mask
+            np.testing.assert_array_equal(foreground(*told).mask, wanted)
+
+
+def components(is_set: np.ndarray) -> np.ndarray:
+    return cv2.connectedComponents(is_set.astype(np.uint8), connectivity=4)[1]

@@ -1,0 +1,179 @@
+"""Surfaces and foregrounds against their plain twins, with every instruction set."""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from ldo_service.geometry import Camera
+from ldo_service.kernels import _foreground
+from ldo_service.semantics.foreground import ForegroundConfig, Surfaces
+from ldo_service.semantics.foreground_reference import foreground_reference, surfaces_reference
+
+CONFIG = ForegroundConfig()
+# whole vectors and words, cut ones, and sides below the nine pixels that a normal's pair reads
+SIZES = ((120, 160), (64, 128), (97, 131), (9, 70), (33, 5), (4, 4), (3, 8), (2, 17), (1, 40))
+SIZES += ((40, 1), (1, 1))
+COMPARE_ALL = """
+from ldo_service.geometry import Camera
+from ldo_service.semantics.foreground import ForegroundConfig, Surfaces, foreground, surfaces
+for name in {key.split("/")[0] for key in given}:
+    depth_m, plain = given[f"{name}/depth_m"], given[f"{name}/labels"]
+    h, w = depth_m.shape
+    told = Camera(w, h, 0.9 * w, 1.1 * h, 0.47 * w, 0.51 * h), ForegroundConfig()
+    found = surfaces(depth_m, *told)
+    result |= {f"{name}/labels": found.labels, f"{name}/sizes": found.sizes}
+    plain = Surfaces(plain, np.bincount(plain.ravel()))
+    for k, box in enumerate(given[f"{name}/boxes"]):
+        result[f"{name}/mask{k}"] = foreground(box, depth_m, plain, *told).mask
+"""
+
+
+def camera(height: int, width: int) -> Camera:
+    return Camera(width, height, 0.9 * width, 1.1 * height, 0.47 * width, 0.51 * height)
+
+
+def scene(height: int, width: int) -> np.ndarray:
+    """A slanted wall with a crease and boxes before it: noise on the left, holes and what is no
+    depth on the right."""
+    rng = np.random.default_rng(height * width)
+    v, u = np.indices((height, width))
+    depth_m = 2.5 + 0.8 * np.abs(u / width - 0.4) + 0.3 * v / height
+    for _ in range(8):
+        low = rng.uniform(0, [height, width]).astype(int)
+        high = low + 1 + rng.uniform(0, [height / 2, width / 2]).astype(int)
+        depth_m[low[0] : high[0], low[1] : high[1]] = rng.uniform(0.6, 2.2)
+    depth_m *= 1 + 0.004 * rng.normal(size=depth_m.shape) * (u < width / 3)
+    gone = (rng.random(depth_m.shape) < 0.03) & (u > width / 2)
+    depth_m[gone] = rng.choice([0, -1, np.nan, np.inf, 1e-9], np.count_nonzero(gone))
+    return depth_m.astype(np.float32)
+
+
+def boxes(height: int, width: int) -> np.ndarray:
+    """Some within the image, some across its border, one around it, one beside it."""
+    rng = np.random.default_rng(width)
+    low = rng.uniform(-0.2, 0.8, (12, 2)) * [width, height]
+    some = np.concatenate([low, low + rng.uniform(0.1, 0.6, (12, 2)) * [width, height]], axis=1)
+    whole, beside = [-9, -9, width + 9, height + 9], [width + 3, 0, width + 9, height]
+    return np.concatenate([some, [whole, beside]])
+
+
+def plain(height: int, width: int) -> tuple[np.ndarray, Surfaces]:
+    depth_m = scene(height, width)
+    return depth_m, surfaces_reference(depth_m, camera(height, width), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
+    given = {}
+    for size in SIZES:
+        name, (depth_m, found) = "{}x{}".format(*size), plain(*size)
+        given |= {f"{name}/depth_m": depth_m, f"{name}/labels": found.labels}
+        given[f"{name}/boxes"] = boxes(*size)
+    return with_isa(COMPARE_ALL, given)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_surfaces_are_those_of_the_plain_twin(size: tuple[int, int], by_kernel: dict) -> None:
+    _, wanted = plain(*size)
+    labels = by_kernel["{}x{}/labels".format(*size)]
+    differ = (labels > 0) != (wanted.labels > 0)  # by rounding, where a cosine is at its threshold
+    assert np.count_nonzero(differ) <= 1e-4 * differ.size
+    if not differ.any():
+        np.testing.assert_array_equal(labels, wanted.labels)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_pieces_are_numbered_and_counted_as_opencv_does(
+    size: tuple[int, int], by_kernel: dict
+) -> None:
+    labels = by_kernel["{}x{}/labels".format(*size)]
+    _, wanted = cv2.connectedComponents((labels > 0).astype(np.uint8), connectivity=4)
+    np.testing.assert_array_equal(labels, wanted)
+    np.testing.assert_array_equal(
+        by_kernel["{}x{}/sizes".format(*size)], np.bincount(labels.ravel())
+    )
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_foregrounds_are_those_of_the_plain_twin(size: tuple[int, int], by_kernel: dict) -> None:
+    depth_m, found = plain(*size)
+    for k, box in enumerate(boxes(*size)):
+        wanted = foreground_reference(box, depth_m, found, camera(*size), CONFIG)
+        np.testing.assert_array_equal(by_kernel["{}x{}/mask{}".format(*size, k)], wanted.mask)
+
+
+def test_scenes_have_steps_creases_holes_and_things() -> None:
+    """So that the comparisons above compare something."""
+    depth_m, found = plain(97, 131)
+    assert len(found.sizes) > 8
+    assert 0.2 < np.mean(found.labels > 0) < 0.9
+    sizes = [
+        np.count_nonzero(foreground_reference(b, depth_m, found, camera(97, 131), CONFIG).mask)
+        for b in boxes(97, 131)
+    ]
+    assert np.count_nonzero(sizes) >= 4
+    assert 0 in sizes
+
+
+def test_pieces_hang_together_by_sides_alone_however_they_wind() -> None:
+    """Blocks of depth in a labyrinth without any: of a block its middle, and what joins it to the
+    next, are smooth."""
+    labyrinth = np.random.default_rng(0).random((40, 60)) < 0.6
+    depth_m = np.kron(labyrinth, np.ones((3, 3))).astype(np.float32)
+    labels = np.empty(depth_m.shape, np.int32)
+    sizes = _foreground.surfaces(depth_m, 200.0, 200.0, 90.0, 60.0, 0.05, 0.0, labels)
+    _, wanted = cv2.connectedComponents((labels > 0).astype(np.uint8), connectivity=4)
+    assert wanted.max() > 20
+    np.testing.assert_array_equal(labels, wanted)
+    np.testing.assert_array_equal(sizes, np.bincount(wanted.ravel()))
+
+
+def given_to_foreground(**changes: object) -> tuple:
+    depth_m, labels = np.ones((20, 30), np.float32), np.zeros((20, 30), np.int32)
+    told = {
+        "depth_m": depth_m,
+        "focal_px": 20.0,
+        "labels": labels,
+        "sizes": np.array([600]),
+        "row": 5,
+        "column": 5,
+        "min_inside": 0.5,
+        "max_gap": 0.15,
+        "depth_bin": 0.05,
+        "near_mode": 0.1,
+        "grow_px": 2,
+        "mask": np.ones((10, 10), np.uint8),
+    }
+    return tuple((told | changes).values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"depth_m": np.ones((20, 30))}, "float32"),
+        ({"labels": np.zeros((19, 30), np.int32)}, "shape"),
+        ({"labels": np.full((20, 30), -1, np.int32)}, "sizes"),
+        ({"labels": np.full((20, 30), 1, np.int32)}, "sizes"),
+        ({"sizes": np.ones(1, np.int32)}, "int64"),
+        ({"row": -1}, "within the image"),
+        ({"column": 21}, "within the image"),
+        ({"mask": np.ones((0, 10), np.uint8)}, "shape"),
+        ({"focal_px": 0.0}, "positive"),
+        ({"depth_bin": 1e-9}, "1e-4"),
+        ({"max_gap": np.nan}, "negative"),
+    ],
+)
+def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _foreground.foreground(*given_to_foreground(**changes))
+
+
+def test_a_mask_is_written_whole() -> None:
+    told = given_to_foreground()
+    _foreground.foreground(*told)
+    assert told[-1].all()  # all is at one depth, on edges
+    nothing = given_to_foreground(depth_m=np.zeros((20, 30), np.float32))
+    _foreground.foreground(*nothing)
+    assert not nothing[-1].any()
