@@ -127,6 +127,15 @@ class Config:
     stage: StageConfig = field(default_factory=StageConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
 
+    def __post_init__(self) -> None:
+        patience_s = self.vlm_labeller.http.endpoint.patience_s
+        if self.vlm_labeller.url and patience_s >= self.stage.stall_after_s:
+            raise ConfigError(
+                f"vlm_labeller.http.endpoint.patience_s={patience_s:g} must be below "
+                f"stage.stall_after_s={self.stage.stall_after_s:g}: the service ends when an actor "
+                "is busy for so long."
+            )
+
     def with_map_folder(self, folder: Path) -> "Config":
         """The mapper keeps images and sleeping Gaussians there, if nowhere else: its successor
         finds them."""
