@@ -104,3 +104,8 @@ def test_no_labeller_behind_a_server_may_be_waited_for_until_it_is_given_up() ->
     with pytest.raises(ConfigError, match=r"patience_s=300 must be below stage\.stall_after_s=60"):
         load_config(settings=[server, patient])
     assert load_config(settings=[server, patient, "stage.stall_after_s=301"])
+
+
+def test_who_orders_a_labeller_to_do_something_waits_until_it_is_done_with_a_region() -> None:
+    config = Config()
+    assert config.vlm_labeller.http.endpoint.patience_s < config.service.control_timeout_s
