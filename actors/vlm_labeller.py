@@ -1,7 +1,8 @@
 """Names of regions that the detector does not know.                     actors/vlm_labeller.py
 
 in   label/request   LabelRequest   Latest(1 per region)   a newer look at a region says more
-in   label/add       LabelAdd       Latest(32)             asked by a person, now and then
+in   label/add       LabelAdd       Latest(32)             asked by a person, now and then, who
+                                                           waits: it goes first
 out  label/open      LabelOpen      one for every request, late by design
 out  label/names     LabelNames     one for every label/add
 
@@ -61,7 +62,7 @@ class VlmLabeller(Actor):
     name = "vlm_labeller"
     inputs = (
         In(LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),
-        In(LABEL_ADD, Latest(32)),
+        In(LABEL_ADD, Latest(32), goes_first=True),
     )
     outputs = (Out(LABEL_OPEN), Out(LABEL_NAMES))
 

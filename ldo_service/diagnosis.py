@@ -65,7 +65,9 @@ def _silent(how_long: str) -> Trouble:
 
 
 def _of_steps(health: Health) -> Iterator[Trouble]:
-    waiting = sum(count.waiting for count in health.inputs)
+    waiting = _waiting(health)
+    if _is_labeller(health):
+        return
     if health.busy_s > SLOW_STEP_S:
         yield Trouble(
             f"has been busy with one message for {health.busy_s:.0f} s",
@@ -76,6 +78,15 @@ def _of_steps(health: Health) -> Iterator[Trouble]:
             f"took none of {waiting} waiting messages for {health.step_age_s:.0f} s",
             "it waits for room at a consumer: look at the actors that take what it makes",
         )
+
+
+def _waiting(health: Health) -> int:
+    return sum(count.waiting for count in health.inputs)
+
+
+def _is_labeller(health: Health) -> bool:
+    """It may take its time: nobody waits for it."""
+    return bool(health.facts.get("labellers"))
 
 
 def _of_failures(health: Health) -> Iterator[Trouble]:
@@ -139,6 +150,11 @@ def remarks(seen: Seen) -> Iterator[str]:
 
 
 def _of_answers(health: Health) -> Iterator[str]:
+    if _is_labeller(health) and health.busy_s > SLOW_STEP_S:
+        yield (
+            f"has been busy with one region for {health.busy_s:.0f} s, and {_waiting(health)} "
+            "wait: names come late, and nobody waits for them"
+        )
     if refused := health.facts.get("answers_refused"):
         questions = health.facts.get("questions", 0)
         yield f"refused {refused:.0f} of {questions:.0f} answers: no name, or not one asked for"

@@ -94,3 +94,18 @@ def every_field(config: object) -> Iterator[tuple[str, object]]:
 def test_every_setting_is_a_plain_value() -> None:
     for name, value in every_field(Config()):
         assert isinstance(value, bool | int | float | str | tuple), name
+
+
+def test_no_labeller_behind_a_server_may_be_waited_for_until_it_is_given_up() -> None:
+    """The service would end with it."""
+    server = "vlm_labeller.url=http://127.0.0.1:8000/v1"
+    patient = "vlm_labeller.http.endpoint.patience_s=300"
+    assert load_config(settings=[patient]).vlm_labeller.url == ""
+    with pytest.raises(ConfigError, match=r"patience_s=300 must be below stage\.stall_after_s=60"):
+        load_config(settings=[server, patient])
+    assert load_config(settings=[server, patient, "stage.stall_after_s=301"])
+
+
+def test_who_orders_a_labeller_to_do_something_waits_until_it_is_done_with_a_region() -> None:
+    config = Config()
+    assert config.vlm_labeller.http.endpoint.patience_s < config.service.control_timeout_s

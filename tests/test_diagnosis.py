@@ -73,6 +73,12 @@ def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
         (health(held=True), "ldo control resume"),
         (health(inputs=inputs("camera/rgbd", delivered=0)), "no frame yet"),
         (health(inputs=inputs("camera/rgbd"), step_age_s=9.0), "last frame 9 s ago"),
+        (
+            health(
+                busy_s=12.0, step_age_s=12.0, inputs=inputs(waiting=3), facts={"labellers": 1.0}
+            ),
+            "one region for 12 s, and 3 wait: names come late",
+        ),
         (health(facts={"answers_refused": 2.0, "questions": 9.0}), "refused 2 of 9 answers"),
         (health(facts={"answers_without_logprobs": 4.0}), "confidence_untold"),
         (health(facts={"names_refused": 1.0}), "refused 1 names"),

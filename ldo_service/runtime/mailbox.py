@@ -132,7 +132,8 @@ class Mailbox:
 
     # --- taking, on the event loop --------------------------------------------------------------
     async def take(self) -> Delivery | Order | None:
-        """An order, else the oldest delivery; None when the mailbox was closed and is empty."""
+        """An order, else the oldest delivery, of an input that goes first if there is one; None
+        when the mailbox was closed and is empty."""
         while True:
             with self._lock:
                 self._wake_pending = False
@@ -140,7 +141,8 @@ class Mailbox:
                 if self._orders:
                     return self._orders.popleft()
                 if self._order and not self._held:
-                    delivery = self._order.popleft()
+                    delivery = next((d for d in self._order if d.port.goes_first), self._order[0])
+                    self._order.remove(delivery)
                     self._inlets[delivery.port.topic.name].waiting.popleft()
                     return delivery
                 if self._closed:

@@ -48,8 +48,11 @@ Policy = Lossless | Latest
 
 @dataclass(frozen=True, slots=True)
 class In:
+    """`goes_first`: what comes here is taken before all that waits at other inputs."""
+
     topic: Topic
     policy: Policy
+    goes_first: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.policy, Latest) and self.policy.per_key and self.topic.key is None:

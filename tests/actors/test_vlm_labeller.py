@@ -279,6 +279,23 @@ async def test_a_slow_labeller_keeps_the_newest_of_each_region_and_no_more_than_
     assert dropped == 2 + 8
 
 
+async def test_who_adds_a_name_waits_for_one_region_and_not_for_all_that_wait() -> None:
+    transport, gate, said = MemoryTransport(), Event(), []
+    for topic in (LABEL_OPEN, LABEL_NAMES):
+        transport.subscribe(topic.name, lambda *_, name=topic.name: said.append(name))
+    labeller = Scripted([("cup", 0.5)], gate)
+    mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
+    operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
+    async with running(stage(transport, labeller)):
+        for region in range(5):
+            await send(mapper, request(region))
+        await eventually(lambda: labeller.seen)
+        await send(operator, LabelAdd(stamp_ns=1, name="teapot"))
+        gate.set()
+        await eventually(lambda: len(said) == 6)
+    assert said == [LABEL_OPEN.name, LABEL_NAMES.name, *[LABEL_OPEN.name] * 4]
+
+
 async def test_a_state_survives_the_stage(pair: Path, names: Path) -> None:
     config = VlmLabellerConfig(model=str(pair), names=str(names))
     store, transport, told = MemoryStore(), MemoryTransport(), []
@@ -305,6 +322,7 @@ async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelOpen]:
     operator = Outlet(Out(LABEL_ADD), "operator", 1, transport)
     async with running(one) as tasks:
         await send(mapper, request(0, "blue"))
+        await eventually(lambda: len(heard) == 1)
         await send(operator, LabelAdd(stamp_ns=1, name="blue"))
         await send(mapper, request(1, "blue"))
         await eventually(lambda: len(heard) == 2)

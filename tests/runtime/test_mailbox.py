@@ -44,6 +44,18 @@ async def test_latest_drops_the_oldest_and_counts() -> None:
     assert (counted.delivered, counted.dropped, counted.peak, counted.waiting) == (2, 8, 2, 0)
 
 
+async def test_what_goes_first_is_taken_before_all_that_waits_and_in_its_own_order() -> None:
+    transport = MemoryTransport()
+    ports = In(NUMBERS, Latest(8)), In(DOUBLES, Latest(8), goes_first=True)
+    mailbox = Mailbox("me", ports, transport)
+    patient, hasty = Feed(transport), Feed(transport, DOUBLES.name)
+    for value in range(3):
+        patient.send(value)
+        hasty.send(10 + value)
+    assert [stamp for _, stamp in await take_all(mailbox)] == [10, 11, 12, 0, 1, 2]
+    assert [counted.delivered for counted in mailbox.statistics()] == [3, 3]
+
+
 async def test_latest_per_key_keeps_the_newest_of_each() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Latest(1, per_key=True)),), transport)

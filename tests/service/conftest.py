@@ -41,7 +41,7 @@ class LiveService:
     """`ldo serve`, its log, and a client that listens to health and poses."""
 
     def __init__(self, folder: Path, *arguments: str, command: Sequence[str] = LDO) -> None:
-        self.endpoint = free_endpoint()
+        self.endpoint, self.state = free_endpoint(), folder / "s"
         self.log_path = folder / "serve.log"
         self._log = self.log_path.open("w")
         self.process = subprocess.Popen(
@@ -51,7 +51,7 @@ class LiveService:
                 "--endpoint",
                 self.endpoint,
                 "--state",
-                str(folder / "s"),
+                str(self.state),
                 *arguments,
             ],
             stderr=self._log,

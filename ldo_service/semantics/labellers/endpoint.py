@@ -24,7 +24,8 @@ class EndpointConfig:
     timeout_s: float = 10.0  # of one attempt
     attempts: int = 3
     backoff_s: float = 0.5  # before the second attempt; doubled before each further one
-    patience_s: float = 40.0  # of one question with all attempts and waits; below stall_after_s
+    patience_s: float = 40.0  # of a region, with all its views, attempts and waits; below
+    # stage.stall_after_s, at which an actor is given up
     per_minute: float = 60.0  # attempts, evenly spaced
     rest_s: float = 10.0  # after a question that failed, nothing is asked; doubled with each more
     rest_most_s: float = 300.0
@@ -62,9 +63,9 @@ class Endpoint:
         self._failures = 0  # in a row
         self.attempts = 0
 
-    def post(self, path: str, body: bytes) -> bytes:
-        """The answer to a question. Raises EndpointError when there is none in time."""
-        until_s = self._clock() + self._config.patience_s
+    def post(self, path: str, body: bytes, until_s: float) -> bytes:
+        """The answer to a question. Raises EndpointError when there is none by `until_s` of the
+        clock."""
         if self._clock() < self._rested_at_s:
             raise EndpointError(f"{self.url} failed before and is left alone for a while.")
         try:

@@ -74,7 +74,7 @@ class HttpLabeller:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.config = config or HttpConfig()
-        self._endpoint = Endpoint(url, self.config.endpoint, clock, sleep)
+        self._endpoint, self._clock = Endpoint(url, self.config.endpoint, clock, sleep), clock
         self._names = list(dict.fromkeys(map(canonical, names)))
         self._questions = self._refused = self._undecided = self._untold = 0
         self.identity = f"{self.config.model or 'model'} at {url}"
@@ -97,15 +97,21 @@ class HttpLabeller:
 
     def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
         """See `Labeller`. A view whose answer is refused has no opinion; when the server fails
-        after a view was answered, that view's answer stands alone."""
+        after a view was answered, that view's answer stands alone. All of them have `patience_s`
+        together: one that would take longer than is left, going by those before, is left out."""
         views: list[list[Opinion]] = []
+        until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0
         for crop in crops[: self.config.views]:
+            start_s = self._clock()
+            if start_s + slowest_s > until_s:
+                break
             try:
-                views.append(self._look(crop))
+                views.append(self._look(crop, until_s))
             except EndpointError:
                 if not any(views):
                     raise
                 break
+            slowest_s = max(slowest_s, self._clock() - start_s)
         return fused_over_views(views)
 
     def facts(self) -> dict[str, float]:
@@ -120,9 +126,10 @@ class HttpLabeller:
             "answers_without_logprobs": self._untold,
         }
 
-    def _look(self, crop: np.ndarray) -> list[Opinion]:
+    def _look(self, crop: np.ndarray, until_s: float) -> list[Opinion]:
         self._questions += 1
-        answer = read_answer(self._endpoint.post("/chat/completions", self._question(crop)))
+        body = self._endpoint.post("/chat/completions", self._question(crop), until_s)
+        answer = read_answer(body)
         name = name_of(answer.text, self.names, self.config.most_words)
         if name is None:
             self._undecided += canonical(answer.text.strip(" .\"'")) == NONE

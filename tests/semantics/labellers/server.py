@@ -34,7 +34,7 @@ def serving(*answers: Callable[[BaseHTTPRequestHandler], None]) -> Iterator[Serv
             server.asked.append(json.loads(self.rfile.read(length)))
             server.paths.append(self.path)
             server.keys.append(self.headers["Authorization"])
-            self.over = server.over
+            self.over, self.question = server.over, server.asked[-1]
             with suppress(OSError):  # who asked has left
                 server.next_answer()(self)
 

@@ -5,6 +5,7 @@ import logging
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler
 from math import sqrt
 
 import cv2
@@ -216,6 +217,21 @@ def test_log_probabilities_that_are_none_do_not_count(logprob: str) -> None:
 def test_a_view_that_was_answered_stands_when_the_next_one_fails() -> None:
     with serving(says("cup", 0.9), sends(404)) as server:
         assert labeller(server.url).label([RED, RED]) == [("cup", pytest.approx(0.9))]
+
+
+@pytest.mark.parametrize(("each_s", "asked"), [(5, 3), (13, 3), (15, 2), (25, 1), (40, 1)])
+def test_all_views_of_a_region_together_try_its_patience(each_s: float, asked: int) -> None:
+    time = Time()
+
+    def says_late(handler: BaseHTTPRequestHandler) -> None:
+        time.now_s += each_s
+        says("cup", 0.5)(handler)
+
+    with serving(says_late) as server:
+        one = labeller(server.url, time=time, views=3)
+        assert one.label([RED] * 3) == [("cup", pytest.approx(0.5))]
+    assert len(server.asked) == asked
+    assert time.now_s - 100 <= EndpointConfig().patience_s
 
 
 # --- manners --------------------------------------------------------------------------------------

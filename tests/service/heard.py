@@ -1,0 +1,88 @@
+"""What a live service says of its poses and of names, as it says it."""
+
+from contextlib import ExitStack
+
+import numpy as np
+
+from ldo_service.gaussians.model import GaussianMap
+from ldo_service.runtime.state_store import FolderStore
+from ldo_service.schemas import Correction, InputCount, LabelOpen, LabelRequest, TrackedPose
+from ldo_service.schemas.topics import GRAPH_CORRECTION, POSE_TRACKED
+from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.wire import keyframe_poses_of
+from tests.service.conftest import LiveService
+from tests.service.exhibits import Guide
+
+
+class Heard:
+    """Kept by `listen`, to be called often. `guide` is told of each request."""
+
+    def __init__(self, service: LiveService, stack: ExitStack, guide: Guide | None = None) -> None:
+        self.service, self._guide = service, guide
+        self.poses: list[TrackedPose] = []
+        self.frame_of: dict[int, int] = {}  # by keyframe
+        self.requests: list[LabelRequest] = []
+        self.answers: list[LabelOpen] = []
+        self.late: list[int] = []  # keyframes that were made until each answer came
+        listen = service.client.listen
+        self._requests = stack.enter_context(listen("label/request", LabelRequest))
+        self._answers = stack.enter_context(listen("label/open", LabelOpen))
+
+    def listen(self) -> None:
+        requests = self._requests()  # of keyframes whose poses were told before
+        for pose in self.service.poses():
+            self._take(pose)
+        for request in requests:
+            self.requests.append(request)
+            if self._guide:
+                self._guide.told(request, self.frame_of[request.keyframe])
+        for answer in self._answers():
+            self.answers.append(answer)
+            self.late.append(max(self.frame_of) - answer.keyframe)
+
+    def _take(self, pose: TrackedPose) -> None:
+        self.poses.append(pose)
+        if pose.keyframe is not None:
+            self.frame_of[pose.keyframe] = pose.frame
+
+    def ask_again(self) -> None:
+        """For the last pose, if it got lost on the way."""
+        for pose in self.service.client.last(POSE_TRACKED):
+            assert isinstance(pose, TrackedPose)
+            if pose.frame > max((known.frame for known in self.poses), default=-1):
+                self._take(pose)
+
+    def has_all_answers(self) -> bool:
+        """Whatever was asked is answered, and the map has taken it."""
+        self.listen()
+        labeller = self.service.update_health()["vlm_labeller"]
+        asked, taken = (
+            self.input("vlm_labeller", "label/request"),
+            self.input("mapper", "label/open"),
+        )
+        is_idle = labeller.state == "ready" and asked.waiting == 0
+        return is_idle and asked.delivered == taken.delivered + taken.dropped + taken.lost
+
+    def input(self, actor: str, topic: str) -> InputCount:
+        """As of the last heartbeat."""
+        inputs = self.service.update_health()[actor].inputs
+        return next(count for count in inputs if count.topic == topic)
+
+    def fact(self, actor: str, name: str) -> float:
+        return self.service.update_health()[actor].facts.get(name, 0.0)
+
+    def graph(self) -> dict[int, np.ndarray]:
+        """T_map_keyframe [4, 4] by keyframe, as the optimizer has them."""
+        (correction,) = self.service.client.last(GRAPH_CORRECTION)
+        assert isinstance(correction, Correction)
+        return keyframe_poses_of(correction)
+
+    def map(self) -> tuple[GaussianMap, tuple[str, ...]]:
+        """As the mapper has it, and the names of its labels."""
+        answer = self.service.client.control("save")
+        assert answer.ok, answer.text
+        state = FolderStore(self.service.state / "state").load("mapper")
+        assert state is not None
+        saved = state["map"]
+        vocabulary = Vocabulary.unpacked(saved["semantics"]["vocabulary"])
+        return GaussianMap.restore(saved["map"]["map"]), vocabulary.names
