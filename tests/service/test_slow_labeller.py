@@ -22,8 +22,8 @@ from tests.service.conftest import PATIENCE, live_service, wait_until
 from tests.service.exhibits import Guide, flat, placed
 from tests.service.heard import Heard
 
-FRAMES = range(0, 120, 2)
-SILENT = 30  # of these frames, before the first answer
+FRAMES = range(0, 84, 2)
+SILENT = 20  # of these frames, before the first answer
 LATE = 5  # keyframes, at least, of that answer
 LOST_AFTER_S = (
     5.0  # a frame that nobody took, and the first while not all are there for its keyframe
