@@ -10,8 +10,7 @@ from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES, COCO_COUNT
 
 INPUT_PX = (320, 256)  # width, height
 STRIDES_PX = (8, 16, 32)
-SHAPES = tuple((INPUT_PX[1] // s, INPUT_PX[0] // s) for s in STRIDES_PX)
-CELL_COUNT = sum(rows * columns for rows, columns in SHAPES)
+CELL_COUNT = sum(INPUT_PX[1] // s * (INPUT_PX[0] // s) for s in STRIDES_PX)
 THINGS = tuple(name for name in CLASS_NAMES if name in CATALOGUE)
 NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOGUE)  # those first
 NOTHING = len(THINGS)
@@ -25,10 +24,11 @@ SMALLEST_PX = 20  # visible of an object that is told
 ID_COUNT = 256
 
 
-def grid() -> tuple[np.ndarray, np.ndarray]:
-    """Middles [N, 2] and sides [N, 1] of all cells, in pixels, the finest first."""
+def grid(size_px: tuple[int, int] = INPUT_PX) -> tuple[np.ndarray, np.ndarray]:
+    """Middles [N, 2] and sides [N, 1] of all cells of an image, in pixels, the finest first."""
     middles, sides = [], []
-    for stride, (rows, columns) in zip(STRIDES_PX, SHAPES, strict=True):
+    for stride in STRIDES_PX:
+        columns, rows = (side // stride for side in size_px)
         cells = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
         middles.append((cells.reshape(-1, 2) + 0.5) * stride)
         sides.append(np.full((rows * columns, 1), stride))
@@ -79,13 +79,14 @@ def told(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
 
 def _counts(plane: np.ndarray, kinds: int) -> list[np.ndarray]:
     """Pixels of each object in each cell [cells, kinds], grid by grid."""
-    rows, columns = SHAPES[0]
     stride = STRIDES_PX[0]
+    rows, columns = (side // stride for side in plane.shape)
     v, u = np.divmod(np.arange(plane.size), plane.shape[1])
     cell = v // stride * columns + u // stride
     fine = np.bincount(cell * kinds + plane.ravel(), minlength=rows * columns * kinds)
     counts = [fine.reshape(rows, columns, kinds)]
-    for rows, columns in SHAPES[1:]:
+    for _ in STRIDES_PX[1:]:
+        rows, columns = rows // 2, columns // 2
         counts.append(counts[-1].reshape(rows, 2, columns, 2, kinds).sum(axis=(1, 3)))
     return [count.reshape(-1, kinds) for count in counts]
 

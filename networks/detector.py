@@ -13,13 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 import training
 from cells import BOXES_CELLS, INPUT_PX, STRIDES_PX, THINGS, grid
-from layers import Graph, Live, Statistics, Weights, residual
+from layers import Graph, Live, Statistics, Weights, merged, residual
 from views import Views
 
-from examples import batches
+from examples import SMALL, batches
 
 WIDE, TOLD_BY = 48, 64  # channels of the neck and of the heads
-RATE = 2e-3
+RATE = 1e-2
 BOX_WEIGHT, FIT_WEIGHT = 1.5, 1.0  # beside the names' entropy
 TOLD = (4, 1, len(THINGS) + 1)  # sides of the box, fit of the box, names and nothing
 
@@ -34,14 +34,14 @@ def network(net: Live | Graph, image) -> list:
 
 def _trunk(net: Live | Graph, image) -> tuple:
     """What is seen, on each grid."""
-    x = residual(net, net.conv(net.folded(image, 4), "stem", 32, size=1), "stage4", 32)
-    fine = net.conv(x, "down8", 64, stride=2)
+    x = residual(net, merged(net, image, "stem", 32, side=4), "stage4", 32)
+    fine = merged(net, x, "down8", 64)
     for k in range(2):
         fine = residual(net, fine, f"stage8.{k}", 64)
-    middle = net.conv(fine, "down16", 96, stride=2)
+    middle = merged(net, fine, "down16", 96)
     for k in range(3):
         middle = residual(net, middle, f"stage16.{k}", 96)
-    coarse = net.conv(middle, "down32", 128, stride=2)
+    coarse = merged(net, middle, "down32", 128)
     for k in range(3):
         coarse = residual(net, coarse, f"stage32.{k}", 128)
     return fine, middle, coarse
@@ -71,7 +71,7 @@ def predicted(net: Live, images):
     levels = network(net, images)
     flat = [level.reshape(level.shape[0], -1, level.shape[-1]) for level in levels]
     rows = jnp.concatenate(flat, axis=1)
-    middles, sides = grid()
+    middles, sides = grid(images.shape[2:0:-1])
     reach = (rows[..., :4] + BOXES_CELLS) * sides
     corners = jnp.concatenate([middles - reach[..., :2], middles + reach[..., 2:]], -1)
     return corners, rows[..., 4], rows[..., 5:]
@@ -128,10 +128,8 @@ def train(material: Views, steps: Sequence[int], seed: int) -> First:
     rng = np.random.default_rng([seed, 1])
     live = Live({}, rng=rng)
     network(live, jnp.zeros((1, *INPUT_PX[::-1], 3)))
-    sources = rng, np.random.default_rng([seed, 6])
-    learned = training.fit_in_rounds(
-        loss, live.weights, [batches(material, source) for source in sources], steps, RATE
-    )
+    rounds = [batches(material, rng, SMALL), batches(material, np.random.default_rng([seed, 6]))]
+    learned = training.fit_in_rounds(loss, live.weights, rounds, steps, RATE)
     rng = np.random.default_rng([seed, 4])
     images = (batch[0].astype(np.float32) / 255 for batch in batches(material, rng))
     return First(learned, training.statistics(network, learned, images))

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from crops import DEVIATION, INPUT_PX, MARGIN, MEAN, crop, cut, enlarged, framed, resized
-from layers import Graph, Live, Statistics, Weights, residual
+from layers import Graph, Live, Statistics, Weights, merged, residual
 from views import Seen, Views
 from wear import repainted, worsened
 
@@ -31,7 +31,7 @@ CUT_MOST = 0.5  # of a box, without so much of one side
 OCCLUDED_SHARE, OCCLUDER = 0.3, (0.3, 0.7)  # of crops, by things of that share of their side
 BLUR_PX = 0.06  # of the crop's longer side
 
-BATCH, RATE = 32, 2e-3
+BATCH, RATE = 32, 1e-2
 SCALE = 16.0  # of cosines while training; what is told is fitted afterwards
 SMOOTHING = 0.05  # of the right answer, over all names
 
@@ -51,7 +51,7 @@ ABOUT_THINGS = Framing((0.0, 0.25), 0.08, 0.3)
 
 def network(net: Live | Graph, image) -> list:
     """[N, 1, 1, D], before it is brought to length 1."""
-    x = residual(net, net.conv(net.folded(image, 4), "stem", 64), "stage4", 64)
+    x = residual(net, merged(net, image, "stem", 64, side=4), "stage4", 64)
     x = net.conv(x, "down8", 128, stride=2)
     for k in range(2):
         x = residual(net, x, f"stage8.{k}", 128)
@@ -105,14 +105,16 @@ def learnable(seen: Seen) -> tuple[Seen, np.ndarray]:
     return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)
 
 
-def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) -> Iterator[tuple]:
+def batches(
+    material: Views, rng: np.random.Generator, side_px: int = INPUT_PX, size: int = BATCH
+) -> Iterator[tuple]:
     """Crops about true boxes, made worse; each name as often as the root of its number of boxes."""
     seen, names = learnable(material.seen)
     counts = np.bincount(names, minlength=len(NAMES))
     odds = 1 / np.sqrt(counts[names])
     odds /= odds.sum()
     while True:
-        rows, others = rng.choice(len(names), (2, BATCH), p=odds)
+        rows, others = rng.choice(len(names), (2, size), p=odds)
         shown = [shown_in(material, seen, row, side_px, rng, ABOUT_THINGS) for row in rows]
         before = [
             shown_in(

@@ -1,28 +1,42 @@
 """What the detector learns from: frames moved, zoomed, mirrored, repainted and made worse."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import islice
 
 import cv2
 import numpy as np
 from cells import ID_COUNT, INPUT_PX, THINGS, told, visible
 from views import Seen, Views
-from wear import repainted, worsened
+from wear import BLUR_PX, repainted, worsened
 
 from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES
 
 BATCH = 8
 PADDING = 114
-ZOOM = (0.8, 1.5)
 
 
-def batches(material: Views, rng: np.random.Generator) -> Iterator[tuple]:
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """What an example is shown on: its size, multiples of the widest cell, and how large it is."""
+
+    size_px: tuple[int, int] = INPUT_PX  # width, height
+    zoom: tuple[float, float] = (0.8, 1.5)
+
+
+# The first round's: three eighths of the work; things as large as they will be, and smaller
+SMALL = Canvas((192, 160), (0.5, 1.2))
+
+
+def batches(
+    material: Views, rng: np.random.Generator, canvas: Canvas = Canvas()
+) -> Iterator[tuple]:
     """Frames in random order without end, each with what its cells are to tell."""
     names = _names_of_ids(material)
     order = _shuffled(len(material.colors), rng)
     while True:
         examples = [
-            _example(material.colors[f], material.instances[f], names[f], rng)
+            _example(material.colors[f], material.instances[f], names[f], canvas, rng)
             for f in islice(order, BATCH)
         ]
         yield tuple(map(np.array, zip(*examples, strict=True)))
@@ -45,18 +59,42 @@ def _names_of_ids(material: Views) -> np.ndarray:
 
 
 def _example(
-    color: np.ndarray, plane: np.ndarray, names: np.ndarray, rng: np.random.Generator
+    color: np.ndarray,
+    plane: np.ndarray,
+    names: np.ndarray,
+    canvas: Canvas,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, ...]:
-    """An image of the input's size, and what its cells are to tell."""
-    color = worsened(repainted(color, plane, rng), rng)
-    zoom, is_mirrored = rng.uniform(*ZOOM), rng.random() < 0.5
-    size = np.array(color.shape[1::-1])
-    shift = (np.array(INPUT_PX) - zoom * size) * rng.uniform(0, 1, 2)
-    A = np.array([[zoom, 0, shift[0]], [0, zoom, shift[1]]])
-    A[:, 2] += zoom / 2 - 0.5  # OpenCV counts from the middles of pixels
-    way = cv2.INTER_AREA if zoom < 0.9 else cv2.INTER_LINEAR
-    color = cv2.warpAffine(color, A, INPUT_PX, flags=way, borderValue=(PADDING,) * 3)
-    plane = cv2.warpAffine(plane, A, INPUT_PX, flags=cv2.INTER_NEAREST, borderValue=0)
-    if is_mirrored:
-        color, plane = color[:, ::-1], plane[:, ::-1]
-    return color, *told(plane, visible(plane, names))
+    """An image of the canvas' size, and what its cells are to tell."""
+    zoom = rng.uniform(*canvas.zoom)
+    place_px = (np.array(canvas.size_px) - zoom * np.array(color.shape[1::-1])) * rng.random(2)
+    seen, shown = _windows(color.shape[1::-1], place_px, zoom, canvas.size_px)
+    color, plane = color[seen], plane[seen]
+    size_px = shown[1].stop - shown[1].start, shown[0].stop - shown[0].start
+    if zoom < 1:  # made worse when it is small: that is less
+        color = cv2.resize(color, size_px, interpolation=cv2.INTER_AREA)
+        plane = cv2.resize(plane, size_px, interpolation=cv2.INTER_NEAREST)
+    color = worsened(repainted(color, plane, rng), rng, BLUR_PX * min(zoom, 1))
+    image = np.full((*canvas.size_px[::-1], 3), PADDING, np.uint8)
+    ids = np.zeros(image.shape[:2], np.uint8)
+    image[shown] = cv2.resize(color, size_px)
+    ids[shown] = cv2.resize(plane, size_px, interpolation=cv2.INTER_NEAREST)
+    if rng.random() < 0.5:
+        image, ids = image[:, ::-1], ids[:, ::-1]
+    return image, *told(ids, visible(ids, names))
+
+
+def _windows(
+    size_px: tuple[int, int], place_px: np.ndarray, zoom: float, canvas_px: tuple[int, int]
+) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Rows and columns of a frame that are on a canvas, where its corner is at `place_px` of that,
+    and rows and columns of the canvas that show them."""
+    first = np.maximum(-place_px / zoom, 0).astype(int)
+    stop = np.minimum(np.ceil((canvas_px - place_px) / zoom), size_px).astype(int)
+    start = np.maximum(np.round(place_px + zoom * first), 0).astype(int)
+    end = np.minimum(np.round(place_px + zoom * stop), canvas_px).astype(int)
+    rows_columns = [
+        tuple(slice(*ends) for ends in zip(low[::-1], high[::-1], strict=True))
+        for low, high in ((first, stop), (start, end))
+    ]
+    return rows_columns[0], rows_columns[1]

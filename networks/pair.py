@@ -5,7 +5,8 @@ and a third a part of one. So in the second round half of each batch are crops o
 there is one name more, for what is no thing.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
 
 import encoder
 import jax.numpy as jnp
@@ -22,7 +23,9 @@ from ldo_service.semantics.region_views import ViewConfig
 
 NO_NAME = "background"  # of a region that is no thing
 NO_THINGS = (*BUILDING.split(), NO_NAME)
-FIRST_SIDE_PX = 48  # crops of the first round are smaller: half again as many a minute
+# Sides of crops in pixels, and shares of a round's steps: small ones first, of which a minute has
+# several times as many (Tan and Le, EfficientNetV2, ICML 2021)
+SIDES = ((32, 0.3), (48, 0.7)), ((48, 0.5), (INPUT_PX, 0.5))
 ABOUT_REGIONS = Framing((0.1, 0.2), 0.04, 0.0)  # many are cut off as they are
 REGIONS_SHARE, NO_THING_SHARE = 0.5, 0.35  # of a batch, and of these
 MARGIN = ViewConfig().context  # of a region's sides, that a labeller's crop has around it
@@ -37,11 +40,12 @@ def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
     weights = live.weights | {"texts.kernel": texts}
     first, second = (share * RATE for share in training.ROUND_RATES)
     # things
-    things = encoder.batches(material, rng, FIRST_SIDE_PX)
+    things = growing(lambda side_px: encoder.batches(material, rng, side_px), SIDES[0], steps[0])
     weights = training.fit(encoder.loss, weights, things, steps[0], first)
     # and regions
     weights |= {"texts.kernel": _with_no_name(weights["texts.kernel"])}
-    both = batches(material, np.random.default_rng([seed, 7]))
+    rng = np.random.default_rng([seed, 7])
+    both = growing(lambda side_px: batches(material, rng, side_px), SIDES[1], steps[1])
     weights = training.fit(encoder.loss, weights, both, steps[1], second)
     texts = np.asarray(encoder.unit(jnp.asarray(weights.pop("texts.kernel"))))
     again = batches(material, np.random.default_rng([seed, 5]))
@@ -56,17 +60,26 @@ def _with_no_name(texts: np.ndarray) -> np.ndarray:
     return np.concatenate([texts, texts[building].mean(axis=0, keepdims=True)])
 
 
-def batches(material: Views, rng: np.random.Generator) -> Iterator[tuple]:
+def growing(
+    source: Callable[[int], Iterator[tuple]], sides: Sequence[tuple[int, float]], steps: int
+) -> Iterator[tuple]:
+    """Batches of `source(side_px)` for so many steps, `sides` as in SIDES."""
+    for side_px, share in sides[:-1]:
+        yield from islice(source(side_px), round(share * steps))
+    yield from source(sides[-1][0])
+
+
+def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) -> Iterator[tuple]:
     """As those of `encoder`, with regions in place of a half."""
     regions, names = named(material.regions)
     odds, count = _odds(names), round(REGIONS_SHARE * BATCH)
-    for crops, told in encoder.batches(material, rng):
+    for crops, told in encoder.batches(material, rng, side_px, BATCH - count):
         rows = rng.choice(len(names), count, p=odds)
-        for k, row in enumerate(rows):
-            shown = encoder.shown_in(material, regions, row, INPUT_PX, rng, ABOUT_REGIONS)
-            crops[k] = encoder.example(shown, None, INPUT_PX, rng)
-        told[:count] = names[rows]
-        yield crops, told
+        shown = [
+            encoder.shown_in(material, regions, row, side_px, rng, ABOUT_REGIONS) for row in rows
+        ]
+        others = np.array([encoder.example(one, None, side_px, rng) for one in shown])
+        yield np.concatenate((crops, others)), np.concatenate((told, names[rows]))
 
 
 def named(regions: Seen) -> tuple[Seen, np.ndarray]:

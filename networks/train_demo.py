@@ -41,12 +41,12 @@ from material import Rooms, render_all
 from views import Seen, Views
 from wear import worsened
 
-TRAINING = Rooms(range(200, 520), 8)
+TRAINING = Rooms(range(200, 488), 8)
 CALIBRATION = Rooms(range(160, 172), 12)
 HELD_OUT = Rooms(range(172, 190), 12)
 SEED = 0
 APART = 0.2  # of scores at most: the graph cuts its crops by other pixels
-STEPS = {"detector": (2000, 1500), "encoder": (9000, 10000)}  # of two rounds each
+STEPS = {"detector": (1900, 1400), "encoder": (5500, 6500)}  # of two rounds each
 FLAT_STRIDE = 8  # of its frames that are scored
 SHIPPED = Path(__file__).parents[1] / "ldo_service" / "demo_networks"
 

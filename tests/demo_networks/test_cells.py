@@ -35,7 +35,8 @@ def told(cells: ModuleType, plane: np.ndarray, names: np.ndarray) -> dict[int, t
     """Names, weights, boxes and whether they are told, in rows and columns of each grid."""
     columns = cells.told(plane, cells.visible(plane, names))
     grids, start = {}, 0
-    for stride, shape in zip(cells.STRIDES_PX, cells.SHAPES, strict=True):
+    for stride in cells.STRIDES_PX:
+        shape = tuple(side // stride for side in plane.shape)
         end = start + shape[0] * shape[1]
         grids[stride] = tuple(c[start:end].reshape(*shape, *c.shape[1:]) for c in columns)
         start = end

@@ -27,7 +27,8 @@ def layers(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 def test_both_readings_of_a_network_tell_the_same(layers: ModuleType, tmp_path: Path) -> None:
     def network(net, image):
         x = net.conv(net.folded(image, 2), "stem", 8, size=1)
-        small = layers.residual(net, net.conv(x, "down", 8, stride=2), "block", 8)
+        small = layers.residual(net, layers.merged(net, x, "merge", 8), "block", 8)
+        small = net.add(small, net.conv(x, "down", 8, stride=2))
         joined = net.join([x, net.enlarged(net.widest(small))])
         return net.linear(net.mean(net.conv(joined, "out", 6)), "told", 3, 0.5)
 
@@ -44,6 +45,21 @@ def test_both_readings_of_a_network_tell_the_same(layers: ModuleType, tmp_path: 
     session = onnxruntime.InferenceSession(tmp_path / "net.onnx")
     theirs = np.asarray(session.run(None, {"image": image.transpose(0, 3, 1, 2).copy()})[0])[0]
     np.testing.assert_allclose(theirs, mine, atol=HALF)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+@pytest.mark.parametrize("side", [2, 3, 4, 7])
+def test_a_product_with_what_is_unfolded_is_a_convolution(
+    layers: ModuleType, side: int, stride: int
+) -> None:
+    rng = np.random.default_rng(0)
+    image, kernel = (rng.random(shape, np.float32) for shape in ((2, side, side, 5), (3, 3, 5, 4)))
+    product = layers.unfolded(image, 3, stride) @ kernel.reshape(-1, 4)
+    form = ("NHWC", "HWIO", "NHWC")
+    expected = layers.jax.lax.conv_general_dilated(
+        image, kernel, (stride, stride), layers.pads(3), dimension_numbers=form
+    )
+    np.testing.assert_allclose(product, expected, atol=1e-4)
 
 
 def test_a_mirror_image_and_halves_of_a_batch(layers: ModuleType, tmp_path: Path) -> None:
