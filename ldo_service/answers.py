@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.schemas import MapObjects, Pose
-from ldo_service.semantics.search import Encode, nearest_names, search
+from ldo_service.semantics.search import Encode, NotCompared, nearest_names, search
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +33,14 @@ def answer(
     """
     objects = found.objects
     named = [dict(one.distribution) for one in objects]
-    hits = search(text, named)
-    if not hits and encode is not None:
-        hits = search(text, named, encode)
+    hits, why_not = search(text, named), ""
+    if not hits and objects and encode is not None:
+        try:
+            hits = search(text, named, encode)
+        except NotCompared as error:
+            why_not = f" Words were not compared by what they mean: {error}"
     if not hits:
-        raise DataError(_nothing(text, [one.name for one in objects]))
+        raise DataError(_nothing(text, [one.name for one in objects]) + why_not)
     answers = []
     for hit in hits:
         one = objects[hit.index]

@@ -51,8 +51,10 @@ class ServiceConfig:
     silent_after_s: float = 10.0  # a process without a heartbeat for so long is killed
     sync_state: bool = False  # a step is on the disk before it is told: a power cut costs what a
     # kill does, and each step three syncs, 12 ms on a virtual disk. False: it may cost the state
-    control_timeout_s: float = 45.0  # for each actor to obey, which it does between two steps: the
-    # slowest measured is 0.6 s, and a labeller may wait for its server for 40
+    control_timeout_s: float = (
+        55.0  # for all actors to obey, which each does between two steps: the
+    )
+    # slowest measured is 0.6 s, and a labeller may wait for its server for 50
     keys: str = ""  # folder that `ldo keys add` made, for TLS; --keys names another
     max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped; a 4K frame can have 58 MB
     metrics_address: str = LOOPBACK  # who reads them sees when the robot works; 0.0.0.0: everybody
@@ -128,14 +130,24 @@ class Config:
     stage: StageConfig = field(default_factory=StageConfig)
     viewer: ViewerConfig = field(default_factory=ViewerConfig)
 
-    def __post_init__(self) -> None:
-        patience_s = self.vlm_labeller.http.endpoint.patience_s
-        if self.vlm_labeller.url and patience_s >= self.stage.stall_after_s:
-            raise ConfigError(
-                f"vlm_labeller.http.endpoint.patience_s={patience_s:g} must be below "
-                f"stage.stall_after_s={self.stage.stall_after_s:g}: the service ends when an actor "
-                "is busy for so long."
-            )
+    def check_patience(self) -> None:
+        """Of a service: nobody may be given up who only waits for a labeller's server.
+
+        Raises ConfigError.
+        """
+        endpoint = self.vlm_labeller.http.endpoint
+        longest_s = endpoint.patience_s + endpoint.timeout_s  # to connect counts anew
+        limits = {
+            "stage.stall_after_s": self.stage.stall_after_s,
+            "service.control_timeout_s": self.service.control_timeout_s,
+        }
+        for name, limit_s in limits.items():
+            if self.vlm_labeller.url and longest_s >= limit_s:
+                raise ConfigError(
+                    f"vlm_labeller.http.endpoint: patience_s={endpoint.patience_s:g} and "
+                    f"timeout_s={endpoint.timeout_s:g} together must be below "
+                    f"{name}={limit_s:g}: raise that, or lower these."
+                )
 
     def with_map_folder(self, folder: Path) -> "Config":
         """The mapper keeps images and sleeping Gaussians there, if nowhere else: its successor

@@ -6,6 +6,7 @@ they begin anew: a late correction of 50 keyframes would outdate the first one o
 
 import asyncio
 import logging
+import time
 from collections.abc import Awaitable, Callable, Sequence
 
 import msgspec
@@ -15,6 +16,8 @@ from ldo_service.runtime.transport import Transport
 from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
 
 log = logging.getLogger(__name__)
+
+LEAST_S = 2.0  # 3x the slowest step measured
 
 
 class ControlFailed(Exception):
@@ -94,13 +97,15 @@ class Control:
         return f"{', '.join(self._actors)} began anew.{still}"
 
     async def _each(self, what: What, actors: Sequence[str]) -> None:
-        """One after the other: a producer may have to wait for a consumer that is not held yet.
+        """One after the other: a producer may have to wait for a consumer that is not held yet. All
+        have `timeout_s` together, and who comes after one that hangs a moment at least.
 
         Raises ControlFailed, after all have been told, naming those that did not obey.
         """
-        failures = []
+        failures, until_s = [], time.monotonic() + self._timeout_s
         for actor in actors:
-            error = await self._commander.order(what, actor, self._timeout_s)
+            within_s = max(until_s - time.monotonic(), min(LEAST_S, self._timeout_s))
+            error = await self._commander.order(what, actor, within_s)
             failures += [f"{actor} {error}"] if error else []
         if failures:
             advice = "`ldo doctor` shows how the actors are; then ask again."

@@ -66,9 +66,9 @@ def _silent(how_long: str) -> Trouble:
 
 def _of_steps(health: Health) -> Iterator[Trouble]:
     waiting = _waiting(health)
-    if _is_labeller(health):
-        return
     if health.busy_s > SLOW_STEP_S:
+        if _waits_for_server(health):
+            return
         yield Trouble(
             f"has been busy with one message for {health.busy_s:.0f} s",
             "give it less work per message; beyond stage.stall_after_s it is given up",
@@ -84,9 +84,9 @@ def _waiting(health: Health) -> int:
     return sum(count.waiting for count in health.inputs)
 
 
-def _is_labeller(health: Health) -> bool:
-    """It may take its time: nobody waits for it."""
-    return bool(health.facts.get("labellers"))
+def _waits_for_server(health: Health) -> bool:
+    """A labeller's server may take its time: patience_s bounds that, and the map goes on."""
+    return "attempts" in health.facts
 
 
 def _of_failures(health: Health) -> Iterator[Trouble]:
@@ -150,10 +150,10 @@ def remarks(seen: Seen) -> Iterator[str]:
 
 
 def _of_answers(health: Health) -> Iterator[str]:
-    if _is_labeller(health) and health.busy_s > SLOW_STEP_S:
+    if _waits_for_server(health) and health.busy_s > SLOW_STEP_S:
         yield (
-            f"has been busy with one region for {health.busy_s:.0f} s, and {_waiting(health)} "
-            "wait: names come late, and nobody waits for them"
+            f"has asked its server about one region for {health.busy_s:.0f} s, and "
+            f"{_waiting(health)} wait: names come late, and the map goes on without"
         )
     if refused := health.facts.get("answers_refused"):
         questions = health.facts.get("questions", 0)

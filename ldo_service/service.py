@@ -67,6 +67,7 @@ class Service:
         Raises ConfigError when the port cannot be had, StageError when an actor was given up.
         """
         check_graph(GRAPH)
+        self.config.check_patience()
         self._require_known(self.only)
         self._require_known(self.config.service.spawned)
         names, silent_after_s = [box.name for box in GRAPH], self.config.service.silent_after_s

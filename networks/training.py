@@ -1,9 +1,10 @@
 """Gradient descent: Muon with a rate that warms up and fades out in a line.
 
-The step of a kernel is its momentum with all singular values made alike (Jordan et al., Muon, 2024),
-of the size that Adam's would have (Liu et al., Muon is scalable, 2025); of each tap of a convolution
-by itself, which takes half the time and learns as much. Names of crops of rooms kept apart after 1000
-steps: 33 % by Adam, 41 % by this. All that is no kernel goes by Adam.
+The step of a kernel is its momentum with all singular values made alike (Jordan et al., Muon,
+2024), of the size that Adam's would have (Liu et al., Muon is scalable, 2025); of each tap of a
+convolution by itself, which takes half the time and learns as much. Of crops of rooms kept apart
+33 % are named right after 1000 steps of Adam, 41 % after as many of this. What is no kernel goes by
+Adam.
 """
 
 import logging

@@ -49,7 +49,15 @@ def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
         (seen(health(), heartbeat_age_s=1.6), "no heartbeat for 1.6 s"),
         (seen(health(), has_token=False), "token is absent"),
         (seen(health(busy_s=12.0, inputs=inputs(waiting=1))), "busy with one message for 12 s"),
+        (
+            seen(health(busy_s=12.0, facts={"labellers": 1.0})),  # no server's
+            "busy with one message for 12 s",
+        ),
         (seen(health(step_age_s=20.0, inputs=inputs(waiting=4))), "none of 4 waiting messages"),
+        (
+            seen(health(step_age_s=20.0, inputs=inputs(waiting=4), facts={"attempts": 7.0})),
+            "none of 4 waiting messages",
+        ),
         (seen(health(set_aside=1, failures=2, restarts=2)), "1 messages aside"),
         (seen(health(facts={"networks_missing": 1.0, "networks": 0.0})), "without the network"),
         (seen(health(facts={"inferences_failed": 3.0})), "3 inferences fail"),
@@ -74,9 +82,7 @@ def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
         (health(inputs=inputs("camera/rgbd", delivered=0)), "no frame yet"),
         (health(inputs=inputs("camera/rgbd"), step_age_s=9.0), "last frame 9 s ago"),
         (
-            health(
-                busy_s=12.0, step_age_s=12.0, inputs=inputs(waiting=3), facts={"labellers": 1.0}
-            ),
+            health(busy_s=12.0, step_age_s=12.0, inputs=inputs(waiting=3), facts={"attempts": 7.0}),
             "one region for 12 s, and 3 wait: names come late",
         ),
         (health(facts={"answers_refused": 2.0, "questions": 9.0}), "refused 2 of 9 answers"),

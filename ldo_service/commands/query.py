@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.answers import Answer, answer
 from ldo_service.client import connect
 from ldo_service.config import load_config
@@ -21,8 +22,8 @@ from ldo_service.runs.objects_file import read_objects
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
-from ldo_service.semantics.labellers.dual_encoder import DualEncoder, DualEncoderConfig
-from ldo_service.semantics.search import Encode
+from ldo_service.semantics.labellers.dual_encoder import DualEncoderConfig
+from ldo_service.semantics.search import Encode, NotCompared
 from ldo_service.wire import transform
 
 from .options import Endpoint, Json, KeysFolder, Robot
@@ -61,7 +62,7 @@ def query(
     """
     is_live = where == LIVE
     found, eye = _live(robot, endpoint, keys) if is_live else _of_run(Path(where).expanduser())
-    encode = _texts_of(model, Path(where).expanduser()) if model or not is_live else None
+    encode = _texts_of(model, None if is_live else Path(where).expanduser())
     answers = answer(text, found, eye, encode)
     if json_:
         print(json.dumps([_plain(one) for one in answers]))
@@ -87,29 +88,31 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
     return found, eye
 
 
-def _texts_of(model: str, run: Path) -> Encode:
+def _texts_of(model: str, run: Path | None) -> Encode:
     """Of a pair, or where none is named of the labeller that a run had. It is opened when it is
-    asked: a name that cannot be opened is a ConfigError then; a run's labeller may be gone, and
-    nothing is like anything."""
+    asked: a name that cannot be opened is a ConfigError then; a run's labeller may be gone."""
 
     def encode(texts: Sequence[str]) -> np.ndarray:
+        if model:
+            return open_labeller(model, DualEncoderConfig()).texts.encode(texts)
+        had = None if run is None else _labeller_of(run)
+        if had is None:
+            raise NotCompared("`--model NAME` names a pair of encoders that can.")
         try:
-            return _opened(model, run).texts.encode(texts)
-        except ConfigError:
-            if model:
-                raise
-            return np.zeros((len(texts), 1))
+            return open_labeller(had.model, had.dual_encoder).texts.encode(texts)
+        except ConfigError as error:
+            raise NotCompared(f"{error} `--model NAME` names another pair.") from error
 
     return encode
 
 
-def _opened(model: str, run: Path) -> DualEncoder:
-    if model:
-        return open_labeller(model, DualEncoderConfig())
-    config = load_config(run / "config.yaml").vlm_labeller
-    if not config.model:
-        raise ConfigError(f"{run} had no pair of encoders.")
-    return open_labeller(config.model, config.dual_encoder)
+def _labeller_of(run: Path) -> VlmLabellerConfig | None:
+    """None where it had no pair, or its settings are of another version."""
+    try:
+        config = load_config(run / "config.yaml").vlm_labeller
+    except ConfigError:
+        return None
+    return config if config.model else None
 
 
 def _plain(one: Answer) -> dict[str, object]:

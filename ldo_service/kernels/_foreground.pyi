@@ -37,6 +37,7 @@ def foreground(
     of it is the object in its middle: 1, else 0.
 
     `labels` [H, W] and `sizes` [S] as `surfaces` returns them. Releases the GIL. Raises ValueError
-    for arrays that do not fit and windows that are empty or beyond the image. One thread.
+    for arrays that do not fit and windows that are empty or beyond the image. One thread; where a
+    depth is at the edge of a bin of the mode the outcome may differ between instruction sets.
     `ldo_service.semantics.foreground` says more.
     """

@@ -26,6 +26,8 @@ Kernels kernels_for(Isa isa) {
 
 Kernels kernels;  // chosen when the module is imported
 
+constexpr double kMost = 1e6;  // of a share: far within the range of a float
+
 DepthImage image_of(const Array& depth_m) {
   require(depth_m.ndim() == 2 && depth_m.size() > 0, "depth_m must have shape [H, W].");
   const size_t height = depth_m.shape(0), width = depth_m.shape(1);
@@ -35,7 +37,7 @@ DepthImage image_of(const Array& depth_m) {
 
 // As NumPy rounds it: a share in double precision, one more than it in single.
 float ratio_of(double share, const std::string& name) {
-  require(share >= 0 && std::isfinite(share), name + " must not be negative.");
+  require(share >= 0 && share <= kMost, name + " must lie in 0..1e6.");
   return static_cast<float>(1.0 + share);
 }
 
@@ -81,8 +83,9 @@ void foreground(const Array& depth_m, double focal_px, const Array& labels, cons
   const Window window{row, column, static_cast<int>(mask.shape(0)),
                       static_cast<int>(mask.shape(1))};
   require(min_inside >= 0 && min_inside <= 1, "min_inside must lie in 0..1.");
-  require(depth_bin >= 1e-4 && std::isfinite(depth_bin), "depth_bin must be at least 1e-4.");
-  require(near_mode >= 0 && grow_px >= 0, "near_mode and grow_px must not be negative.");
+  require(depth_bin >= 1e-4 && depth_bin <= 1, "depth_bin must lie in 1e-4..1.");
+  require(near_mode >= 0 && near_mode <= kMost && grow_px >= 0,
+          "near_mode must lie in 0..1e6, grow_px must not be negative.");
   const ForegroundRule rule{min_inside, ratio_of(max_gap, "max_gap"), depth_bin, near_mode,
                             grow_px};
   uint8_t* out = values_of<uint8_t>(mask, "mask");

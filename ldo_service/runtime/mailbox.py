@@ -1,4 +1,5 @@
-"""All inputs of one actor, merged in order of arrival, bounded, every drop counted."""
+"""All inputs of one actor, merged in order of arrival but for those that go first, bounded, every
+drop counted."""
 
 import asyncio
 import logging

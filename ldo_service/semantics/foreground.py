@@ -13,6 +13,8 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
 
+MOST = 1e6  # of a share
+
 
 @dataclass(frozen=True, slots=True)
 class ForegroundConfig:
@@ -31,8 +33,10 @@ class ForegroundConfig:
         shares = (self.max_step, self.min_cosine, self.min_inside, self.max_gap, self.near_mode)
         if not (min(shares) >= 0 and max(self.min_cosine, self.min_inside) <= 1):
             raise ConfigError(f"{self}: shares must not be negative, cosine and inside at most 1.")
-        if not (self.depth_bin >= 1e-4 and self.grow_px >= 0):
-            raise ConfigError(f"{self}: depth_bin must be at least 1e-4, grow_px not negative.")
+        if max(shares) > MOST:
+            raise ConfigError(f"{self}: shares may be {MOST:g} at most, which leaves nothing out.")
+        if not (1e-4 <= self.depth_bin <= 1 and 0 <= self.grow_px <= 64):
+            raise ConfigError(f"{self}: depth_bin must be within 1e-4..1, grow_px within 0..64.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

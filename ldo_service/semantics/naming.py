@@ -57,8 +57,9 @@ class Naming:
     """Chooses what to ask, and knows what was asked. Bounded; the same calls give the same bits,
     also after `unpacked`."""
 
-    def __init__(self, config: NamingConfig | None = None) -> None:
-        self.config = config or NamingConfig()
+    def __init__(self, config: NamingConfig | None = None, *, is_heard: bool = True) -> None:
+        """`is_heard`: names are claimed; else they are learnt, and boxes stay as they are."""
+        self.config, self._is_heard = config or NamingConfig(), is_heard
         self._regions = RegionsToName(self.config.regions)
         self._open: dict[tuple[int, int], Asked] = {}  # by region and keyframe, the oldest first
         self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
@@ -96,7 +97,8 @@ class Naming:
         for question in sightings.questions:
             self._remember(question)
         claims = replace(claims, parts=fitting_parts(len(claims.boxes), doubtful))
-        told = with_opinions(claims, sightings.opinions, vocabulary, self._boxes_vote)
+        opinions = sightings.opinions if self._is_heard else []
+        told = with_opinions(claims, opinions, vocabulary, self._boxes_vote)
         return told, sightings.questions
 
     def _remember(self, question: Question) -> None:
@@ -142,7 +144,8 @@ class Naming:
             anew=asked.kind == "standing"
             and confidence >= self.config.regions.settled
             and before is not None
-            and not before.votes,
+            and not before.votes
+            and not before.label,
         )
 
     def shown_in(self, region: int) -> tuple[int, ...]:
@@ -187,9 +190,11 @@ class Naming:
         }
 
     @staticmethod
-    def unpacked(packed: Mapping[str, Any], config: NamingConfig | None = None) -> "Naming":
+    def unpacked(
+        packed: Mapping[str, Any], config: NamingConfig | None = None, *, is_heard: bool = True
+    ) -> "Naming":
         """As it was."""
-        out = Naming(config)
+        out = Naming(config, is_heard=is_heard)
         out._regions = RegionsToName.unpacked(packed["regions"], out.config.regions)
         out._open = {
             (region, keyframe): _unpacked(*row) for region, keyframe, *row in packed["open"]

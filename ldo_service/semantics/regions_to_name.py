@@ -51,7 +51,7 @@ class RegionConfig:
     answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's; all boxes
     # of a name together count as one that is certain
     boxes_vote: bool = True  # or what boxes say is weighed Gaussian by Gaussian (III.B), and a
-    # region is what the labeller says alone
+    # region is what the labeller says alone; regions of a state keep the votes they had
     least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
     least_carried: float = 0.5  # sure of its name, to be told where nothing sets a region apart
     most_carried: int = 32  # names of a keyframe told so: as many as it has candidates

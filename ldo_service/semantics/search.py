@@ -9,12 +9,17 @@ import numpy as np
 from .class_names import normalised
 from .synonyms import answers_to
 
-# Vectors [T, D] of length 1 of T texts, as the text half of an open-vocabulary labeller gives them.
+# Vectors [T, D] of length 1 of T texts, as the text half of an open-vocabulary labeller gives them;
+# zeros of those that it cannot place. Raises NotCompared.
 Encode = Callable[[Sequence[str]], np.ndarray]
 
 AKIN = 0.9  # of a word for a kind of the thing, or for what it is a kind of; the thing itself is 1
 LEAST_COSINE = 0.85  # of vectors of texts; CLIP has 0.7 for things that have nothing in common
 LEAST_SCORE = 0.1
+
+
+class NotCompared(Exception):
+    """Texts could not be compared by what they mean; the text says why, as a sentence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,8 @@ def nearness(text: str, names: Sequence[str], encode: Encode | None = None) -> d
     others = [name for name in names if name not in near]
     if encode is not None and others:
         vectors = encode([normalised(text), *others])
+        if not vectors[0].any():
+            raise NotCompared(f"The pair of encoders has no text {text!r}.")
         cosines = np.clip(vectors[1:] @ vectors[0], 0, 1)
         for name, cosine in zip(others, cosines.tolist(), strict=True):
             if cosine >= LEAST_COSINE:

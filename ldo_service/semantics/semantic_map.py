@@ -37,13 +37,6 @@ class SemanticMapConfig:
     most_said_again: int = 64  # the newest keyframes whose boxes came: after a restart those of a
     # window, 8, come once more
 
-    @property
-    def told_apart(self) -> NamingConfig:
-        """Of the naming; where the fusion is not to hear a labeller, its names are no box's."""
-        regions = self.naming.regions
-        boxes_vote = regions.boxes_vote and self.labelling.fusion.rule != "detector"
-        return replace(self.naming, regions=replace(regions, boxes_vote=boxes_vote))
-
     def __post_init__(self) -> None:
         if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MOST_LABELS:
             raise ConfigError(
@@ -82,7 +75,8 @@ class SemanticMap:
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.most_names)
         self.objects = Objects(self.config.objects)
-        self.naming = Naming(self.config.told_apart) if has_labeller else None
+        is_heard = self.config.labelling.fusion.rule != "detector"
+        self.naming = Naming(self.config.naming, is_heard=is_heard) if has_labeller else None
         self._map, self._threads = map_, threads
         self._by_detector, self._by_labeller = set[int](), set[int]()  # labels they gave
         self._done: dict[int, None] = {}  # the newest keyframes, in order
@@ -287,7 +281,8 @@ class SemanticMap:
         }
         self._by_detector, self._by_labeller = map(set, state["given"])
         if self.naming and state["naming"]:
-            self.naming = Naming.unpacked(state["naming"], self.config.told_apart)
+            is_heard = self.config.labelling.fusion.rule != "detector"
+            self.naming = Naming.unpacked(state["naming"], self.config.naming, is_heard=is_heard)
 
     def statistics(self) -> dict[str, float]:
         """`label_disagreement` is that of the newest keyframe labelled, summed over its Gaussians:

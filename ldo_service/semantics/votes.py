@@ -24,7 +24,7 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
     >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
     (('tv', 0.4, 0.6),)
     """
-    if not name:
+    if not name or most <= 0:
         return votes
     had = next((total for one, total, _ in votes if one == name), 0.0)
     return _added(votes, ((name, min(sure**2, max(most - had, 0.0)), sure),))

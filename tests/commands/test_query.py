@@ -143,15 +143,18 @@ def pair(tmp_path: Path) -> Path:
 
 
 def test_what_no_table_knows_is_found_by_what_it_means(capsys, folder: Path, pair: Path) -> None:
-    assert ldo(capsys, "query", folder, "throne")[0] == 3
+    code, _, err = ldo(capsys, "query", folder, "throne")
+    assert (code, "--model NAME" in err) == (3, True)
     code, out, _ = ldo(capsys, "query", folder, "throne", "--model", pair, "--json")
     assert code == 0
     answers = json.loads(out)
     assert [one["id"] for one in answers] == [9, 5, 1]
     assert answers[0]["score"] == pytest.approx(0.95 * 0.95, abs=1e-3)
-    for word in ("piano", "unicorn"):
+    for word, is_known in (("piano", True), ("unicorn", False)):
         code, _, err = ldo(capsys, "query", folder, word, "--model", pair)
         assert (code, "none of 4 objects" in err) == (3, True)
+        assert ("has no text 'unicorn'" in err) != is_known
+        assert_one_paragraph(err)
 
 
 def test_a_run_is_asked_by_the_labeller_that_it_had(capsys, folder: Path, pair: Path) -> None:
@@ -160,7 +163,8 @@ def test_a_run_is_asked_by_the_labeller_that_it_had(capsys, folder: Path, pair: 
     assert (code, [one["id"] for one in json.loads(out)]) == (0, [9, 5, 1])
     shutil.rmtree(pair)
     code, _, err = ldo(capsys, "query", folder, "throne")
-    assert (code, "none of 4 objects" in err) == (3, True)
+    assert (code, "none of 4 objects" in err, "--model NAME" in err) == (3, True, True)
+    assert_one_paragraph(err)
     assert ldo(capsys, "query", folder, "sofa")[0] == 0
 
 

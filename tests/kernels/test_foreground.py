@@ -162,12 +162,36 @@ def given_to_foreground(**changes: object) -> tuple:
         ({"mask": np.ones((0, 10), np.uint8)}, "shape"),
         ({"focal_px": 0.0}, "positive"),
         ({"depth_bin": 1e-9}, "1e-4"),
-        ({"max_gap": np.nan}, "negative"),
+        ({"max_gap": np.nan}, "max_gap must lie in 0..1e6"),
+        ({"max_gap": np.inf}, "max_gap must lie in 0..1e6"),
+        ({"near_mode": np.inf}, "near_mode must lie in 0..1e6"),
     ],
 )
 def test_what_does_not_fit_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         _foreground.foreground(*given_to_foreground(**changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fx": 0.0}, "positive focal lengths"),
+        ({"cy": np.nan}, "finite"),
+        ({"max_step": -0.1}, "max_step must lie in 0..1e6"),
+        ({"min_cosine": 1.1}, "min_cosine"),
+        ({"labels": np.zeros((20, 29), np.int32)}, "labels must have shape"),
+    ],
+)
+def test_what_does_not_fit_a_depth_image_is_refused(changes: dict, message: str) -> None:
+    told = {
+        "depth_m": np.ones((20, 30), np.float32),
+        **dict.fromkeys(("fx", "fy", "cx", "cy"), 20.0),
+        "max_step": 0.05,
+        "min_cosine": 0.9,
+        "labels": np.zeros((20, 30), np.int32),
+    }
+    with pytest.raises(ValueError, match=message):
+        _foreground.surfaces(*(told | changes).values())
 
 
 def test_a_mask_is_written_whole() -> None:

@@ -80,6 +80,21 @@ def test_kernel_does_what_its_twin_does(rule, is_masked) -> None:
         assert np.count_nonzero(kernel.regions == wanted) > 10
 
 
+@pytest.mark.parametrize("count", [16, 17, 40])
+def test_many_regions_are_tried_as_few_are(count: int) -> None:
+    """More than a vector has lanes, over each other and beside the image."""
+    rng, rows = np.random.default_rng(5), scattered(1500)
+    low = rng.uniform(-10, 50, (count, 2))
+    boxes = np.concatenate([low, low + rng.uniform(2, 25, (count, 2))], axis=1).astype(np.float32)
+    scores = rng.uniform(0.2, 1, count).astype(np.float32)
+    config = AssignmentConfig(max_depth_gap_m=1.0)
+    kernel = ours(rows, Regions.of_boxes(boxes, scores), config)
+    view = CAMERA, T_CAMERA_MAP, depth_image(), boxes.astype(float), scores, None, config
+    twin = assign_reference(rows, *view)
+    assert np.count_nonzero(kernel.regions != twin.regions) <= 3
+    assert kernel.regions.max() >= count - 4, "the last ones have some too"
+
+
 def test_a_mask_that_fills_its_box_is_the_box() -> None:
     rows, box = scattered(2000), np.array([[9.5, 7.5, 40.5, 30.5]])
     full = [Foreground(8, 10, np.ones((23, 31), bool))]

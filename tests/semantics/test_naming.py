@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ldo_service.gaussians.views import View
 from ldo_service.geometry import Camera
 from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.labelling import Claims
 from ldo_service.semantics.naming import Naming, fitting_parts, with_opinions
 from ldo_service.semantics.regions import Answer
-from ldo_service.semantics.regions_to_name import Opinion, RegionsToName
+from ldo_service.semantics.regions_to_name import Opinion, RegionConfig, RegionsToName
 from ldo_service.semantics.trigger import Candidate
 from ldo_service.semantics.vocabulary import Vocabulary
 
@@ -50,6 +51,35 @@ def test_where_boxes_have_no_vote_both_words_are_weighed() -> None:
     assert named.labels.tolist() == claims.labels.tolist()
     assert named.open_labels[0] == vocabulary.index("microwave")
     assert named.open_confidences.tolist() == [np.float32(0.9), 0]
+
+
+def test_a_region_whose_boxes_have_no_vote_is_as_sure_as_the_labeller_is() -> None:
+    """Also where a box says the same, and was surer of it."""
+    regions, camera = (
+        RegionsToName(RegionConfig(boxes_vote=False)),
+        Camera(160, 120, 120, 120, 80, 60),
+    )
+    color, depth_m = np.zeros((120, 160, 3), np.uint8), np.full((120, 160), 2.0, np.float32)
+    sure = replace(region(0), score=0.9)
+    for keyframe in (3, 4):
+        place = color, depth_m, camera, {3: np.eye(4), 4: np.eye(4)}
+        seen = regions.see(keyframe, [sure], *place)
+        regions.answered(0, Answer("tv", 0.4))
+    (opinion,) = seen.opinions
+    assert (opinion.label, opinion.sure) == ("tv", pytest.approx(0.4))
+
+
+@pytest.mark.parametrize("is_heard", [True, False])
+def test_who_is_not_heard_changes_nothing_about_boxes(is_heard: bool) -> None:
+    naming = Naming.unpacked(asked_about(region(kind="standing")).packed, is_heard=is_heard)
+    naming.answered(0, 3, Answer("cushion", 0.9), vocabulary := Vocabulary(256))
+    before = Claims.none()
+    color, depth_m = np.zeros((3, 120, 160), np.uint8), np.full((120, 160), 2.0, np.float32)
+    camera = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
+    view = View(4, camera, color, depth_m, np.eye(4))
+    no_name, T = np.zeros((120, 160), bool), {3: np.eye(4), 4: np.eye(4)}
+    claims, _ = naming.see(view, before, vocabulary, no_name, T)
+    assert bool(len(claims.boxes)) == is_heard
 
 
 def test_a_region_without_a_box_is_a_claim_of_its_own() -> None:

@@ -25,9 +25,8 @@ from tests.service.heard import Heard
 FRAMES = range(0, 84, 2)
 SILENT = 20  # of these frames, before the first answer
 LATE = 5  # keyframes, at least, of that answer
-LOST_AFTER_S = (
-    5.0  # a frame that nobody took, and the first while not all are there for its keyframe
-)
+# A frame that nobody took, and the first while not all are there for its keyframe
+LOST_AFTER_S = 5.0
 LIGHT = ("detector.model=demo", "mapper.iterations=2", "stage.heartbeat_s=0.1")
 PATIENT = (  # it may take for ever
     *("http.endpoint.timeout_s=600", "http.endpoint.patience_s=600"),
@@ -125,7 +124,7 @@ def test_nobody_waits_for_a_slow_labeller_and_its_answers_lie_where_it_was_asked
     guide = Guide(sequence, range(len(sequence)), waits=True)
     with serving(guide) as server:
         use = [f"vlm_labeller.{setting}" for setting in (f"url={server.url}", *PATIENT)]
-        use.append("stage.stall_after_s=900")
+        use += ["stage.stall_after_s=1500", "service.control_timeout_s=1500"]
         with walk(tmp_path / "slow", sequence, *use, guide=guide) as walker:
             slow = walker.heard
             # it is asked, and says nothing

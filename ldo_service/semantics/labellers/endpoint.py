@@ -35,8 +35,17 @@ class EndpointConfig:
         times = (self.timeout_s, self.patience_s, self.per_minute)
         if min(times) <= 0 or min(self.backoff_s, self.rest_s, self.rest_most_s) < 0:
             raise ConfigError(f"{self}: times must be positive.")
+        if self.patience_s < self.timeout_s:
+            raise ConfigError(
+                f"patience_s={self.patience_s:g} must be at least timeout_s={self.timeout_s:g}, "
+                "which one attempt may take."
+            )
         if self.attempts < 1:
             raise ConfigError("attempts must be at least 1.")
+
+
+class OutOfPatience(EndpointError):
+    """No time is left, and the server did nothing wrong."""
 
 
 class Endpoint:
@@ -65,11 +74,13 @@ class Endpoint:
 
     def post(self, path: str, body: bytes, until_s: float) -> bytes:
         """The answer to a question. Raises EndpointError when there is none by `until_s` of the
-        clock."""
+        clock; a server that could not have its `timeout_s` until then is not left alone for it."""
         if self._clock() < self._rested_at_s:
             raise EndpointError(f"{self.url} failed before and is left alone for a while.")
         try:
             answer = self._insist(path, body, until_s)
+        except OutOfPatience:
+            raise
         except EndpointError:
             rest_s = self._config.rest_s * 2 ** min(self._failures, 30)
             self._rested_at_s = self._clock() + min(rest_s, self._config.rest_most_s)
@@ -79,13 +90,16 @@ class Endpoint:
         return answer
 
     def _insist(self, path: str, body: bytes, until_s: float) -> bytes:
-        failure = EndpointError("")
+        failure = OutOfPatience(f"{self.url} may not be asked again within patience_s.")
         for attempt in range(self._config.attempts):
             pause_s = self._config.backoff_s * 2 ** (attempt - 1) if attempt else 0.0
             self._wait(pause_s, until_s, failure)
+            within_s = min(self._config.timeout_s, until_s - self._clock())
             try:
-                return self._ask(path, body, min(self._config.timeout_s, until_s - self._clock()))
+                return self._ask(path, body, within_s)
             except _Passing as passing:
+                if within_s < self._config.timeout_s and self._clock() >= until_s:
+                    raise failure from passing  # nobody knows what it would have said
                 failure = EndpointError(
                     f"{self.url} {passing} ({attempt + 1} attempts): is the server up, and the "
                     "address right?"
@@ -93,12 +107,11 @@ class Endpoint:
         raise failure
 
     def _wait(self, pause_s: float, until_s: float, failure: EndpointError) -> None:
-        """Until the next attempt may be made. Raises when that is too late."""
+        """Until the next attempt may be made. Raises `failure` when that is too late."""
         now_s = self._clock()
         start_s = max(now_s + pause_s, self._free_at_s)
         if start_s >= until_s:
-            late = EndpointError(f"{self.url} may not be asked again within patience_s.")
-            raise failure if str(failure) else late
+            raise failure
         if start_s > now_s:
             self._sleep(start_s - now_s)
         self._free_at_s = start_s + 60 / self._config.per_minute

@@ -234,6 +234,38 @@ def test_all_views_of_a_region_together_try_its_patience(each_s: float, asked: i
     assert time.now_s - 100 <= EndpointConfig().patience_s
 
 
+@pytest.mark.parametrize(
+    ("first_s", "endpoint", "second"),
+    [
+        (19, {"timeout_s": 30}, [("cup", pytest.approx(0.5))]),  # cut after 21 of its 30 s
+        (19, {"timeout_s": 21}, None),  # had its time, and is left alone
+    ],
+)
+def test_a_view_cut_off_by_patience_is_no_failure_of_the_server(
+    first_s: float, endpoint: dict, second: list | None
+) -> None:
+    time, later_s = Time(), iter([first_s, 21, 0])
+
+    def says_or_hangs_up(handler: BaseHTTPRequestHandler) -> None:
+        wait_s = next(later_s)
+        time.now_s += wait_s
+        (hangs_up if wait_s == 21 else says("cup", 0.5))(handler)
+
+    with serving(says_or_hangs_up) as server:
+        one = labeller(server.url, time=time, views=2, endpoint={"attempts": 1, **endpoint})
+        assert one.label([RED] * 2) == [("cup", pytest.approx(0.5))]
+        if second is not None:
+            assert one.label([RED]) == second
+        else:
+            with pytest.raises(EndpointError, match="left alone"):
+                one.label([RED])
+
+
+def test_a_question_that_may_not_have_one_attempt_s_time_is_refused() -> None:
+    with pytest.raises(ConfigError, match="patience_s=5 must be at least timeout_s=10"):
+        EndpointConfig(patience_s=5)
+
+
 # --- manners --------------------------------------------------------------------------------------
 def test_attempts_are_spaced_evenly() -> None:
     time, times = Time(), []
