@@ -31,9 +31,9 @@ const uint32_t* indices_of(const Array& indices, size_t n) {
   require(indices.ndim() == 1, "indices must have shape [V].");
   const uint32_t* which = values_of<uint32_t>(indices, "indices");
   const size_t v = indices.shape(0);
-  bool ascend = v == 0 || which[v - 1] < n;
-  for (size_t i = 1; i < v; ++i) ascend = ascend && which[i - 1] < which[i];
-  require(ascend, "indices must ascend and be below the number of rows.");
+  bool is_wrong = v > 0 && which[v - 1] >= n;
+  for (size_t i = 1; i < v; ++i) is_wrong |= which[i - 1] >= which[i];  // all: that is a vector's
+  require(!is_wrong, "indices must ascend and be below the number of rows.");
   return which;
 }
 
@@ -137,9 +137,11 @@ LabelRow* label_rows_of(const WritableArray& rows) {
 void require_observations(const Observations& seen, size_t v) {
   bool labels = true, confident = true, sized = true;
   for (size_t i = 0; i < v; ++i) {
-    labels = labels && seen.label[i] >= kNotSeen && seen.label[i] < 256;
-    confident = confident && (seen.label[i] < 0 || is_share(seen.confidence[i]));
-    sized = sized && seen.extent_m[i] >= 0.0f;
+    const int label = seen.label[i];
+    const float c = seen.confidence[i];
+    labels &= (label >= kNotSeen) & (label < 256);
+    confident &= (label < 0) | ((c >= 0.0f) & (c <= 1.0f));
+    sized &= seen.extent_m[i] >= 0.0f;
   }
   require(labels, "labels that were observed must be below 256, -1 for a miss, or -2.");
   require(confident, "confidences must lie in 0..1.");

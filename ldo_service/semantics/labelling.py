@@ -8,7 +8,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 
-from .assignment import UNMATCHED, Assigned, AssignmentConfig, Regions, assign
+from .assignment import HIDDEN, Assigned, AssignmentConfig, Regions, assign
 from .consistency import ConsistencyConfig, Disagreement, agree
 from .foreground import Foreground, ForegroundConfig, foreground, surfaces
 from .fusion import FusionConfig, fused
@@ -167,28 +167,31 @@ def observations(
 ) -> Observations:
     """Labels and confidences of the Gaussians that a region got; misses of the others in view. The
     side of an object is that of a square like its box, at the depth of the Gaussian."""
-    hit = where.regions >= 0
-    labels = np.full(len(indices), NOT_SEEN, np.int16)
-    if not is_late:
-        labels[where.regions == UNMATCHED] = MISS
-    confidences = np.zeros(len(indices), np.float32)
-    sides_px = np.full(len(indices), config.labels.least_px, np.float32)
-    of = where.regions[hit]
-    both = fused(
-        claims.labels.take(of),
-        claims.confidences.take(of),
-        where.overlaps[hit],
-        claims.open_labels.take(of),
-        claims.open_confidences.take(of),
-        config.fusion,
-    )
-    labels[hit] = np.where(both.confidences > 0, both.labels, NOT_SEEN)
-    confidences[hit] = both.confidences
-    if is_late:
-        labels[np.flatnonzero(hit)[2 * both.by_detector >= both.confidences]] = NOT_SEEN
-    corners = np.reshape(claims.boxes, (-1, 2, 2))
-    sides_px[hit] = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1)).take(of)
+    # by the outcome: hidden, in no region, in region 0, 1, ...
+    outcome = where.regions - HIDDEN
+    said = np.where((claims.confidences > 0) & (not is_late), claims.labels, NOT_SEEN)
+    miss = NOT_SEEN if is_late else MISS
+    labels = np.array([NOT_SEEN, miss, *said], np.int16).take(outcome)
+    confidences = np.array([0, 0, *claims.confidences], np.float32).take(outcome)
+    corners, least_px = np.reshape(claims.boxes, (-1, 2, 2)), config.labels.least_px
+    sides_px = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))
+    # where a labeller has spoken too, by the Gaussian
+    is_fused = np.array([False, False, *(claims.open_confidences > 0)])
+    if is_fused.any():
+        both = np.flatnonzero(is_fused.take(outcome))
+        of = where.regions[both]
+        one = fused(
+            claims.labels.take(of),
+            claims.confidences.take(of),
+            where.overlaps[both],
+            claims.open_labels.take(of),
+            claims.open_confidences.take(of),
+            config.fusion,
+        )
+        is_told = one.confidences > (2 * one.by_detector if is_late else 0)
+        labels[both] = np.where(is_told, one.labels, NOT_SEEN)
+        confidences[both] = one.confidences
     extents_m = np.maximum(where.depths_m, 0)
     extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))
-    extents_m *= sides_px
+    extents_m *= np.array([least_px, least_px, *sides_px], np.float32).take(outcome)
     return Observations(indices, labels, confidences, extents_m)
