@@ -105,7 +105,8 @@ def main() -> None:
     where_few = assign(rows, few, CAMERA, T, depth_m, regions, CONFIG.assignment)
     seen_few = observations(where_few, few, CAMERA, claims, CONFIG)
     view = CAMERA, T, depth_m, claims.boxes, claims.scores(), masks, CONFIG.assignment
-    keyframe = rows, labels, indices, CAMERA, T, depth_m, claims, CONFIG
+    # labels of its own: `agree` alone, again and again, spreads those of the steps
+    keyframe = rows, new_labels(n), indices, CAMERA, T, depth_m, claims, CONFIG
     steps = [
         Step("surfaces", lambda: surfaces(*image), lambda: surfaces_reference(*image)),
         Step(
