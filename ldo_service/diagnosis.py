@@ -73,7 +73,7 @@ def _of_steps(health: Health) -> Iterator[Trouble]:
             f"has been busy with one message for {health.busy_s:.0f} s",
             "give it less work per message; beyond stage.stall_after_s it is given up",
         )
-    elif waiting and health.step_age_s > IDLE_S and not health.held:
+    elif waiting and not health.busy_s and health.step_age_s > IDLE_S and not health.held:
         yield Trouble(
             f"took none of {waiting} waiting messages for {health.step_age_s:.0f} s",
             "it waits for room at a consumer: look at the actors that take what it makes",

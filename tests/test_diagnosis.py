@@ -34,6 +34,7 @@ def seen(of: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1
         seen(health(step_age_s=3600.0)),  # nothing to do is no trouble
         seen(health(step_age_s=60.0, held=True, inputs=inputs(waiting=3))),
         seen(health(busy_s=0.5, state="busy", inputs=inputs(waiting=8))),
+        seen(health(busy_s=4.0, step_age_s=9.0, state="busy", inputs=inputs(waiting=8))),
         seen(health(inputs=inputs(dropped=500, rejected=3))),  # what a slow machine does
     ],
 )
