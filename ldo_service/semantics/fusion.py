@@ -64,8 +64,8 @@ def fused(
     confidences = np.asarray(detector_confidences, np.float32)
     open_confidences = np.asarray(open_confidences, np.float32)
     invoked = (open_confidences > 0) & (config.rule != "detector")
-    alpha, at = np.ones(len(confidences), np.float32), np.flatnonzero(invoked)
-    alpha[at] = _alpha(overlaps[at] * confidences[at], open_confidences[at], config)
+    alpha = np.where(invoked, _alpha(overlaps * confidences, open_confidences, config), 1)
+    alpha = alpha.astype(np.float32)
     by_detector, by_labeller = alpha * confidences, (1 - alpha) * open_confidences
     labels = np.where(by_detector >= by_labeller, detector_labels, open_labels)
     return Fused(labels.astype(np.int16), by_detector + by_labeller, alpha, by_detector)
