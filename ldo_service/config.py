@@ -51,10 +51,8 @@ class ServiceConfig:
     silent_after_s: float = 10.0  # a process without a heartbeat for so long is killed
     sync_state: bool = False  # a step is on the disk before it is told: a power cut costs what a
     # kill does, and each step three syncs, 12 ms on a virtual disk. False: it may cost the state
-    control_timeout_s: float = (
-        55.0  # for all actors to obey, which each does between two steps: the
-    )
-    # slowest measured is 0.6 s, and a labeller may wait for its server for 50
+    control_timeout_s: float = 55.0  # for all actors to obey, each between two steps: the slowest
+    # measured is 0.6 s, and a labeller may wait for its server for 50
     keys: str = ""  # folder that `ldo keys add` made, for TLS; --keys names another
     max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped; a 4K frame can have 58 MB
     metrics_address: str = LOOPBACK  # who reads them sees when the robot works; 0.0.0.0: everybody

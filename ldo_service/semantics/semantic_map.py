@@ -44,6 +44,10 @@ class SemanticMapConfig:
                 f"{MOST_LABELS}."
             )
 
+    @property
+    def hears_labeller(self) -> bool:
+        return self.labelling.fusion.rule != "detector"
+
 
 @dataclass(frozen=True, slots=True)
 class Learnt:
@@ -75,7 +79,7 @@ class SemanticMap:
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.most_names)
         self.objects = Objects(self.config.objects)
-        is_heard = self.config.labelling.fusion.rule != "detector"
+        is_heard = self.config.hears_labeller
         self.naming = Naming(self.config.naming, is_heard=is_heard) if has_labeller else None
         self._map, self._threads = map_, threads
         self._by_detector, self._by_labeller = set[int](), set[int]()  # labels they gave
@@ -281,7 +285,7 @@ class SemanticMap:
         }
         self._by_detector, self._by_labeller = map(set, state["given"])
         if self.naming and state["naming"]:
-            is_heard = self.config.labelling.fusion.rule != "detector"
+            is_heard = self.config.hears_labeller
             self.naming = Naming.unpacked(state["naming"], self.config.naming, is_heard=is_heard)
 
     def statistics(self) -> dict[str, float]:
