@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator
+from itertools import islice, repeat
 from pathlib import Path
 from types import ModuleType
 
@@ -43,3 +44,17 @@ def test_descent_finds_the_least_and_leaves_what_it_began_with(training: ModuleT
     )
     np.testing.assert_allclose(found["x.kernel"], goal, atol=0.05)
     assert start["x.kernel"].tolist() == [3.0, -2.0]
+
+
+def test_crops_grow_after_their_shares_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    before = set(sys.modules)
+    import pair
+
+    try:
+        sides = islice(pair.growing(repeat, ((32, 0.3), (48, 0.7)), 10), 14)
+        assert list(sides) == [32] * 3 + [48] * 11
+    finally:
+        for name in set(sys.modules) - before:
+            if Path(getattr(sys.modules[name], "__file__", None) or "").parent.name == "networks":
+                del sys.modules[name]
