@@ -13,7 +13,14 @@ FEWEST_BLOCKS = 16
 OUTLIER_SIGMAS = 2.5
 MAX_GAIN = 3.0  # and its inverse: a stop and a half
 ROUNDS = 6
-GAIN_PRIOR = 1e-4  # variance of colour below which gain 1 is believed more than the images
+# What is believed of a camera before its image is seen, standard deviations: it changes its gain, and
+# hardly adds anything. Where a wall fills the image, gain and bias cannot be told apart; with any
+# bias the map was painted with a gain of 1.7 there.
+GAIN_SIGMA = 0.3
+BIAS_SIGMA = 0.02  # of the range
+PATCHES = 50  # that the blocks of an image are worth at most: neighbours err alike
+FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.01  # of a block's colour
+MAX_SIGMA = 0.1  # beyond, the images show different things
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -60,17 +67,20 @@ def estimated_exposure(
     """Gain and bias of a new image against what the map shows at its pose, where it shows enough.
 
     rendered, seen [H, W, 3] in 0..1, opacity [H, W]. Least squares over averages of 8x8 pixels that
-    are opaque and not saturated, without outliers (moved things, new surface). None where these are
-    too few, or the gain is none that a camera would choose: then the images show different things.
+    are opaque and not saturated, without outliers (moved things, new surface), drawn to gain 1 and
+    more so to bias 0. None where these are too few, or the gain is none that a camera would choose,
+    or leaves too much unexplained: then the images show different things.
     """
     x, y = _averaged(rendered), _averaged(seen)
     saturated = _averaged(seen.max(axis=-1) >= SATURATED)
     usable = (_averaged(opacity) > 0.95) & (saturated == 0)
     if np.count_nonzero(usable) < max(FEWEST_BLOCKS, LEAST_SHARE * usable.size):
         return None
-    channels = np.array([_robust_line(x[usable, c], y[usable, c]) for c in range(3)])
-    is_plausible = np.all((channels[:, 0] > 1 / MAX_GAIN) & (channels[:, 0] < MAX_GAIN))
-    return Exposure.of(channels.T) if is_plausible else None
+    lines = [_robust_line(x[usable, c], y[usable, c]) for c in range(3)]
+    is_plausible = all(
+        1 / MAX_GAIN < gain < MAX_GAIN and sigma < MAX_SIGMA for gain, _, sigma in lines
+    )
+    return Exposure.of(np.array(lines).T[:2]) if is_plausible else None
 
 
 def _averaged(image: np.ndarray) -> np.ndarray:
@@ -79,16 +89,20 @@ def _averaged(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
-def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and offset of y over x, both [M]; the slope is drawn to one where x hardly varies."""
-    inlier = np.ones(len(x), bool)
-    slope, offset = 1.0, 0.0
+def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
+    """Slope and offset of y over x, both [M]: least squares with a prior, without outliers; and the
+    deviation of all of them from it, by its median."""
+    design = np.stack([x, np.ones_like(x)], axis=1).astype(float)
+    prior = np.diag([GAIN_SIGMA**-2, BIAS_SIGMA**-2])
+    inlier, sigma = np.ones(len(x), bool), FIRST_SIGMA
+    line, residual = np.array([1.0, 0.0]), np.abs(y - x)
     for _ in range(ROUNDS):
-        a, b = x[inlier].astype(float), y[inlier].astype(float)
-        covariance = float(np.mean((a - a.mean()) * (b - b.mean())))
-        slope = (covariance + GAIN_PRIOR) / (float(a.var()) + GAIN_PRIOR)
-        offset = float(b.mean()) - slope * float(a.mean())
-        residual = np.abs(y - slope * x - offset)
-        sigma = 1.4826 * float(np.median(residual[inlier]))
-        inlier = residual <= max(OUTLIER_SIGMAS * sigma, 0.01)
-    return slope, offset
+        seen = design[inlier]
+        weight = min(PATCHES / len(seen), 1.0) / sigma**2
+        line = np.linalg.solve(
+            weight * seen.T @ seen + prior, weight * seen.T @ y[inlier] + prior @ [1.0, 0.0]
+        )
+        residual = np.abs(y - design @ line)
+        sigma = max(1.4826 * float(np.median(residual[inlier])), LEAST_SIGMA)
+        inlier = residual <= OUTLIER_SIGMAS * sigma
+    return float(line[0]), float(line[1]), 1.4826 * float(np.median(residual))

@@ -61,12 +61,25 @@ def test_without_a_map_behind_it_no_exposure_is_estimated() -> None:
     assert estimated_exposure(shown, opacity, seen) is None
 
 
-def test_one_colour_alone_changes_no_gain() -> None:
+def test_one_colour_alone_says_how_the_gain_changed() -> None:
+    """Gain and bias cannot be told apart there, and cameras change their gain."""
     flat = np.full((160, 160, 3), 0.5, np.float32)
     found = estimated_exposure(flat, np.ones((160, 160), np.float32), flat * np.float32(0.8))
     assert found is not None
-    np.testing.assert_allclose(found.gain, 1.0, atol=1e-3)
+    np.testing.assert_allclose(found.gain, 0.8, atol=0.01)
     np.testing.assert_allclose(found.applied(flat), 0.4, atol=1e-3)
+
+
+def test_a_wall_that_the_map_shows_badly_changes_no_contrast() -> None:
+    """Errors of the map in what has little contrast are no gain of 0.5 and a bias of 0.3."""
+    rng = np.random.default_rng(5)
+    patches = rng.normal(0.7, 0.02, (20, 20, 3)).astype(np.float32)
+    shown = (patches + rng.normal(0, 0.02, patches.shape)).repeat(8, axis=0).repeat(8, axis=1)
+    seen = 0.9 * patches.repeat(8, axis=0).repeat(8, axis=1)
+    found = estimated_exposure(shown, np.ones(shown.shape[:2], np.float32), seen)
+    assert found is not None
+    np.testing.assert_allclose(found.gain, 0.9, atol=0.06)
+    np.testing.assert_allclose(found.bias, 0.0, atol=0.04)
 
 
 def test_removed_undoes_applied() -> None:
