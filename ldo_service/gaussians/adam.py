@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from weakref import ref
 
 import numpy as np
@@ -97,14 +98,16 @@ class Adam:
         rate: float = 1.0,
         needle_weight: float = 0.0,
         needle_ratio: float = 1.0,
+        max_sigma_px: float = inf,
     ) -> Reached:
         """`step` against the gradients of what `rasteriser` last rendered of this map, which are
-        never written out; `Rasteriser.gradients` says what `by_planes` and the needles are."""
+        never written out; `Rasteriser` says what `by_planes`, needles and `max_sigma_px` are."""
         reached = rasteriser.descend(
             by_planes,
             self._step(gaussians, rate),
             needle_weight=needle_weight,
             needle_ratio=needle_ratio,
+            max_sigma_px=max_sigma_px,
         )
         gaussians.touch(reached.indices)
         return reached

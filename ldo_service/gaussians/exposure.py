@@ -13,9 +13,9 @@ FEWEST_BLOCKS = 16
 OUTLIER_SIGMAS = 2.5
 MAX_GAIN = 3.0  # and its inverse: a stop and a half
 ROUNDS = 6
-# What is believed of a camera before its image is seen, standard deviations: it changes its gain, and
-# hardly adds anything. Where a wall fills the image, gain and bias cannot be told apart; with any
-# bias the map was painted with a gain of 1.7 there.
+# What is believed of a camera before its image is seen, standard deviations: it changes its gain,
+# and hardly adds anything. Where a wall fills the image the two cannot be told apart; with any bias
+# the map was painted with a gain of 1.7 there.
 GAIN_SIGMA = 0.3
 BIAS_SIGMA = 0.02  # of the range
 PATCHES = 50  # that the blocks of an image are worth at most: neighbours err alike

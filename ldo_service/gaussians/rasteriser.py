@@ -2,6 +2,7 @@
 `kernels/projection_gradient.hpp`; its judge is the derivative of `render_reference`."""
 
 from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 
@@ -122,12 +123,14 @@ class Rasteriser:
         *,
         needle_weight: float = 0.0,
         needle_ratio: float = 1.0,
+        max_sigma_px: float = inf,
     ) -> Reached:
         """The step of `step` against what `gradients` would give, to the same bits.
 
         Changes the rows that were rendered, in place, and the moments. Their gradients stay in
-        cache, which saves a sixth of an iteration. Raises ValueError where `step` is for other
-        rows than were rendered last, or they were stepped on since.
+        cache, which saves a sixth of an iteration. Of what moved, no standard deviation is longer
+        then than `max_sigma_px` in this view, at the depth of the mean. Raises ValueError where
+        `step` is for other rows than were rendered last, or they were stepped on since.
         """
         indices = self._room_for_indices()
         if len(self._weights) < self._visible:
@@ -149,6 +152,7 @@ class Rasteriser:
             weights,
             needle_weight,
             float(np.log(needle_ratio)),
+            max_sigma_px,
             self.threads,
         )
         return Reached(indices, weights, xi)

@@ -119,11 +119,13 @@ def descend(
     weights: NDArray[np.float32],
     needle_weight: float = 0.0,
     needle_log_ratio: float = 0.0,
+    max_sigma_px: float = ...,
     threads: int = 1,
 ) -> NDArray[np.float64]:
     """`backpropagate` and `adam_step` in one, without writing the gradients of the rows out.
 
-    `rows`, `mean`, `square` and `steps` change in place, as do the bits that `adam_step` changes.
+    `rows`, `mean`, `square` and `steps` change in place, as do the bits that `adam_step` changes;
+    then standard deviations of what moved are cut to `max_sigma_px` of the view, without end.
     Writes the V row numbers to `indices` [V] and the Gaussians' weights to `weights` [V]; returns
     dL/dxi [6]. The rendering is used up.
     """

@@ -22,9 +22,9 @@ class AdamStep {
     }
   }
 
-  // Each row belongs to one thread at a time.
-  void operator()(uint32_t row, Floats gradient) const {
-    if (!any(Floats(0.0f) < abs(gradient))) return;  // hidden behind others
+  // Whether the row moved. Each belongs to one thread at a time.
+  bool operator()(uint32_t row, Floats gradient) const {
+    if (!any(Floats(0.0f) < abs(gradient))) return false;  // hidden behind others
     const int64_t at = static_cast<int64_t>(row) * kAdamFloats;
     const Correction& correction = corrections_[std::min(++rows_.steps[row], kCorrections - 1)];
     const Floats mean =
@@ -36,6 +36,7 @@ class AdamStep {
     square.store(rows_.square + at);
     (Floats::load(rows_.parameters + at) - rate_ * correction.mean * mean / size)
         .store(rows_.parameters + at);
+    return true;
   }
 
  private:

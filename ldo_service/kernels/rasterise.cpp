@@ -146,6 +146,23 @@ void add_up(const Buffer<PoseSums>& poses, double* out) {
   }
 }
 
+// Cuts a row to the size that a view allows.
+class SizeBound {
+ public:
+  SizeBound(const View& view, SizeLimit limit)
+      : view_(view), per_depth_(limit.most_px / std::max(view.fx, view.fy)) {}
+  void operator()(float* row) const {
+    const float *forward = view_.T_camera_map + 8, *mean = row + kMean;
+    const float z = forward[0] * mean[0] + forward[1] * mean[1] + forward[2] * mean[2] + forward[3];
+    const float most = std::log(per_depth_ * std::max(z, kNearPlane));
+    for (int k = 0; k < 3; ++k) row[kLogScale + k] = std::min(row[kLogScale + k], most);
+  }
+
+ private:
+  const View view_;
+  const float per_depth_;
+};
+
 // From the derivatives by the images to those by the rows, which `take` gets one by one.
 template <class Take>
 void differentiate(Pass& opaque, const float* planes, const float* gradients, NeedlePenalty penalty,
@@ -213,15 +230,16 @@ void backpropagate(Pass& pass, const float* planes, const float* gradients, Need
 
 // In place: nothing reads a row again once its gradient is known.
 void descend(Pass& pass, const float* planes, const float* gradients, NeedlePenalty penalty,
-             AdamRows rows, const AdamRates& rates, int threads, Reached out) {
+             SizeLimit size, AdamRows rows, const AdamRates& rates, int threads, Reached out) {
   const AdamStep step(rows, rates);
+  const SizeBound bound(pass.view, size);
   differentiate(pass, planes, gradients, penalty, threads, out.pose,
                 [&](int64_t place, uint32_t row, Floats gradient) {
                   alignas(64) float fields[kRowFloats];
                   gradient.store(fields);
                   out.indices[place] = row;
                   out.weights[place] = fields[kWeight];
-                  step(row, gradient);
+                  if (step(row, gradient)) bound(rows.parameters + int64_t{row} * kRowFloats);
                 });
 }
 

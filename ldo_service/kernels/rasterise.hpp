@@ -70,6 +70,12 @@ struct NeedlePenalty {
   float weight, log_ratio;
 };
 
+// No standard deviation of a Gaussian may be longer than `most_px` where a view fits it: one that
+// grows over a wall without texture outshines all that is to be seen there later.
+struct SizeLimit {
+  float most_px;
+};
+
 struct Gradients {
   uint32_t* indices;  // [visible] rows that the view reaches, ascending
   float* rows;        // [visible, kRowFloats] their gradients
@@ -99,8 +105,8 @@ struct Reached {      // by a step of Adam
                         Pass&, float* planes);                                                 \
   void backpropagate(Pass&, const float* planes, const float* gradients, NeedlePenalty,        \
                      int threads, Gradients out);                                              \
-  void descend(Pass&, const float* planes, const float* gradients, NeedlePenalty, AdamRows,    \
-               const AdamRates&, int threads, Reached out);                                    \
+  void descend(Pass&, const float* planes, const float* gradients, NeedlePenalty, SizeLimit,   \
+               AdamRows, const AdamRates&, int threads, Reached out);                          \
   }
 LDO_DECLARE_RASTERISE(baseline)
 LDO_DECLARE_RASTERISE(avx2)

@@ -3,6 +3,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -291,8 +292,9 @@ PoseGradient descend(PassOfPython& held, const WritableArray& rows, const Writab
                      float beta1, float beta2, float epsilon, const Array& planes,
                      const Array& gradients, const WritableArray& indices,
                      const WritableArray& weights, float needle_weight, float needle_log_ratio,
-                     int threads) {
+                     float max_sigma_px, int threads) {
   const Backward b(held, rows, planes, gradients, needle_weight, needle_log_ratio, threads);
+  require(max_sigma_px > 0, "max_sigma_px must be positive.");
   const AdamRows state = adam_rows_of(rows, mean, square, steps);
   const AdamRates hyper = adam_rates_of(rates, beta1, beta2, epsilon);
   const size_t visible = b.pass->visible;
@@ -304,7 +306,8 @@ PoseGradient descend(PassOfPython& held, const WritableArray& rows, const Writab
   held.is_rendered = false;  // the rows are about to change
   {
     nb::gil_scoped_release release;
-    kernels.descend(*b.pass, b.images, b.by_images, b.penalty, state, hyper, threads, out);
+    kernels.descend(*b.pass, b.images, b.by_images, b.penalty, {max_sigma_px}, state, hyper,
+                    threads, out);
   }
   return pose_gradient(std::move(pose));
 }
@@ -333,7 +336,8 @@ NB_MODULE(_rasterise, m) {
         "threads"_a = 1);
   m.def("descend", &descend, "forward"_a, "rows"_a, "mean"_a, "square"_a, "steps"_a, "rates"_a,
         "beta1"_a, "beta2"_a, "epsilon"_a, "planes"_a, "gradients"_a, "indices"_a, "weights"_a,
-        "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f, "threads"_a = 1);
+        "needle_weight"_a = 0.0f, "needle_log_ratio"_a = 0.0f,
+        "max_sigma_px"_a = std::numeric_limits<float>::infinity(), "threads"_a = 1);
 }
 
 }  // namespace ldo

@@ -176,6 +176,7 @@ def test_gaussians_that_changed_are_those_whose_steps_grew(start: tuple) -> None
         {"exposure_rate": -1.0},
         {"translation_rate_m": -1.0},
         {"max_needle_ratio": 0.5},
+        {"max_sigma_px": 0.0},
     ],
 )
 def test_senseless_configuration_is_refused(change: dict) -> None:
