@@ -46,8 +46,12 @@ class SplatBoxer {
     clamp(v + half_y, -0.5f, bottom).store(out.y1);
     p.z.store(out.z);
     const Mask inside = (u >= -0.5f) & (u < right) & (v >= -0.5f) & (v < bottom);
-    out.expected = bits(inside & (p.z >= kNearPlane) & is_finite(columns)) & ((1u << count) - 1);
-    keep_on_surface(u, v, out);
+    u.store(out.u);
+    v.store(out.v);
+    const Mask drawn = inside & (p.z >= kNearPlane) & is_finite(columns);
+    const Floats measured = depth_at(select(drawn, u, 0.0f), select(drawn, v, 0.0f));
+    const Mask on_surface = (Floats(0.0f) < measured) & (abs(p.z - measured) < max_gap_m_);
+    out.expected = bits(drawn & on_surface) & ((1u << count) - 1);
   }
 
  private:
@@ -61,16 +65,15 @@ class SplatBoxer {
     for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
   }
 
-  void keep_on_surface(Floats u, Floats v, SplatBoxes& out) const {
-    u.store(out.u);
-    v.store(out.v);
-    for (uint32_t rest = out.expected; rest != 0; rest &= rest - 1) {
-      const int i = __builtin_ctz(rest);
-      const int64_t row = static_cast<int64_t>(out.v[i] + 0.5f);
-      const float measured_m = depth_m_[row * view_.width + static_cast<int64_t>(out.u[i] + 0.5f)];
-      const bool is_near = measured_m > 0.0f && std::fabs(out.z[i] - measured_m) < max_gap_m_;
-      out.expected &= ~(static_cast<uint32_t>(!is_near) << i);
-    }
+  // Of the pixels that hold these points.
+  Floats depth_at(Floats u, Floats v) const {
+    alignas(64) float column[kLanes], row[kLanes], depth_m[kLanes];
+    (u + 0.5f).store(column);
+    (v + 0.5f).store(row);
+    for (int i = 0; i < kLanes; ++i)
+      depth_m[i] =
+          depth_m_[static_cast<int64_t>(row[i]) * view_.width + static_cast<int64_t>(column[i])];
+    return Floats::load(depth_m);
   }
 
   const View view_;
