@@ -187,11 +187,13 @@ class Candidates {
 };
 
 // Of sixteen splats the region whose reliability, overlap times score, is largest: the first of
-// equals.
+// equals. Writes it, and the overlap, for the first `count`.
 class Contest {
  public:
-  explicit Contest(uint32_t expected) {
-    for (int i = 0; i < kLanes; ++i) region[i] = expected >> i & 1 ? kUnmatched : kUnexpected;
+  Contest(uint32_t expected, int count, int32_t* region, float* overlap)
+      : region_(region), overlap_(overlap) {
+    for (int i = 0; i < count; ++i) region_[i] = expected >> i & 1 ? kUnmatched : kUnexpected;
+    std::fill_n(overlap_, count, 0.0f);
   }
 
   void enter(int32_t j, const Region& candidate, const SplatBoxes& s, const AssignmentRule& rule) {
@@ -206,15 +208,14 @@ class Contest {
       const float reliability = shared * candidate.score;
       if (!(shared > rule.min_overlap && reliability > best_[i])) continue;
       best_[i] = reliability;
-      region[i] = j;
-      overlap[i] = shared;
+      region_[i] = j;
+      overlap_[i] = shared;
     }
   }
 
-  int32_t region[kLanes];
-  float overlap[kLanes] = {};
-
  private:
+  int32_t* const region_;
+  float* const overlap_;
   float best_[kLanes] = {};
 };
 

@@ -25,12 +25,10 @@ void assign(const float* rows, const uint32_t* indices, int64_t v, const View& v
       const int count = static_cast<int>(std::min<int64_t>(kLanes, end - first));
       SplatBoxes splats;
       boxes_of(rows, indices + first, count, splats);
-      Contest contest(splats.expected);
+      Contest contest(splats.expected, count, out.region + first, out.overlap + first);
       candidates.each_near(
           splats, [&](int32_t j, const Region& region) { contest.enter(j, region, splats, rule); });
-      std::copy_n(contest.region, count, out.region + first);
-      std::copy_n(contest.overlap, count, out.overlap + first);
-      std::copy_n(splats.z, count, out.z + first);
+      Floats::load(splats.z).store_first(out.z + first, count);
     }
   });
 }
