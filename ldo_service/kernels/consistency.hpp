@@ -1,5 +1,7 @@
 // Neighbours that disagree about what they are, and a step towards each other.
 #pragma once
+#include <limits>
+
 #include "label_update.hpp"
 #include "neighbourhood.hpp"
 #include "projection.hpp"
@@ -20,9 +22,8 @@ inline uint8_t top_label(const LabelRow& row) {
 class Neighbours16 {
  public:
   Neighbours16(const float* rows, const uint32_t* indices, const LabelRow* labels,
-               const uint32_t* places, int count)
-      : count_(count) {
-    std::copy_n(places, count, place_);
+               const uint32_t* places, int count) {
+    for (auto& column : mean_) std::fill_n(column, kLanes, std::numeric_limits<float>::infinity());
     label_[0] = kBackground;
     std::fill_n(share_[0], kLanes, 0.0f);
     for (int j = 0; j < count; ++j) {
@@ -40,15 +41,14 @@ class Neighbours16 {
     return sum(select((tops >= own) & (own >= tops), 0.0f, weights));
   }
 
-  // exp(-d^2 / sigma^2) / |N| of each within the radius of `mean`, but for Gaussian `self`.
-  Floats weights(const float* mean, uint32_t self, const ConsistencyRule& rule) const {
+  // exp(-d^2 / sigma^2) / |N| of each within the radius of `mean`, but for the one in lane
+  // `self`, which may be in none.
+  Floats weights(const float* mean, int self, const ConsistencyRule& rule) const {
     const Floats x = Floats::load(mean_[0]) - mean[0], y = Floats::load(mean_[1]) - mean[1],
                  z = Floats::load(mean_[2]) - mean[2];
     const Floats square = x * x + y * y + z * z;
-    alignas(64) float counts[kLanes] = {};
-    for (int j = 0; j < count_; ++j) counts[j] = place_[j] == self ? 0.0f : 1.0f;
-    const Mask near =
-        (square < rule.radius_m * rule.radius_m) & (Floats(0.5f) < Floats::load(counts));
+    const Mask near = (square < rule.radius_m * rule.radius_m) &
+                      (abs(Floats::ramp() - static_cast<float>(self)) >= 0.5f);
     const int n = __builtin_popcount(bits(near));
     if (n == 0) return 0.0f;
     const Floats kernel = exp(square * (-1.0f / (rule.sigma_m * rule.sigma_m)));
@@ -71,9 +71,7 @@ class Neighbours16 {
   }
 
   static constexpr int kMost = 1 + kLanes * kSlots;
-  const int count_;
-  uint32_t place_[kLanes];
-  alignas(64) float mean_[3][kLanes] = {};
+  alignas(64) float mean_[3][kLanes];  // none is near those that only fill up the vector
   alignas(64) float top_[kLanes] = {};
   int n_labels_ = 1;
   uint8_t label_[kMost];

@@ -63,7 +63,8 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
         const uint32_t i = voxels.begin(active[a])[k];
         if (is_bare && before[i].weights[0] == 0.0f) continue;  // all is background
         const float* mean = rows + static_cast<int64_t>(indices[i]) * kRowFloats;
-        step(around, around.weights(mean, i, rule), before[i], labels[indices[i]], sums[job]);
+        const Floats weights = around.weights(mean, k < kOwn ? static_cast<int>(k) : -1, rule);
+        step(around, weights, before[i], labels[indices[i]], sums[job]);
       }
     }
   });

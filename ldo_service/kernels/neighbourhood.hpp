@@ -28,6 +28,8 @@ struct Stencil {
 };
 inline constexpr Stencil kStencil;
 
+constexpr int64_t kOwn = kLanes / 2;  // the first of a voxel stand for it
+
 class Voxels {
  public:
   // Of the rows that `indices` [v] name: their places in that list, by voxel, in order. Voxels are
@@ -69,7 +71,7 @@ class Voxels {
     return out;
   }
 
-  // Up to sixteen Gaussians: the first eight of the voxel, then the first of each of those around
+  // Up to sixteen Gaussians: the first kOwn of the voxel, then the first of each of those around
   // it, nearest voxels first, the second of each, and so on.
   int around(int64_t cell, uint32_t (&out)[kLanes]) const {
     int64_t cells[27], n_cells = 0, most = 0;
@@ -80,7 +82,7 @@ class Voxels {
       most = std::max(most, count(other));
     }
     int n = 0;
-    for (; n < std::min<int64_t>(kLanes / 2, count(cell)); ++n) out[n] = begin(cell)[n];
+    for (; n < std::min(kOwn, count(cell)); ++n) out[n] = begin(cell)[n];
     for (int64_t turn = 0; turn < most && n < kLanes; ++turn)
       for (int64_t k = 0; k < n_cells && n < kLanes; ++k)
         if (turn < count(cells[k])) out[n++] = begin(cells[k])[turn];
