@@ -44,7 +44,7 @@ void update(LabelRow* rows, const uint32_t* indices, int64_t v, const Observatio
 
 Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices, int64_t v,
                    const ConsistencyRule& rule, int threads) {
-  constexpr int64_t kJobVoxels = 256;
+  constexpr int64_t kJobVoxels = 256, kAhead = 8;
   const Voxels voxels(rows, indices, v, 2.0f * rule.sigma_m);
   Buffer<LabelRow> before(v);
   for (int64_t i = 0; i < v; ++i) before[i] = labels[indices[i]];
@@ -59,8 +59,13 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
       const int count = voxels.around(active[a], places);
       const Neighbours16 around(rows, indices, before.data(), places, count);
       const bool is_bare = around.labels() == 1;
-      for (int64_t k = 0; k < voxels.count(active[a]); ++k) {
-        const uint32_t i = voxels.begin(active[a])[k];
+      const uint32_t* members = voxels.begin(active[a]);
+      const int64_t last = voxels.count(active[a]) - 1;
+      for (int64_t k = 0; k <= last; ++k) {
+        // They lie apart in memory: asked for some turns before they are read.
+        const uint32_t i = members[k], later = indices[members[std::min(k + kAhead, last)]];
+        __builtin_prefetch(rows + static_cast<int64_t>(later) * kRowFloats);
+        __builtin_prefetch(labels + later, 1);
         if (is_bare && before[i].weights[0] == 0.0f) continue;  // all is background
         const float* mean = rows + static_cast<int64_t>(indices[i]) * kRowFloats;
         const Floats weights = around.weights(mean, k < kOwn ? static_cast<int>(k) : -1, rule);
