@@ -43,7 +43,10 @@ class Voxels {
       for (int64_t i = 0; i < n; ++i)
         keys[i] =
             key_of(rows + static_cast<int64_t>(indices[begin + i]) * kRowFloats, 1.0f / edge_m);
-      for (int64_t i = 0; i < n; ++i) cell_of_[begin + i] = enter(keys[i]);
+      for (int64_t i = 0; i < n; ++i) {
+        const int32_t cell = cell_of_[begin + i] = enter(keys[i]);
+        if (cell >= 0) ++starts_[cell + 1];
+      }
     }
     sort_members(v);
   }
@@ -128,6 +131,7 @@ class Voxels {
   int32_t added(uint64_t key, size_t slot) {
     const int32_t cell = static_cast<int32_t>(keys_.size());
     keys_.push_back(key);
+    starts_.push_back(0);
     table_[slot] = cell;
     if (4 * keys_.size() > table_.size()) {
       table_.assign(size_t{1} << ++table_bits_, -1);
@@ -146,9 +150,6 @@ class Voxels {
   int64_t find(uint64_t key) const { return table_[slot_for(key)]; }
 
   void sort_members(int64_t v) {
-    starts_.assign(keys_.size() + 1, 0);
-    for (int64_t i = 0; i < v; ++i)
-      if (cell_of_[i] >= 0) ++starts_[cell_of_[i] + 1];
     for (size_t k = 1; k < starts_.size(); ++k) starts_[k] += starts_[k - 1];
     std::vector<int64_t> next(starts_.begin(), starts_.end() - 1);
     for (int64_t i = 0; i < v; ++i)
@@ -160,7 +161,7 @@ class Voxels {
   Buffer<int32_t> cell_of_;
   Buffer<uint32_t> members_;
   std::vector<uint64_t> keys_;
-  std::vector<int64_t> starts_;
+  std::vector<int64_t> starts_{0};
 };
 
 }  // namespace ldo::LDO_ISA
