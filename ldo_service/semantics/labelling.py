@@ -168,7 +168,7 @@ def observations(
     """Labels and confidences of the Gaussians that a region got; misses of the others in view. The
     side of an object is that of a square like its box, at the depth of the Gaussian."""
     # by the outcome: hidden, in no region, in region 0, 1, ...
-    outcome = where.regions - HIDDEN
+    outcome = np.subtract(where.regions, HIDDEN, dtype=np.intp)  # as `take` would have it
     said = np.where((claims.confidences > 0) & (not is_late), claims.labels, NOT_SEEN)
     miss = NOT_SEEN if is_late else MISS
     labels = np.array([NOT_SEEN, miss, *said], np.int16).take(outcome)
