@@ -65,11 +65,11 @@ class SplatBoxer {
     for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
   }
 
-  // Of the pixels that hold these points.
+  // Of the pixels that hold these points: just short of the image's end a half rounds up.
   Floats depth_at(Floats u, Floats v) const {
     alignas(64) float column[kLanes], row[kLanes], depth_m[kLanes];
-    (u + 0.5f).store(column);
-    (v + 0.5f).store(row);
+    min(u + 0.5f, view_.width - 1.0f).store(column);
+    min(v + 0.5f, view_.height - 1.0f).store(row);
     for (int i = 0; i < kLanes; ++i)
       depth_m[i] =
           depth_m_[static_cast<int64_t>(row[i]) * view_.width + static_cast<int64_t>(column[i])];

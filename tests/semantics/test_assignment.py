@@ -137,6 +137,17 @@ def test_gaussians_that_are_not_finite_are_hidden() -> None:
     assert np.all(seen.regions[1::4] == HIDDEN)
 
 
+def test_a_point_that_rounds_to_behind_the_image_is_its_last_pixel() -> None:
+    """The last float below 0.5, plus a half, is 1: what lies behind is not of the image."""
+    rows, memory = np.zeros((1, 16), np.float32), np.array([[1.0, 9.0]], np.float32)
+    rows[0, 2], rows[0, 3:6], rows[0, 6] = 1.0, -4, 1
+    just_short = float(np.nextafter(np.float32(0.5), np.float32(0)))
+    camera = Camera(1, 1, 50.0, 50.0, just_short, 0.0)
+    regions = Regions.of_boxes(np.array([[0.0, 0.0, 0.0, 0.0]]), np.ones(1))
+    look = rows, np.zeros(1, np.uint32), camera, np.eye(4), memory.ravel()[:1].reshape(1, 1)
+    assert assign(*look, regions, AssignmentConfig()).regions.tolist() != [HIDDEN]
+
+
 def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     rows, regions = scattered(20_000), Regions.of_foregrounds(BOXES, SCORES, parts())
     alone, many = (ours(rows, regions, AssignmentConfig(), threads) for threads in (1, 3))

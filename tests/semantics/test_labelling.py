@@ -163,6 +163,17 @@ def test_a_keyframe_without_claims_counts_misses_of_what_is_in_view() -> None:
     assert np.all(fields(labels)["misses"] == 1)
 
 
+def test_gaussians_that_are_not_finite_stay_without_a_label() -> None:
+    rows, config = surfels(), LabellingConfig()
+    broken = np.flatnonzero(thing())[::7]
+    rows[broken, 2] = np.nan
+    labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
+    label_keyframe(rows, labels, indices, CAMERA, np.eye(4), depth_image(), claims(), config)
+    is_chair = top_labels(labels) == CHAIR
+    assert not is_chair[broken].any()
+    assert np.mean(is_chair[np.setdiff1d(np.flatnonzero(thing()), broken)]) > 0.95
+
+
 def test_an_image_of_labels_shows_the_thing() -> None:
     rows, labels = labelled(LabellingConfig(), claims())
     shown = render(rows, CAMERA, np.eye(4), contributions=True)
