@@ -14,12 +14,12 @@ OUTLIER_SIGMAS = 2.5
 MAX_GAIN = 3.0  # and its inverse: a stop and a half
 ROUNDS = 6
 # What is believed of a camera before its image is seen, standard deviations: it changes its gain,
-# and hardly adds anything. Where a wall fills the image the two cannot be told apart; with any bias
-# the map was painted with a gain of 1.7 there.
+# and hardly adds anything. Where a wall fills the image the two cannot be told apart; with the bias
+# left free the map was painted with a gain of 1.7 there. Half of a flat, held out: 0.4 dB.
 GAIN_SIGMA = 0.3
 BIAS_SIGMA = 0.02  # of the range
 PATCHES = 50  # that the blocks of an image are worth at most: neighbours err alike
-FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.01  # of a block's colour
+FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.01  # of a block's colour, at the first round and at the least
 MAX_SIGMA = 0.1  # beyond, the images show different things
 
 
@@ -74,6 +74,7 @@ def estimated_exposure(
     x, y = _averaged(rendered), _averaged(seen)
     saturated = _averaged(seen.max(axis=-1) >= SATURATED)
     usable = (_averaged(opacity) > 0.95) & (saturated == 0)
+    usable &= np.isfinite(x + y).all(axis=-1)
     if np.count_nonzero(usable) < max(FEWEST_BLOCKS, LEAST_SHARE * usable.size):
         return None
     lines = [_robust_line(x[usable, c], y[usable, c]) for c in range(3)]
@@ -90,17 +91,21 @@ def _averaged(image: np.ndarray) -> np.ndarray:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """Slope and offset of y over x, both [M]: least squares with a prior, without outliers; and the
-    deviation of all of them from it, by its median."""
+    """Slope a and offset b of y over x, both [M], and the deviation sigma of all from that line, by
+    the median of the absolute residuals (MAD).
+
+    The a and b of the least  w sum (y - a x - b)^2 / sigma^2 + (a - 1)^2 / GAIN_SIGMA^2
+    + b^2 / BIAS_SIGMA^2,  w = min(PATCHES / M, 1), of those that are no outliers.
+    """
     design = np.stack([x, np.ones_like(x)], axis=1).astype(float)
-    prior = np.diag([GAIN_SIGMA**-2, BIAS_SIGMA**-2])
+    prior, expected = np.diag([GAIN_SIGMA**-2, BIAS_SIGMA**-2]), np.array([1.0, 0.0])
     inlier, sigma = np.ones(len(x), bool), FIRST_SIGMA
-    line, residual = np.array([1.0, 0.0]), np.abs(y - x)
+    line, residual = expected, np.abs(y - x)
     for _ in range(ROUNDS):
         seen = design[inlier]
         weight = min(PATCHES / len(seen), 1.0) / sigma**2
         line = np.linalg.solve(
-            weight * seen.T @ seen + prior, weight * seen.T @ y[inlier] + prior @ [1.0, 0.0]
+            weight * seen.T @ seen + prior, weight * seen.T @ y[inlier] + prior @ expected
         )
         residual = np.abs(y - design @ line)
         sigma = max(1.4826 * float(np.median(residual[inlier])), LEAST_SIGMA)

@@ -125,7 +125,7 @@ def descend(
     """`backpropagate` and `adam_step` in one, without writing the gradients of the rows out.
 
     `rows`, `mean`, `square` and `steps` change in place, as do the bits that `adam_step` changes;
-    then standard deviations of what moved are cut to `max_sigma_px` of the view, without end.
+    then standard deviations of what moved are cut to `max_sigma_px` of the view; inf: none is.
     Writes the V row numbers to `indices` [V] and the Gaussians' weights to `weights` [V]; returns
     dL/dxi [6]. The rendering is used up.
     """

@@ -191,7 +191,7 @@ def observations(
         is_told = one.confidences > (2 * one.by_detector if is_late else 0)
         labels[both] = np.where(is_told, one.labels, NOT_SEEN)
         confidences[both] = one.confidences
-    extents_m = np.fmax(where.depths_m, 0)  # 0 of what is not finite, which is hidden
+    extents_m = np.fmax(where.depths_m, 0)  # NaN is hidden, and has none
     extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))
     extents_m *= np.array([least_px, least_px, *sides_px], np.float32).take(outcome)
     return Observations(indices, labels, confidences, extents_m)

@@ -82,6 +82,14 @@ def test_a_wall_that_the_map_shows_badly_changes_no_contrast() -> None:
     np.testing.assert_allclose(found.bias, 0.0, atol=0.04)
 
 
+def test_a_pixel_that_is_not_finite_says_nothing() -> None:
+    shown, seen = shown_and_seen(0.8, 0.0)
+    shown[5, 7, 1] = np.nan
+    found = estimated_exposure(shown, np.ones(shown.shape[:2], np.float32), seen)
+    assert found is not None
+    np.testing.assert_allclose(found.gain, 0.8, atol=0.02)
+
+
 def test_removed_undoes_applied() -> None:
     exposure = Exposure.of(np.array([[0.8, 1.1, 0.9], [0.05, -0.02, 0.0]]))
     color = np.random.default_rng(0).uniform(0.1, 0.8, (4, 5, 3)).astype(np.float32)
