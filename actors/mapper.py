@@ -24,6 +24,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
+from ldo_service.gaussians.repair import MapRepair, RepairConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.keyframe_links import KeyframeLinks
@@ -112,6 +113,10 @@ class MapperConfig:
     mended_keyframes: int = 2  # per new one: a closure that moves a hundred is mended in fifty
     mended_at_end: int = 200  # when the stream ends, the newest: some seconds
     mending_iterations: int = 3  # of the optimiser, as for a new keyframe when many wait
+    due_iterations: int = 12  # for a keyframe that a correction moves so far against the first one,
+    # half of them against others: as many as a new one gets
+    paid_iterations: int = 6  # of these, with each new keyframe while no other waits: it takes half
+    # as long again. A run over a file does the rest at its end, `map/refine` when asked
 
     def __post_init__(self) -> None:
         counts = (
@@ -120,9 +125,11 @@ class MapperConfig:
         )
         if min(self.iterations, self.least_iterations) < 0:
             raise ConfigError("mapper.iterations and least_iterations must not be negative.")
-        if min(self.mended_keyframes, self.mended_at_end, self.mending_iterations) < 0:
+        mending = (self.mended_keyframes, self.mended_at_end, self.mending_iterations)
+        if min(*mending, self.due_iterations, self.paid_iterations) < 0:
             raise ConfigError(
-                "mapper.mended_keyframes, mended_at_end and mending_iterations: none is negative."
+                "mapper.mended_keyframes, mended_at_end, mending_iterations, due_iterations and "
+                "paid_iterations: none is negative."
             )
         if min(counts) < 1 or self.threads < 0 or self.snapshot_growth < 0:
             raise ConfigError(
@@ -136,6 +143,10 @@ class MapperConfig:
     def pace(self) -> Pace:
         """Of telling others."""
         return Pace(**{f.name: getattr(self, f.name) for f in fields(Pace)})
+
+    def repair(self) -> RepairConfig:
+        """After corrections."""
+        return RepairConfig(**{f.name: getattr(self, f.name) for f in fields(RepairConfig)})
 
 
 class Mapper(Actor):
@@ -176,8 +187,7 @@ class Mapper(Actor):
         self._links = KeyframeLinks(self._poses, self.config.measured_keyframes)
         self._teller = MapTeller(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
-        self._to_mend: list[int] = []  # keyframes that corrections moved far
-        self._mended = 0  # Gaussians that the map held twice
+        self._repair = MapRepair(self._map, self.config.repair())
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -215,7 +225,7 @@ class Mapper(Actor):
         moving = mask_of(message.is_moving)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         learnt = self._semantics.mapped(message.keyframe)
-        self._mend(self.config.mended_keyframes, self.config.mending_iterations)
+        self._repair.with_keyframe(is_behind=self._waiting() > 0)
         # tell
         yield from self._refinement()
         yield from self._teller.keyframe(self._now())
@@ -226,16 +236,17 @@ class Mapper(Actor):
     def _iterations(self) -> int:
         """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
         the neighbour of the next. Those that are mended with it have their share."""
-        waiting = self.situation.waiting.get(KEYFRAME_NEW, 0)
         config = self.config
-        mending = config.mending_iterations * min(config.mended_keyframes, len(self._to_mend))
         return max(
-            config.iterations // (1 + waiting) - mending,
+            config.iterations // (1 + self._waiting()) - self._repair.mending_iterations,
             min(config.least_iterations, config.iterations),
         )
 
+    def _waiting(self) -> int:
+        return self.situation.waiting.get(KEYFRAME_NEW, 0)
+
     def _refine(self, message: MapRefine) -> Iterator[Output]:
-        self._map.refine(message.iterations, (message.first_rate, message.last_rate))
+        self._repair.refine(message.iterations, (message.first_rate, message.last_rate))
         self._semantics.refresh()
         self._checkpoint = {}  # is due: half a minute of work, and perhaps no keyframe follows
         yield from self._refinement()
@@ -280,9 +291,8 @@ class Mapper(Actor):
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         held = self._links.acknowledged(message.refinements)
         self._poses.correct(message.graph_version, keyframe_poses_of(message), held=held)
-        misplaced, torn = self._misplaced()
-        motions = tuple(self._motion(keyframe) for keyframe in misplaced)
-        self._to_mend = sorted({*self._to_mend, *torn})
+        self._repair.note(self._poses)
+        motions = tuple(self._motion(keyframe) for keyframe in self._misplaced())
         if motions:
             T_new_old = {m.keyframe: transform(m.T_new_old) for m in motions}
             self._map.move(T_new_old)
@@ -290,21 +300,13 @@ class Mapper(Actor):
             yield self._teller.delta(self._now(), motions=motions)
             yield from self._objects()
 
-    def _misplaced(self) -> tuple[list[int], list[int]]:
-        """Keyframes that are so far from where their Gaussians are that it shows, and those that
-        are far off; too little to show adds up until it is enough."""
+    def _misplaced(self) -> list[int]:
+        """Keyframes that are so far from where their Gaussians are that it shows; too little to
+        show adds up until it is enough."""
         config, placed = self.config, self._map.views.poses
-        keyframes = np.array(list(placed), np.int64)
         T_now, T_gaussians = self._poses.of(placed), placed.of(placed)
         shows = se3.differ(T_now, T_gaussians, config.motion_min_m, config.motion_min_rad)
-        is_torn = se3.differ(T_now, T_gaussians, config.mending_min_m, config.mending_min_rad)
-        return keyframes[shows].tolist(), keyframes[is_torn].tolist()
-
-    def _mend(self, most: int, iterations: int) -> None:
-        """Some of the keyframes that corrections laid over others, the newest first. At the end
-        without iterations: they would move keyframes, and nobody takes a refinement any more."""
-        for _ in range(min(most, len(self._to_mend))):
-            self._mended += self._map.mend(self._to_mend.pop(), iterations)
+        return np.array(list(placed), np.int64)[shows].tolist()
 
     def _motion(self, keyframe: int) -> AnchorMotion:
         """From where its Gaussians are to where the keyframe is."""
@@ -340,7 +342,7 @@ class Mapper(Actor):
     def finish(self) -> Iterator[Output]:
         """The whole map, so that whoever listens ends with it."""
         if self._map.size():
-            self._mend(self.config.mended_at_end, iterations=0)
+            self._repair.at_end()
             self._semantics.refresh()
             yield from self._teller.snapshot(self._now())
             yield from self._objects()
@@ -371,7 +373,7 @@ class Mapper(Actor):
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
             "told": self._teller.state(),
-            "to_mend": list(self._to_mend),
+            **self._repair.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -383,14 +385,13 @@ class Mapper(Actor):
         self._poses.restore(saved["poses"])
         self._links.restore(saved["links"])
         self._teller.restore(saved["told"])
-        self._to_mend = list(saved["to_mend"])
+        self._repair.restore(saved)
 
     def facts(self) -> dict[str, float]:
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
-            "keyframes_to_mend": len(self._to_mend),
-            "gaussians_mended": self._mended,  # held twice after a correction, and removed
+            **self._repair.facts(),
             **self._map.statistics(),
             **self._semantics.statistics(),
         }

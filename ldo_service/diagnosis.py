@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ldo_service.schemas import Health
+from ldo_service.schemas.map import MOST_ITERATIONS
 
 SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians)
 IDLE_S = 5.0  # a mailbox with messages is emptied within a step; a camera sends many a second
@@ -146,6 +147,11 @@ def remarks(seen: Seen) -> Iterator[str]:
         yield f"had its last frame {health.step_age_s:.0f} s ago"
     if health.facts.get("networks") == 0 and not health.facts.get("networks_missing"):
         yield "has no model: nothing is detected until detector.model names one of `ldo models`"
+    if due := health.facts.get("iterations_due"):
+        yield (
+            f"is due {due:.0f} iterations since a correction tore the map: keyframes bring some, "
+            f"`ldo control refine --iterations {min(int(due), MOST_ITERATIONS)}` at once"
+        )
     yield from _of_answers(health)
 
 

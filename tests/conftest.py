@@ -54,7 +54,7 @@ def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
     prepare(folder, overwrite=False)
     config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))
     job = Job(open_sequence(str(room_folder)), folder, config, Selection(), print)
-    run_over_file(job, lambda _done: None)
+    run_over_file(job, lambda *_: None)
     return folder
 
 

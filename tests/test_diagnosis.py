@@ -89,6 +89,8 @@ def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
         (health(facts={"answers_refused": 2.0, "questions": 9.0}), "refused 2 of 9 answers"),
         (health(facts={"answers_without_logprobs": 4.0}), "confidence_untold"),
         (health(facts={"names_refused": 1.0}), "refused 1 names"),
+        (health(facts={"iterations_due": 40.0}), "ldo control refine --iterations 40`"),
+        (health(facts={"iterations_due": 900.0}), "ldo control refine --iterations 500`"),
     ],
 )
 def test_what_is_no_fault_is_a_remark(of: Health, says: str) -> None:

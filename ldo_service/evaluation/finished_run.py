@@ -55,7 +55,7 @@ class PosedMap:
     """A map [N, 16] (see `gaussians.model`), T_map_camera of the frames that are not LOST, the
     exposures of its keyframes, and what its Gaussians are if a detector looked."""
 
-    name: str  # online: at the end of the stream; refined: after further iterations
+    name: str  # online: as the run left it; refined: after further iterations
     rows: np.ndarray
     trajectory: Trajectory
     exposures: Exposures

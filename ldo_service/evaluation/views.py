@@ -23,7 +23,8 @@ colours in 0..1, renderings clipped. PSNR: pixels and channels pooled. SSIM: Wan
 Gaussian of 1.5 px, windows inside the image; some published systems print MS-SSIM, often higher.
 Depth L1: mean depth of the rendering, over pixels with measured depth and rendered opacity above
 0.5; "of measured" is the share of measured pixels that these are. Cells: mean / median of frames.
-online: the map at the end of the stream; refined: after the further iterations of --refine.
+online: the map at the end of the stream, fitted again where corrections had torn it; refined: after
+the further iterations of --refine.
 A: held-out frames, tracked and never mapped; every pixel. The map has one brightness, the camera's
 changes: its gain and bias per channel are interpolated between the keyframes before and after.
 Exposure fitted: to each judged frame itself, by least squares. No exposure: the map as it is.

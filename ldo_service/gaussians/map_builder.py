@@ -1,7 +1,8 @@
 """How keyframes become a map: grown where it lacks something, fitted to a window, bounded."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice, zip_longest
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,7 @@ from .sleep_choice import SleepConfig, choose_sleepers
 from .views import View, sampled_surface, schedule, shared_surface, shown_within
 
 MOST_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
+TRIES_PER_DRAW = 4  # of keyframes at random, where many see what sleeps
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,19 +259,38 @@ class MapBuilder:
         return touched
 
     def _is_usable(self, keyframe: int) -> bool:
-        """Its images are there, and nothing of what it may see sleeps: or what is awake would be
-        bent to stand in for it."""
-        is_awake = not self.sleeping.seen_from(self.views.placed(keyframe), self._reach_m)
-        return is_awake and self.views.is_readable(keyframe)
+        return self.is_awake(keyframe) and self.views.is_readable(keyframe)
 
-    def refine(self, iterations: int, rates: tuple[float, float] = (1.0, 1.0)) -> None:
-        """Fit to random keyframes, with steps that shrink or grow from one rate to the other."""
-        known, self._shown = self.views.store.keyframes(), None
-        if known:
-            chosen = self._rng(len(self.views), self._iterations).integers(
-                len(known), size=iterations
-            )
-            self._fit([known[i] for i in chosen], rates)
+    def refine(
+        self,
+        iterations: int,
+        rates: tuple[float, float] = (1.0, 1.0),
+        *,
+        first: Sequence[int] = (),
+        effort: float = inf,
+    ) -> int:
+        """Fit to random keyframes, with steps that shrink or grow from one rate to the other; until
+        all of `first` are through, to one of them and one at random in turn. How many iterations it
+        were: fewer where `effort` was spent, or where most keyframes see what sleeps.
+        """
+        self._shown, before = None, self._iterations
+        drawn = self._drawn(iterations - len(first))
+        turns = (k for pair in zip_longest(first, drawn) for k in pair if k is not None)
+        self._fit(turns, rates, effort)
+        return self._iterations - before
+
+    def _drawn(self, count: int) -> list[int]:
+        """So many keyframes at random, one perhaps more than once, that see nothing that sleeps."""
+        known = self.views.store.keyframes()
+        if not known:
+            return []
+        rng = self._rng(len(self.views), self._iterations)
+        tried = rng.integers(len(known), size=TRIES_PER_DRAW * count)
+        return list(islice((known[i] for i in tried if self.is_awake(known[i])), count))
+
+    def is_awake(self, keyframe: int) -> bool:
+        """Whether all is awake that it may see: else what is would be bent to stand in for it."""
+        return not self.sleeping.seen_from(self.views.placed(keyframe), self._reach_m)
 
     # --- after a correction -----------------------------------------------------------------------
     def mend(self, keyframe: int, iterations: int) -> int:

@@ -1,8 +1,8 @@
 """What a run is asked to do."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from ldo_service.config import Config
 from ldo_service.datasets import Sequence
@@ -11,9 +11,14 @@ from ldo_service.geometry import Trajectory
 
 from .source import Selection, Warn, require_overlap
 
-Advance = Callable[[int], None]  # called with the number of frames and refinements done
-
 REFINE_ITERATIONS = 25  # asked of the mapper at a time: about a second
+
+
+class Advance(Protocol):
+    """Told how many frames and refinements are done, and of how many, where corrections left more
+    to do than was asked for."""
+
+    def __call__(self, done: int, total: int | None = None, /) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +42,11 @@ class Job:
             require_overlap(self.prior, self.sequence, self.selection.indices(self.sequence))
 
     @property
-    def refinements(self) -> int:
-        """In how many requests the iterations are asked for."""
-        return -(-self.refine // REFINE_ITERATIONS)
-
-    @property
     def work(self) -> int:
         """Frames and refinements."""
-        return len(self.selection.indices(self.sequence)) + self.refinements
+        return len(self.selection.indices(self.sequence)) + requests(self.refine)
+
+
+def requests(iterations: int) -> int:
+    """In how many the mapper is asked for so many iterations."""
+    return -(-iterations // REFINE_ITERATIONS)

@@ -13,15 +13,16 @@ from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import MapRefine
 
 from .folder import RunFolder
-from .job import REFINE_ITERATIONS, Advance, Job
+from .job import REFINE_ITERATIONS, Advance, Job, requests
 from .source import Reader, with_prior
-from .summary import Usage, percentiles, summarise
+from .summary import Percentiles, Usage, percentiles, summarise
 
 LAST_RATE = 0.05  # of the steps when the map is refined: they shrink so far, to settle
 
 
 def run_over_file(job: Job, advance: Advance) -> RunFolder:
-    """Run every actor over the chosen frames and write the folder; then refine the map, if asked.
+    """Run every actor over the chosen frames, fit the map again where corrections have torn it, and
+    write the folder; then refine the map, if asked.
 
     Independent of the machine's load: see `runtime.logical_clock`. A run that is interrupted or
     fails leaves what it has done, and its summary says so. Raises DataError when nothing or too
@@ -33,7 +34,7 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
     reader = Reader(job.sequence, indices, job.warn)
     record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
     started = Usage.now()
-    is_finished = False
+    work, stage_ms, is_finished = job.work, {}, False
     with LogicalClock(
         list(actors.values()),
         config.run.latency_frames(),
@@ -43,25 +44,32 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
             for done in clock.run(with_prior(reader, job.prior)):
                 advance(done + 1 + reader.rejected)
             clock.finish()
+            stage_ms = percentiles_of(clock)
+            if due := int(actors["mapper"].facts()["iterations_due"]):
+                work += requests(due)
+                for done in clock.run(refinements(due, record.newest_stamp_ns)):
+                    advance(done + 1 + reader.rejected, work)
+                clock.finish()
             is_finished = True
         finally:
             used = Usage.now().since(started)
             rejected = reader.rejected + int(actors["frame_source"].facts()["frames_rejected"])
-            stage_ms = {
-                name: percentiles(steps) for name, steps in clock.step_ms().items() if steps
-            }
-            solving = actors["optimizer"].facts()
-            summary = summarise(
-                record, used, len(indices), rejected, stage_ms, drops={}, solving=solving
-            )
+            facts = actors["optimizer"].facts() | actors["mapper"].facts()
+            stage_ms = stage_ms or percentiles_of(clock)
+            summary = summarise(record, used, len(indices), rejected, stage_ms, {}, facts)
             record.close({**summary, "interrupted": not is_finished})
         require_usable(record, config.run.max_rejected)
         if job.refine:
             for done in clock.run(refinements(job.refine, record.newest_stamp_ns)):
-                advance(done + 1 + reader.rejected)
+                advance(done + 1 + reader.rejected, work)
             clock.finish()
             record.write_refined(job.refine)
     return record
+
+
+def percentiles_of(clock: LogicalClock) -> dict[str, Percentiles]:
+    """Of what the steps of each actor took so far."""
+    return {name: percentiles(steps) for name, steps in clock.step_ms().items() if steps}
 
 
 def with_all_cores(config: Config) -> Config:

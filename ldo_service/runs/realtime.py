@@ -112,10 +112,13 @@ class _RealTimeRun:
         stage_ms = {h.actor: {"p50": h.step_ms_p50, "p95": h.step_ms_p95} for h in healths}
         drops = {f"{h.actor} {i.topic}": i.dropped for h in healths for i in h.inputs if i.dropped}
         frames = len(self._indices)
-        solving = next((h.facts for h in healths if h.actor == "optimizer"), {})
-        self._record.close(
-            summarise(self._record, used, frames, rejected, stage_ms, drops, solving)
-        )
+        facts = {
+            name: value
+            for health in healths
+            if health.actor in ("optimizer", "mapper")
+            for name, value in health.facts.items()
+        }
+        self._record.close(summarise(self._record, used, frames, rejected, stage_ms, drops, facts))
         require_usable(self._record, self._config.run.max_rejected)
         return self._record
 

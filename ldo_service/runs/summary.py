@@ -39,11 +39,12 @@ def summarise(
     rejected: int,
     stage_ms: dict[str, Percentiles],
     drops: dict[str, int],
-    solving: Mapping[str, float],
+    facts: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The summary of a finished run; `drops` by "actor topic", `solving` the optimizer's facts.
+    """The summary of a finished run; `drops` by "actor topic", `facts` of optimizer and mapper.
 
-    FPS counts everything from the first read to the last step; nothing is excluded as warm-up.
+    FPS counts everything from the first read to the last step, and what is due to the map at the
+    end; nothing is excluded as warm-up.
     """
     in_map = record.in_map()
     return {
@@ -65,8 +66,10 @@ def summarise(
         "loops_accepted": record.loops.accepted,
         "loops_rejected": record.loops.rejected,
         "vlm_calls": record.labeller_calls,
-        "optimizations": int(solving.get("optimizations", 0)),
-        "optimizations_saved": int(solving.get("optimizations_saved", 0)),  # left for later
+        "optimizations": int(facts.get("optimizations", 0)),
+        "optimizations_saved": int(facts.get("optimizations_saved", 0)),  # left for later
+        "iterations": int(facts.get("iterations", 0)),  # of the map's optimiser
+        "iterations_due": int(facts.get("iterations_due", 0)),  # still, after corrections
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
         "versions": versions(),

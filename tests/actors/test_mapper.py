@@ -328,6 +328,90 @@ def test_surface_that_a_correction_lays_over_itself_is_held_once(keyframes) -> N
     assert quality[10] > quality[0] - 0.3
 
 
+def torn(keyframes, config: MapperConfig) -> Mapper:
+    """Three keyframes, the same again after drift, and the correction that lays them together."""
+    T_drift = se3.exp(np.array([0, 0.02, 0, 0, 0.1, 0]))
+    second = around_again(keyframes[:3], T_drift, first=100)
+    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes[:3]}
+    closed = correction_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
+    mapper = Mapper(config)
+    handled(mapper, [*keyframes[:3], *second, closed])
+    return mapper
+
+
+def psnr_of(mapper: Mapper, keyframe: Keyframe) -> float:
+    T_map_camera = transform(keyframe.T_odom_keyframe)
+    return seen_psnr(mapper._map.gaussians.rows, rgbd_of(keyframe), T_map_camera)
+
+
+def test_what_a_correction_has_torn_fits_as_before_after_the_iterations_that_are_due(
+    keyframes,
+) -> None:
+    whole = Mapper(CONFIG)
+    handled(whole, keyframes[:3])
+    mapper = torn(keyframes, CONFIG)
+    facts = mapper.facts()
+    assert facts["iterations_due"] == 3 * CONFIG.due_iterations
+    assert psnr_of(mapper, keyframes[1]) < psnr_of(whole, keyframes[1]) - 1
+    handled(mapper, [MapRefine(stamp_ns=0, iterations=30)])
+    assert mapper.facts()["iterations_due"] == 6
+    handled(mapper, [MapRefine(stamp_ns=0, iterations=6)])
+    assert mapper.facts()["iterations_due"] == 0
+    assert mapper.facts()["iterations"] == facts["iterations"] + 36
+    assert psnr_of(mapper, keyframes[1]) > psnr_of(whole, keyframes[1])
+
+
+def test_a_keyframe_is_due_no_more_however_often_it_moves(keyframes) -> None:
+    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes[:4]}
+    mapper = Mapper(CONFIG)
+    handled(mapper, keyframes[:4])
+    for version in range(1, 4):
+        T_turned = se3.exp(np.array([0, 0.02 * version, 0, 0, 0, 0]))
+        moved = {k: T if k < 2 else T_turned @ T for k, T in poses.items()}
+        handled(mapper, [correction_message(0, version, moved)])
+        assert mapper.facts()["iterations_due"] == 2 * CONFIG.due_iterations
+
+
+def test_a_map_that_moves_as_a_whole_is_as_good_as_before(keyframes) -> None:
+    T_moved = se3.exp(np.array([0, 0.3, 0, 1, 0, 0]))
+    moved = {k.keyframe: T_moved @ transform(k.T_odom_keyframe) for k in keyframes}
+    mapper = Mapper(CONFIG)
+    handled(mapper, [*keyframes, correction_message(0, 1, moved)])
+    assert mapper.facts()["iterations_due"] == 0
+    assert mapper.facts()["keyframes_to_mend"] == len(keyframes)
+
+
+def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes) -> None:
+    config = replace(CONFIG, due_iterations=4, paid_iterations=6)
+    mapper, never = torn(keyframes, config), torn(keyframes, replace(config, paid_iterations=0))
+    due, more = [], []
+    for i, k in enumerate(around_again(keyframes[3:7], np.eye(4), first=200)):
+        if i == 2:
+            predecessor, mapper = mapper, Mapper(config)
+            mapper.restore(predecessor.checkpoint())
+        before = [m.facts()["iterations"] for m in (mapper, never)]
+        for one in (mapper, never):
+            one.situation = Situation(waiting={KEYFRAME_NEW: int(i == 1)})
+            handled(one, [k])
+        done, usual = (
+            m.facts()["iterations"] - n for m, n in zip((mapper, never), before, strict=True)
+        )
+        due.append(mapper.facts()["iterations_due"])
+        more.append(done - usual)
+    assert due == [6, 6, 0, 0]
+    assert more == [6, 0, 6, 0]
+    assert never.facts()["iterations_due"] == 12
+
+
+def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
+    state = torn(keyframes, CONFIG).checkpoint()
+    del state["map"]["due"]
+    mapper = Mapper(CONFIG)
+    mapper.restore(state)
+    assert mapper.facts()["iterations_due"] == 0
+    assert mapper.facts()["keyframes_to_mend"] == 3
+
+
 def test_a_correction_that_moves_nothing_says_nothing(keyframes) -> None:
     mapper = Mapper(CONFIG)
     handled(mapper, keyframes)
@@ -396,7 +480,7 @@ def test_what_was_taken_since_the_checkpoint_gives_the_same_bits_again(
     past = Past(state, taken=tuple(map(as_taken, taken[1:])))
     second = successor(Mapper(config), past, lambda: Mapper(config))
     one, other = first.checkpoint()["map"], second.checkpoint()["map"]
-    for part in ("map", "semantics", "poses", "links", "to_mend"):
+    for part in ("map", "semantics", "poses", "links", "to_mend", "due"):
         assert encode_state(one[part]) == encode_state(other[part]), part
     version = max(delta.version for delta in deltas_of(told))
     assert all(delta.version > version for delta in deltas_of(second.resumed()))

@@ -77,7 +77,7 @@ def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
     tracker, *others = [Watched(actors[name]) for name in ("tracker", "loop_closer", "mapper")]
     prepare(folder, overwrite=False)
     with standing_in(*actors.values()):
-        record = run_over_file(Job(sequence, folder, config, Selection(), print), lambda _: None)
+        record = run_over_file(Job(sequence, folder, config, Selection(), print), lambda *_: None)
     odometry = Trajectory(*map(np.array, zip(*tracker.odometry, strict=True)))
     run = read_run(folder)
     tracks = (odometry, run.estimates["online"], run.estimates["final"])

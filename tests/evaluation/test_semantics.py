@@ -83,7 +83,7 @@ def sequence(folder: Path) -> Sequence:
 @pytest.fixture(scope="module")
 def unlabelled(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "room"
-    run_over_file(job(sequence, folder, "tracker.hold_out=5"), lambda _done: None)
+    run_over_file(job(sequence, folder, "tracker.hold_out=5"), lambda *_: None)
     return folder
 
 

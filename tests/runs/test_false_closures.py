@@ -38,7 +38,7 @@ def kitchen(data: Path) -> Sequence:
 
 
 def run(kitchen: Sequence, folder: Path) -> Kept:
-    run_over_file(job(kitchen, folder), lambda _: None)
+    run_over_file(job(kitchen, folder), lambda *_: None)
     keyframes, loops = (
         json.loads((folder / name).read_text()) for name in ("keyframes.json", "loops.json")
     )

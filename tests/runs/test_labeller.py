@@ -25,7 +25,7 @@ def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -
     if server:
         settings += [f"vlm_labeller.http.{setting}" for setting in QUICK]
         settings += [f"vlm_labeller.url={server.url}"]
-    return run_over_file(job(sequence, folder, *settings, frames=FRAMES), lambda _: None)
+    return run_over_file(job(sequence, folder, *settings, frames=FRAMES), lambda *_: None)
 
 
 @pytest.fixture(scope="module")

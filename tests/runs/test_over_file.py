@@ -42,7 +42,9 @@ class Spoilt(Cached):
 
 
 def run(sequence: Sequence, folder: Path, *settings: str, warn: Warn = print) -> RunFolder:
-    return run_over_file(job(sequence, folder, *settings, frames=FRAMES, warn=warn), lambda _: None)
+    return run_over_file(
+        job(sequence, folder, *settings, frames=FRAMES, warn=warn), lambda *_: None
+    )
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +141,7 @@ def test_a_refined_map_lies_beside_the_runs_own_and_looks_better(
     room: Sequence, tmp_path: Path
 ) -> None:
     asked, done = replace(job(room, tmp_path / "out", frames=10), refine=30), []
-    record = run_over_file(asked, done.append)
+    record = run_over_file(asked, lambda count, _total=None: done.append(count))
     assert record.summary["refine_iterations"] == 30
     assert done[-1] == asked.work
     run = read_run(tmp_path / "out")

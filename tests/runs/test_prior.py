@@ -66,7 +66,7 @@ def test_a_covered_camera_is_found_at_once_and_the_run_repeats(
 ) -> None:
     for name in ("first", "second"):
         of_run = job(hurried, tmp_path / name, frames=FRAMES, prior=prior)
-        run_over_file(of_run, lambda _done: None)
+        run_over_file(of_run, lambda *_: None)
     expected = ["LOST" if index in COVERED else "OK" for index in range(FRAMES)]
     assert statuses(tmp_path / "first") == expected
     first, second = (
