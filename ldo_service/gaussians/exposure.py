@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 
 LEAST_GAIN = 0.1  # below, nothing of the map's brightness can be told from the image
-BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of brightness
+LEAST_BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of
+BLOCKS_ACROSS = 40  # brightness; so many blocks in a row say as much as more would
 SATURATED = 0.97  # of the range: beyond, the sensor says no more
 LEAST_SHARE = 0.15  # of the image that must be comparable
 FEWEST_BLOCKS = 16
@@ -62,32 +63,37 @@ def fitted_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
 
 
 def estimated_exposure(
-    rendered: np.ndarray, opacity: np.ndarray, seen: np.ndarray
+    rendered: np.ndarray, opacity: np.ndarray, seen: np.ndarray, mask: np.ndarray | None = None
 ) -> Exposure | None:
-    """Gain and bias of a new image against what the map shows at its pose, where it shows enough.
+    """Gain and bias of an image against what the map shows at its pose, where it shows enough.
 
-    rendered, seen [H, W, 3] in 0..1, opacity [H, W]. Least squares over averages of 8x8 pixels that
-    are opaque and not saturated, without outliers (moved things, new surface), drawn to gain 1 and
-    more so to bias 0. None where these are too few, or the gain is none that a camera would choose,
-    or leaves too much unexplained: then the images show different things.
+    rendered [3, H, W] in 0..1, opacity [H, W], seen [3, H, W] uint8, mask [H, W] uint8, 0 where a
+    pixel does not count. Least squares over averages of blocks of pixels that are opaque and not
+    saturated, without outliers (moved things, new surface), drawn to gain 1 and more so to bias 0.
+    None where these are too few, or the gain is none that a camera would choose, or leaves too much
+    unexplained: then the images show different things.
     """
-    x, y = _averaged(rendered), _averaged(seen)
-    saturated = _averaged(seen.max(axis=-1) >= SATURATED)
-    usable = (_averaged(opacity) > 0.95) & (saturated == 0)
-    usable &= np.isfinite(x + y).all(axis=-1)
+    x = np.stack([_averaged(plane) for plane in rendered])
+    y = np.stack([_averaged(plane) for plane in seen]) * np.float32(1 / 255)
+    usable = (_averaged(opacity) > 0.95) & np.isfinite(x).all(axis=0)
+    usable &= _averaged(seen.max(axis=0) >= 255 * SATURATED) == 0
+    if mask is not None:
+        usable &= _averaged(mask > 0) > 0.99
     if np.count_nonzero(usable) < max(FEWEST_BLOCKS, LEAST_SHARE * usable.size):
         return None
-    lines = [_robust_line(x[usable, c], y[usable, c]) for c in range(3)]
+    lines = [_robust_line(x[c, usable], y[c, usable]) for c in range(3)]
     is_plausible = all(
         1 / MAX_GAIN < gain < MAX_GAIN and sigma < MAX_SIGMA for gain, _, sigma in lines
     )
     return Exposure.of(np.array(lines).T[:2]) if is_plausible else None
 
 
-def _averaged(image: np.ndarray) -> np.ndarray:
-    height, width = (n // BLOCK_PX for n in image.shape[:2])
-    image = np.ascontiguousarray(image[: height * BLOCK_PX, : width * BLOCK_PX], np.float32)
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+def _averaged(plane: np.ndarray) -> np.ndarray:
+    """Means of square blocks of [H, W]; what is left at two of the edges has none."""
+    block = max(LEAST_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
+    height, width = (n // block for n in plane.shape)
+    plane = np.ascontiguousarray(plane[: height * block, : width * block], np.float32)
+    return cv2.resize(plane, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
@@ -97,17 +103,22 @@ def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
     The a and b of the least  w sum (y - a x - b)^2 / sigma^2 + (a - 1)^2 / GAIN_SIGMA^2
     + b^2 / BIAS_SIGMA^2,  w = min(PATCHES / M, 1), of those that are no outliers.
     """
-    design = np.stack([x, np.ones_like(x)], axis=1).astype(float)
-    prior, expected = np.diag([GAIN_SIGMA**-2, BIAS_SIGMA**-2]), np.array([1.0, 0.0])
+    gain_weight, bias_weight = GAIN_SIGMA**-2, BIAS_SIGMA**-2
+    x, y = x.astype(float), y.astype(float)
     inlier, sigma = np.ones(len(x), bool), FIRST_SIGMA
-    line, residual = expected, np.abs(y - x)
+    gain, bias, residual = 1.0, 0.0, np.abs(y - x)
     for _ in range(ROUNDS):
-        seen = design[inlier]
-        weight = min(PATCHES / len(seen), 1.0) / sigma**2
-        line = np.linalg.solve(
-            weight * seen.T @ seen + prior, weight * seen.T @ y[inlier] + prior @ expected
-        )
-        residual = np.abs(y - design @ line)
+        among_x, among_y = x[inlier], y[inlier]
+        weight = min(PATCHES / len(among_x), 1.0) / sigma**2
+        aa, ab = weight * among_x @ among_x + gain_weight, weight * among_x.sum()
+        bb, right_b = weight * len(among_x) + bias_weight, weight * among_y.sum()
+        right_a = weight * among_x @ among_y + gain_weight
+        determinant = aa * bb - ab * ab
+        gain = (bb * right_a - ab * right_b) / determinant
+        bias = (aa * right_b - ab * right_a) / determinant
+        residual = np.abs(y - gain * x - bias)
         sigma = max(1.4826 * float(np.median(residual[inlier])), LEAST_SIGMA)
-        inlier = residual <= OUTLIER_SIGMAS * sigma
-    return float(line[0]), float(line[1]), 1.4826 * float(np.median(residual))
+        before, inlier = inlier, residual <= OUTLIER_SIGMAS * sigma
+        if np.array_equal(before, inlier):
+            break
+    return float(gain), float(bias), 1.4826 * float(np.median(residual))

@@ -34,7 +34,6 @@ class ImageLoss:
     d_ssim: float  # 1 - SSIM
     depth_m: float  # over the pixels whose depth was measured
     psnr_db: float
-    by_exposure: np.ndarray  # [2, 3] derivative of the total by gains and biases
 
 
 def image_loss(
@@ -68,7 +67,7 @@ def image_loss(
         inside = tile_mask(tiles, *depth_m.shape)
         share = float(np.mean(inside))
         mask = inside if mask is None else inside * mask
-    (l1, d_ssim, depth, squared), by_exposure = _loss.image_loss(
+    l1, d_ssim, depth, squared = _loss.image_loss(
         planes,
         color,
         depth_m,
@@ -87,7 +86,6 @@ def image_loss(
         d_ssim,
         depth,
         -10 * log10(max(squared, 1e-20)),
-        np.array(by_exposure).reshape(2, 3),
     )
 
 

@@ -158,9 +158,9 @@ class MapBuilder:
         self, frame: RgbdFrame, before: Rendering, is_moving: np.ndarray | None
     ) -> Exposure:
         """Against the map; where too little of it is in view, as the keyframe before."""
-        color = frame.color * np.float32(1 / 255)
-        opacity = before.opacity if is_moving is None else before.opacity * ~is_moving
-        estimated = estimated_exposure(before.color, opacity, color)
+        rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
+        counts = None if is_moving is None else (~is_moving).astype(np.uint8)
+        estimated = estimated_exposure(rendered, before.opacity, seen, counts)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
         return self.views.exposures[self._newest]

@@ -12,8 +12,8 @@ def image_loss(
     depth_weight: float,
     gradients: NDArray[np.float32],
     threads: int = 1,
-) -> tuple[tuple[float, float, float, float], list[float]]:
-    """(L1, D-SSIM, depth L1, squared error) and the derivatives by gains and biases [6].
+) -> tuple[float, float, float, float]:
+    """(L1, D-SSIM, depth L1, squared error).
 
     Writes the derivatives by the planes to `gradients`; `ldo_service.gaussians.loss` says what
     the arguments hold. Releases the GIL. Raises ValueError for arrays that do not fit. Bitwise

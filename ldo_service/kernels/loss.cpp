@@ -23,7 +23,7 @@ inline Floats sign(Floats x) {
 }
 
 struct RowSums {  // of one channel of one row of a strip
-  float l1 = 0, ssim = 0, squares = 0, gain = 0, bias = 0;
+  float l1 = 0, ssim = 0, squares = 0;
 };
 
 struct Part {  // of the image: what one job works on
@@ -195,21 +195,10 @@ class PartLoss {
     if (in_.mask != nullptr)
       for (int i = kMargin; i < end; ++i)
         if (in_.mask[at + i] == 0) by_exposed[i] = 0.0f;
-    Floats gain = 0.0f, bias = 0.0f;
     int i = kMargin;
-    for (; i + kLanes <= end; i += kLanes) {
-      const Floats g = Floats::load(by_exposed + i);
-      gain = gain + g * Floats::load(rendered_ + at + i);
-      bias = bias + g;
-      (g * gain_).store(gradients_ + at + i);
-    }
-    sums_[row].gain = LDO_ISA::sum(gain);
-    sums_[row].bias = LDO_ISA::sum(bias);
-    for (; i < end; ++i) {
-      sums_[row].gain += by_exposed[i] * rendered_[at + i];
-      sums_[row].bias += by_exposed[i];
-      gradients_[at + i] = by_exposed[i] * gain_;
-    }
+    for (; i + kLanes <= end; i += kLanes)
+      (Floats::load(by_exposed + i) * gain_).store(gradients_ + at + i);
+    for (; i < end; ++i) gradients_[at + i] = by_exposed[i] * gain_;
   }
 
   const LossInput& in_;
@@ -284,15 +273,12 @@ void image_loss(const LossInput& in, int threads, LossOutput& out) {
   const double values = 3.0 * in.width * in.height;
   double ssim = 0.0;
   out.l1 = out.squared_error = 0.0;
-  std::fill(out.exposure, out.exposure + 6, 0.0);
   for (int column = 0; column < cut.columns(); ++column)
     for (int y = 0; y < in.height; ++y) {
       const RowSums& row = sums[static_cast<size_t>(column) * in.height + y];
       out.l1 += row.l1 / values;
       ssim += row.ssim / values;
       out.squared_error += row.squares / values;
-      out.exposure[column / cut.strips] += row.gain;
-      out.exposure[3 + column / cut.strips] += row.bias;
     }
   out.d_ssim = 1.0 - ssim;
 }

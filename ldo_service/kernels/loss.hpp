@@ -22,7 +22,6 @@ struct LossOutput {
   float* gradients;          // by the five planes
   double l1, d_ssim, depth;  // means, without their weights
   double squared_error;      // mean over pixels and channels
-  double exposure[6];        // derivative of the weighted sum by gains and biases
 };
 
 #define LDO_DECLARE_LOSS(isa)                                         \

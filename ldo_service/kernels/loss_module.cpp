@@ -1,9 +1,7 @@
 // Python binding of the loss: checks what comes in, picks the instruction set.
-#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
-#include <array>
 #include <optional>
 #include <tuple>
 
@@ -27,12 +25,9 @@ decltype(&baseline::image_loss) chosen = nullptr;  // when the module is importe
 
 using Terms = std::tuple<double, double, double, double>;
 
-std::tuple<Terms, std::array<double, 6>> image_loss(const Array& planes, const Array& color,
-                                                    const Array& depth,
-                                                    const std::optional<Array>& mask,
-                                                    const Array& exposure, float l1, float d_ssim,
-                                                    float depth_weight,
-                                                    const WritableArray& gradients, int threads) {
+Terms image_loss(const Array& planes, const Array& color, const Array& depth,
+                 const std::optional<Array>& mask, const Array& exposure, float l1, float d_ssim,
+                 float depth_weight, const WritableArray& gradients, int threads) {
   require_threads(threads);
   require(planes.ndim() == 3 && planes.shape(0) == 5 && planes.size() > 0,
           "planes must have shape [5, H, W].");
@@ -57,9 +52,7 @@ std::tuple<Terms, std::array<double, 6>> image_loss(const Array& planes, const A
     nb::gil_scoped_release release;
     chosen(in, threads, out);
   }
-  std::array<double, 6> by_exposure;
-  std::copy(out.exposure, out.exposure + 6, by_exposure.begin());
-  return {{out.l1, out.d_ssim, out.depth, out.squared_error}, by_exposure};
+  return {out.l1, out.d_ssim, out.depth, out.squared_error};
 }
 
 }  // namespace

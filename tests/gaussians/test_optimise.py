@@ -101,7 +101,7 @@ def test_restored_optimiser_continues_as_the_original(start: tuple) -> None:
 
 def test_brightness_of_a_frame_goes_into_its_exposure(start: tuple) -> None:
     darker = replace(start[1][2], color=(start[1][2].color * 0.8).astype(np.uint8))
-    config = OptimiserConfig(adam=AdamConfig(color=0.001), exposure_prior=0.0)
+    config = OptimiserConfig(adam=AdamConfig(color=0.001))
     _, views, _ = optimised((start[0], [*start[1][:2], darker]), config, plan=in_turns(90))
     shown = views[2].exposure.applied(np.full((1, 1, 3), 0.5, np.float32))
     assert np.abs(shown - 0.4).max() < 0.04
@@ -173,7 +173,8 @@ def test_gaussians_that_changed_are_those_whose_steps_grew(start: tuple) -> None
 @pytest.mark.parametrize(
     "change",
     [
-        {"exposure_rate": -1.0},
+        {"exposure_share": -0.1},
+        {"exposure_share": 1.1},
         {"translation_rate_m": -1.0},
         {"max_needle_ratio": 0.5},
         {"max_sigma_px": 0.0},
