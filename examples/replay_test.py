@@ -4,7 +4,10 @@ Record once, with a camera or `ldo publish`, and stop with Ctrl-C:
 
     ldo record recordings/desk
 
-    LDO_RECORDING=recordings/desk pytest examples/replay_test.py
+    LDO_RECORDING=recordings/desk pytest replay_test.py
+
+in a folder of your own; in a clone of this repository after `make test`, which installs what its
+settings of pytest ask for.
 
 Each recorded actor is a case. One that fails names the step, and the message that differs.
 """

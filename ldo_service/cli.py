@@ -1,7 +1,8 @@
 """The command `ldo`: its verbs, and what becomes of an error.
 
 Exit codes: 0 done, 1 other errors, 2 bad arguments or configuration, 3 bad input data, 4 a stage
-gave up, 5 a replay diverged. An error is one paragraph; --debug adds the traceback.
+gave up, 5 a replay diverged, 130 interrupted. An error is one paragraph; --debug adds the
+traceback.
 """
 
 import logging
@@ -15,6 +16,11 @@ from rich.console import Console
 
 from ldo_service.errors import LdoError
 
+KEEPING = (
+    "demo",
+    "run",
+    "suite",
+)  # verbs that leave what they have done, when they are interrupted
 HELP = """\
 usage: ldo VERB ...
 
@@ -56,7 +62,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Console(stderr=True, highlight=False, markup=False).print(f"ldo: {error}", soft_wrap=True)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        Console(stderr=True).print("ldo: interrupted; a run keeps what it has done.")
+        kept = "; what is done is kept" if words[0] in KEEPING else ""
+        Console(stderr=True).print(f"ldo: interrupted{kept}.")
         sys.exit(130)
     except BrokenPipeError:  # `ldo topics | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

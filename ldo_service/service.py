@@ -210,15 +210,27 @@ class Service:
 
 
 def state_folder(folder: Path | None, stack: ExitStack) -> Path:
-    """The given folder, or a temporary one that goes with the process."""
+    """The given folder, or a temporary one that goes with the process. Raises ConfigError where it
+    cannot be written, and where a run or a recording lies in it."""
     if folder is None:
         return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):
             raise ConfigError(f"{folder} cannot be written: choose another with --state.")
+        found = {path.name for path in folder.iterdir()}
     except OSError as error:
         raise ConfigError(f"{folder} cannot be used for state: {error.strerror}.") from error
+    if "state" not in found and "frames.csv" in found:
+        raise ConfigError(
+            f"{folder} is what `ldo run` wrote, and holds no state of a service: choose another "
+            f"folder with --state. To track in its map: --localise {folder}."
+        )
+    if "state" not in found and any(name.endswith(".mcap") for name in found):
+        raise ConfigError(
+            f"{folder} is a recording, and holds no state of a service: choose another folder with "
+            "--state."
+        )
     return folder
 
 

@@ -27,12 +27,22 @@ def write_objects(folder: Path, objects: MapObjects) -> None:
     (folder / OBJECTS).write_bytes(text + b"\n")
 
 
+def refuse_state(folder: Path) -> None:
+    """Raises DataError for a folder where a service keeps its state."""
+    if (folder / "state").is_dir():
+        raise DataError(
+            f"{folder} holds the state of a service, and nothing that `ldo run` writes: "
+            f"`ldo serve --resume {folder}` goes on with it, and `live` names that service here."
+        )
+
+
 def read_objects(folder: Path) -> MapObjects:
     """Raises DataError when there is no such file, or it is not what `write_objects` writes."""
     path = folder / OBJECTS
     if not folder.is_dir():
         raise DataError(f"{folder} is not a folder: name that of a finished `ldo run`, or `live`.")
     if not path.is_file():
+        refuse_state(folder)
         raise DataError(
             f"{folder} has no {OBJECTS}: the run kept no objects, which takes a detector. "
             "`ldo run` the sequence again with detector.model set; `ldo models` tells how."

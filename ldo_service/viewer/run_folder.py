@@ -13,7 +13,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import has_refined, read_viewpoints
 from ldo_service.runs.folder import REFINED
 from ldo_service.runs.loops_file import LOOPS, read_loops
-from ldo_service.runs.objects_file import OBJECTS, read_objects
+from ldo_service.runs.objects_file import OBJECTS, read_objects, refuse_state
 
 from . import panel
 from .config import ViewerConfig
@@ -33,6 +33,8 @@ class RunFolder:
             raise DataError(f"{folder} is not a folder: name that of an `ldo run`, or `live`.")
         self._folder, self._config = folder, config
         self._begin()
+        if not any(_signature(folder / name) for name in PARTS):
+            refuse_state(folder)
         if not any(_signature(folder / name) for name in ("config.yaml", *PARTS)):
             raise DataError(
                 f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt: "

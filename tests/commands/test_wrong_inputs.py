@@ -12,10 +12,12 @@ ROS = "publish", "ros2", "--color", "/c/image_raw"
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with an empty folder, a full one, and files that are nothing."""
+    """An empty folder, a full one, those of a run and of a service, and files that are nothing."""
     monkeypatch.chdir(tmp_path)
-    for name in ("empty", "full", "junk"):
-        (tmp_path / name).mkdir()
+    for name in ("empty", "full", "junk", "ran", "kept/state"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("ran/frames.csv", "ran/config.yaml", "kept/config.yaml"):
+        (tmp_path / name).touch()
     (tmp_path / "full" / "thesis.tex").write_text("years of work")
     (tmp_path / "junk" / "tracker.mcap").write_bytes(b"no recording")
     (tmp_path / "suite.yaml").write_text(SUITE)
@@ -36,6 +38,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("eval empty synthetic:room", 3, "is it what `ldo run` wrote"),
         ("query nowhere chair", 3, "nowhere is not a folder"),
         ("query empty chair", 3, "empty has no objects.json"),
+        ("query kept chair", 3, "kept holds the state of a service"),
         ("publish nowhere", 3, "nowhere does not exist"),
         ("publish junk", 3, "junk holds no camera/rgbd"),
         ("publish realsense --size 3", 2, "--size 3"),
@@ -54,6 +57,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("simulate synthetic:room --max-frames 0", 2, "at most 0 frames"),
         ("serve --localise nowhere", 3, "no places.msgpack"),
         ("serve --state suite.yaml", 2, "cannot be used for state"),
+        ("serve --resume ran", 2, "ran is what `ldo run` wrote"),
+        ("serve --state junk", 2, "junk is a recording"),
         ("serve --set tracker.nothing=1", 2, "no setting tracker.nothing"),
         ("serve --keys empty --endpoint tls/127.0.0.1:1", 2, "ca.crt cannot be read"),
         ("replay junk --verify", 3, "no MCAP file"),

@@ -171,3 +171,7 @@ def test_a_folder_that_no_run_wrote_is_refused(tmp_path: Path) -> None:
     (tmp_path / "holiday.jpg").write_bytes(b"")
     with pytest.raises(DataError, match="holds nothing that `ldo run` writes"):
         RunFolder(tmp_path, CONFIG)
+    (tmp_path / "config.yaml").touch()
+    (tmp_path / "state").mkdir()
+    with pytest.raises(DataError, match="the state of a service"):
+        RunFolder(tmp_path, CONFIG)
