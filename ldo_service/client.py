@@ -221,7 +221,8 @@ class Client:
             raise ConfigError(
                 "the map has no objects yet, which takes a keyframe, also after a restart, and a "
                 "detector that looked at it: `ldo serve --set detector.model=...`; `ldo models` "
-                "tells how."
+                "tells how. A service that localises takes none: those of its map are in the map's "
+                "folder."
             )
         raise self._nobody("answers", MAP_OBJECTS)
 

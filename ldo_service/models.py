@@ -178,9 +178,9 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
         path = Path(model).expanduser()
         if not path.is_file():
             raise ConfigError(
-                f"detector.model={model} is neither an ONNX file nor registered in "
-                f"{models.folder}, where there are: {', '.join(models.names) or 'none'}. "
-                "`ldo models add NAME FILE` registers one."
+                f"detector.model={model} is neither `demo`, which comes with the package, nor an "
+                f"ONNX file, nor registered in {models.folder}, where there are: "
+                f"{', '.join(models.names) or 'none'}. `ldo models add NAME FILE` registers one."
             )
         return OnnxDetector(path, config)
     found = models.get(model)

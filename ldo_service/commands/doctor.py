@@ -118,8 +118,8 @@ def networks() -> Iterator[Finding]:
     if not models.names:
         yield Finding(
             "absent",
-            "networks: nothing is detected without one; `ldo models add NAME FILE` registers a "
-            "YOLOv5, YOLOX or YOLOv8 in ONNX",
+            "networks of your own: `demo` knows the synthetic scenes alone; `ldo models add NAME "
+            "FILE` registers a YOLOv5, YOLOX or YOLOv8 in ONNX",
         )
     for name in models.names:
         try:

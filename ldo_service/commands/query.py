@@ -84,6 +84,8 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
     eye = None
     for pose in poses:
         assert isinstance(pose, TrackedPose)
+        if pose.segment:
+            continue  # where that is in the map is not known
         eye = (transform(pose.T_map_odom) @ transform(pose.T_odom_camera))[:3, 3]
     return found, eye
 

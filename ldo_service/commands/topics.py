@@ -13,6 +13,8 @@ from ldo_service.schemas.topics import HEALTH, TOPICS
 
 from .options import Robot
 
+WIDTH = 160  # into a pipe or a file: no key is cut short
+
 
 def topics(
     robot: Robot = "robot",
@@ -35,7 +37,10 @@ def topics(
     elif mermaid:
         print(drawing())
     else:
-        Console().print(_table(robot))
+        console = Console()
+        if not console.is_terminal:
+            console.width = WIDTH
+        console.print(_table(robot))
 
 
 def _table(robot: str) -> Table:

@@ -129,7 +129,7 @@ def test_a_network_that_fails_is_counted_and_warned_about_once(
 def test_a_run_over_a_file_is_told_before_it_begins(tmp_path: Path, model: Path) -> None:
     require_detector(DetectorConfig())
     require_detector(DetectorConfig(model=str(model)))
-    with pytest.raises(ConfigError, match="neither an ONNX file nor registered"):
+    with pytest.raises(ConfigError, match="nor an ONNX file, nor registered"):
         require_detector(DetectorConfig(model="nothing"))
     (tmp_path / "garbage.onnx").write_text("garbage")
     with pytest.raises(ModelError, match="no network in ONNX"):

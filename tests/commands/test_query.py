@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 import zenoh
 
 from ldo_service.client import connect
+from ldo_service.commands import query
 from ldo_service.demo_networks import IMAGE_ENCODER
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
@@ -54,6 +57,22 @@ def folder(tmp_path: Path) -> Path:
     T[1, 0, 3] = 1
     Trajectory(np.array([0.0, 1.0]), T).save(tmp_path / "trajectory.txt")
     return tmp_path
+
+
+@pytest.mark.parametrize("segment", [0, 3])
+def test_from_a_segment_that_is_not_joined_no_distance_is_known(
+    capsys, monkeypatch: pytest.MonkeyPatch, segment: int
+) -> None:
+    here = Pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    nowhere = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    pose = msgspec.structs.replace(
+        EXAMPLES["tracked_pose"], T_odom_camera=here, T_map_odom=nowhere, segment=segment
+    )
+    service = Mock(objects=lambda: FOUND, last=lambda _topic: [pose])
+    monkeypatch.setattr(query, "connect", lambda *_: nullcontext(service))
+    _, out, _ = ldo(capsys, "query", "live", "couch", "--json")
+    (answer,) = json.loads(out)
+    assert answer["distance"] == (None if segment else 2.0)
 
 
 def test_objects_survive_the_file(folder: Path) -> None:
