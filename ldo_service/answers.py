@@ -54,5 +54,6 @@ def answer(
 def _nothing(text: str, names: list[str]) -> str:
     if not names:
         return "the map has no objects yet: a detector has to find one in three keyframes."
-    near = ", ".join(nearest_names(text, names))
-    return f"none of {len(names)} objects answers to {text!r}. There is {near}."
+    near = nearest_names(text, names)
+    more = " and more" if len(set(names)) > len(near) else ""
+    return f"none of {len(names)} objects answers to {text!r}. There is {', '.join(near)}{more}."

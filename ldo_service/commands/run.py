@@ -106,7 +106,7 @@ def run(
     if record.summary["gaussians_apart"]:
         Console().print(apart(record.summary["gaussians_apart"]), style="dim")
     if localise:
-        Console().print(f"The map is that of {localise}, as it was.", style="dim")
+        Console().print(localised(record.statuses, localise), style="dim")
 
 
 def apart(gaussians: int) -> str:
@@ -114,6 +114,15 @@ def apart(gaussians: int) -> str:
         f"map.ply leaves out {gaussians:,} Gaussians: the camera was lost, went on, and nothing it "
         "saw from then on was recognised, so where they belong is not known."
     )
+
+
+def localised(statuses: dict[str, int], folder: Path) -> str:
+    if statuses["OK"] + statuses["WEAK"] == 0:
+        return (
+            f"No frame was recognised: is {folder} a map of this place, seen from about the same "
+            "heights and by a camera as wide?"
+        )
+    return f"The map is that of {folder}, as it was."
 
 
 def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:
