@@ -16,11 +16,7 @@ from rich.console import Console
 
 from ldo_service.errors import LdoError
 
-KEEPING = (
-    "demo",
-    "run",
-    "suite",
-)  # verbs that leave what they have done, when they are interrupted
+KEEPING = ("demo", "run", "suite")  # verbs that leave what they have done
 HELP = """\
 usage: ldo VERB ...
 
