@@ -1,5 +1,6 @@
 """ldo run"""
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from math import gcd
 from pathlib import Path
@@ -10,11 +11,13 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
+from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.recordings.sequence import open_source
-from ldo_service.runs.folder import prepare
-from ldo_service.runs.job import Job
+from ldo_service.runs.folder import RunFolder, prepare
+from ldo_service.runs.front_end import FrontEnd
+from ldo_service.runs.job import Advance, Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
 from ldo_service.runs.source import Selection
@@ -66,6 +69,18 @@ def run(
             "tracker. tracker.T_base_camera says where the camera sits on it",
         ),
     ] = None,
+    keep_front_end: Annotated[
+        bool,
+        tyro.conf.arg(help="keep what tracker and detector say in DIR/front_end.mcap, images too"),
+    ] = False,
+    front_end: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="RUN",
+            help="take what they said from this folder of a run over the same frames, and run the "
+            "others alone: what their settings are worth, poses being equal",
+        ),
+    ] = None,
     realtime: Annotated[
         bool, tyro.conf.arg(help="pace by stamps and drop late frames, as the service does")
     ] = False,
@@ -79,9 +94,12 @@ def run(
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
       ldo run ~/data/desk_again --out runs/again --localise runs/desk
+      ldo run synthetic:flat --out runs/half --front-end runs/flat --set mapper.iterations=7
     """
-    if realtime and refine:
-        raise ConfigError("--refine needs a run over a file: leave out --realtime.")
+    over_file = {"--refine": refine, "--front-end": front_end, "--keep-front-end": keep_front_end}
+    looking = {"--prior": prior, "--localise": localise, "--keep-front-end": keep_front_end}
+    require_none_of("--realtime", realtime, over_file)
+    require_none_of("--front-end", front_end, looking)
     require_separate(localise, out, refine)
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
@@ -90,23 +108,41 @@ def run(
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.data.options())
-    other = None if prior is None else Trajectory.load(prior)
-    job = Job(sequence, out, settings, selection, console.print, refine, other)
+    job = Job(
+        *(sequence, out, settings, selection, console.print),
+        refine=refine,
+        prior=Trajectory.load(prior) if prior else None,
+        front_end=kept_front_end(front_end, out, settings, sequence, selection)
+        if front_end
+        else None,
+        keep_front_end=keep_front_end,
+    )
     prepare(out, overwrite)
-    with progress("run", job.work, console) as advance:
-        go = run_in_real_time if realtime else run_over_file
-        try:
-            record = go(job, advance)
-        except OSError as error:
-            raise ConfigError(
-                f"{out} cannot be written: {error.strerror}. Free some space, or choose another "
-                "folder; what is there is incomplete."
-            ) from error
+    record = carried_out(job, run_in_real_time if realtime else run_over_file, console)
     Console().print(summary_table(record.summary, out))
     if record.summary["gaussians_apart"]:
         Console().print(apart(record.summary["gaussians_apart"]), style="dim")
     if localise:
         Console().print(localised(record.statuses, localise), style="dim")
+
+
+def carried_out(job: Job, go: Callable[[Job, Advance], RunFolder], console: Console) -> RunFolder:
+    with progress("run", job.work, console) as advance:
+        try:
+            return go(job, advance)
+        except OSError as error:
+            raise ConfigError(
+                f"{job.folder} cannot be written: {error.strerror}. Free some space, or choose "
+                "another folder; what is there is incomplete."
+            ) from error
+
+
+def kept_front_end(
+    run: Path, out: Path, settings: Config, sequence: Sequence, selection: Selection
+) -> FrontEnd:
+    if run.expanduser().resolve() == out.expanduser().resolve():
+        raise ConfigError(f"--out {out} would replace the front end: choose another folder.")
+    return FrontEnd.open(run, settings, sequence, selection)
 
 
 def apart(gaussians: int) -> str:
@@ -133,6 +169,13 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
     if threads is not None:
         mapper = replace(mapper, threads=threads)
     return replace(config, tracker=tracker, mapper=mapper)
+
+
+def require_none_of(option: str, is_given: object, others: Mapping[str, object]) -> None:
+    """Options that leave an option nothing to do, or would themselves have nothing to do."""
+    wrong = [name for name, value in others.items() if value]
+    if is_given and wrong:
+        raise ConfigError(f"{option} and {wrong[0]} do not go together: leave one of them out.")
 
 
 def require_separate(localise: Path | None, out: Path, refine: int) -> None:

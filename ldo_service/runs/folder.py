@@ -11,6 +11,7 @@ semantics.npz           what those Gaussians are, if a detector looked: see `sem
 objects.json            the objects among them, if a detector looked: see `objects_file`
 places.msgpack          what `--localise` finds the camera by, at the newest poses
 loops.json              places that were compared, and why each pair was refused: `runs.loops_file`
+front_end.mcap          what tracker and detector said, if it was to be kept: see `runs.front_end`
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
 refined/                trajectory, keyframes and map after more iterations, if they were asked for
@@ -54,6 +55,7 @@ from ldo_service.semantics.saved import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
 from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
+from .front_end import FRONT_END
 from .loops_file import LOOPS, LoopRecord
 from .objects_file import OBJECTS, write_objects
 from .places import PlaceRecord
@@ -73,7 +75,15 @@ EXPORTED = {  # by `ldo export`, per format
 WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
-        *(PLACES, OBJECTS, LOOPS, SEMANTICS, f"{REFINED}/{SEMANTICS}", f"{REFINED}/{OBJECTS}"),
+        *(
+            PLACES,
+            OBJECTS,
+            LOOPS,
+            FRONT_END,
+            SEMANTICS,
+            f"{REFINED}/{SEMANTICS}",
+            f"{REFINED}/{OBJECTS}",
+        ),
         *("trajectory.png", "rendering.png", "labels.png"),  # by `eval` and `demo`
         "views.png",  # by `demo` up to 0.1
         *(f"{REFINED}/{name}" for name in MAP_FILES),

@@ -9,6 +9,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 
+from .front_end import FrontEnd
 from .source import Selection, Warn, require_overlap
 
 REFINE_ITERATIONS = 25  # asked of the mapper at a time: about a second
@@ -25,7 +26,8 @@ class Advance(Protocol):
 class Job:
     """A sequence and which of its frames, the configuration, where the results go, who is warned,
     how many iterations refine the map after the last frame, and where another odometry had the
-    robot's base."""
+    robot's base; a front end that another run kept, in place of one over the frames, or whether to
+    keep this one's."""
 
     sequence: Sequence
     folder: Path
@@ -34,6 +36,8 @@ class Job:
     warn: Warn
     refine: int = 0
     prior: Trajectory | None = None  # T_odom_base, in a frame of its own
+    front_end: FrontEnd | None = None
+    keep_front_end: bool = False
 
     def __post_init__(self) -> None:
         if self.refine < 0:

@@ -1,8 +1,10 @@
 """A run over a sequence, on the logical clock."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,9 +12,10 @@ from ldo_service.actors.graph import make_actors
 from ldo_service.config import Config, config_yaml
 from ldo_service.errors import DataError
 from ldo_service.runtime.logical_clock import LogicalClock
-from ldo_service.schemas import MapRefine
+from ldo_service.schemas import MapRefine, Message
 
 from .folder import RunFolder
+from .front_end import ACTORS, FrontEnd, FrontEndRecord
 from .job import REFINE_ITERATIONS, Advance, Job, requests
 from .source import Reader, with_prior
 from .summary import Percentiles, Usage, percentiles, summarise
@@ -28,48 +31,102 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
     fails leaves what it has done, and its summary says so. Raises DataError when nothing or too
     little can be read, and StageError when an actor fails.
     """
-    indices = job.selection.indices(job.sequence)
-    config = with_all_cores(job.config)
-    actors = {actor.name: actor for actor in make_actors(config)}
-    reader = Reader(job.sequence, indices, job.warn)
-    record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
-    started = Usage.now()
-    work, stage_ms, is_finished = job.work, {}, False
-    with LogicalClock(
-        list(actors.values()),
-        config.run.latency_frames(),
-        lambda _actor, message, step_ms: record.observe(message, step_ms),
-    ) as clock:
+    with FileRun(job, advance) as run:
         try:
-            for done in clock.run(with_prior(reader, job.prior)):
-                advance(done + 1 + reader.rejected)
-            clock.finish()
-            stage_ms = percentiles_of(clock)
-            if due := int(actors["mapper"].facts()["iterations_due"]):
-                work += requests(due)
-                for done in clock.run(refinements(due, record.newest_stamp_ns)):
-                    advance(done + 1 + reader.rejected, work)
-                clock.finish()
-            is_finished = True
+            run.stream()
+            run.repair()
         finally:
-            used = Usage.now().since(started)
-            rejected = reader.rejected + int(actors["frame_source"].facts()["frames_rejected"])
-            facts = actors["optimizer"].facts() | actors["mapper"].facts()
-            stage_ms = stage_ms or percentiles_of(clock)
-            summary = summarise(record, used, len(indices), rejected, stage_ms, {}, facts)
-            record.close({**summary, "interrupted": not is_finished})
-        require_usable(record, config.run.max_rejected)
+            run.close()
+        require_usable(run.record, job.config.run.max_rejected)
         if job.refine:
-            for done in clock.run(refinements(job.refine, record.newest_stamp_ns)):
-                advance(done + 1 + reader.rejected, work)
-            clock.finish()
-            record.write_refined(job.refine)
-    return record
+            run.refine()
+    return run.record
 
 
-def percentiles_of(clock: LogicalClock) -> dict[str, Percentiles]:
-    """Of what the steps of each actor took so far."""
-    return {name: percentiles(steps) for name, steps in clock.step_ms().items() if steps}
+class FileRun:
+    """The parts of a run, for a context: `stream`, `repair`, `close`, `refine`."""
+
+    def __init__(self, job: Job, advance: Advance) -> None:
+        self._job, self._advance, self._work = job, advance, job.work
+        self._frames = job.selection.indices(job.sequence)
+        config = with_all_cores(job.config)
+        actors = [a for a in make_actors(config) if not (job.front_end and a.name in ACTORS)]
+        self._actors = {actor.name: actor for actor in actors}
+        self._reader = Reader(job.sequence, self._frames, job.warn)
+        self.record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
+        self._kept: FrontEndRecord | None = None
+        self._clock = LogicalClock(actors, config.run.latency_frames(), self._observe)
+        self._contexts = ExitStack()
+        self._started = Usage.now()
+        self._stage_ms: dict[str, Percentiles] = {}
+        self._is_finished = False
+
+    def __enter__(self) -> "FileRun":
+        job = self._job
+        if job.keep_front_end:
+            kept = FrontEndRecord(job.folder, job.config, job.sequence, job.selection)
+            self._kept = self._contexts.enter_context(kept)
+        self._contexts.enter_context(self._clock)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._contexts.__exit__(*error)
+
+    def stream(self) -> None:
+        """Take every frame."""
+        front_end = self._job.front_end
+        frames = with_prior(self._reader, self._job.prior)
+        self._run(self._heard_again(front_end) if front_end else frames)
+        self._stage_ms = self._step_percentiles()
+
+    def repair(self) -> None:
+        """Fit the map again where corrections have torn it."""
+        if due := int(self._actors["mapper"].facts()["iterations_due"]):
+            self._work += requests(due)
+            self._run(refinements(due, self.record.newest_stamp_ns))
+        self._is_finished = True
+
+    def close(self) -> None:
+        """Write what there is."""
+        used = Usage.now().since(self._started)
+        facts = self._actors["optimizer"].facts() | self._actors["mapper"].facts()
+        stage_ms = self._stage_ms or self._step_percentiles()
+        frames, rejected = len(self._frames), self._rejected()
+        summary = summarise(self.record, used, frames, rejected, stage_ms, {}, facts)
+        self.record.close({**summary, "interrupted": not self._is_finished})
+
+    def refine(self) -> None:
+        """As many iterations as were asked for, into a folder of their own."""
+        self._run(refinements(self._job.refine, self.record.newest_stamp_ns))
+        self.record.write_refined(self._job.refine)
+
+    def _run(self, source: Iterable[Message | tuple[Message, ...]]) -> None:
+        for tick in self._clock.run(source):
+            done = tick + 1 + self._reader.rejected
+            self._advance(min(done, self._work), self._work)
+        self._clock.finish()
+
+    def _heard_again(self, front_end: FrontEnd) -> Iterator[tuple[Message, ...]]:
+        for messages in front_end:
+            for message in messages:
+                self.record.observe(message, step_ms=0.0)
+            yield messages
+
+    def _observe(self, _actor: str, message: Message, step_ms: float) -> None:
+        self.record.observe(message, step_ms)
+        if self._kept:
+            self._kept.observe(message, self._clock.now)
+
+    def _rejected(self) -> int:
+        if self._job.front_end:
+            return self._job.front_end.rejected
+        by_source = int(self._actors["frame_source"].facts()["frames_rejected"])
+        return self._reader.rejected + by_source
+
+    def _step_percentiles(self) -> dict[str, Percentiles]:
+        """Of what the steps of each actor took so far."""
+        steps_of = self._clock.step_ms()
+        return {name: percentiles(steps) for name, steps in steps_of.items() if steps}
 
 
 def with_all_cores(config: Config) -> Config:

@@ -97,6 +97,7 @@ class LogicalClock:
         self._due: list[Due] = []
         self._started = 0
         self._tick = -1
+        self.now = -1  # tick of what is being passed on, for an observer
 
     def __enter__(self) -> "LogicalClock":
         return self
@@ -144,6 +145,7 @@ class LogicalClock:
             due = heapq.heappop(self._due)
             thread = self._threads[due.rank]
             answer = _answer(due, thread.actor.name)
+            self.now = due.tick
             for message in answer.messages:
                 self._observe(thread.actor.name, message, answer.step_ms)
                 self._deliver(message, due.tick)

@@ -28,12 +28,21 @@ class Entry:
     source: str
     settings: tuple[str, ...]
     seed: int | None  # None: the source has none
+    front_end: str | None = None  # variant whose front end it takes; None: it has its own
 
     @property
     def folder(self) -> Path:
         """Within that of the suite's results."""
+        return self._folder_of(self.variant)
+
+    @property
+    def front_end_folder(self) -> Path | None:
+        """Of the run whose front end it takes."""
+        return self._folder_of(self.front_end) if self.front_end else None
+
+    def _folder_of(self, variant: str) -> Path:
         seed = "" if self.seed is None else f"@{self.seed}"
-        return Path(self.sequence) / f"{self.variant}{seed}"
+        return Path(self.sequence) / f"{variant}{seed}"
 
 
 class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -45,6 +54,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     variants: dict[str, tuple[str, ...]] = field(default_factory=lambda: {"LDO-SLAM": ()})
     # name: settings, as of `ldo run --set`
     figures: tuple[str, ...]
+    front_end: str | None = None  # variant that alone looks at frames: the others take what its
+    # tracker and detector said, so that poses are equal; the first
     seeds: tuple[int, ...] = (0,)  # of synthetic sources: another run of a folder is the same run
     hold_out: int = 0
     refine: int = 0
@@ -61,6 +72,8 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 raise ConfigError(
                     f"{name!r} cannot be the name of a folder: letters, digits, spaces and ._+- do."
                 )
+        if self.front_end not in (None, next(iter(self.variants))):
+            raise ConfigError(f"front_end is {self.front_end!r}: it must be the first variant.")
         unknown = sorted(set(self.figures) - FIGURES.keys())
         if unknown:
             raise ConfigError(f"no figure {', '.join(unknown)}. There is {', '.join(FIGURES)}.")
@@ -69,11 +82,18 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         """All runs, sequence by sequence; sources lie in the folder `data`."""
         for sequence, source in self.sequences.items():
             for variant, settings in self.variants.items():
+                front_end = None if variant == self.front_end else self.front_end
                 if not source.startswith(SYNTHETIC):
-                    yield Entry(sequence, variant, str(data / source), settings, None)
+                    where = str(data / source)
+                    yield Entry(sequence, variant, where, settings, None, front_end)
                     continue
                 for seed in self.seeds:
-                    yield Entry(sequence, variant, f"{source}@{seed}", settings, seed)
+                    where = f"{source}@{seed}"
+                    yield Entry(sequence, variant, where, settings, seed, front_end)
+
+    def front_end_settings(self) -> tuple[str, ...] | None:
+        """Of the variant that alone looks at frames; None: each does."""
+        return None if self.front_end is None else self.variants[self.front_end]
 
     def options(self) -> list[str]:
         """Of `ldo run`, alike for all."""

@@ -73,6 +73,7 @@ class Work:
             **asdict(entry),
             "settings": (*self.settings, *entry.settings),
             "options": self.suite.options(),
+            "front_end_settings": self.suite.front_end_settings(),
             "ldo": versions()["ldo-slam"],
         }
         return json.dumps(told, indent=1)
@@ -87,6 +88,10 @@ class Work:
             word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)
         ]
         run = ("run", entry.source, "--out", str(folder), "--overwrite", *self.suite.options())
+        if entry.front_end_folder:
+            run += ("--front-end", str(self.out / entry.front_end_folder))
+        elif self.suite.front_end:
+            run += ("--keep-front-end",)
         for name in (TOLD, RESULTS):  # `ldo run` replaces what it wrote, and nothing else
             (folder / name).unlink(missing_ok=True)
         done = _ldo(*run, *settings)

@@ -48,6 +48,22 @@ def test_a_suite_runs_what_it_can_and_goes_on_where_it_stopped(capsys, suite: Pa
     )
 
 
+def test_variants_may_take_the_front_end_of_the_first(capsys, tmp_path: Path) -> None:
+    variants = {"whole": ["mapper.iterations=1"], "rougher": ["mapper.iterations=0"]}
+    path = tmp_path / "rooms.yaml"
+    one = {"sequences": {"room": "synthetic:room"}, "variants": variants, "front_end": "whole"}
+    path.write_text(json.dumps(SUITE | one))
+    words = "suite", path, "--out", tmp_path / "out"
+    assert ldo(capsys, *words)[0] == 0
+    whole, rougher = (tmp_path / "out/room" / f"{name}@0" for name in variants)
+    online = "trajectory_online.txt"
+    assert (whole / online).read_bytes() == (rougher / online).read_bytes()
+    assert (whole / "map.ply").read_bytes() != (rougher / "map.ply").read_bytes()
+    stages = json.loads((rougher / "summary.json").read_text())["stage_ms"]
+    assert "tracker" not in stages
+    assert "mapper" in stages
+
+
 def test_a_suite_that_is_not_there_is_named(capsys, tmp_path: Path) -> None:
     code, _, err = ldo(capsys, "suite", tmp_path / "none.yaml", "--out", tmp_path / "out")
     assert code == 2

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from ldo_service.config import load_config
@@ -52,6 +53,14 @@ def test_folders_run_once_and_synthetic_sources_with_each_seed() -> None:
     ]
     assert entries[3] == Entry("flat", "short", "synthetic:flat@3", (SETTING,), 3)
     assert entries[4].source == "/data/tum/desk"
+
+
+def test_all_take_the_front_end_of_the_first_with_their_seed_where_one_is_named() -> None:
+    shared = msgspec.structs.replace(TWO, front_end="plain")
+    first, again, other, other_again = list(shared.entries(Path()))[:4]
+    assert (first.front_end_folder, again.front_end_folder) == (None, None)
+    assert (other.front_end_folder, other_again.front_end_folder) == (first.folder, again.folder)
+    assert {entry.front_end_folder for entry in TWO.entries(Path())} == {None}
 
 
 def test_each_figure_of_several_sequences_has_its_table() -> None:
@@ -107,6 +116,7 @@ def test_a_figure_that_was_not_judged_is_none_and_no_error(name: str) -> None:
         ({"figures": []}, "one at least"),
         ({"variants": {"../up": []}}, "cannot be the name of a folder"),
         ({"sequences": {"": "x"}}, "cannot be the name of a folder"),
+        ({"front_end": "default"}, "front_end is 'default': it must be the first variant"),
         ({"sequnces": {}}, "is not a suite: .*sequnces"),
         ({"seeds": ["x"]}, "is not a suite: .*seeds"),
     ],

@@ -1,0 +1,161 @@
+"""A front end that was kept: heard again, the others make the same; with other settings, others."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from ldo_service.config import load_config
+from ldo_service.datasets import Sequence
+from ldo_service.errors import ConfigError, DataError, FrameError, StageError
+from ldo_service.geometry import RawFrame
+from ldo_service.runs.front_end import FRONT_END, FrontEnd
+from ldo_service.runs.job import Job
+from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.source import Selection
+
+from .jobs import ROUGH, Rearranged, job
+
+WALK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]
+SETTINGS = ("loop_closer.loops.retrieval.exclude_frames=5", "detector.model=demo")
+BAD = 7  # frame that cannot be read
+MADE = ("trajectory.txt", "trajectory_online.txt", "keyframes.json", "map.ply", "objects.json")
+
+
+class Spoilt(Rearranged):
+    def read(self, index: int) -> RawFrame:
+        if index == BAD:
+            raise FrameError(f"frame {index} is truncated. Copy it again.")
+        return super().read(index)
+
+
+class Unread(Rearranged):
+    def read(self, index: int) -> RawFrame:
+        raise AssertionError(f"frame {index} is read, which a front end has seen")
+
+
+@pytest.fixture(scope="module")
+def walk(room: Sequence) -> Sequence:
+    return Spoilt(room, WALK)
+
+
+@pytest.fixture(scope="module")
+def whole(walk: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("front_end") / "whole"
+    run_over_file(replace(job(walk, folder, *SETTINGS), keep_front_end=True), lambda *_: None)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def alike(room: Sequence, whole: Path) -> Path:
+    return again(room, whole, whole.parent / "alike")
+
+
+def again(room: Sequence, whole: Path, folder: Path, *settings: str) -> Path:
+    """A run of the others, by what was kept."""
+    asked = job(Unread(room, WALK), folder, *SETTINGS, *settings)
+    front_end = FrontEnd.open(whole, asked.config, asked.sequence, asked.selection)
+    run_over_file(replace(asked, front_end=front_end), lambda *_: None)
+    return folder
+
+
+def opened(whole: Path, sequence: Sequence, *settings: str, frames: int | None = None) -> FrontEnd:
+    config = load_config(settings=(ROUGH, *SETTINGS, *settings))
+    return FrontEnd.open(whole, config, sequence, Selection(max_frames=frames))
+
+
+def loops_of(folder: Path) -> list[tuple[list[int], list[int]]]:
+    found = json.loads((folder / "loops.json").read_text())
+    return [(one["keyframes"], one["references"]) for one in found["candidates"]]
+
+
+def test_what_is_made_of_it_is_what_the_whole_run_made(whole: Path, alike: Path) -> None:
+    for name in MADE:
+        assert (alike / name).read_bytes() == (whole / name).read_bytes(), name
+    assert loops_of(alike) == loops_of(whole) != []
+    ours, theirs = (json.loads((f / "summary.json").read_text()) for f in (alike, whole))
+    for name in ("frames", "frames_rejected", "status", "keyframes", "boxes", "loops_accepted"):
+        assert ours[name] == theirs[name], name
+    assert ours["frames_rejected"] == 1
+    assert theirs["boxes"] > 0
+    assert ours["stage_ms"].keys() == theirs["stage_ms"].keys() - {
+        *("frame_source", "tracker", "detector")
+    }
+
+
+def test_frames_are_told_as_they_were(whole: Path, alike: Path) -> None:
+    ours, theirs = (
+        list(csv.DictReader((folder / "frames.csv").read_text().splitlines()))
+        for folder in (alike, whole)
+    )
+    assert [row | {"track_ms": ""} for row in ours] == [row | {"track_ms": ""} for row in theirs]
+    assert {row["track_ms"] for row in ours} == {"0.000"}  # nobody tracked
+
+
+def test_another_map_is_made_of_the_same_poses(room: Sequence, whole: Path, tmp_path: Path) -> None:
+    other = again(room, whole, tmp_path / "other", "mapper.iterations=0")
+    online = "trajectory_online.txt"
+    assert (other / online).read_bytes() == (whole / online).read_bytes()
+    assert (other / "map.ply").read_bytes() != (whole / "map.ply").read_bytes()
+
+
+def test_a_setting_that_would_have_no_effect_is_refused(walk: Sequence, whole: Path) -> None:
+    with pytest.raises(ConfigError, match=r"tracker\.hold_out is 5 and was 0 when"):
+        opened(whole, walk, "tracker.hold_out=5")
+    with pytest.raises(ConfigError, match=r"run\.detector_latency_frames is 4 and was 3"):
+        opened(whole, walk, "run.detector_latency_frames=4")
+
+
+def test_other_frames_are_refused(room: Sequence, walk: Sequence, whole: Path) -> None:
+    with pytest.raises(DataError, match=f"is of {len(WALK)} frames of .*asked for are 12 of"):
+        opened(whole, walk, frames=12)
+    later = Rearranged(room, WALK)
+    later.stamps_ns = later.stamps_ns + 1
+    with pytest.raises(DataError, match="at their stamps"):
+        opened(whole, later)
+
+
+def test_a_run_that_kept_none_is_refused(walk: Sequence, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"has no front_end\.mcap: `ldo run --keep-front-end`"):
+        opened(tmp_path, walk)
+
+
+def test_what_is_no_recording_is_refused(walk: Sequence, tmp_path: Path) -> None:
+    (tmp_path / FRONT_END).write_bytes(b"not MCAP")
+    with pytest.raises(DataError, match="cannot be read as a recording"):
+        opened(tmp_path, walk)
+
+
+def test_a_file_that_was_cut_off_is_refused(walk: Sequence, whole: Path, tmp_path: Path) -> None:
+    body = (whole / FRONT_END).read_bytes()
+    (tmp_path / FRONT_END).write_bytes(body[: len(body) // 2])
+    with pytest.raises(DataError, match="is not whole"):
+        opened(tmp_path, walk)
+
+
+def test_a_run_that_fails_leaves_none_for_others(
+    room: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr("ldo_service.actors.loop_closer.LoopCloser.handle", fails)
+    asked = job(Rearranged(room, WALK), tmp_path / "out")
+    with pytest.raises(StageError, match="out of luck"):
+        run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
+    monkeypatch.undo()
+    with pytest.raises(DataError, match="is not whole"):
+        FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
+
+
+def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -> None:
+    tight = "record.max_gb=0.0000001"
+    asked: Job = job(Rearranged(room, WALK), tmp_path / "out", tight)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ldo_service.runtime.recording_file.CHECK_EVERY_BYTES", 1000)
+        record = run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
+    assert record.summary["frames"] == len(WALK)  # the run goes on
+    with pytest.raises(DataError, match="is not whole"):
+        FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
