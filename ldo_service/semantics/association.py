@@ -5,10 +5,11 @@ what a detector would draw about what it can see of it. A landmark and a region 
 
     IoU of their boxes >= 0.4,  they share a class,  and their depths meet;
 
-of all ways to pair them the one with the largest sum of IoU is taken.
+of all ways to pair them the one with the largest sum of IoU is taken. Before, regions that show a
+part of what another shows are made one with it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -29,12 +30,17 @@ class AssociationConfig:
     max_depth_gap_m: float = 0.1  # between their depths, and of members hidden (delta_z, III.A)
     min_gaussians: int = 8  # of a region: with fewer nothing is known of where it is
     max_regions: int = 64  # per keyframe, those with the most Gaussians: COCO images have 7
+    # Detectors box a plant, its crown and its pot. The share of a box in a larger one of its class,
+    # at the same depth, to show a part of what that shows:
+    part_inside: float = 0.9
 
     def __post_init__(self) -> None:
         if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
             raise ConfigError(f"{self}: min_iou must be in (0, 1], min_shared in 0..1.")
         if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
             raise ConfigError(f"{self}: max_depth_gap_m positive, counts at least 1.")
+        if not 0 < self.part_inside <= 1:
+            raise ConfigError(f"part_inside={self.part_inside:g} must be in (0, 1].")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,6 +51,7 @@ class MapView:
     indices      [V] uint32, ascending: rows of those that made the image
     regions      [V] int32, region of each, see `Assigned`; negative: none
     boxes        [M, 4] of the regions: x0 y0 x1 y1, px
+    classes      [M] what is said to be in them
     depth_m      [H, W] float32, as it was measured
     """
 
@@ -58,6 +65,7 @@ class MapView:
     indices: np.ndarray
     regions: np.ndarray
     boxes: np.ndarray
+    classes: np.ndarray
     depth_m: np.ndarray
 
     def __post_init__(self) -> None:
@@ -68,6 +76,8 @@ class MapView:
             raise ValueError(f"{len(self.regions)} regions of {v} Gaussians among {n} rows.")
         if v and self.regions.max() >= len(self.boxes):
             raise ValueError(f"region {self.regions.max()} has none of {len(self.boxes)} boxes.")
+        if len(self.classes) != len(self.boxes):
+            raise ValueError(f"{len(self.classes)} classes of {len(self.boxes)} regions.")
         if self.depth_m.shape != size:
             raise ValueError(f"depth has shape {self.depth_m.shape}, its camera {size}.")
 
@@ -114,6 +124,38 @@ def found(view: MapView, T_camera_map: np.ndarray, config: AssociationConfig) ->
         near_m[:, 0],
         far_m[:, 0],
     )
+
+
+def with_whole_things(view: MapView, regions: Found, config: AssociationConfig) -> MapView:
+    """A view in which regions that are parts of another belong to it."""
+    part_of = whole_of(regions, view.classes[regions.numbers], config)
+    if np.array_equal(part_of, np.arange(len(part_of))):
+        return view
+    numbers = np.arange(len(view.boxes))
+    numbers[regions.numbers] = regions.numbers[part_of]
+    is_hit = view.regions >= 0
+    return replace(view, regions=np.where(is_hit, numbers[view.regions * is_hit], view.regions))
+
+
+def whole_of(regions: Found, classes: np.ndarray, config: AssociationConfig) -> np.ndarray:
+    """[R] which region shows all of what each of R shows a part of; itself where none does. Their
+    classes are the same, their depths meet, and one box lies in the other, the largest of all that
+    it lies in."""
+    low = np.maximum(regions.boxes[:, None, :2], regions.boxes[None, :, :2])
+    high = np.minimum(regions.boxes[:, None, 2:], regions.boxes[None, :, 2:])
+    common = np.prod(np.clip(high - low, 0, None), axis=2)
+    area = np.prod(regions.boxes[:, 2:] - regions.boxes[:, :2], axis=1)
+    gap_m = np.maximum(regions.near_m[:, None], regions.near_m) - np.minimum(
+        regions.far_m[:, None], regions.far_m
+    )
+    is_part = (area[:, None] < area) & (common >= config.part_inside * area[:, None])
+    is_part &= (classes[:, None] == classes) & (gap_m <= config.max_depth_gap_m)
+    whole = np.arange(len(area))
+    for part in np.argsort(-area, kind="stable"):  # so that a part of a part is one of the whole
+        around = np.flatnonzero(is_part[part])
+        if len(around):
+            whole[part] = whole[around[np.argmax(area[around])]]
+    return whole
 
 
 def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:

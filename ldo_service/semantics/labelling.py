@@ -86,6 +86,11 @@ class Claims:
         """[M], by which regions compete where they overlap."""
         return np.maximum(self.confidences, self.open_confidences)
 
+    def classes(self) -> np.ndarray:
+        """[M] labels, of the surer of both."""
+        is_told = self.open_confidences > self.confidences
+        return np.where(is_told, self.open_labels, self.labels)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Labelled:

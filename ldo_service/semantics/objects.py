@@ -19,6 +19,7 @@ from .association import (
     found,
     look,
     paired,
+    with_whole_things,
 )
 from .distributions import divergence, entropy
 from .labels import BACKGROUND
@@ -125,7 +126,7 @@ class Objects:
         T_camera_map = se3.inverse(view.T_map_camera)
         limits = self.config.association
         # what is there, and what should be
-        regions = found(view, T_camera_map, limits)
+        view, regions = _seen(view, T_camera_map, limits)
         near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
         looks = look(self._table[near], view, T_camera_map, limits)
         # which is which
@@ -358,3 +359,12 @@ class Objects:
             "objects_retired": self._retired,
             "objects_refused": self._refused,  # there are max_objects
         }
+
+
+def _seen(
+    view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
+) -> tuple[MapView, Found]:
+    """What a keyframe shows of things, not of their parts."""
+    regions = found(view, T_camera_map, config)
+    whole = with_whole_things(view, regions, config)
+    return whole, regions if whole is view else found(whole, T_camera_map, config)

@@ -143,7 +143,7 @@ class SemanticMap:
         self._boxes += len(found.boxes) if found else 0
         self._disagreement = labelled.disagreement
         # which objects they are
-        seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims.boxes)
+        seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims)
         return Learnt(keyframe, self.objects.observe(seen, self._spared()), asked)
 
     def _seen(self, keyframe: int) -> tuple[View, Contributions]:
@@ -217,12 +217,13 @@ class SemanticMap:
         return labelled
 
     def _map_view(
-        self, view: View, indices: np.ndarray, regions: np.ndarray, boxes: np.ndarray
+        self, view: View, indices: np.ndarray, regions: np.ndarray, claims: Claims
     ) -> MapView:
         gaussians = self._map.gaussians
         at = view.keyframe, view.camera, view.T_map_camera
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
-        return MapView(*at, *known, indices, regions, boxes, view.depth_m)
+        seen = indices, regions, claims.boxes, claims.classes(), view.depth_m
+        return MapView(*at, *known, *seen)
 
     # --- answers ----------------------------------------------------------------------------------
     def answer(self, region: int, keyframe: int, answer: Answer) -> bool:

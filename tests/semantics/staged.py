@@ -149,7 +149,8 @@ class Stage:
             self.keyframe,
             *at,
             *(gaussians.rows, labels, gaussians.ids, gaussians.anchors),
-            *(shown.indices, labelled.assigned.regions, claims.boxes, depth_m),
+            *(shown.indices, labelled.assigned.regions),
+            *(claims.boxes, claims.classes(), depth_m),
         )
 
     def walk(self, things: Sequence[Thing], T_world_camera: np.ndarray) -> Iterator[Observed]:

@@ -1,15 +1,25 @@
 """Boxes and pairs against brute force."""
 
 import doctest
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from ldo_service.semantics import association
-from ldo_service.semantics.association import AssociationConfig, associate, found, overlaps
+from ldo_service.semantics.association import (
+    AssociationConfig,
+    Found,
+    associate,
+    found,
+    overlaps,
+    whole_of,
+    with_whole_things,
+)
 from ldo_service.semantics.labels import distribution
 from ldo_service.semantics.landmarks import MEMBERS, shuffled
 
@@ -82,10 +92,8 @@ def test_regions_are_samples_of_their_gaussians() -> None:
     view, _ = stage.show(shot, shot.claims(THINGS))
     rng = np.random.default_rng(1)
     regions = rng.choice([-1, 0, 1, 2], len(view.regions), p=[0.2, 0.7, 0.094, 0.006])
-    view = type(view)(
-        *(view.keyframe, view.camera, view.T_map_camera, view.rows, view.labels, view.ids),
-        *(view.anchors, view.indices, regions.astype(np.int32), np.zeros((3, 4)), view.depth_m),
-    )
+    boxes, classes = np.zeros((3, 4)), np.zeros(3, int)
+    view = replace(view, regions=regions.astype(np.int32), boxes=boxes, classes=classes)
     assert np.count_nonzero(regions == 0) > 3 * MEMBERS
     got = found(view, np.linalg.inv(view.T_map_camera), AssociationConfig(min_gaussians=30))
     counts = np.bincount(regions[regions >= 0], minlength=3)
@@ -97,3 +105,62 @@ def test_regions_are_samples_of_their_gaussians() -> None:
         weights = 1 / (1 + np.exp(-view.rows[rows, 10].astype(float)))
         expected = np.average(distribution(view.labels[rows]), axis=0, weights=weights)
         np.testing.assert_allclose(p, expected, atol=1e-5)
+
+
+PLANT, TABLE = 60, 62
+WHOLE = (0, 0, 100, 200)  # px
+
+
+def seen(*regions: tuple[tuple[int, int, int, int], float, float]) -> Found:
+    """Regions of boxes, near and far ends."""
+    boxes, near_m, far_m = (np.array(values, float) for values in zip(*regions, strict=True))
+    members = np.zeros((len(boxes), MEMBERS), np.int64)
+    return Found(np.arange(len(boxes)), boxes, members, members, members, near_m, far_m)
+
+
+def wholes(regions: Found, classes: list[int]) -> list[int]:
+    return whole_of(regions, np.array(classes), AssociationConfig()).tolist()
+
+
+@pytest.mark.parametrize(
+    ("other", "near_m", "name", "is_part"),
+    [
+        ((10, 0, 90, 100), 2.0, PLANT, True),
+        ((-5, 0, 95, 100), 2.0, PLANT, True),  # 95 % of it
+        ((-15, 0, 85, 100), 2.0, PLANT, False),  # 85 %: two that overlap
+        ((10, 0, 90, 100), 2.0, TABLE, False),
+        ((10, 0, 90, 100), 2.5, PLANT, False),  # one behind the other
+        ((10, 0, 90, 100), 2.35, PLANT, True),  # within what depth cannot tell
+        (WHOLE, 2.0, PLANT, False),  # neither is the larger
+    ],
+)
+def test_a_part_lies_in_a_larger_box_of_its_class_at_its_depth(
+    other: tuple[int, int, int, int], near_m: float, name: int, is_part: bool
+) -> None:
+    regions = seen((other, near_m, near_m + 0.2), (WHOLE, 2.0, 2.3))
+    assert wholes(regions, [name, PLANT]) == [1 if is_part else 0, 1]
+
+
+def test_a_part_of_a_part_is_one_of_the_whole() -> None:
+    crown, top = (0, 0, 100, 100), (20, 0, 80, 50)
+    regions = seen((top, 2, 2.2), (crown, 2, 2.2), (WHOLE, 2, 2.2), ((90, 0, 300, 200), 2, 2.2))
+    assert wholes(regions, [PLANT] * 4) == [2, 2, 2, 3]
+    # a top that lies at the depth of the crown alone is one of the whole too
+    behind = seen((top, 2.5, 2.6), (crown, 2.1, 2.45), (WHOLE, 2.0, 2.2))
+    assert wholes(behind, [PLANT] * 3) == [2, 2, 2]
+
+
+def test_gaussians_of_parts_are_those_of_the_whole() -> None:
+    stage = Stage()
+    shot = shoot(THINGS, poses(1)[0])
+    view, _ = stage.show(shot, shot.claims(THINGS))
+    boxes = np.array([[0, 0, 20, 20], [30, 30, 60, 60], [0, 0, 20, 40]], float)
+    regions = np.random.default_rng(1).integers(-2, 3, len(view.regions)).astype(np.int32)
+    view = replace(view, regions=regions, boxes=boxes, classes=np.array([PLANT, PLANT, PLANT]))
+    config = AssociationConfig()
+    whole = with_whole_things(view, found(view, np.linalg.inv(view.T_map_camera), config), config)
+    np.testing.assert_array_equal(whole.regions, np.where(regions == 0, 2, regions))
+    # nobody's part, nothing new
+    apart = replace(view, classes=np.array([PLANT, PLANT, TABLE]))
+    regions_apart = found(apart, np.linalg.inv(view.T_map_camera), config)
+    assert with_whole_things(apart, regions_apart, config) is apart

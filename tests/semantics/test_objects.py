@@ -232,6 +232,33 @@ def test_two_halves_become_one_when_the_whole_is_seen() -> None:
     assert np.linalg.norm(landmark["centroid"] - true.mean(axis=0)) < 0.05
 
 
+def with_upper_part(shot: Shot) -> Claims:
+    """The box of a thing, and one of its upper half: detectors see crowns and pots of plants."""
+    v, u = np.nonzero(shot.instances)
+    x0, y0, x1, y1 = u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5
+    boxes = np.array([[x0, y0, x1, y1], [x0, y0, x1, (y0 + y1) / 2]])
+    return Claims.of_detector(boxes, np.full(2, BALL.label), np.array([0.6, 0.9], np.float32))
+
+
+def test_a_thing_that_is_detected_twice_is_one_object() -> None:
+    stage, boxes = Stage(), []
+    for _ in range(6):
+        shot = shoot((BALL,), AHEAD, stage.keyframe)
+        claims = with_upper_part(shot)
+        view, told = stage.show(shot, claims)
+        assert set(view.regions.tolist()) >= {0, 1}  # each has Gaussians of its own
+        boxes += [(seen.box, claims.boxes[0]) for seen in told.observations]
+    (landmark,) = stage.objects.landmarks
+    assert landmark["seen"] == 6
+    assert stage.objects.statistics()["object_candidates"] == 0
+    assert boxes
+    for seen, whole in boxes:
+        np.testing.assert_array_equal(seen, whole)
+    members = np.isin(stage.builder.gaussians.ids, landmark["members"])
+    heights = stage.builder.gaussians.means[members, 2]
+    assert heights.min() < 0.15 < 0.25 < heights.max()  # of both halves
+
+
 def test_two_neighbours_of_one_class_stay_two() -> None:
     other = replace(BALL, solid=replace(BALL.solid, center_m=(0.42, 0.9, 0.2)))
     stage = Stage()
