@@ -41,14 +41,19 @@ def group_to_condense(
 ) -> list[int]:
     """The oldest `size` active keyframes that odometry connects one after another, and the next;
     none of the newest `window`. One of `heads`, that others follow, is the first of its group, as
-    it cannot follow itself. Empty where there are none."""
+    it cannot follow itself. Empty where there are none.
+
+    The next after a group is measured from its last, or the group is longer, up to twice: what it
+    is measured from instead would follow the first, and all between would be held from one side."""
     linked = {frozenset(pair) for pair in measured}
     run: list[int] = []
-    for keyframe in active[:-window] if window else active:
+    for place, keyframe in enumerate(active[:-window] if window else active):
         if keyframe in heads or not any(frozenset((k, keyframe)) in linked for k in run):
             run = []
         run.append(keyframe)
-        if len(run) == size + 1:
+        following = active[place + 1 : place + 2]
+        goes_on = all(frozenset((keyframe, k)) in linked for k in following)
+        if len(run) > 2 * size or (len(run) > size and goes_on):
             return run
     return []
 

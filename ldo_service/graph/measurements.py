@@ -106,26 +106,44 @@ class Measurements:
         joins = (m for pair, m in self.joins.items() if pair != without)
         yield from map(self.between_variables, joins)
 
-    # --- heads ------------------------------------------------------------------------------------
+    # --- followers --------------------------------------------------------------------------------
     def in_head(self, keyframe: int) -> tuple[int, np.ndarray]:
-        """The variable that stands for a keyframe, and T_variable_keyframe [4, 4]."""
+        """The first of its group, or itself, and T_head_keyframe [4, 4]."""
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
         return int(self.followers.heads[row]), self.followers.T_head[row]
 
+    def in_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
+        """The variable that stands for a keyframe, the nearer of the two that it lies between, and
+        T_variable_keyframe [4, 4]."""
+        row = self.rows.get(keyframe)
+        if row is None or self.followers.shares[row] <= 0.5:
+            return self.in_head(keyframe)
+        return int(self.followers.tails[row]), self.followers.T_tail[row]
+
+    def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
+        """The variables that stand for both: another one where that would be the same."""
+        a, b = self.in_variable(m.a), self.in_variable(m.b)
+        return (a, b) if a[0] != b[0] else (self.in_head(m.a), self.in_head(m.b))
+
     def between_variables(self, m: RelativePose) -> RelativePose:
-        (a, T_a), (b, T_b) = self.in_head(m.a), self.in_head(m.b)
+        (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):
             return m
         return carried(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """[6, 6] of followers among its ends: their share of what their group is known by."""
+        """[6, 6] of followers among its ends: their share of what their group is known by, as far
+        as they are from the variable that stands for them."""
         total = np.zeros((6, 6))
-        for row in (self.rows[k] for k in (m.a, m.b) if k in self.rows):
+        for keyframe, (variable, _) in zip((m.a, m.b), self.ends(m), strict=True):
+            if (row := self.rows.get(keyframe)) is None:
+                continue
             pair = int(self.followers.heads[row]), int(self.followers.tails[row])
-            total += self.followers.shares[row] * np.linalg.inv(self.condensed[pair].information)
+            share = self.followers.shares[row]
+            away = share if variable == pair[0] else 1 - share
+            total += away * np.linalg.inv(self.condensed[pair].information)
         return total
 
     # --- factors ----------------------------------------------------------------------------------
@@ -152,7 +170,7 @@ class Measurements:
             case "closure":
                 return self._closure_factor(self.closures.accepted[pair], self._noise.robust_sigmas)
         sight = self.sights[pair]
-        return sight_factor(sight, *self.in_head(sight.keyframe), self._noise)
+        return sight_factor(sight, *self.in_variable(sight.keyframe), self._noise)
 
     def with_closures(
         self, closures: Iterable[RelativePose], initial: Variables

@@ -7,6 +7,7 @@ import scipy.optimize
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.graph.condensing import group_to_condense
 from ldo_service.graph.factors import NoiseConfig
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
 from ldo_service.runtime.state_store import decode_state, encode_state
@@ -240,6 +241,58 @@ def test_a_condensed_graph_answers_a_loop_as_the_whole_one_does() -> None:
     assert len(loops) == len(condensed.closures.accepted) == len(whole.closures.accepted) == 8
     assert np.sqrt(np.mean(off**2)) < 0.1 * drifted
     assert ate_m(condensed, truth) < 1.2 * ate_m(whole, truth)
+
+
+def test_a_loop_bends_all_links_alike_where_keyframes_are_not_measured_from_the_one_before() -> (
+    None
+):
+    """Many are measured from two before, the eleventh ones here. Judge: the graph of all."""
+    truth = round_trips(240, 120)
+    walk = odometry(truth, 3, window=3, sigma=1e-4, drift_share=0.01, drift_rad_per_m=0.009)
+    measured = [[m for m in links if m.b % 11 or m.a != m.b - 1] for links in walk]
+    loops = closures(truth, 15, 100, 3)
+    condensed, whole = (walked(truth[0], measured, loops, config=c) for c in (None, WHOLE))
+    assert condensed.variables < 0.3 * whole.variables
+
+    def worst_rad(graph: KeyframeGraph) -> float:
+        poses = graph.placed()[1]
+        return max(
+            se3.rotation_angle(se3.inverse(se3.inverse(a) @ b) @ se3.inverse(c) @ d)
+            for a, b, c, d in zip(poses, poses[1:], truth, truth[1:], strict=False)
+        )
+
+    assert worst_rad(condensed) < 1.2 * worst_rad(whole)
+
+
+def test_a_closure_holds_a_follower_as_well_as_a_variable() -> None:
+    """It hangs on the nearer end of its group. Judge: the graph of all keyframes."""
+    truth = round_trips(240, 120)
+    walk = odometry(truth, 3, window=3, sigma=1e-4, drift_share=0.01, drift_rad_per_m=0.009)
+    measured = list(walk)
+    loops = {
+        b: RelativePose(b - 120, b, se3.inverse(truth[b - 120]) @ truth[b], REFINED)
+        for b in range(138, 240, 20)  # the eighth of ten
+    }
+    condensed, whole = (walked(truth[0], measured, loops, config=c) for c in (None, WHOLE))
+
+    def off_m(graph: KeyframeGraph) -> float:
+        each = [
+            se3.inverse(m.T_a_b) @ se3.inverse(graph.pose(m.a)) @ graph.pose(m.b)
+            for m in loops.values()
+        ]
+        return float(np.mean([np.linalg.norm(T[:3, 3]) for T in each]))
+
+    assert off_m(condensed) < 1.5 * off_m(whole)
+
+
+def test_a_group_ends_where_the_next_keyframe_is_measured_from() -> None:
+    chain = [(k - 1, k) for k in range(1, 60)]
+    assert group_to_condense(range(60), chain, (), 10, 20) == list(range(11))
+    skips_10_and_11 = [(9 if b in (11, 12) else a, b) for a, b in chain]
+    assert group_to_condense(range(60), skips_10_and_11, (), 10, 20) == list(range(13))
+    from_the_first = [(0, k) for k in range(1, 60)]  # nothing is measured from the one before
+    assert group_to_condense(range(60), from_the_first, (), 10, 20) == list(range(21))
+    assert group_to_condense(range(11), chain, (), 10, 0) == list(range(11))  # nothing follows
 
 
 def test_a_closure_within_a_group_stays_in_what_it_becomes() -> None:
