@@ -100,6 +100,7 @@ def run(
     looking = {"--prior": prior, "--localise": localise, "--keep-front-end": keep_front_end}
     require_none_of("--realtime", realtime, over_file)
     require_none_of("--front-end", front_end, looking)
+    require_none_of("--localise", localise, {"--keep-front-end": keep_front_end})
     require_separate(localise, out, refine)
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)

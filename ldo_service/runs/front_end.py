@@ -1,30 +1,29 @@
 """What the front end of a run said, kept to run other back ends on the same poses and keyframes.
 
-The front end is who looks at every frame and asks nothing of the map: frame source, tracker and
-detector. Given its words again, each at the tick at which it was heard, the others make what they
-made in the run that was kept, to the bit; with other settings of theirs they make what those
-settings are worth, the camera's poses being the same.
+The front end is who looks at every frame: frame source, tracker and detector. Given its words
+again, each at the tick at which it was heard, the others make what they made in the run that was
+kept, to the bit; with other settings of theirs they make what those settings are worth, odometry
+being the same. What the tracker knew of the map, by corrections, is that of the kept run: so are
+the poses as they were published, and to which keyframes it returned.
 """
 
 import json
 import logging
-from collections.abc import Iterator
-from collections.abc import Sequence as Places
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
 import msgspec
 import numpy as np
-import yaml
 
 from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
-from ldo_service.config import Config, config_of, config_yaml
+from ldo_service.config import Config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.plain_yaml import plain_values
 from ldo_service.runtime.mcap_index import McapIndex, Place
 from ldo_service.runtime.recording_file import ABOUT, RecordingFile
 from ldo_service.schemas import Message, decode
@@ -44,7 +43,7 @@ DETECTOR_LATENCY = "run.detector_latency_frames"
 
 class FrontEndRecord:
     """Keeps what is heard, in a context. Of a run that fails, grows past `record.max_gb` or fills
-    the disk it is never finished, and so is no front end for others."""
+    the disk nothing is left: it would be no front end for others."""
 
     def __init__(
         self, folder: Path, config: Config, sequence: Sequence, selection: Selection
@@ -53,8 +52,8 @@ class FrontEndRecord:
             "source": sequence.name,
             "stride": str(selection.stride),
             "frames": str(len(selection.indices(sequence))),
-            "config": config_yaml(config),
-            "versions": json.dumps(versions()),
+            "settings": json.dumps(front_end_settings(config)),
+            "ldo": versions()["ldo-slam"],
         }
         self._file = RecordingFile(folder / FRONT_END, about, config.record)
 
@@ -65,17 +64,21 @@ class FrontEndRecord:
         body = msgspec.msgpack.encode(message)
         self._file.add(topic.name, topic.message, body, tick, message.stamp_ns)
         if self._file.is_open and self._file.is_over_limit():
-            log.error("%s: record.max_gb or record.min_free_gb: it ends here", self._file.path)
-            self._file.abandon()
+            log.error("%s: no room by record.max_gb and min_free_gb: not kept", self._file.path)
+            self._drop()
 
     def __enter__(self) -> "FrontEndRecord":
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_rest: object) -> None:
+        self._file.close()
         if error:
-            self._file.abandon()
-        else:
-            self._file.close()
+            self._drop()
+
+    def _drop(self) -> None:
+        self._file.abandon()
+        with suppress(OSError):
+            self._file.path.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,12 +104,9 @@ class FrontEnd:
             )
         index = McapIndex(path)
         if not index.is_whole:
-            raise DataError(
-                f"{path} is not whole: its run was stopped, the disk was full, or it grew past "
-                "record.max_gb. Make that run again."
-            )
+            raise DataError(f"{path} is not whole: its run was killed. Make that run again.")
         about = index.metadata.get(ABOUT, {})
-        _require_settings(path, about.get("config", ""), config)
+        _require_settings(path, about, config)
         frames = len(selection.indices(sequence))
         told = (sequence.name, str(selection.stride), str(frames))
         kept = tuple(about.get(name, "") for name in ("source", "stride", "frames"))
@@ -128,38 +128,43 @@ class FrontEnd:
             yield self._messages(list(places))
             tick += 1
 
-    def _messages(self, places: Places[Place]) -> tuple[Message, ...]:
+    def _messages(self, places: list[Place]) -> tuple[Message, ...]:
         try:
             return tuple(decode(self._index.body(p), MESSAGES[p.topic]) for p in places)
-        except (msgspec.DecodeError, LookupError) as error:
+        except (msgspec.DecodeError, LookupError, OSError) as error:
             raise DataError(f"{self._index.path}, frame {places[0].number}: {error}.") from error
 
 
-def _require_settings(path: Path, text: str, config: Config) -> None:
+def front_end_settings(config: Config) -> dict[str, object]:
+    """Those that a front end depends on, by their dotted names."""
+    tree = msgspec.to_builtins(config)
+    sections = {name: tree[name] for name in (*sorted(ACTORS), "data")}
+    return {**dict(_leaves("", sections)), DETECTOR_LATENCY: config.run.detector_latency_frames}
+
+
+def _leaves(prefix: str, tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _leaves(f"{prefix}{key}.", value)
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> None:
     try:
-        kept = config_of(plain_values(text) or {})
-    except yaml.YAMLError as error:
-        raise DataError(f"{path}: its configuration cannot be read: {error}.") from error
-    asked, was = (dict(_settings(one)) for one in (config, kept))
+        was = dict(json.loads(about.get("settings", "")))
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{path} does not say how it was made: {error}.") from error
+    asked = json.loads(json.dumps(front_end_settings(config)))
+    if was.keys() != asked.keys():
+        made_by, ours = about.get("ldo", "an unknown version"), versions()["ldo-slam"]
+        raise DataError(
+            f"{path} is of LDO-SLAM {made_by}, which had other settings than this, {ours}. Make "
+            "that run again."
+        )
     for name, value in asked.items():
         if was[name] != value:
             raise ConfigError(
                 f"{name} is {value} and was {was[name]} when {path} was made: the front end does "
                 "not run again. Leave it as it was, or leave out --front-end."
             )
-
-
-def _settings(config: Config) -> Iterator[tuple[str, object]]:
-    """Those that a front end depends on, by their dotted names."""
-    tree = msgspec.to_builtins(config)
-    for section in (*sorted(ACTORS), "data"):
-        yield from _leaves(section, tree[section])
-    yield DETECTOR_LATENCY, config.run.detector_latency_frames
-
-
-def _leaves(name: str, value: object) -> Iterator[tuple[str, object]]:
-    if not isinstance(value, dict):
-        yield name, value
-        return
-    for key, inner in value.items():
-        yield from _leaves(f"{name}.{key}", inner)

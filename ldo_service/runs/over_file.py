@@ -4,7 +4,6 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -56,27 +55,27 @@ class FileRun:
         self.record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
         self._kept: FrontEndRecord | None = None
         self._clock = LogicalClock(actors, config.run.latency_frames(), self._observe)
-        self._contexts = ExitStack()
         self._started = Usage.now()
         self._stage_ms: dict[str, Percentiles] = {}
         self._is_finished = False
 
     def __enter__(self) -> "FileRun":
-        job = self._job
-        if job.keep_front_end:
-            kept = FrontEndRecord(job.folder, job.config, job.sequence, job.selection)
-            self._kept = self._contexts.enter_context(kept)
-        self._contexts.enter_context(self._clock)
+        self._clock.__enter__()
         return self
 
-    def __exit__(self, *error: Any) -> None:
-        self._contexts.__exit__(*error)
+    def __exit__(self, *error: object) -> None:
+        self._clock.__exit__(*error)
 
     def stream(self) -> None:
         """Take every frame."""
-        front_end = self._job.front_end
-        frames = with_prior(self._reader, self._job.prior)
-        self._run(self._heard_again(front_end) if front_end else frames)
+        job = self._job
+        frames = with_prior(self._reader, job.prior)
+        with ExitStack() as kept:
+            if job.keep_front_end:
+                record = FrontEndRecord(job.folder, job.config, job.sequence, job.selection)
+                self._kept = kept.enter_context(record)
+            self._run(self._heard_again(job.front_end) if job.front_end else frames)
+        self._kept = None
         self._stage_ms = self._step_percentiles()
 
     def repair(self) -> None:

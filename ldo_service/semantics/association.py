@@ -31,7 +31,7 @@ class AssociationConfig:
     min_gaussians: int = 8  # of a region: with fewer nothing is known of where it is
     max_regions: int = 64  # per keyframe, those with the most Gaussians: COCO images have 7
     # Detectors box a plant, its crown and its pot. The share of a box in a larger one of its class,
-    # at the same depth, to show a part of what that shows:
+    # at the same depth, to show a part of what that shows; above 1 none does:
     part_inside: float = 0.9
 
     def __post_init__(self) -> None:
@@ -39,8 +39,8 @@ class AssociationConfig:
             raise ConfigError(f"{self}: min_iou must be in (0, 1], min_shared in 0..1.")
         if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
             raise ConfigError(f"{self}: max_depth_gap_m positive, counts at least 1.")
-        if not 0 < self.part_inside <= 1:
-            raise ConfigError(f"part_inside={self.part_inside:g} must be in (0, 1].")
+        if self.part_inside <= 0:
+            raise ConfigError(f"part_inside={self.part_inside:g} must be positive.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,7 +51,7 @@ class MapView:
     indices      [V] uint32, ascending: rows of those that made the image
     regions      [V] int32, region of each, see `Assigned`; negative: none
     boxes        [M, 4] of the regions: x0 y0 x1 y1, px
-    classes      [M] what is said to be in them
+    classes      [M, 2] what a detector and a labeller say is in them; -1: it says nothing
     depth_m      [H, W] float32, as it was measured
     """
 
@@ -127,31 +127,49 @@ def found(view: MapView, T_camera_map: np.ndarray, config: AssociationConfig) ->
 
 
 def with_whole_things(view: MapView, regions: Found, config: AssociationConfig) -> MapView:
-    """A view in which regions that are parts of another belong to it."""
-    part_of = whole_of(regions, view.classes[regions.numbers], config)
-    if np.array_equal(part_of, np.arange(len(part_of))):
+    """A view in which regions that are parts of another belong to it. That one may have lost all
+    of its Gaussians to them: then it is where its largest part is."""
+    near_m = np.full(len(view.boxes), np.inf)
+    far_m = -near_m
+    near_m[regions.numbers], far_m[regions.numbers] = regions.near_m, regions.far_m
+    whole = whole_of(np.asarray(view.boxes, float), view.classes, near_m, far_m, config)
+    if np.array_equal(whole, np.arange(len(whole))):
         return view
-    numbers = np.arange(len(view.boxes))
-    numbers[regions.numbers] = regions.numbers[part_of]
     is_hit = view.regions >= 0
-    return replace(view, regions=np.where(is_hit, numbers[view.regions * is_hit], view.regions))
+    numbers = np.where(is_hit, whole[view.regions * is_hit], view.regions)
+    return replace(view, regions=numbers.astype(np.int32))
 
 
-def whole_of(regions: Found, classes: np.ndarray, config: AssociationConfig) -> np.ndarray:
-    """[R] which region shows all of what each of R shows a part of; itself where none does. Their
-    classes are the same, their depths meet, and one box lies in the other, the largest of all that
-    it lies in."""
-    low = np.maximum(regions.boxes[:, None, :2], regions.boxes[None, :, :2])
-    high = np.minimum(regions.boxes[:, None, 2:], regions.boxes[None, :, 2:])
-    common = np.prod(np.clip(high - low, 0, None), axis=2)
-    area = np.prod(regions.boxes[:, 2:] - regions.boxes[:, :2], axis=1)
-    gap_m = np.maximum(regions.near_m[:, None], regions.near_m) - np.minimum(
-        regions.far_m[:, None], regions.far_m
-    )
-    is_part = (area[:, None] < area) & (common >= config.part_inside * area[:, None])
-    is_part &= (classes[:, None] == classes) & (gap_m <= config.max_depth_gap_m)
+def whole_of(
+    boxes: np.ndarray,
+    classes: np.ndarray,
+    near_m: np.ndarray,
+    far_m: np.ndarray,
+    config: AssociationConfig,
+) -> np.ndarray:
+    """[M] which region shows all of what each of M shows a part of; itself where none does. They
+    share a class, their depths meet, and one box lies in the other, the largest of all that it
+    lies in. Boxes [M, 4], classes [M, 2]; depths [M], infinite where nothing is known.
+
+    >>> plant, crown, pot = [0, 0, 9, 20], [0, 0, 9, 12], [2, 12, 7, 20]
+    >>> at_m = np.full(3, 2.0)
+    >>> whole_of(np.array([pot, plant, crown]), np.zeros((3, 2)), at_m, at_m, AssociationConfig())
+    array([1, 1, 1])
+    """
+    area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+    common = intersections(boxes, boxes)
+    is_part = (common > 0) & (common >= config.part_inside * area[:, None])
+    is_part &= area[:, None] < area
+    is_part &= np.any((classes[:, None] == classes) & (classes >= 0), axis=2)
+    near_m, far_m = near_m.copy(), far_m.copy()
+    by_size = np.argsort(-area, kind="stable")
+    for k in np.flatnonzero(np.isinf(near_m)):
+        parts = by_size[is_part[by_size, k] & np.isfinite(near_m[by_size])]
+        if len(parts):
+            near_m[k], far_m[k] = near_m[parts[0]], far_m[parts[0]]
+    is_part &= depth_gaps_m(near_m, far_m, near_m, far_m) <= config.max_depth_gap_m
     whole = np.arange(len(area))
-    for part in np.argsort(-area, kind="stable"):  # so that a part of a part is one of the whole
+    for part in by_size:  # so that a part of a part is one of the whole
         around = np.flatnonzero(is_part[part])
         if len(around):
             whole[part] = whole[around[np.argmax(area[around])]]
@@ -247,14 +265,26 @@ def overlaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     >>> overlaps(np.array([[0, 0, 2, 2]]), np.array([[1, 0, 3, 2], [5, 5, 6, 6]])).round(3)
     array([[0.333, 0.   ]])
     """
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    common = np.prod(np.clip(high - low, 0, None), axis=2)
+    common = intersections(boxes, others)
     area, other = (
         np.prod(np.clip(these[:, 2:] - these[:, :2], 0, None), axis=1) for these in (boxes, others)
     )
     union = area[:, None] + other[None] - common
     return np.where(common > 0, common / np.where(union > 0, union, 1), 0)
+
+
+def intersections(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Areas [K, R] that boxes [K, 4] and [R, 4] share."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return np.prod(np.clip(high - low, 0, None), axis=2)
+
+
+def depth_gaps_m(
+    near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
+) -> np.ndarray:
+    """[K, R] between intervals [K] and [R]; negative where they overlap."""
+    return np.maximum(near_m[:, None], others_near_m) - np.minimum(far_m[:, None], others_far_m)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -271,9 +301,7 @@ def paired(
 ) -> Pairs:
     """Of landmarks with distributions [K, C]."""
     iou = overlaps(looks.boxes, regions.boxes)
-    gap_m = np.maximum(looks.near_m[:, None], regions.near_m) - np.minimum(
-        looks.far_m[:, None], regions.far_m
-    )
+    gap_m = depth_gaps_m(looks.near_m, looks.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
     k, r = np.nonzero(allowed)
     allowed[k, r] = shared(distributions[k], regions.distributions[r]) >= config.min_shared

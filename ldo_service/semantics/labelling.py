@@ -87,9 +87,9 @@ class Claims:
         return np.maximum(self.confidences, self.open_confidences)
 
     def classes(self) -> np.ndarray:
-        """[M] labels, of the surer of both."""
-        is_told = self.open_confidences > self.confidences
-        return np.where(is_told, self.open_labels, self.labels)
+        """[M, 2] labels of detector and labeller, -1 where they say nothing."""
+        said = (self.labels, self.confidences), (self.open_labels, self.open_confidences)
+        return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in said], axis=1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

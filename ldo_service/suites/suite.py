@@ -16,6 +16,7 @@ from .figures import FIGURES
 
 HERE = Path(__file__).parent
 SYNTHETIC = "synthetic:"
+OF_FRONT_END = frozenset({"fps", "tracking_s", "ate_online_cm"})
 NAME = re.compile(r"[\w][\w .+-]{0,60}")  # becomes the name of a folder
 
 
@@ -77,6 +78,12 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         unknown = sorted(set(self.figures) - FIGURES.keys())
         if unknown:
             raise ConfigError(f"no figure {', '.join(unknown)}. There is {', '.join(FIGURES)}.")
+        of_front_end = sorted(OF_FRONT_END.intersection(self.figures))
+        if self.front_end and of_front_end:
+            raise ConfigError(
+                f"{of_front_end[0]} is of the front end too, which all variants have from "
+                f"{self.front_end!r}: leave out the figure, or front_end."
+            )
 
     def entries(self, data: Path) -> Iterator[Entry]:
         """All runs, sequence by sequence; sources lie in the folder `data`."""

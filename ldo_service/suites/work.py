@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from ldo_service.errors import ConfigError
+from ldo_service.runs.front_end import FRONT_END
 from ldo_service.versions import versions
 
 from .figures import Judged
@@ -73,14 +74,18 @@ class Work:
             **asdict(entry),
             "settings": (*self.settings, *entry.settings),
             "options": self.suite.options(),
-            "front_end_settings": self.suite.front_end_settings(),
             "ldo": versions()["ldo-slam"],
         }
+        if self.suite.front_end is None:
+            del told["front_end"]
+        else:
+            told["front_end_settings"] = self.suite.front_end_settings()
         return json.dumps(told, indent=1)
 
     def _is_finished(self, entry: Entry, folder: Path) -> bool:
         told = folder / TOLD
-        return told.is_file() and told.read_text() == self._told(entry)
+        is_kept = entry.variant != self.suite.front_end or (folder / FRONT_END).is_file()
+        return is_kept and told.is_file() and told.read_text() == self._told(entry)
 
     def _run(self, entry: Entry, folder: Path) -> str:
         """Why it failed; empty when it did not."""

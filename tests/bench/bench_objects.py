@@ -65,7 +65,7 @@ class Rooms:
         number = np.full(OBJECTS + 1, -1, np.int32)
         number[here] = np.arange(len(here))
         boxes = [[*px[thing == k].min(axis=0), *px[thing == k].max(axis=0)] for k in here]
-        classes = 2 + here % 60
+        classes = np.stack([2 + here % 60] * 2, axis=1)
         return MapView(
             *(keyframe, CAMERA, T_map_camera, self.rows, self.labels, np.arange(len(self.rows))),
             *(np.zeros(len(self.rows), np.int32), indices, number[thing]),

@@ -52,7 +52,7 @@ def test_variants_may_take_the_front_end_of_the_first(capsys, tmp_path: Path) ->
     variants = {"whole": ["mapper.iterations=1"], "rougher": ["mapper.iterations=0"]}
     path = tmp_path / "rooms.yaml"
     one = {"sequences": {"room": "synthetic:room"}, "variants": variants, "front_end": "whole"}
-    path.write_text(json.dumps(SUITE | one))
+    path.write_text(json.dumps(SUITE | one | {"figures": ["ate_cm"]}))
     words = "suite", path, "--out", tmp_path / "out"
     assert ldo(capsys, *words)[0] == 0
     whole, rougher = (tmp_path / "out/room" / f"{name}@0" for name in variants)
@@ -62,6 +62,9 @@ def test_variants_may_take_the_front_end_of_the_first(capsys, tmp_path: Path) ->
     stages = json.loads((rougher / "summary.json").read_text())["stage_ms"]
     assert "tracker" not in stages
     assert "mapper" in stages
+    (whole / "front_end.mcap").unlink()  # one that is gone is made again
+    path.write_text(path.read_text().replace("mapper.iterations=0", "mapper.iterations=2"))
+    assert ldo(capsys, *words)[0] == 0
 
 
 def test_a_suite_that_is_not_there_is_named(capsys, tmp_path: Path) -> None:

@@ -11,8 +11,7 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError, StageError
 from ldo_service.geometry import RawFrame
-from ldo_service.runs.front_end import FRONT_END, FrontEnd
-from ldo_service.runs.job import Job
+from ldo_service.runs.front_end import FRONT_END, FrontEnd, front_end_settings
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
 
@@ -146,16 +145,38 @@ def test_a_run_that_fails_leaves_none_for_others(
     with pytest.raises(StageError, match="out of luck"):
         run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
     monkeypatch.undo()
-    with pytest.raises(DataError, match="is not whole"):
-        FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
+    assert not (tmp_path / "out" / FRONT_END).exists()
 
 
 def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -> None:
     tight = "record.max_gb=0.0000001"
-    asked: Job = job(Rearranged(room, WALK), tmp_path / "out", tight)
+    asked = job(Rearranged(room, WALK), tmp_path / "out", tight)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ldo_service.runtime.recording_file.CHECK_EVERY_BYTES", 1000)
         record = run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
     assert record.summary["frames"] == len(WALK)  # the run goes on
-    with pytest.raises(DataError, match="is not whole"):
-        FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
+    assert not (tmp_path / "out" / FRONT_END).exists()
+
+
+def test_it_is_whole_when_the_stream_ends(
+    room: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("ldo_service.runs.over_file.FileRun.repair", fails)
+    asked = job(Rearranged(room, WALK), tmp_path / "out")
+    with pytest.raises(KeyboardInterrupt):
+        run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
+    kept = FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
+    assert kept.rejected == 0
+
+
+def test_one_of_a_version_with_other_settings_is_refused(
+    walk: Sequence, whole: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = load_config(settings=(ROUGH, *SETTINGS))
+    more = front_end_settings(asked) | {"tracker.clairvoyance": True}
+    monkeypatch.setattr("ldo_service.runs.front_end.front_end_settings", lambda _: more)
+    with pytest.raises(DataError, match=r"is of LDO-SLAM .*had other settings than this"):
+        FrontEnd.open(whole, asked, walk, Selection())

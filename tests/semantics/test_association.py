@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 from ldo_service.semantics import association
 from ldo_service.semantics.association import (
     AssociationConfig,
-    Found,
     associate,
     found,
     overlaps,
@@ -92,7 +91,7 @@ def test_regions_are_samples_of_their_gaussians() -> None:
     view, _ = stage.show(shot, shot.claims(THINGS))
     rng = np.random.default_rng(1)
     regions = rng.choice([-1, 0, 1, 2], len(view.regions), p=[0.2, 0.7, 0.094, 0.006])
-    boxes, classes = np.zeros((3, 4)), np.zeros(3, int)
+    boxes, classes = np.zeros((3, 4)), np.zeros((3, 2), int)
     view = replace(view, regions=regions.astype(np.int32), boxes=boxes, classes=classes)
     assert np.count_nonzero(regions == 0) > 3 * MEMBERS
     got = found(view, np.linalg.inv(view.T_map_camera), AssociationConfig(min_gaussians=30))
@@ -111,15 +110,13 @@ PLANT, TABLE = 60, 62
 WHOLE = (0, 0, 100, 200)  # px
 
 
-def seen(*regions: tuple[tuple[int, int, int, int], float, float]) -> Found:
-    """Regions of boxes, near and far ends."""
+Seen = tuple[tuple[int, int, int, int], float, float]
+
+
+def wholes(regions: list[Seen], classes: list[tuple[int, int]]) -> list[int]:
+    """Of regions with their boxes, near and far ends."""
     boxes, near_m, far_m = (np.array(values, float) for values in zip(*regions, strict=True))
-    members = np.zeros((len(boxes), MEMBERS), np.int64)
-    return Found(np.arange(len(boxes)), boxes, members, members, members, near_m, far_m)
-
-
-def wholes(regions: Found, classes: list[int]) -> list[int]:
-    return whole_of(regions, np.array(classes), AssociationConfig()).tolist()
+    return whole_of(boxes, np.array(classes), near_m, far_m, AssociationConfig()).tolist()
 
 
 @pytest.mark.parametrize(
@@ -132,22 +129,43 @@ def wholes(regions: Found, classes: list[int]) -> list[int]:
         ((10, 0, 90, 100), 2.5, PLANT, False),  # one behind the other
         ((10, 0, 90, 100), 2.35, PLANT, True),  # within what depth cannot tell
         (WHOLE, 2.0, PLANT, False),  # neither is the larger
+        ((300, 300, 300, 310), 2.0, PLANT, False),  # of no size, and elsewhere
     ],
 )
 def test_a_part_lies_in_a_larger_box_of_its_class_at_its_depth(
     other: tuple[int, int, int, int], near_m: float, name: int, is_part: bool
 ) -> None:
-    regions = seen((other, near_m, near_m + 0.2), (WHOLE, 2.0, 2.3))
-    assert wholes(regions, [name, PLANT]) == [1 if is_part else 0, 1]
+    regions: list[Seen] = [(other, near_m, near_m + 0.2), (WHOLE, 2.0, 2.3)]
+    assert wholes(regions, [(name, -1), (PLANT, -1)]) == [1 if is_part else 0, 1]
 
 
 def test_a_part_of_a_part_is_one_of_the_whole() -> None:
-    crown, top = (0, 0, 100, 100), (20, 0, 80, 50)
-    regions = seen((top, 2, 2.2), (crown, 2, 2.2), (WHOLE, 2, 2.2), ((90, 0, 300, 200), 2, 2.2))
-    assert wholes(regions, [PLANT] * 4) == [2, 2, 2, 3]
+    crown, top, beside = (0, 0, 100, 100), (20, 0, 80, 50), (90, 0, 300, 200)
+    regions: list[Seen] = [(top, 2, 2.2), (crown, 2, 2.2), (WHOLE, 2, 2.2), (beside, 2, 2.2)]
+    assert wholes(regions, [(PLANT, -1)] * 4) == [2, 2, 2, 3]
     # a top that lies at the depth of the crown alone is one of the whole too
-    behind = seen((top, 2.5, 2.6), (crown, 2.1, 2.45), (WHOLE, 2.0, 2.2))
-    assert wholes(behind, [PLANT] * 3) == [2, 2, 2]
+    behind: list[Seen] = [(top, 2.5, 2.6), (crown, 2.1, 2.45), (WHOLE, 2.0, 2.2)]
+    assert wholes(behind, [(PLANT, -1)] * 3) == [2, 2, 2]
+
+
+def test_a_class_is_shared_where_detector_or_labeller_say_the_same() -> None:
+    regions: list[Seen] = [((10, 0, 90, 100), 2, 2.2), (WHOLE, 2, 2.2)]
+    for part, whole, is_part in (
+        ((PLANT, -1), (PLANT, TABLE), True),  # the labeller has spoken of the whole alone
+        ((-1, TABLE), (PLANT, TABLE), True),
+        ((PLANT, -1), (-1, PLANT), False),
+        ((-1, -1), (-1, -1), False),
+    ):
+        assert wholes(regions, [part, whole]) == [1 if is_part else 0, 1]
+
+
+def test_parts_that_took_all_of_the_whole_are_one() -> None:
+    crown, pot = (0, 0, 100, 120), (20, 120, 80, 200)
+    nothing = (np.inf, -np.inf)
+    regions: list[Seen] = [(crown, 2.0, 2.4), (pot, 2.1, 2.3), (WHOLE, *nothing)]
+    assert wholes(regions, [(PLANT, -1)] * 3) == [2, 2, 2]
+    apart: list[Seen] = [(crown, 2.0, 2.4), (pot, 2.9, 3.3), (WHOLE, *nothing)]
+    assert wholes(apart, [(PLANT, -1)] * 3) == [2, 1, 2]
 
 
 def test_gaussians_of_parts_are_those_of_the_whole() -> None:
@@ -156,11 +174,11 @@ def test_gaussians_of_parts_are_those_of_the_whole() -> None:
     view, _ = stage.show(shot, shot.claims(THINGS))
     boxes = np.array([[0, 0, 20, 20], [30, 30, 60, 60], [0, 0, 20, 40]], float)
     regions = np.random.default_rng(1).integers(-2, 3, len(view.regions)).astype(np.int32)
-    view = replace(view, regions=regions, boxes=boxes, classes=np.array([PLANT, PLANT, PLANT]))
+    view = replace(view, regions=regions, boxes=boxes, classes=np.full((3, 2), PLANT))
     config = AssociationConfig()
     whole = with_whole_things(view, found(view, np.linalg.inv(view.T_map_camera), config), config)
     np.testing.assert_array_equal(whole.regions, np.where(regions == 0, 2, regions))
     # nobody's part, nothing new
-    apart = replace(view, classes=np.array([PLANT, PLANT, TABLE]))
+    apart = replace(view, classes=np.array([[PLANT, -1], [PLANT, -1], [TABLE, -1]]))
     regions_apart = found(apart, np.linalg.inv(view.T_map_camera), config)
     assert with_whole_things(apart, regions_apart, config) is apart

@@ -232,21 +232,23 @@ def test_two_halves_become_one_when_the_whole_is_seen() -> None:
     assert np.linalg.norm(landmark["centroid"] - true.mean(axis=0)) < 0.05
 
 
-def with_upper_part(shot: Shot) -> Claims:
-    """The box of a thing, and one of its upper half: detectors see crowns and pots of plants."""
+def with_parts(shot: Shot, scores: tuple[float, ...]) -> Claims:
+    """The box of a thing, and of its upper half, and of its lower half where that has a score."""
     v, u = np.nonzero(shot.instances)
     x0, y0, x1, y1 = u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5
-    boxes = np.array([[x0, y0, x1, y1], [x0, y0, x1, (y0 + y1) / 2]])
-    return Claims.of_detector(boxes, np.full(2, BALL.label), np.array([0.6, 0.9], np.float32))
+    middle = (y0 + y1) / 2
+    boxes = np.array([[x0, y0, x1, y1], [x0, y0, x1, middle], [x0, middle, x1, y1]])
+    n = len(scores)
+    return Claims.of_detector(boxes[:n], np.full(n, BALL.label), np.array(scores, np.float32))
 
 
-def test_a_thing_that_is_detected_twice_is_one_object() -> None:
+@pytest.mark.parametrize("scores", [(0.6, 0.9), (0.95, 0.9, 0.8), (0.6, 0.9, 0.8)])
+def test_a_thing_that_is_detected_in_parts_is_one_object(scores: tuple[float, ...]) -> None:
     stage, boxes = Stage(), []
     for _ in range(6):
         shot = shoot((BALL,), AHEAD, stage.keyframe)
-        claims = with_upper_part(shot)
-        view, told = stage.show(shot, claims)
-        assert set(view.regions.tolist()) >= {0, 1}  # each has Gaussians of its own
+        claims = with_parts(shot, scores)
+        _, told = stage.show(shot, claims)
         boxes += [(seen.box, claims.boxes[0]) for seen in told.observations]
     (landmark,) = stage.objects.landmarks
     assert landmark["seen"] == 6

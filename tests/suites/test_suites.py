@@ -56,7 +56,7 @@ def test_folders_run_once_and_synthetic_sources_with_each_seed() -> None:
 
 
 def test_all_take_the_front_end_of_the_first_with_their_seed_where_one_is_named() -> None:
-    shared = msgspec.structs.replace(TWO, front_end="plain")
+    shared = msgspec.structs.replace(TWO, front_end="plain", figures=("ate_cm",))
     first, again, other, other_again = list(shared.entries(Path()))[:4]
     assert (first.front_end_folder, again.front_end_folder) == (None, None)
     assert (other.front_end_folder, other_again.front_end_folder) == (first.folder, again.folder)
@@ -117,6 +117,10 @@ def test_a_figure_that_was_not_judged_is_none_and_no_error(name: str) -> None:
         ({"variants": {"../up": []}}, "cannot be the name of a folder"),
         ({"sequences": {"": "x"}}, "cannot be the name of a folder"),
         ({"front_end": "default"}, "front_end is 'default': it must be the first variant"),
+        (
+            {"front_end": "whole", "variants": {"whole": []}, "figures": ["miou", "fps"]},
+            "fps is of the front end too",
+        ),
         ({"sequnces": {}}, "is not a suite: .*sequnces"),
         ({"seeds": ["x"]}, "is not a suite: .*seeds"),
     ],
