@@ -14,7 +14,7 @@ its distribution over C classes. The paper's four kinds of edges, and what they 
 
 with lambda = 0.5, w_sem = 0.1, z_kl the centre of a detected box and q_kl the distribution of what
 is in it. The printed similarity has a direction and the pair has none: half of each is taken.
-s = 1/32 for what the sights of one object err by together (`factors.NoiseConfig`).
+s = 1/320 for what the sights of one object err by together (`factors.NoiseConfig`).
 w_kl = exp(-2 H(q_kl)) above 0.5 nats, else 1: what was observed vaguely counts less. The entropy is
 that of the observation, known beforehand; that of p_l would change the weights with the solution.
 
@@ -34,7 +34,7 @@ the weighted geometric mean of what was observed:
 A long journey is bounded by condensing (`condensing`): marginalising the old keyframes would leave
 a dense prior, linearised where they are today, that later loop closures could not bend, and no
 variable to close a loop with. In its place, of each ten keyframes the first stays a variable; a
-relative measurement to the next such one holds what the others knew, and these follow rigidly. A
-relative measurement says nothing of where its ends are in the map, so corrections of any size leave
-it true.
+relative measurement to the next such one holds what the others knew, and these follow both, each by
+its share of the way. A relative measurement says nothing of where its ends are in the map, so
+corrections of any size leave it true. A follower that a closure would bend is a variable again.
 """

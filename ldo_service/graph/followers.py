@@ -51,6 +51,29 @@ class Followers:
         T_head[row], T_tail[row] = T_head_keyframe, T_tail_head @ T_head_keyframe
         return replace(self, T_head=T_head, T_tail=T_tail)
 
+    def parted(self, row: int) -> "Followers":
+        """Without one, which is a variable again: those of its group lie before or behind it."""
+        of_group = (self.heads == self.heads[row]) & (self.tails == self.tails[row])
+        share = self.shares[row]
+        before, behind = of_group & (self.shares < share), of_group & (self.shares > share)
+        to_head, to_tail = np.linalg.inv(self.T_head[row]), np.linalg.inv(self.T_tail[row])
+        one = self.keyframes[row]
+        parted = replace(
+            self,
+            heads=np.where(behind, one, self.heads),
+            tails=np.where(before, one, self.tails),
+            T_head=np.where(behind[:, None, None], to_head @ self.T_head, self.T_head),
+            T_tail=np.where(before[:, None, None], to_tail @ self.T_tail, self.T_tail),
+            shares=np.select(
+                [before, behind], [self.shares / share, (self.shares - share) / (1 - share)],
+                self.shares,
+            ),
+        )
+        return parted.without(row)
+
+    def without(self, row: int) -> "Followers":
+        return Followers(*(np.delete(getattr(self, name), row, 0) for name in self.__slots__))
+
     def packed(self) -> dict[str, np.ndarray]:
         return {name: getattr(self, name) for name in self.__slots__}
 

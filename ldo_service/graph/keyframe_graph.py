@@ -24,11 +24,18 @@ class KeyframeGraphConfig:
     closures: ClosuresConfig = field(default_factory=ClosuresConfig)
     condense_keyframes: int = 10  # of which one stays a variable (paper, III.C: every 10)
     window_keyframes: int = 20  # the newest stay as they are: they are still measured anew
+    # An end of a closure that follows, and is bent by more sigmas of it, is a variable again, while
+    # there are so many keyframes for each: a solution takes time with the variables
+    most_bent: float = 0.1
+    keyframes_each: int = 5
     most_changes: int = 64  # between two rebuilds: what a successor repeats to hold the same bits
 
     def __post_init__(self) -> None:
-        if min(self.condense_keyframes, self.window_keyframes, self.most_changes) < 1:
+        counts = self.condense_keyframes, self.window_keyframes, self.most_changes
+        if min(*counts, self.keyframes_each) < 1:
             raise ConfigError(f"{self}: keyframes and changes must be at least 1.")
+        if self.most_bent < 0:
+            raise ConfigError(f"most_bent={self.most_bent:g} must not be negative.")
 
 
 class KeyframeGraph:
@@ -147,8 +154,21 @@ class KeyframeGraph:
         if not verdict.changes:
             return self._refuse(closure)
         known.closures = known.closures.after(closure, verdict)
-        self._rebase(variables)
+        self._rebase(self._with_ends(closure, variables))
         return verdict
+
+    def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
+        """Make ends that a closure bends too much to follow variables again."""
+        known, config = self._known, self._config
+        for keyframe in (closure.a, closure.b):
+            is_room = len(known.condensed) * config.keyframes_each < len(self)
+            if is_room and known.bent(keyframe, variables) > config.most_bent:
+                follower = known.followers.only(known.rows[keyframe])
+                ends = int(follower.heads[0]), int(follower.tails[0])
+                T_head, T_tail = (variables[k][None] for k in ends)
+                known.part(keyframe)
+                variables = {**variables, keyframe: follower.placed(T_head, T_tail)[0]}
+        return variables
 
     def _join(self, measured: RelativePose) -> None:
         """Two components become one: the younger moves as a whole into the older one's frame,

@@ -99,6 +99,35 @@ class Measurements:
         for m in bridges(outside, [(m.a, m.b) for m in self.relative()]):
             self.measure(m)
 
+    def part(self, keyframe: int) -> None:
+        """Make a follower a variable again, between the two that it lies between: what is known
+        from one to the other is spread over both parts, each by its share."""
+        row = self.rows[keyframe]
+        head, tail = int(self.followers.heads[row]), int(self.followers.tails[row])
+        share, T_head = float(self.followers.shares[row]), self.followers.T_head[row]
+        edge = self.condensed.pop((head, tail))
+        T_tail = se3.inverse(T_head) @ edge.T_a_b
+        covariance, adjoint = np.linalg.inv(edge.information), se3.adjoint(T_tail)
+        before = np.linalg.inv(share * adjoint @ covariance @ adjoint.T)
+        behind = edge.information / (1 - share)
+        self.condensed[head, keyframe] = RelativePose(head, keyframe, T_head, before)
+        self.condensed[keyframe, tail] = RelativePose(keyframe, tail, T_tail, behind)
+        self.followers = self.followers.parted(row)
+        self.rows = self.followers.index()
+
+    def bent(self, keyframe: int, variables: Variables) -> float:
+        """How far apart the two ends say that a follower is, in sigmas of a closure; 0 of a
+        variable."""
+        row = self.rows.get(keyframe)
+        if row is None:
+            return 0.0
+        follower = self.followers.only(row)
+        T_head, T_tail = variables[int(follower.heads[0])], variables[int(follower.tails[0])]
+        by_head, by_tail = T_head @ follower.T_head[0], T_tail @ follower.T_tail[0]
+        off, share = np.abs(se3.log(se3.inverse(by_head) @ by_tail)), float(follower.shares[0])
+        sigmas = np.repeat([self._noise.sigma_loop_rad, self._noise.sigma_loop_m], 3)
+        return min(share, 1 - share) * float((off / sigmas).max())
+
     def relative(self, without: Pair | None = None) -> Iterable[RelativePose]:
         """All that holds variables together for good, or all but one join."""
         yield from self.odometry.values()

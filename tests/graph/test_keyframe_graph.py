@@ -264,14 +264,15 @@ def test_a_loop_bends_all_links_alike_where_keyframes_are_not_measured_from_the_
     assert worst_rad(condensed) < 1.2 * worst_rad(whole)
 
 
-def test_a_closure_holds_a_follower_as_well_as_a_variable() -> None:
-    """It hangs on the nearer end of its group. Judge: the graph of all keyframes."""
+@pytest.mark.parametrize("place", [5, 8])
+def test_a_closure_holds_a_follower_as_well_as_a_variable(place: int) -> None:
+    """The fifth of ten, or one that is nearer to the end. Judge: the graph of all keyframes."""
     truth = round_trips(240, 120)
     walk = odometry(truth, 3, window=3, sigma=1e-4, drift_share=0.01, drift_rad_per_m=0.009)
     measured = list(walk)
     loops = {
         b: RelativePose(b - 120, b, se3.inverse(truth[b - 120]) @ truth[b], REFINED)
-        for b in range(138, 240, 20)  # the eighth of ten
+        for b in range(130 + place, 240, 20)
     }
     condensed, whole = (walked(truth[0], measured, loops, config=c) for c in (None, WHOLE))
 
@@ -283,6 +284,40 @@ def test_a_closure_holds_a_follower_as_well_as_a_variable() -> None:
         return float(np.mean([np.linalg.norm(T[:3, 3]) for T in each]))
 
     assert off_m(condensed) < 1.5 * off_m(whole)
+
+
+def test_a_group_that_is_parted_says_what_it_said() -> None:
+    truth = kitchen(60)
+    graph = walked(truth[0], odometry(truth, 5, window=2))
+    known, before = graph._known, graph.poses()
+    whole = known.condensed[10, 20]
+    assert not known.bent(14, before) > 1e-6
+    known.part(14)
+    one, other = known.condensed[10, 14], known.condensed[14, 20]
+    np.testing.assert_allclose(one.T_a_b @ other.T_a_b, whole.T_a_b, atol=1e-12)
+    to_tail = se3.adjoint(se3.inverse(other.T_a_b))  # a perturbation at 14, as 20 sees it
+    covariance = to_tail @ np.linalg.inv(one.information) @ to_tail.T
+    covariance += np.linalg.inv(other.information)
+    np.testing.assert_allclose(covariance, np.linalg.inv(whole.information), rtol=1e-6)
+    # the others of the group are where they were, before it and behind it
+    assert 14 not in known.rows
+    ends = {k: before[k] for k in (10, 14, 20)}
+    for keyframe in (11, 12, 13, 15, 16, 17, 18, 19):
+        follower = known.followers.only(known.rows[keyframe])
+        pair = int(follower.heads[0]), int(follower.tails[0])
+        assert pair == ((10, 14) if keyframe < 14 else (14, 20))
+        placed = follower.placed(*(ends[k][None] for k in pair))[0]
+        np.testing.assert_allclose(placed, before[keyframe], atol=1e-9)
+    np.testing.assert_allclose(known.followers.shares[[known.rows[12], known.rows[17]]], 0.5)
+
+
+def test_no_more_than_one_keyframe_in_five_is_a_variable_for_closures() -> None:
+    truth = round_trips(240, 120)
+    measured = list(odometry(truth, 3, window=3, drift_share=0.01, drift_rad_per_m=0.009))
+    loops = closures(truth, 2, 100, 3)
+    graph = walked(truth[0], measured, loops)
+    assert len(graph._known.condensed) > 25  # groups of ten would be 22
+    assert len(graph._known.condensed) <= 240 / 5
 
 
 def test_a_group_ends_where_the_next_keyframe_is_measured_from() -> None:
