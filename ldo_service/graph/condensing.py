@@ -43,17 +43,23 @@ def group_to_condense(
     none of the newest `window`. One of `heads`, that others follow, is the first of its group, as
     it cannot follow itself. Empty where there are none.
 
-    The next after a group is measured from its last, or the group is longer, up to twice: what it
-    is measured from instead would follow the first, and all between would be held from one side."""
+    The next after a group, where odometry goes on, is measured from its last, or the group is
+    longer, up to twice: one that is measured from others of it would hang on an end of the group,
+    and take what a correction bends there alone."""
     linked = {frozenset(pair) for pair in measured}
+
+    def are_linked(run: Sequence[int], keyframe: int) -> bool:
+        return any(frozenset((k, keyframe)) in linked for k in run)
+
     run: list[int] = []
     for place, keyframe in enumerate(active[:-window] if window else active):
-        if keyframe in heads or not any(frozenset((k, keyframe)) in linked for k in run):
+        if keyframe in heads or not are_linked(run, keyframe):
             run = []
         run.append(keyframe)
         following = active[place + 1 : place + 2]
-        goes_on = all(frozenset((keyframe, k)) in linked for k in following)
-        if len(run) > 2 * size or (len(run) > size and goes_on):
+        passes_by = any(are_linked(run[:-1], k) for k in following)
+        is_end = not passes_by or any(are_linked([keyframe], k) for k in following)
+        if len(run) > 2 * size or (len(run) > size and is_end):
             return run
     return []
 

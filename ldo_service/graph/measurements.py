@@ -27,8 +27,8 @@ from .solver import Name, Variables, point_key
 
 
 class Measurements:
-    """Between keyframes that are variables, and others that follow them rigidly: what is measured
-    of a follower is measured of the variable that it follows, its head."""
+    """Between keyframes that are variables, and others that follow two of them: what is measured of
+    a follower is measured of the nearer one."""
 
     def __init__(self, noise: NoiseConfig, closures: ClosuresConfig) -> None:
         self._noise = noise
@@ -45,10 +45,13 @@ class Measurements:
 
     # --- what changes -----------------------------------------------------------------------------
     def measure(self, m: RelativePose) -> Name:
-        """The factor's name; in place of what was measured between the same variables."""
-        m = self.between_variables(m)
-        self.odometry[m.a, m.b] = m
-        return ("odometry", m.a, m.b)
+        """The factor's name; in place of what was measured between the same variables, but what is
+        measured of followers in place of nothing that is."""
+        between = self.between_variables(m)
+        pair = between.a, between.b
+        if between is m or pair not in self.odometry:
+            self.odometry[pair] = between
+        return ("odometry", *pair)
 
     def measure_anew(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> Name | None:
         """The name of the factor that is another one now; of a follower, which is placed where it

@@ -328,6 +328,22 @@ def test_a_group_ends_where_the_next_keyframe_is_measured_from() -> None:
     from_the_first = [(0, k) for k in range(1, 60)]  # nothing is measured from the one before
     assert group_to_condense(range(60), from_the_first, (), 10, 20) == list(range(21))
     assert group_to_condense(range(11), chain, (), 10, 0) == list(range(11))  # nothing follows
+    ends_at_10 = [pair for pair in chain if pair != (10, 11)]  # then the camera was lost
+    assert group_to_condense(range(60), ends_at_10, (), 10, 20) == list(range(11))
+
+
+def test_what_is_measured_of_a_follower_replaces_nothing_measured_of_its_variable() -> None:
+    truth = kitchen(81)
+    graph = walked(truth[0], odometry(truth[:80], 1, sigma=0.0))
+    assert {10, 20}.isdisjoint(graph._known.rows)
+    exact = RelativePose(20, 80, se3.inverse(truth[20]) @ truth[80], REFINED)
+    aside = se3.exp(np.array([0, 0, 0, 0.05, 0, 0]))
+    wrong = RelativePose(19, 80, se3.inverse(truth[19]) @ truth[80] @ aside, REFINED)
+    for order in ((exact, wrong), (wrong, exact)):
+        again = KeyframeGraph()
+        again.restore(decode_state(encode_state(graph.snapshot())))
+        again.add(*order)
+        np.testing.assert_allclose(again.pose(80), truth[80], atol=1e-5)
 
 
 def test_a_closure_within_a_group_stays_in_what_it_becomes() -> None:
