@@ -65,7 +65,8 @@ class Followers:
             T_head=np.where(behind[:, None, None], to_head @ self.T_head, self.T_head),
             T_tail=np.where(before[:, None, None], to_tail @ self.T_tail, self.T_tail),
             shares=np.select(
-                [before, behind], [self.shares / share, (self.shares - share) / (1 - share)],
+                [before, behind],
+                [self.shares / share, (self.shares - share) / (1 - share)],
                 self.shares,
             ),
         )
