@@ -112,7 +112,7 @@ def test_closures_undo_what_odometry_drifted() -> None:
     assert last.not_believed == ()
     assert error_m(last) < error_m(drifted) / 3, "steps that are 1 % too long stay so"
     assert optimizer.facts()["closures"] == 7
-    assert optimizer.facts()["keyframes_solved"] < 40
+    assert optimizer.facts()["keyframes_solved"] < 45  # the newest 20, and ends of closures
 
 
 def test_a_false_closure_is_told_as_not_believed_and_moves_nothing() -> None:
