@@ -467,3 +467,43 @@ def test_a_keyframe_that_others_follow_never_follows_itself() -> None:
     assert graph.variables < 14
     for k, T_map_keyframe in poses.items():
         np.testing.assert_allclose(T_map_keyframe, truth[k], atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_whatever_is_measured_of_whom_ties_two_variables_and_is_saved(seed: int) -> None:
+    """Segments, old references, refinements and closures of any pair, one after another."""
+    rng, truth = np.random.default_rng(seed), kitchen(80)
+    graph = KeyframeGraph()
+    graph.add_first(0, truth[0])
+
+    def link(a: int, b: int) -> RelativePose:
+        noise = se3.exp(rng.normal(scale=1e-3, size=6))
+        return RelativePose(a, b, se3.inverse(truth[a]) @ truth[b] @ noise, INFORMATION)
+
+    def connected(before: int) -> list[int]:
+        return [k for k in range(before) if graph.first_of(k) == graph.first_of(before - 1)]
+
+    for b in range(1, 80):
+        if rng.random() < 0.03:
+            graph.add_first(b, truth[b])
+        else:
+            known = connected(b)
+            chosen = {*rng.choice(known[-4:], 2).tolist()}
+            chosen |= {int(rng.choice(known))} if rng.random() < 0.05 else set()
+            graph.add(*(link(a, b) for a in sorted(chosen, reverse=True)))
+        for _ in range(int(rng.integers(3))):
+            graph.close(link(*sorted(rng.choice(b + 1, 2, replace=False).tolist())))
+        if rng.random() < 0.2 and (behind := connected(b + 1)[:-1]):
+            graph.replace([link(behind[-1], b)])
+        known = graph._known
+        for kind in ("odometry", "condensed", "joins"):
+            for m in getattr(known, kind).values():
+                assert len({end for end, _ in known.ends(m)}) == 2
+        for m in graph.closures.accepted.values():
+            assert len({end for end, _ in known.ends(m)}) == 2
+    successor = KeyframeGraph()
+    successor.restore(decode_state(encode_state(graph.snapshot())))
+    np.testing.assert_array_equal(successor.placed()[1], graph.placed()[1])
+    off_m = np.linalg.norm((graph.placed()[1] - np.array(truth))[:, :3, 3], axis=1)
+    first = [k for k in range(80) if graph.first_of(k) == 0]
+    assert off_m[first].max() < 0.05
