@@ -10,7 +10,16 @@ import pytest
 
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
-from ldo_service.suites import Entry, Judged, Outcome, Suite, known_suites, load_suite, markdown
+from ldo_service.suites import (
+    Entry,
+    Judged,
+    Outcome,
+    Suite,
+    Work,
+    known_suites,
+    load_suite,
+    markdown,
+)
 from ldo_service.suites.figures import FIGURES
 
 SETTING = "mapper.iterations=2"
@@ -61,6 +70,19 @@ def test_all_take_the_front_end_of_the_first_with_their_seed_where_one_is_named(
     assert (first.front_end_folder, again.front_end_folder) == (None, None)
     assert (other.front_end_folder, other_again.front_end_folder) == (first.folder, again.folder)
     assert {entry.front_end_folder for entry in TWO.entries(Path())} == {None}
+
+
+def test_a_first_run_whose_front_end_is_gone_is_not_finished(tmp_path: Path) -> None:
+    shared = msgspec.structs.replace(TWO, front_end="plain", figures=("ate_cm",))
+    work = Work(shared, Path("/data"), tmp_path)
+    first, _, other, _ = work.entries()[:4]
+    for entry in (first, other):
+        (tmp_path / entry.folder).mkdir(parents=True)
+        (tmp_path / entry.folder / "entry.json").write_text(work._told(entry))
+    assert work._is_finished(other, tmp_path / other.folder)
+    assert not work._is_finished(first, tmp_path / first.folder)
+    (tmp_path / first.folder / "front_end.mcap").touch()
+    assert work._is_finished(first, tmp_path / first.folder)
 
 
 def test_each_figure_of_several_sequences_has_its_table() -> None:
