@@ -113,9 +113,7 @@ def run(
         *(sequence, out, settings, selection, console.print),
         refine=refine,
         prior=Trajectory.load(prior) if prior else None,
-        front_end=kept_front_end(front_end, out, settings, sequence, selection)
-        if front_end
-        else None,
+        front_end=kept_front_end(front_end, out, settings, sequence, selection),
         keep_front_end=keep_front_end,
     )
     prepare(out, overwrite)
@@ -139,8 +137,10 @@ def carried_out(job: Job, go: Callable[[Job, Advance], RunFolder], console: Cons
 
 
 def kept_front_end(
-    run: Path, out: Path, settings: Config, sequence: Sequence, selection: Selection
-) -> FrontEnd:
+    run: Path | None, out: Path, settings: Config, sequence: Sequence, selection: Selection
+) -> FrontEnd | None:
+    if run is None:
+        return None
     if run.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(f"--out {out} would replace the front end: choose another folder.")
     return FrontEnd.open(run, settings, sequence, selection)

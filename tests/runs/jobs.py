@@ -36,6 +36,8 @@ SOON = tuple(
         "confirm_apart_rad=0.05",
     )
 )
+AND_BACK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]  # a short walk: here, away, here
+LONG_AGO = "loop_closer.loops.retrieval.exclude_frames=5"  # its first frames, at its end
 HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
 
 

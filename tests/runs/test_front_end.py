@@ -15,10 +15,9 @@ from ldo_service.runs.front_end import FRONT_END, FrontEnd, front_end_settings
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
 
-from .jobs import ROUGH, Rearranged, job
+from .jobs import AND_BACK, LONG_AGO, ROUGH, Rearranged, job
 
-WALK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]
-SETTINGS = ("loop_closer.loops.retrieval.exclude_frames=5", "detector.model=demo")
+SETTINGS = (LONG_AGO, "detector.model=demo")
 BAD = 7  # frame that cannot be read
 MADE = ("trajectory.txt", "trajectory_online.txt", "keyframes.json", "map.ply", "objects.json")
 
@@ -37,7 +36,7 @@ class Unread(Rearranged):
 
 @pytest.fixture(scope="module")
 def walk(room: Sequence) -> Sequence:
-    return Spoilt(room, WALK)
+    return Spoilt(room, AND_BACK)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +53,7 @@ def alike(room: Sequence, whole: Path) -> Path:
 
 def again(room: Sequence, whole: Path, folder: Path, *settings: str) -> Path:
     """A run of the others, by what was kept."""
-    asked = job(Unread(room, WALK), folder, *SETTINGS, *settings)
+    asked = job(Unread(room, AND_BACK), folder, *SETTINGS, *settings)
     front_end = FrontEnd.open(whole, asked.config, asked.sequence, asked.selection)
     run_over_file(replace(asked, front_end=front_end), lambda *_: None)
     return folder
@@ -108,9 +107,9 @@ def test_a_setting_that_would_have_no_effect_is_refused(walk: Sequence, whole: P
 
 
 def test_other_frames_are_refused(room: Sequence, walk: Sequence, whole: Path) -> None:
-    with pytest.raises(DataError, match=f"is of {len(WALK)} frames of .*asked for are 12 of"):
+    with pytest.raises(DataError, match=f"is of {len(AND_BACK)} frames of .*asked for are 12 of"):
         opened(whole, walk, frames=12)
-    later = Rearranged(room, WALK)
+    later = Rearranged(room, AND_BACK)
     later.stamps_ns = later.stamps_ns + 1
     with pytest.raises(DataError, match="at their stamps"):
         opened(whole, later)
@@ -141,7 +140,7 @@ def test_a_run_that_fails_leaves_none_for_others(
         raise RuntimeError("out of luck")
 
     monkeypatch.setattr("ldo_service.actors.loop_closer.LoopCloser.handle", fails)
-    asked = job(Rearranged(room, WALK), tmp_path / "out")
+    asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
     with pytest.raises(StageError, match="out of luck"):
         run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
     monkeypatch.undo()
@@ -150,11 +149,11 @@ def test_a_run_that_fails_leaves_none_for_others(
 
 def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -> None:
     tight = "record.max_gb=0.0000001"
-    asked = job(Rearranged(room, WALK), tmp_path / "out", tight)
+    asked = job(Rearranged(room, AND_BACK), tmp_path / "out", tight)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ldo_service.runtime.recording_file.CHECK_EVERY_BYTES", 1000)
         record = run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
-    assert record.summary["frames"] == len(WALK)  # the run goes on
+    assert record.summary["frames"] == len(AND_BACK)  # the run goes on
     assert not (tmp_path / "out" / FRONT_END).exists()
 
 
@@ -165,7 +164,7 @@ def test_it_is_whole_when_the_stream_ends(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("ldo_service.runs.over_file.FileRun.repair", fails)
-    asked = job(Rearranged(room, WALK), tmp_path / "out")
+    asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
     with pytest.raises(KeyboardInterrupt):
         run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
     kept = FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)

@@ -20,21 +20,19 @@ from ldo_service.runs.simulation import Made, simulate_graph
 from ldo_service.runs.source import Selection
 from tests.schemas.examples import EXAMPLES
 
-from .jobs import ROUGH, Rearranged, job
-
-WALK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]
+from .jobs import AND_BACK, LONG_AGO, ROUGH, Rearranged, job
 
 
 @pytest.fixture(scope="module")
 def returning(room: Sequence) -> Rearranged:
-    return Rearranged(room, WALK)
+    return Rearranged(room, AND_BACK)
 
 
 @pytest.fixture(scope="module")
 def finished(returning: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short walk, whose first frames count as long ago."""
     folder = tmp_path_factory.mktemp("loops") / "out"
-    run_over_file(job(returning, folder, "loop_closer.loops.retrieval.exclude_frames=5"), print)
+    run_over_file(job(returning, folder, LONG_AGO), print)
     return folder
 
 
