@@ -63,6 +63,10 @@ class KeyframePoses:
         """T_map_keyframe [n, 4, 4] of known ones."""
         return self._known.all["T_map"][self._known.rows(keyframes)]
 
+    def are_known(self, keyframes: Collection[int]) -> np.ndarray:
+        """[n] bool of n keyframes."""
+        return self._known.are_known(keyframes)
+
     def chain(
         self,
         keyframe: int,

@@ -38,11 +38,20 @@ class Records:
 
     def rows(self, ids: Iterable[int]) -> np.ndarray:
         """Of those ids that are known, as often as they are named."""
+        rows, is_known = self._found(ids)
+        return rows[is_known]
+
+    def are_known(self, ids: Iterable[int]) -> np.ndarray:
+        """[n] bool of n ids."""
+        return self._found(ids)[1]
+
+    def _found(self, ids: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Rows [n] of n ids, and which of these are theirs [n] bool."""
         wanted = np.fromiter(ids, np.int64)
         rows = np.searchsorted(self.ids, wanted)
         is_known = rows < self._count
         is_known[is_known] = self.ids[rows[is_known]] == wanted[is_known]
-        return rows[is_known]
+        return rows, is_known
 
     def put(self, id_: int, *values: Any) -> None:
         """Its other fields, in their order; in place of what was known of it."""

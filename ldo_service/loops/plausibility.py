@@ -46,17 +46,15 @@ class Plausibility:
     def may_meet(self, old: Sequence[View], new: View) -> np.ndarray:
         """[S] bool: which of S views a keyframe may show again, wherever it looks: all but those
         that are farther or turned more than drift and the width of a view explain."""
-        known = np.array([self._is_known(view, new) for view in old], bool)
+        if new.keyframe not in self._poses:
+            return np.ones(len(old), bool)
+        root = self._root(new.place.segment)
+        known = self._poses.are_known([view.keyframe for view in old])
+        known &= np.array([self._root(view.place.segment) == root for view in old], bool)
         may = ~known
         at = np.flatnonzero(known)
-        if not len(at):
-            return may
-        views, config, T_new = (
-            [old[k] for k in at.tolist()],
-            self._config,
-            self._poses[new.keyframe],
-        )
-        T_old = np.array([self._poses[view.keyframe] for view in views])
+        views, config = [old[k] for k in at.tolist()], self._config
+        T_new, T_old = self._poses[new.keyframe], self._poses.of([v.keyframe for v in views])
         way_m = np.abs(new.path_m - np.array([view.path_m for view in views]))
         depth_m = np.array([view.place.median_depth_m for view in views])
         reach_m = config.view_depths * np.maximum(depth_m, new.place.median_depth_m)

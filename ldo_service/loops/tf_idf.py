@@ -51,7 +51,7 @@ class Histograms:
         """[N] float32 in 0..1: how like each row a row [W] is; 0 where either is empty."""
         weight = self.idf() ** 2
         product = np.einsum("nw,w->n", self.rows, weight * row.astype(np.float32))
-        squares = np.einsum("nw,nw,w->n", self.rows, self.rows, weight)
+        squares = np.einsum("nw,w->n", self.rows**2, weight)
         own = float(np.einsum("w,w,w->", row.astype(np.float32), row.astype(np.float32), weight))
         norms = np.sqrt(squares * own)
         return np.clip(np.where(norms > 0, product / np.where(norms > 0, norms, 1), 0), 0, 1)

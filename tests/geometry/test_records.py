@@ -29,6 +29,8 @@ def test_records_are_what_a_dict_would_hold() -> None:
 def test_only_known_ids_have_a_row() -> None:
     made = records([5, 3, 9])
     assert made.ids[made.rows([9, 4, 3, 10, 3])].tolist() == [9, 3, 3]
+    assert made.are_known([9, 4, 3, 10, 3]).tolist() == [True, False, True, False, True]
+    assert Records(NUMBER).are_known([0]).tolist() == [False]
 
 
 def test_what_is_not_kept_is_forgotten_and_can_come_again() -> None:
