@@ -58,6 +58,7 @@ class FrameSource(Actor):
         In(CAMERA_DEPTH, Latest(4)),
     )
     outputs = (Out(FRAME_RGBD),)
+    is_prompt = True
 
     def __init__(self, config: FrameSourceConfig | None = None) -> None:
         super().__init__()

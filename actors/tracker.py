@@ -115,6 +115,7 @@ class Tracker(Actor):
         In(DETECTION_BOXES, Latest(1)),
     )
     outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, never_wait=True))
+    is_prompt = True
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
         super().__init__()

@@ -39,6 +39,7 @@ class Actor:
     # asks what no journal records: a replay leaves it out, and who takes what it makes is fed from
     # what it took then
     talks_outside = False
+    is_prompt = False  # a robot waits for what it makes: its thread comes before those of others
 
     def __init__(self) -> None:
         self.situation = Situation()

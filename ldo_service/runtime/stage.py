@@ -88,7 +88,8 @@ class Stage:
     # --- life -----------------------------------------------------------------------------------
     async def run(self) -> None:
         """Once. Raises RestartsExhausted or StageStalled when it gives up."""
-        self._worker = Worker(self.name)
+        nice = 0 if self._actor.is_prompt else self._config.nice
+        self._worker = Worker(self.name, nice=nice)
         self._open_outlets()
         if self._keeper.past.is_none:
             self._begin()

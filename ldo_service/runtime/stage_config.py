@@ -14,6 +14,8 @@ class StageConfig:
     heartbeat_s: float = 0.5  # a stopped process shows within two of these
     stall_after_s: float = 60.0  # 100x the slowest step measured (mapper, 1.5 M Gaussians)
     evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
+    nice: int = 10  # of threads whose work may be late: a tenth of the weight of those that a robot
+    # waits for, where both want the same core (Linux)
     max_message_mb: float = 64.0  # larger ones are not decoded: raw colour and depth of 8 MP are 58
 
     def __post_init__(self) -> None:
@@ -23,3 +25,5 @@ class StageConfig:
             or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
         ):
             raise ConfigError(f"{self}: counts and times must be positive.")
+        if not 0 <= self.nice <= 19:
+            raise ConfigError(f"stage.nice={self.nice}: must be within 0..19.")

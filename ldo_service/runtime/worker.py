@@ -1,11 +1,13 @@
 """A thread that works off what it is given, in order."""
 
 import asyncio
+import os
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from queue import SimpleQueue
-from threading import Lock, Thread
+from threading import Lock, Thread, get_native_id
 from typing import Any, ParamSpec, TypeVar
 from weakref import WeakSet
 
@@ -17,13 +19,15 @@ class Worker:
     """One daemon thread.
 
     An executor's thread keeps the interpreter from exiting while a job runs, for ever if the job
-    never ends; this one does not. How much may wait is up to who submits.
+    never ends; this one does not. How much may wait is up to who submits. `nice` of 0..19: so much
+    it steps back behind other threads where there are too few cores; on Linux, where each thread
+    may, and those that it starts do as it does.
     """
 
     _all: "WeakSet[Worker]" = WeakSet()
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, *, nice: int = 0) -> None:
+        self.name, self._nice = name, nice
         self._jobs: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._lock = Lock()
         self._closed = False
@@ -67,11 +71,19 @@ class Worker:
         return sorted(worker.name for worker in closed if worker._thread.is_alive())
 
     def _work(self) -> None:
+        _step_back(self._nice)
         while entry := self._jobs.get():
             future, job = entry
             if future.set_running_or_notify_cancel():
                 _settle(future, job)
             del entry, future, job  # a waiting thread holds on to nothing
+
+
+def _step_back(nice: int) -> None:
+    """Of the thread that calls it, from where its process is."""
+    if nice and sys.platform == "linux":
+        thread = get_native_id()
+        os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nice)
 
 
 def _settle(future: Future[Any], job: Callable[[], Any]) -> None:

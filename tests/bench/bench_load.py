@@ -2,12 +2,14 @@
 
     python -m tests.bench.bench_load [--robots 1 4 16] [--minutes 10] [--subscribers 50]
     python -m tests.bench.bench_load --robots 1 --minutes 30 --times 0.8 --plot docs/soak.png
+    python -m tests.bench.bench_load --robots 1 --minutes 1 --hz 3 --busy 2
 
 Each robot is a service of its own that joins the router, all its actors but none of its networks in
 one process; two mapping iterations a keyframe leave the time to the runtime. Its camera sends
 --times what it tracked in a first half minute of 30 Hz, and later of what it tracked in the last
-minute, if that is more. A tenth of the subscribers is slow, a tenth is stopped. Told are memory,
-the latency of every pose and the rate in thirds of the time, and what became of each frame.
+minute, if that is more; or --hz frames a second. --busy programs want a core each all the time. A
+tenth of the subscribers is slow, a tenth is stopped. Told are memory, the latency of every pose and
+the rate in thirds of the time, and what became of each frame.
 """
 
 import argparse
@@ -53,7 +55,10 @@ class Robot:
     process: subprocess.Popen[bytes]
     client: Client
     sent: int = 0
+    since_ns: int = 0  # frames before are not judged: they found the rate, and may come very late
     poses: int = 0
+    judged: int = 0  # poses, and how many of them are sure
+    judged_ok: int = 0
     latest_ms: list[float] = field(default_factory=list)  # since the last sample
     latencies_ms: list[list[float]] = field(default_factory=list)  # of each sample
     health: dict[str, Health] = field(default_factory=dict)
@@ -79,6 +84,10 @@ class Robot:
         pose = decode(sample.payload.to_bytes(), TrackedPose)
         with self.lock:
             self.poses += 1
+            if pose.stamp_ns < self.since_ns:
+                return
+            self.judged += 1
+            self.judged_ok += pose.status == "OK"
             self.latest_ms.append(1e-6 * (time.time_ns() - pose.stamp_ns))
 
     def reported(self, sample: zenoh.Sample) -> None:
@@ -187,6 +196,17 @@ class Crowd:
         return [counts["ldo/*/pose/tracked"] for of_one in said for counts in of_one]
 
 
+@contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Other programs that want a core each."""
+    with ExitStack() as stack:
+        for _ in range(count):
+            program = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+            stack.callback(program.wait)
+            stack.callback(program.kill)
+        yield
+
+
 # --- one run --------------------------------------------------------------------------------------
 @dataclass
 class Outcome:
@@ -198,6 +218,7 @@ def loaded(
     subscribers: int,
     minutes: float,
     times: float,
+    hz: float | None,
     settings: tuple[str, ...],
     scene: list[CameraRgbd],
 ) -> Outcome:
@@ -206,11 +227,9 @@ def loaded(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="load-")))
         stack.enter_context(open_session(network, router=True))
         robots = stack.enter_context(robots_on(network, count, folder, settings))
-        sustained_hz = _sustained(robots, scene)
-        rate_hz = times * sustained_hz
-        print(
-            f"{count} robots track {sustained_hz:.1f} Hz each; sent are {rate_hz:.1f}", flush=True
-        )
+        sustained_hz = None if hz else _sustained(robots, scene)
+        rate_hz = hz or times * (sustained_hz or 0.0)
+        print(f"{count} robots track {sustained_hz} Hz each; sent are {rate_hz:.1f}", flush=True)
         crowd = Crowd(network.endpoint, subscribers, stack)
         before = sum(robot.told() for robot in robots)
         cameras = [Camera(robot, scene, rate_hz) for robot in robots]
@@ -220,7 +239,7 @@ def loaded(
             now_s = time.monotonic()
             for robot, camera in zip(robots, cameras, strict=True):
                 robot.sample(now_s - started_s, now_s - last_s)
-                if len(robot.samples) >= RECENT:
+                if not hz and len(robot.samples) >= RECENT:
                     tracked_hz = float(np.mean([s[3] for s in robot.samples[-RECENT:]]))
                     camera.rate_hz = max(camera.rate_hz, times * tracked_hz)
             last_s = now_s
@@ -246,6 +265,7 @@ def _sustained(robots: list[Robot], scene: list[CameraRgbd]) -> float:
         camera.stop()
     _settle(robots)
     for robot in robots:
+        robot.since_ns = time.time_ns()
         robot.samples.clear()
         robot.latest_ms.clear()
         robot.latencies_ms.clear()
@@ -305,6 +325,8 @@ def table(outcome: Outcome) -> str:
     total = {name: sum(one[name] for one in counted) for name in counted[0]}
     facts = [robot.health["mapper"].facts for robot in outcome.robots]
     total |= {name: round(sum(one[name] for one in facts)) for name in ("keyframes", "gaussians")}
+    total["poses"] = sum(robot.judged for robot in outcome.robots)
+    total["of them OK"] = sum(robot.judged_ok for robot in outcome.robots)
     return "\n".join([*lines, "", ", ".join(f"{name} {n}" for name, n in total.items())])
 
 
@@ -345,7 +367,10 @@ def main() -> None:
     parser.add_argument("--robots", type=int, nargs="+", default=[1, 4, 16])
     parser.add_argument("--subscribers", type=int, default=50)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--times", type=float, default=2.0, help="of the rate that is sustained")
+    rate = parser.add_mutually_exclusive_group()
+    rate.add_argument("--times", type=float, default=2.0, help="of the rate that is sustained")
+    rate.add_argument("--hz", type=float, help="of frames sent to each robot")
+    parser.add_argument("--busy", type=int, default=0, help="programs that compute all the time")
     parser.add_argument(
         "--set", nargs="+", default=[], help="of each service, as `ldo serve` has it"
     )
@@ -353,14 +378,16 @@ def main() -> None:
     arguments = parser.parse_args()
     scene = frames()
     for count in arguments.robots:
-        outcome = loaded(
-            count,
-            arguments.subscribers,
-            arguments.minutes,
-            arguments.times,
-            tuple(arguments.set),
-            scene,
-        )
+        with busy(arguments.busy):
+            outcome = loaded(
+                count,
+                arguments.subscribers,
+                arguments.minutes,
+                arguments.times,
+                arguments.hz,
+                tuple(arguments.set),
+                scene,
+            )
         print(table(outcome), flush=True)
         if arguments.plot:
             cv2.imwrite(str(arguments.plot), plot(outcome.robots[0])[..., ::-1])

@@ -1,6 +1,8 @@
 import asyncio
-from concurrent.futures import CancelledError
-from threading import Event
+import os
+import sys
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from threading import Event, get_native_id
 
 import pytest
 
@@ -63,3 +65,20 @@ def test_one_that_is_at_work_when_all_is_over_is_named() -> None:
     go.set()
     busy.join(10)
     assert "busy" not in Worker.left_busy(0.01)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux lets a thread be nice by itself")
+async def test_a_worker_steps_back_alone_and_so_do_the_threads_it_starts() -> None:
+    def nice() -> int:
+        return os.getpriority(os.PRIO_PROCESS, get_native_id())
+
+    def nice_of_another() -> int:
+        with ThreadPoolExecutor(1) as pool:
+            return pool.submit(nice).result()
+
+    here, prompt, patient = nice(), Worker("prompt"), Worker("patient", nice=3)
+    assert await prompt.run(nice) == here
+    assert await patient.run(nice) == await patient.run(nice_of_another) == min(19, here + 3)
+    assert nice() == here
+    prompt.close()
+    patient.close()
