@@ -20,7 +20,8 @@ check: .venv/dev  ## format, lint, types
 	deploy/check
 
 bench: .venv/tests  ## the benchmarks; copy what they print to tests/bench/RESULTS.md
-	@for program in tests/bench/bench_*.py; do echo "== $$program"; $(BIN)/python $$program || exit 1; done
+	@for program in $(basename $(notdir $(wildcard tests/bench/bench_*.py))); do \
+		echo "== $$program"; $(BIN)/python -m tests.bench.$$program || exit 1; done
 
 clean:  ## remove what the targets above made
 	rm -rf .venv build dist

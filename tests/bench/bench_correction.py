@@ -1,6 +1,6 @@
 """What a loop closure costs those who must not wait, and a keyframe in a long journey.
 
-    python tests/bench/bench_correction.py [--gaussians 300000] [--keyframes 300] [--repeats 10]
+    python -m tests.bench.bench_correction [--gaussians 300000] [--keyframes 300] [--repeats 10]
 
 First the mapper's side, in the thread that maps: a correction that moves every keyframe of a map,
 from the message to moved Gaussians, and the mending of one keyframe, 12 of which lie over each
@@ -10,10 +10,8 @@ and the worst.
 """
 
 import argparse
-import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 
@@ -25,9 +23,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.graph.keyframe_graph import KeyframeGraph
 from ldo_service.schemas import Correction, decode, encode
 from ldo_service.wire import correction_message, keyframe_poses_of
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "graph"))
-from walks import REFINED, between, odometry, round_trips
+from tests.graph.walks import REFINED, between, odometry, round_trips
 
 ROOM_M, SPACING_M, OVER_EACH_OTHER = 6.0, 0.02, 12
 EVERY = 200  # keyframes, between measurements of a journey

@@ -1,6 +1,6 @@
 """What closing loops is worth where odometry drifts, and how long a correction keeps others.
 
-    python tests/bench/bench_drift.py [SOURCE] [--scale 0.01] [--aside 0] [--turn 0.5] [--only RUN]
+    python -m tests.bench.bench_drift [SOURCE] [--scale 0.01] [--aside 0] [--turn 0.5] [--only RUN]
         [--set KEY=VALUE ...]
 
 The whole graph over SOURCE (synthetic:flat), every fifth frame held out: as it is; with odometry
@@ -12,7 +12,6 @@ of the run, beside the Gaussians in memory at its end.
 
 import argparse
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -35,8 +34,6 @@ from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, Message, TrackedPose
 from ldo_service.wire import transform
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.runs.mistaken import Drift, DriftingTracker, standing_in
 
 NO_LOOPS = "loop_closer.is_on=false"

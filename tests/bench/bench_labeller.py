@@ -1,6 +1,6 @@
 """What a labeller that takes 5 s for each call costs a live service, and where its names lie.
 
-    python tests/bench/bench_labeller.py [--delay-s 5] [--rates 2 6] [--seconds 30] [--rest-s 40]
+    python -m tests.bench.bench_labeller [--delay-s 5] [--rates 2 6] [--seconds 30] [--rest-s 40]
 
 `ldo serve` with the built-in detector, in the flat at 320x240; a camera goes through a part of it,
 there and back, for `seconds`, at each of the rates; then it rests, and answers still come. Once
@@ -15,7 +15,6 @@ with a name that frames see, those that lie on the very thing.
 """
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -29,23 +28,20 @@ import msgspec
 import numpy as np
 import zenoh
 
-ROOT = Path(__file__).parent.parent.parent
-sys.path.insert(0, str(ROOT))
-
-from ldo_service.datasets.synthetic.flat import FlatSequence  # noqa: E402
-from ldo_service.evaluation.trajectory import evaluate_trajectory  # noqa: E402
-from ldo_service.geometry import Trajectory  # noqa: E402
-from ldo_service.runtime.network import Network  # noqa: E402
-from ldo_service.runtime.zenoh_transport import open_session  # noqa: E402
-from ldo_service.schemas import CameraRgbd, TrackedPose, decode  # noqa: E402
-from ldo_service.wire import camera_rgbd_message, transform  # noqa: E402
-from tests.semantics.labellers.server import serving  # noqa: E402
-from tests.service.conftest import LiveService, live_service  # noqa: E402
-from tests.service.exhibits import Guide, Placed, flat, placed  # noqa: E402
-from tests.service.heard import Heard  # noqa: E402
+from ldo_service.datasets.synthetic.flat import FlatSequence
+from ldo_service.evaluation.trajectory import evaluate_trajectory
+from ldo_service.geometry import Trajectory
+from ldo_service.runtime.network import Network
+from ldo_service.runtime.zenoh_transport import open_session
+from ldo_service.schemas import CameraRgbd, TrackedPose, decode
+from ldo_service.wire import camera_rgbd_message, transform
+from tests.semantics.labellers.server import serving
+from tests.service.conftest import LiveService, live_service
+from tests.service.exhibits import Guide, Placed, flat, placed
+from tests.service.heard import Heard
 
 PART = range(120)  # frames of the flat that are gone through, there and back
-SETTINGS = ("detector.model=demo",)
+SETTINGS: tuple[str, ...] = ("detector.model=demo",)
 HEADER = """\
 | labeller | sent Hz | poses/s | latency ms p50 | p95 | dropped | ATE cm | apart mm | answers | \
 late p50 | max | right % |

@@ -1,6 +1,6 @@
 """How well the map's labels agree with the truth, by rule, beside painting each frame alone.
 
-    LDO_WEIGHTS=... python tests/bench/bench_labels.py SOURCE [--only TEXT] [--pictures DIR]
+    LDO_WEIGHTS=... python tests/bench/bench_labels.py [SOURCE] [--only TEXT] [--pictures DIR]
                                                        [--fusion P] [--background NAME ...]
     python tests/bench/bench_labels.py synthetic:flat --detectors demo --painted
 
@@ -302,7 +302,7 @@ def judge_all(scene: Scene, runs: list[Follower], builder: MapBuilder, report: R
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("source")
+    parser.add_argument("source", nargs="?", default="synthetic:flat")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--only", default="", help="rules whose name holds this")
     parser.add_argument("--fusion", type=float, metavar="P")

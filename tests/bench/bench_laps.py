@@ -20,14 +20,21 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.graph import make_actors
-from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.mapper import Mapper, MapperConfig, Output
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.pictures import save_picture
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.runtime.vitals import resident_mb
-from ldo_service.schemas import CameraRgbd, Correction, Keyframe, MapRefine, Message
+from ldo_service.schemas import (
+    CameraRgbd,
+    Correction,
+    DetectionBoxes,
+    Keyframe,
+    LabelOpen,
+    MapRefine,
+)
 from ldo_service.wire import camera_rgbd_message, pose_message
 
 COLUMNS = (
@@ -68,7 +75,9 @@ class TimedMapper(Mapper):
         self._frames_per_lap, self._T_world_camera = frames_per_lap, T_world_camera
         self.mapped: list[Mapped] = []
 
-    def handle(self, message: Keyframe | Correction | MapRefine) -> Iterator[Message]:
+    def handle(
+        self, message: Keyframe | DetectionBoxes | LabelOpen | Correction | MapRefine
+    ) -> Iterator[Output]:
         if self._T_world_camera is not None and isinstance(message, Correction):
             return
         if not isinstance(message, Keyframe):
@@ -88,16 +97,19 @@ class TimedMapper(Mapper):
 
     def _note(self, keyframe: Keyframe, cpu_ms: float) -> None:
         facts = self.facts()
-        names = ("gaussians", "gaussians_asleep", "gaussians_over_cap", "gaussians_pruned")
         self.mapped.append(
             Mapped(
-                keyframe.keyframe,
-                keyframe.frame,
-                keyframe.frame // self._frames_per_lap,
-                cpu_ms,
-                *(int(facts[name]) for name in (*names, "gaussians_woken")),
-                facts["keyframes_cache_mb"],
-                resident_mb(),
+                keyframe=keyframe.keyframe,
+                frame=keyframe.frame,
+                lap=keyframe.frame // self._frames_per_lap,
+                cpu_ms=cpu_ms,
+                gaussians=int(facts["gaussians"]),
+                asleep=int(facts["gaussians_asleep"]),
+                over_cap=int(facts["gaussians_over_cap"]),
+                pruned=int(facts["gaussians_pruned"]),
+                woken=int(facts["gaussians_woken"]),
+                images_mb=facts["keyframes_cache_mb"],
+                resident_mb=resident_mb(),
             )
         )
 
@@ -151,7 +163,7 @@ def write(folder: Path, mapped: list[Mapped]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("source", nargs="?", default="synthetic:flat")
     parser.add_argument("--laps", type=int, default=10)
     parser.add_argument("--stride", type=int, default=1)

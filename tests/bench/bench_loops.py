@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -51,6 +52,7 @@ from ldo_service.semantics.labels import MOST_LABELS
 from ldo_service.wire import transform
 
 SUBGRAPHS = 1000
+Taken = Keyframe | DetectionBoxes | Correction  # by the loop closer
 STAGES: tuple[Stages, ...] = ("two_stage", "geometric", "semantic")
 
 
@@ -60,7 +62,7 @@ def coarse_ms(repeats: int = 20) -> float:
     config, poses = LoopsConfig(), KeyframePoses()
     memory = Memory(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
 
-    def subgraph(number: int):
+    def subgraph(number: int) -> Any:
         place = SimpleNamespace(segment=0, median_depth_m=2.0)
         poses.chain(number, None, np.eye(4), se3.exp(rng.normal(size=6)))
         return SimpleNamespace(
@@ -84,10 +86,10 @@ def coarse_ms(repeats: int = 20) -> float:
     return float(np.median(times_ms))
 
 
-def tracked(sequence: Sequence, model: str) -> list[Message]:
+def tracked(sequence: Sequence, model: str) -> list[Taken]:
     """What the loop closer would be given."""
-    config, taken = load_config(), []
-    kinds = (Keyframe, DetectionBoxes, Correction)
+    config = load_config()
+    taken: list[Taken] = []
     actors = [
         FrameSource(config.frame_source),
         Tracker(config.tracker),
@@ -96,7 +98,7 @@ def tracked(sequence: Sequence, model: str) -> list[Message]:
     ]
 
     def observe(_actor: str, message: Message, _ms: float) -> None:
-        if isinstance(message, kinds):
+        if isinstance(message, Taken):
             taken.append(message)
 
     with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
@@ -105,7 +107,7 @@ def tracked(sequence: Sequence, model: str) -> list[Message]:
     return taken
 
 
-def closed(messages: list[Message], seen: dict[int, SeenKeyframe], stages: Stages) -> LoopErrors:
+def closed(messages: list[Taken], seen: dict[int, SeenKeyframe], stages: Stages) -> LoopErrors:
     actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(stages=stages)))
     candidates, closures = [], []
     for step in (*(partial(actor.handle, message) for message in messages), actor.finish):

@@ -92,7 +92,7 @@ def default_sources() -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("sources", nargs="*", metavar="SOURCE")
     parser.add_argument("--frames", type=int, default=120)
     arguments = parser.parse_args()

@@ -139,13 +139,13 @@ def check_agreement(mine: Steps, theirs: Steps) -> None:
 
 def report(n: int, size: str, mine: dict[str, float], theirs: dict[str, float] | None) -> None:
     for name, time_ms in mine.items():
-        other = theirs and theirs.get(name)
+        other = theirs.get(name) if theirs else None
         theirs_ms = f"{other:13.2f} {time_ms / other:6.2f}" if other else f"{'-':>13} {'-':>6}"
         print(f"{n:>10} {size:>9} {name:>10} {time_ms:9.2f} {theirs_ms}")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--repeats", type=int, default=30)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many of the scenes")

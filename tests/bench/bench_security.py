@@ -1,5 +1,7 @@
 """What strangers and careless programs may try, what must come of it, and what does.
 
+    python -m tests.bench.bench_security
+
 The attempts are those of `tests/security`, where they decide; here they are a table.
 """
 
@@ -7,13 +9,10 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent.parent
-sys.path.insert(0, str(ROOT))
-
-from tests.security.attempt import Attempt, Where  # noqa: E402
-from tests.security.attempts import ATTEMPTS  # noqa: E402
-from tests.security.lab import lab  # noqa: E402
-from tests.security.lies import LIES  # noqa: E402
+from tests.security.attempt import Attempt, Where
+from tests.security.attempts import ATTEMPTS
+from tests.security.lab import lab
+from tests.security.lies import LIES
 
 
 def row(attempt: Attempt[Where], where: Where) -> bool:

@@ -1,6 +1,6 @@
 """Milliseconds and bytes of keyframes, and of anchors' Gaussians that sleep, on disk.
 
-python tests/bench/bench_store.py SOURCE [--keyframes 50] [--stride 10] [--active N] [--folder F]
+python tests/bench/bench_store.py [SOURCE] [--keyframes 50] [--stride 10] [--active N] [--folder F]
 
 CPU milliseconds of one thread, medians; the disk's own time shows in the wall column.
 """
@@ -19,7 +19,7 @@ from ldo_service.gaussians import GaussianMap, View, insert
 from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
 from ldo_service.gaussians.keyframe_images import KeyframeImages
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
-from ldo_service.gaussians.sleep import Poses, SleepingGaussians
+from ldo_service.gaussians.sleep import SleepingGaussians
 
 
 def timed_ms(do: Callable[[], object]) -> tuple[float, float]:
@@ -91,7 +91,9 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
     )
 
 
-def mapped(source: str, count: int, stride: int) -> tuple[np.ndarray, np.ndarray, Poses]:
+def mapped(
+    source: str, count: int, stride: int
+) -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
     """Rows and anchors of the Gaussians of the first keyframes, and where those stood."""
     sequence = open_sequence(source)
     truth, gaussians, poses = sequence.truth(), GaussianMap(), {}
@@ -106,8 +108,8 @@ def mapped(source: str, count: int, stride: int) -> tuple[np.ndarray, np.ndarray
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("source")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("source", nargs="?", default="synthetic:room")
     parser.add_argument("--keyframes", type=int, default=50)
     parser.add_argument("--stride", type=int, default=10, help="frames between two keyframes")
     parser.add_argument("--active", type=int, default=1_500_000, help="Gaussians in the map")

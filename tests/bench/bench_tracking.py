@@ -1,6 +1,6 @@
 """Our odometry beside OpenCV's, small_gicp's and Open3D's, on the same frames, one thread each.
 
-    python tests/bench/bench_tracking.py [SOURCE] [--frames N] [--stride N] [--json]
+    python -m tests.bench.bench_tracking [SOURCE] [--frames N] [--stride N] [--json]
         [--without NAME ...]
 
 SOURCE: a data set or synthetic sequence; default: tum/kitchen in LDO_DATA, else synthetic:tour.
@@ -21,7 +21,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from tracking_peers import Step, peers
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
@@ -32,6 +31,7 @@ from ldo_service.kernels import isa
 from ldo_service.schemas import TrackedPose
 from ldo_service.tracking import Odometry, Status
 from ldo_service.wire import keyframe_poses_of, rgbd_message, transform
+from tests.bench.tracking_peers import Step, peers
 
 WARM_UP = 5  # frames left out of the times
 OURS = "ours"
@@ -159,7 +159,7 @@ def on_one_thread() -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("source", nargs="?", default=default_source())
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--stride", type=int, default=1)

@@ -1,6 +1,6 @@
 """What a window that nobody looks at costs a service that has more frames than it can handle.
 
-    python tests/bench/bench_viewer.py [SOURCE] [--pairs N] [--rate HZ] [--frames N]
+    python -m tests.bench.bench_viewer [SOURCE] [--pairs N] [--rate HZ] [--frames N]
 
 SOURCE: default tum/kitchen in LDO_DATA, else synthetic:room. A service, a camera and a viewer, in
 processes of their own. Each round begins with an empty map and is sent the same frames, by default
@@ -31,8 +31,6 @@ from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live import live
 from ldo_service.viewer.window import open_window
 from ldo_service.wire import camera_rgbd_message
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.service.conftest import LiveService, live_service
 
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -149,7 +147,7 @@ def quartiles(values: list[float]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("source", nargs="?", default=default_source())
     parser.add_argument("--pairs", type=int, default=16)
     parser.add_argument("--rate", type=float, default=30.0)

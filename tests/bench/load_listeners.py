@@ -15,7 +15,12 @@ import zenoh
 from ldo_service.runtime.network import Network
 from ldo_service.runtime.zenoh_transport import open_session
 
-TOPICS = ("ldo/*/pose/tracked", "ldo/*/map/delta", "ldo/*/map/snapshot", "ldo/*/health/*")
+TOPICS: tuple[str, ...] = (
+    "ldo/*/pose/tracked",
+    "ldo/*/map/delta",
+    "ldo/*/map/snapshot",
+    "ldo/*/health/*",
+)
 
 
 class Listener:

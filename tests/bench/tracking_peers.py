@@ -7,7 +7,7 @@ otherwise some run away to infinity.
 
 from collections.abc import Callable, Iterator
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -40,7 +40,7 @@ def peers(camera: Camera) -> Iterator[tuple[str, Step]]:
         yield f"small_gicp, frame to frame, {name}", gicp_frames(camera, scale)
         yield f"small_gicp, voxel map, {name}", gicp_voxels(camera, scale)
     try:
-        import open3d
+        import open3d  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         print(f"Open3D is left out ({error}): pip install --group bench.")
         return
@@ -204,7 +204,7 @@ def open3d_model(o3d: ModuleType, camera: Camera) -> Step:
     return step
 
 
-def _tracked(align: Callable[[], object]) -> Found:
+def _tracked(align: Callable[[], Any]) -> Found:
     """What Open3D's tensor odometry found; it raises where its system is singular."""
     try:
         found = align()
