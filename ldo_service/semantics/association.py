@@ -160,7 +160,7 @@ def whole_of(
     common = intersections(boxes, boxes)
     is_part = (common > 0) & (common >= config.part_inside * area[:, None])
     is_part &= area[:, None] < area
-    is_part &= np.any((classes[:, None] == classes) & (classes >= 0), axis=2)
+    is_part &= share_a_class(classes)
     near_m, far_m = near_m.copy(), far_m.copy()
     by_size = np.argsort(-area, kind="stable")
     for k in np.flatnonzero(np.isinf(near_m)):
@@ -174,6 +174,19 @@ def whole_of(
         if len(around):
             whole[part] = whole[around[np.argmax(area[around])]]
     return whole
+
+
+def share_a_class(classes: np.ndarray) -> np.ndarray:
+    """[M, M] bool: which of M things may be of one class, whoever says it of either; [M, 2] what a
+    detector and a labeller say, -1 where they say nothing.
+
+    >>> share_a_class(np.array([[3, -1], [-1, 3], [-1, -1]])).astype(int)
+    array([[1, 1, 0],
+           [1, 1, 0],
+           [0, 0, 0]])
+    """
+    is_same = (classes[:, None, :, None] == classes[:, None]) & (classes >= 0)[:, None]
+    return np.any(is_same, axis=(2, 3))
 
 
 def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:

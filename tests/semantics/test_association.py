@@ -148,12 +148,13 @@ def test_a_part_of_a_part_is_one_of_the_whole() -> None:
     assert wholes(behind, [(PLANT, -1)] * 3) == [2, 2, 2]
 
 
-def test_a_class_is_shared_where_detector_or_labeller_say_the_same() -> None:
+def test_a_class_is_shared_whoever_says_it_of_either() -> None:
     regions: list[Seen] = [((10, 0, 90, 100), 2, 2.2), (WHOLE, 2, 2.2)]
     for part, whole, is_part in (
         ((PLANT, -1), (PLANT, TABLE), True),  # the labeller has spoken of the whole alone
         ((-1, TABLE), (PLANT, TABLE), True),
-        ((PLANT, -1), (-1, PLANT), False),
+        ((PLANT, -1), (-1, PLANT), True),  # what the detector boxed, in what was asked about
+        ((PLANT, -1), (-1, TABLE), False),
         ((-1, -1), (-1, -1), False),
     ):
         assert wholes(regions, [part, whole]) == [1 if is_part else 0, 1]
