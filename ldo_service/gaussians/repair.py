@@ -79,9 +79,12 @@ class MapRepair:
     def with_keyframe(self, *, is_behind: bool) -> None:
         """A share of the work; what is due waits while keyframes do (`is_behind`)."""
         self._mend(self.config.mended_keyframes, self.config.mending_iterations)
-        if self._due and not is_behind:
-            most = self.config.paid_iterations
-            self.refine(min(most, self.due), effort=most)
+        if not self._due or is_behind:
+            return
+        most = self.config.paid_iterations
+        payable = sum(self._due[k] for k in self._awake())
+        if payable:
+            self.refine(min(most, payable), effort=most)
 
     def at_end(self) -> None:
         """Without iterations: they could move keyframes, and nobody takes a refinement any more."""
@@ -96,8 +99,7 @@ class MapRepair:
         self, iterations: int, rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
     ) -> None:
         """Iterations of the optimiser, see `MapBuilder.refine`: first those that are due."""
-        self._forget()
-        awake = [k for k in self._due if self._map.is_awake(k)]
+        awake = self._awake()
         visits = np.repeat(awake, [-(-self._due[k] // 2) for k in awake]).astype(np.int64)
         order = np.random.default_rng(self.due).permutation(visits)
         torn = order[: -(-iterations // 2)].tolist()
@@ -105,6 +107,11 @@ class MapRepair:
         for keyframe, visited in Counter(torn[: -(-done // 2)]).items():
             self._due[keyframe] -= 2 * visited
         self._forget()
+
+    def _awake(self) -> list[int]:
+        """Torn keyframes that see nothing that sleeps: nothing can be fitted to the others."""
+        self._forget()
+        return [k for k in self._due if self._map.is_awake(k)]
 
     def state(self) -> dict[str, Any]:
         return {"to_mend": list(self._to_mend), "due": dict(self._due)}

@@ -381,9 +381,10 @@ def test_a_map_that_moves_as_a_whole_is_as_good_as_before(keyframes) -> None:
     assert mapper.facts()["keyframes_to_mend"] == len(keyframes)
 
 
-def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes) -> None:
-    config = replace(CONFIG, due_iterations=4, paid_iterations=6)
-    mapper, never = torn(keyframes, config), torn(keyframes, replace(config, paid_iterations=0))
+def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes, tmp_path) -> None:
+    config = replace(CONFIG, due_iterations=4, paid_iterations=6, folder=str(tmp_path))
+    mapper = torn(keyframes, config)
+    never = torn(keyframes, replace(config, paid_iterations=0, folder=""))
     due, more = [], []
     for i, k in enumerate(around_again(keyframes[3:7], np.eye(4), first=200)):
         if i == 2:
