@@ -96,6 +96,12 @@ class Landmarks:
         return dense(self.labels, self.weights)
 
     @property
+    def names(self) -> np.ndarray:
+        """[K] int64: what each was called, however unsure the detector was."""
+        said = np.where(self.labels < HIDDEN_NAMES, -1, self.weights).argmax(axis=1)
+        return self.labels[np.arange(len(self)), said].astype(np.int64)
+
+    @property
     def packed(self) -> dict[str, Any]:
         return {"p_odom": self.p_odom, "labels": self.labels, "weights": self.weights}
 
@@ -159,7 +165,7 @@ def layout_of(landmarks: Landmarks) -> np.ndarray:
     first, second = np.triu_indices(len(landmarks), 1)
     if not len(first):
         return out
-    names = landmarks.labels[:, 0].astype(np.int64)
+    names = landmarks.names
     low, high = np.minimum(names[first], names[second]), np.maximum(names[first], names[second])
     bins = np.linalg.norm(landmarks.p_odom[first] - landmarks.p_odom[second], axis=1)
     bins = bins / DISTANCE_BIN_M
@@ -175,7 +181,7 @@ class Matched:
     """How well landmarks of two subgraphs go together that lie in one place."""
 
     count: int  # that are of one kind
-    contradicted: int  # of the new ones, those where only other kinds were
+    contradicted: int  # of the new ones, those where only things of other names were
     divergence: float  # nats, mean over those of one kind
     entropy: float  # nats, likewise, of both
 
@@ -206,7 +212,9 @@ def matched_at(
     alike = near & (_divergences(old, new) < config.max_divergence)
     both = np.flatnonzero(alike.any(axis=0))
     nearest = np.where(alike, gaps_m, np.inf)[:, both].argmin(axis=0)
-    contradicted = int(np.count_nonzero(near.any(axis=0) & ~alike.any(axis=0)))
+    # one name, said with less confidence, is no other thing
+    agrees = alike | (near & (old.names[:, None] == new.names))
+    contradicted = int(np.count_nonzero(near.any(axis=0) & ~agrees.any(axis=0)))
     return matched(old, new, np.column_stack([nearest, both]), contradicted)
 
 

@@ -91,3 +91,18 @@ def test_the_layout_is_the_same_from_every_side_and_another_for_other_distances(
     np.testing.assert_allclose(layout_of(turned), layout_of(here), atol=1e-4)
     assert abs(layout_of(here).sum() - 15) < 1e-4, "one for each pair"
     assert np.minimum(layout_of(wide), layout_of(here)).sum() < 8
+
+
+def test_a_thing_that_was_hardly_made_out_is_the_same_thing() -> None:
+    places = [(float(x), 0.0, 2.0) for x in range(5)]
+    things = (CHAIR, CUP, CHAIR, SINK, CHAIR)
+    sure, unsure = (
+        landmarks(seen(*((thing, score, p) for thing, p in zip(things, places, strict=True))))
+        for score in (0.9, 0.4)
+    )
+    assert unsure.names.tolist() == list(things)
+    found = matched_at(sure, unsure, np.eye(4), CONFIG)
+    assert (found.count, found.contradicted) == (0, 0), "too vague to vouch, and no contradiction"
+    np.testing.assert_array_equal(layout_of(sure), layout_of(unsure))
+    others = landmarks(seen(*((SINK, 0.4, p) for p in places)))
+    assert matched_at(sure, others, np.eye(4), CONFIG).contradicted == 4
