@@ -9,7 +9,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry.relative_pose import RelativePose
 
-from .closures import Closures, ClosuresConfig, Pair, Verdict
+from .closures import Closures, ClosuresConfig, Pair, Verdict, pair_of
 from .condensing import group_to_condense
 from .factors import NoiseConfig, Sight, information
 from .joining import T_new_old, best_without, contradicted, judged
@@ -146,6 +146,8 @@ class KeyframeGraph:
         if self.first_of(closure.a) != self.first_of(closure.b):
             self._join(closure)
             return Verdict(True)
+        if pair_of(closure) in self._known.joins:
+            return Verdict(True)  # the same two images: told again they would count twice
         start, known = self._solver.variables(), self._known
         if known.in_head(closure.a)[0] == known.in_head(closure.b)[0]:
             return self._refuse(closure)  # too late: both hang on one variable by now

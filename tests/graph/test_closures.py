@@ -173,6 +173,17 @@ def test_a_join_stands_against_one_word_and_falls_to_two_that_agree() -> None:
         assert graph.close(off_by(TWO, *pair)).is_accepted
 
 
+def test_a_join_that_is_recognised_again_does_not_vote_for_itself() -> None:
+    graph = apart(TWO)
+    graph.close(off_by(TWO, *FALSE_JOIN))
+    before = graph.placed()[1]
+    assert graph.close(off_by(TWO, *FALSE_JOIN)).is_accepted
+    assert not graph.closures.accepted
+    np.testing.assert_array_equal(graph.placed()[1], before)
+    assert not graph.close(off_by(TWO, *TRUE_ONES[0])).is_accepted
+    assert graph.close(off_by(TWO, *TRUE_ONES[1])) == Verdict(True, (FALSE_JOIN[:2],))
+
+
 def test_false_closures_that_disagree_do_not_outvote_a_join() -> None:
     graph = apart(TWO)
     assert graph.close(off_by(TWO, *TRUE_ONES[0])).is_accepted
