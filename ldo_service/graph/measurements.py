@@ -166,16 +166,19 @@ class Measurements:
         return carried(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
-        """[6, 6] of followers among its ends: their share of what their group is known by, as far
-        as they are from the variable that stands for them."""
+        """[6, 6] at b, of followers among its ends: their share of what their group is known by,
+        as far as they are from the variable that stands for them."""
         total = np.zeros((6, 6))
-        for keyframe, (variable, _) in zip((m.a, m.b), self.ends(m), strict=True):
+        T_b_end = se3.inverse(m.T_a_b), np.eye(4)
+        for keyframe, (variable, _), T in zip((m.a, m.b), self.ends(m), T_b_end, strict=True):
             if (row := self.rows.get(keyframe)) is None:
                 continue
             pair = int(self.followers.heads[row]), int(self.followers.tails[row])
             share = self.followers.shares[row]
             away = share if variable == pair[0] else 1 - share
-            total += away * np.linalg.inv(self.condensed[pair].information)
+            adjoint = se3.adjoint(T @ se3.inverse(self.followers.T_tail[row]))  # of T_b_tail
+            covariance = np.linalg.inv(self.condensed[pair].information)
+            total += away * adjoint @ covariance @ adjoint.T
         return total
 
     # --- factors ----------------------------------------------------------------------------------

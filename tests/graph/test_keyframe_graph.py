@@ -332,6 +332,23 @@ def test_a_group_ends_where_the_next_keyframe_is_measured_from() -> None:
     assert group_to_condense(range(60), ends_at_10, (), 10, 20) == list(range(11))
 
 
+def test_what_a_follower_is_known_by_is_told_where_the_measurement_is() -> None:
+    truth = kitchen(60)
+    graph = walked(truth[0], odometry(truth, 1))
+    known, far = graph._known, 59
+    follower = next(k for k in known.rows if known.in_variable(k)[0] == known.in_head(k)[0])
+    T_far_follower = se3.inverse(truth[far]) @ truth[follower]
+    there = RelativePose(far, follower, T_far_follower, REFINED)
+    back = RelativePose(follower, far, se3.inverse(T_far_follower), REFINED)
+    covariance, adjoint = known._ends_covariance(there), se3.adjoint(T_far_follower)
+    carried = adjoint @ covariance @ adjoint.T
+    np.testing.assert_allclose(known._ends_covariance(back), carried, rtol=1e-9, atol=1e-15)
+    head, _ = known.in_head(follower)
+    known.part(follower)
+    as_variable = np.linalg.inv(known.condensed[head, follower].information)
+    np.testing.assert_allclose(covariance, as_variable, rtol=1e-6, atol=1e-15)
+
+
 def test_what_is_measured_of_a_follower_replaces_nothing_measured_of_its_variable() -> None:
     truth = kitchen(81)
     graph = walked(truth[0], odometry(truth[:80], 1, sigma=0.0))
