@@ -155,7 +155,7 @@ class LoopCloser(Actor):
             place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._joined
         )
         yield from self._told(findings)
-        if findings or not self.recogniser.is_open:
+        if not self.recogniser.is_open or keyframe % RECENT_KEYFRAMES == 0:
             self.poses.keep_only(self._needed())
             self._saved_poses = None
 

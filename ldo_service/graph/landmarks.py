@@ -102,7 +102,8 @@ class Landmark:
 
 
 class Landmarks:
-    """Deterministic; bounded by `most` landmarks, each 4 kB and its sights."""
+    """Deterministic; bounded by `most` landmarks, each 4 kB and its sights, and by the pairs of them
+    that a keyframe showed together."""
 
     def __init__(self, config: LandmarksConfig, noise: NoiseConfig) -> None:
         self._config, self._noise = config, noise

@@ -34,7 +34,7 @@ class LoopsConfig:
     plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
-    features: FeatureConfig = field(default_factory=FeatureConfig)
+    features: FeatureConfig = field(default_factory=lambda: FeatureConfig(min_inliers=12))
     align: AlignConfig = field(default_factory=AlignConfig)
 
     def __post_init__(self) -> None:
@@ -95,16 +95,18 @@ class Recogniser:
         poses       T_map_keyframe of the keyframes kept; those that are not known are not judged by
         joined      segments, each with the older one whose frame it is in
         """
+        findings: list[Finding] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
-            self._open = []  # too few for a subgraph, and nothing places them by what follows
+            findings = self.rest(poses, joined)
+            self._open = []
         self._open.append(self._view(place, frame, stamp_ns, sightings))
-        if not is_whole(self._open, self._config.subgraphs):
-            return []
-        return self._completed(poses, joined)
+        if is_whole(self._open, self._config.subgraphs):
+            findings += self._completed(poses, joined)
+        return findings
 
     def rest(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
         """As `add`, when no keyframe follows: what was begun is whole, if it is long enough. A walk
-        often ends where it began."""
+        often ends where it began, and what was seen last is where a lost camera is."""
         if len(self._open) < self._config.subgraphs.least:
             return []
         return self._completed(poses, joined)

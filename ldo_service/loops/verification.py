@@ -38,8 +38,8 @@ FIT_LEVEL = 1  # of the pyramid, 160 pixels wide: 19,200 points say what overlap
 class VerificationConfig:
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
     fit: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
-    min_inliers: int = 20  # features that agree on the pose, of the best pair of keyframes
-    witness_inliers: int = 12  # of another keyframe of the new subgraph, that says the same
+    min_inliers: int = 20  # features that agree on the pose, of the best pair of keyframes; another
+    # keyframe of the new subgraph that says the same needs `features.min_inliers` alone
     witness_landmarks: int = 3  # or landmarks of one kind that it brings together
     witness_rad: float = 0.08  # rotation plus parallax between what the two say
     pairs: int = 15  # of keyframes whose features are matched, at 3 ms each
@@ -53,7 +53,7 @@ class VerificationConfig:
     max_contradictions: int = 3  # landmarks where others of another kind were, if they are most
 
     def __post_init__(self) -> None:
-        if min(self.min_inliers, self.witness_inliers) < 6 or self.pairs < 1:
+        if self.min_inliers < 6 or self.pairs < 1:
             raise ConfigError(f"{self}: inliers must be at least 6, pairs at least 1.")
         if not 0 <= self.blind_overlap <= 1:
             raise ConfigError(f"blind_overlap={self.blind_overlap:g} must be within 0..1.")
@@ -96,8 +96,7 @@ class Verifier:
         features: FeatureConfig,
         config: VerificationConfig,
     ) -> None:
-        self._align, self._config = align, config
-        self._features = replace(features, min_inliers=config.witness_inliers)
+        self._align, self._features, self._config = align, features, config
         self._opened = lru_cache(OPENED)(lambda view: view.place.keyframe(pyramid))
 
     # --- a pose -----------------------------------------------------------------------------------

@@ -23,6 +23,7 @@ from ldo_service.schemas import (
     Message,
     encode,
 )
+from ldo_service.tracking.features import FeatureConfig
 from ldo_service.wire import (
     camera_message,
     correction_message,
@@ -128,10 +129,9 @@ def test_the_return_is_closed_with_the_true_pose_whatever_odometry_says(said, ro
 
 def without_features(map_pairs: int = 3) -> LoopCloser:
     """For whom no number of features is enough."""
-    verification = VerificationConfig(
-        min_inliers=10_000, witness_inliers=10_000, map_pairs=map_pairs
-    )
-    return LoopCloser(LoopCloserConfig(loops=LoopsConfig(verification=verification)))
+    verification = VerificationConfig(min_inliers=10_000, map_pairs=map_pairs)
+    loops = LoopsConfig(verification=verification, features=FeatureConfig(min_inliers=10_000))
+    return LoopCloser(LoopCloserConfig(loops=loops))
 
 
 def drifted_by(room, shift_m: float) -> list[Keyframe]:
@@ -194,6 +194,17 @@ def test_of_a_segment_that_is_apart_the_map_says_nothing(there, room) -> None:
         for k in keyframes_of(room, SECOND_WALK, len(FIRST_WALK), LONG_AFTER, far)
     ]
     assert closures(handled(LoopCloser(), told([*there, *other])))
+
+
+@pytest.mark.parametrize(("last", "subgraphs"), [(2, 0), (3, 1), (4, 1)])
+def test_what_was_seen_before_a_break_is_a_place(there, last, subgraphs) -> None:
+    actor = LoopCloser()
+    before = there[:last]
+    after = msgspec.structs.replace(there[5], segment=1)
+    handled(actor, told([*before, after]))
+    assert len(actor.recogniser.subgraphs) == subgraphs
+    for subgraph in actor.recogniser.subgraphs:
+        assert list(subgraph.keyframes) == [k.keyframe for k in before]
 
 
 def test_a_place_that_two_old_ones_explain_is_closed_with_neither(there, room) -> None:
@@ -381,3 +392,4 @@ def test_one_stage_alone_can_be_chosen(stages, there, back) -> None:
             assert candidate.similarity == 0
         else:
             assert candidate.evidence in ("", "landmarks")
+    assert closures(found)

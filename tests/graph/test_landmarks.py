@@ -207,7 +207,7 @@ def test_vague_observations_optimise_seldom_and_the_poses_are_as_good() -> None:
     errors, times = {}, {}
     for schedule in ("fixed", "adaptive"):
         config = LandmarksConfig(schedule=schedule)
-        graph, landmarks = seen_on_a_walk(truth, config, sigma=8e-3)
+        graph, landmarks = seen_on_a_walk(truth, config, p=VAGUE, sigma=8e-3)
         errors[schedule], times[schedule] = ate_m(graph, truth), graph.solved_times
         assert (landmarks.skipped > 0) == (schedule == "adaptive")
     assert times["adaptive"] < times["fixed"]
