@@ -102,7 +102,7 @@ class Landmark:
 
 
 class Landmarks:
-    """Deterministic; bounded by `most` landmarks, each 4 kB and its sights, and by the pairs of them
+    """Deterministic; bounded by `most` landmarks, each 4 kB and its sights, and the pairs of them
     that a keyframe showed together."""
 
     def __init__(self, config: LandmarksConfig, noise: NoiseConfig) -> None:
