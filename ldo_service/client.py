@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,6 +48,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import (
+    BY_NAME,
     CONTROL,
     FROM_ODOMETRY,
     FROM_OPERATORS,
@@ -56,6 +58,7 @@ from ldo_service.schemas.topics import (
     MAP_OBJECTS,
     MAP_REFINE,
     POSE_TRACKED,
+    TOPICS,
     Topic,
 )
 
@@ -179,11 +182,12 @@ class Client:
             assert isinstance(message, TrackedPose)
             yield message
 
-    def messages(self, topic: Topic, keep: int = 1) -> Iterator[tuple[Header, Message]]:
-        """Header and message of each sample on a topic, for ever; what a producer repeats that was
-        started again is left out."""
-        numbers = Numbers()
-        with self._subscriber(topic.name, keep) as subscriber:
+    def messages(self, topic: Topic | str, keep: int = 1) -> Iterator[tuple[Header, Message]]:
+        """Header and message of each sample on a topic, or one of that name, for ever; what a
+        producer repeats that was started again is left out. Of those not taken in time the newest
+        `keep` stay. Raises ConfigError for a name that no topic has."""
+        topic, numbers = _topic(topic), Numbers()
+        with self._subscriber(topic.subscribed_as, keep) as subscriber:
             for sample in subscriber:
                 header = _header(sample)
                 if numbers.came(header):
@@ -202,8 +206,14 @@ class Client:
 
             yield inbox
 
-    def last(self, topic: Topic, timeout_s: float = 3.0) -> list[Message]:
-        """The last value of a state topic, all its parts; empty when there is none yet."""
+    def last(self, topic: Topic | str, timeout_s: float = 3.0) -> list[Message]:
+        """The last value of a state topic, or the one of that name, all its parts; empty when there
+        is none yet. Raises ConfigError for a topic that keeps none, and for a name that none has.
+        """
+        topic = _topic(topic)
+        if not topic.is_state:
+            keeping = ", ".join(other.name for other in TOPICS if other.is_state)
+            raise ConfigError(f"{topic.name} keeps no last value. Those that do: {keeping}.")
         replies = self._session.get(
             self._network.expression(topic.name),
             timeout=timeout_s,
@@ -310,6 +320,16 @@ class Client:
     def _subscriber(self, name: str, keep: int) -> Any:
         ring = zenoh.handlers.RingChannel(keep)
         return self._session.declare_subscriber(self._network.expression(name), ring)
+
+
+def _topic(topic: Topic | str) -> Topic:
+    if isinstance(topic, Topic):
+        return topic
+    if topic not in BY_NAME:
+        near = get_close_matches(topic, BY_NAME, 1)
+        hint = f"Did you mean {near[0]}?" if near else "`ldo topics` lists all."
+        raise ConfigError(f"there is no topic {topic!r}. {hint}")
+    return BY_NAME[topic]
 
 
 def _names_or_why(name: str, answer: LabelNames) -> tuple[str, ...]:

@@ -91,7 +91,7 @@ class Service:
     async def _serve(self, session: zenoh.Session, health: HealthCollector) -> None:
         transport = ZenohTransport(session, self.network)
         if self.metrics_port is not None:
-            transport.subscribe(f"{HEALTH.name}/*", health.heard)
+            transport.subscribe(HEALTH.subscribed_as, health.heard)
         stop = Stop()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):

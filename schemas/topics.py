@@ -31,6 +31,12 @@ class Topic:
     is_state: bool = False
     key: str | None = None  # field by which `Latest(per_key=True)` tells messages apart
     answer: type[Message] | None = None  # where `message` is what a query asks
+    is_per_actor: bool = False  # each says it on a name of its own below this one
+
+    @property
+    def subscribed_as(self) -> str:
+        """The name of all that is said on it."""
+        return f"{self.name}/*" if self.is_per_actor else self.name
 
     def expression(self, robot: str) -> str:
         """The Zenoh key expression."""
@@ -63,7 +69,9 @@ MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
 MAP_REFINE = Topic("map/refine", MapRefine, "asked: so many iterations more")
 GRAPH_CORRECTION = Topic("graph/correction", Correction, "all keyframe poses", is_state=True)
-HEALTH = Topic("health", Health, "counters and latency of an actor (health/<actor>)")
+HEALTH = Topic(
+    "health", Health, "counters and latency of an actor (health/<actor>)", is_per_actor=True
+)
 CONTROL = Topic(
     "control", ControlRequest, "asked: pause, resume, save or reset", answer=ControlAnswer
 )
@@ -101,6 +109,8 @@ TOPICS: tuple[Topic, ...] = (
     HEALTH,
     CONTROL,
 )
+
+BY_NAME = {topic.name: topic for topic in TOPICS}
 
 FROM_OUTSIDE = (CAMERA_RGBD, CAMERA_COLOR, CAMERA_DEPTH)  # made by camera programs
 FROM_ODOMETRY = (ODOMETRY_PRIOR,)  # made by the robot's wheels, inertial unit or other camera

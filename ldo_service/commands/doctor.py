@@ -156,7 +156,7 @@ def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[Seen]:
     heard: dict[str, tuple[float, Health]] = {}
     with (
         connect(robot, endpoint, keys) as client,
-        client.listen(f"{HEALTH.name}/*", Health) as inbox,
+        client.listen(HEALTH.subscribed_as, Health) as inbox,
     ):
         until_s = time.monotonic() + LISTEN_S
         while time.monotonic() < until_s:

@@ -28,7 +28,6 @@ from ldo_service.schemas.topics import (
     FROM_ODOMETRY,
     FROM_OPERATORS,
     FROM_OUTSIDE,
-    HEALTH,
     ROBOT_PREFIX,
     TOPICS,
     Topic,
@@ -125,7 +124,7 @@ def rules_of(role: Role) -> Iterator[Rule]:
 
 
 def _rules_of_readers() -> Iterator[Rule]:
-    topics = tuple(f"{topic.name}/*" if topic is HEALTH else topic.name for topic in READABLE)
+    topics = tuple(topic.subscribed_as for topic in READABLE)
     states = tuple(topic.name for topic in READABLE if topic.is_state)
     tokens = (f"{ALIVE}/*",)
     yield Rule("subscribe", ("ingress",), ("declare_subscriber",), topics)

@@ -51,7 +51,7 @@ class Live:
         self._began_s: dict[str, float] = {}  # when another one was first heard of
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
-            stack.enter_context(service.listen(_name(topic), topic.message, keep))
+            stack.enter_context(service.listen(topic.subscribed_as, topic.message, keep))
             for topic, keep in KEPT.items()
         ]
         self._until_camera = stack.enter_context(ExitStack())
@@ -105,7 +105,3 @@ def live(service: Client, config: ViewerConfig) -> Iterator[Live]:
     """Subscribe to all that is shown, and ask for what was said before."""
     with ExitStack() as stack:
         yield Live(service, config, stack)
-
-
-def _name(topic: Topic) -> str:
-    return f"{topic.name}/*" if topic is HEALTH else topic.name

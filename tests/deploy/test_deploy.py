@@ -24,7 +24,7 @@ from ldo_service.metrics import exported as exporting
 from ldo_service.runtime.access import read_access, rules_of
 from ldo_service.schemas import encode
 from ldo_service.schemas.pose import IDENTITY
-from ldo_service.schemas.topics import CONTROL, HEALTH, ODOMETRY_PRIOR, TOPICS
+from ldo_service.schemas.topics import CONTROL, ODOMETRY_PRIOR, TOPICS
 from tests.runtime.conftest import free_port
 from tests.schemas.examples import EXAMPLES
 
@@ -63,7 +63,7 @@ def test_every_topic_has_somebody_who_may_put_and_somebody_who_may_read() -> Non
         return {key for rule in rules for key in rule.keys}
 
     assert keys("service", "put") == keys("service", "declare_subscriber") == {"**"}
-    readable = {f"{topic.name}/*" if topic is HEALTH else topic.name for topic in TOPICS}
+    readable = {topic.subscribed_as for topic in TOPICS}
     for role in ("viewer", "operator"):
         assert keys(role, "declare_subscriber") == readable - {CONTROL.name}
     assert CONTROL.name in keys("operator", "query")

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.graph import GRAPH
+from ldo_service.errors import ConfigError
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
 from tests.service.conftest import LDO, free_endpoint, is_running, live_service, wait_until
@@ -28,6 +29,13 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
         assert {pose.status for pose in poses} == {"OK"}
         assert publisher.wait(20) == 0
         assert isinstance(service.client.last(POSE_TRACKED)[0], TrackedPose)
+        assert service.client.last("pose/tracked") == service.client.last(POSE_TRACKED)
+        heard = service.client.messages("health", keep=16)
+        assert {next(heard)[1].actor for _ in range(16)} == set(EVERY_ACTOR)
+        with pytest.raises(ConfigError, match="Did you mean pose/tracked"):
+            service.client.last("pose/traked")
+        with pytest.raises(ConfigError, match="map/delta keeps no last value"):
+            service.client.last("map/delta")
         parts = service.client.last(MAP_SNAPSHOT)
         assert all(isinstance(part, MapSnapshot) for part in parts)
         assert sum(part.gaussians.ids.shape[0] for part in parts) > 1000
