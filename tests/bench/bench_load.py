@@ -227,9 +227,8 @@ def loaded(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="load-")))
         stack.enter_context(open_session(network, router=True))
         robots = stack.enter_context(robots_on(network, count, folder, settings))
-        sustained_hz = None if hz else _sustained(robots, scene)
-        rate_hz = hz or times * (sustained_hz or 0.0)
-        print(f"{count} robots track {sustained_hz} Hz each; sent are {rate_hz:.1f}", flush=True)
+        rate_hz = hz or times * _sustained(robots, scene)
+        print(f"{count} robots are sent {rate_hz:.1f} Hz each", flush=True)
         crowd = Crowd(network.endpoint, subscribers, stack)
         before = sum(robot.told() for robot in robots)
         cameras = [Camera(robot, scene, rate_hz) for robot in robots]
