@@ -1,6 +1,7 @@
 """A thread that works off what it is given, in order."""
 
 import asyncio
+import logging
 import os
 import sys
 import time
@@ -10,6 +11,8 @@ from queue import SimpleQueue
 from threading import Lock, Thread, get_native_id
 from typing import Any, ParamSpec, TypeVar
 from weakref import WeakSet
+
+log = logging.getLogger(__name__)
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -71,7 +74,7 @@ class Worker:
         return sorted(worker.name for worker in closed if worker._thread.is_alive())
 
     def _work(self) -> None:
-        _step_back(self._nice)
+        _step_back(self.name, self._nice)
         while entry := self._jobs.get():
             future, job = entry
             if future.set_running_or_notify_cancel():
@@ -79,11 +82,15 @@ class Worker:
             del entry, future, job  # a waiting thread holds on to nothing
 
 
-def _step_back(nice: int) -> None:
-    """Of the thread that calls it, from where its process is."""
-    if nice and sys.platform == "linux":
-        thread = get_native_id()
+def _step_back(name: str, nice: int) -> None:
+    """Of the thread that calls it, from where its process is; not where a sandbox forbids it."""
+    if not nice or sys.platform != "linux":
+        return
+    thread = get_native_id()
+    try:
         os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nice)
+    except OSError as error:
+        log.warning("%s does not step back behind poses: %s", name, error.strerror)
 
 
 def _settle(future: Future[Any], job: Callable[[], Any]) -> None:

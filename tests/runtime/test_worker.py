@@ -82,3 +82,17 @@ async def test_a_worker_steps_back_alone_and_so_do_the_threads_it_starts() -> No
     assert nice() == here
     prompt.close()
     patient.close()
+
+
+async def test_a_worker_that_may_not_step_back_works(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def forbidden(*_: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("os.setpriority", forbidden)
+    worker = Worker("mapper", nice=3)
+    assert await worker.run(int) == 0
+    assert "mapper does not step back behind poses: Operation not permitted" in caplog.text
+    worker.close()
