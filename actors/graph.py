@@ -113,7 +113,7 @@ def topics_table() -> str:
     """Markdown: who makes each topic, and who takes it with which policy."""
     lines = ["| topic | says | made by | taken by |", "|---|---|---|---|"]
     for topic in t.TOPICS:
-        name = "health/<actor>" if topic is t.HEALTH else topic.name
+        name = f"{topic.name}/<actor>" if topic.is_per_actor else topic.name
         state = " *" if topic.is_state else ""
         takers = ", ".join(f"{who} {policy}" for who, policy in consumers_of(topic)) or "outside"
         lines.append(f"| `{name}`{state} | {topic.says} | {producer_of(topic)} | {takers} |")

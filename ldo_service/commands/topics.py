@@ -9,7 +9,7 @@ from rich.table import Table
 
 from ldo_service.actors.graph import consumers_of, drawing, producer_of, topics_table
 from ldo_service.schemas.json_schema import json_schema
-from ldo_service.schemas.topics import HEALTH, TOPICS
+from ldo_service.schemas.topics import TOPICS
 
 from .options import Robot
 
@@ -46,7 +46,7 @@ def topics(
 def _table(robot: str) -> Table:
     table = Table("topic", "message", "made by", "taken by")
     for topic in TOPICS:
-        expression = topic.expression(robot) + ("/<actor>" if topic is HEALTH else "")
+        expression = topic.expression(robot) + ("/<actor>" if topic.is_per_actor else "")
         takers = "\n".join(f"{who} {policy}" for who, policy in consumers_of(topic))
         state = " *" if topic.is_state else ""
         table.add_row(

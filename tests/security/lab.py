@@ -17,7 +17,7 @@ from ldo_service.runtime.access import Role
 from ldo_service.runtime.keys import Keys
 from ldo_service.runtime.network import Network
 from ldo_service.runtime.zenoh_transport import open_session
-from ldo_service.schemas.topics import CONTROL, HEALTH, TOPICS
+from ldo_service.schemas.topics import CONTROL, TOPICS
 from tests.runtime.conftest import free_port
 
 ROBOT, OTHER_ROBOT = "mule", "goat"
@@ -27,7 +27,7 @@ SETTLED = "settled"
 LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"  # a camera's keys that were made again; others
 ROLES: tuple[Role, ...] = ("service", "camera", "odometry", "viewer", "operator")
 INSIDE = ("link/order", "link/grant/keyframe/new", "link/welcome/keyframe/new")  # between actors
-NAMES = (*(f"{t.name}/mapper" if t is HEALTH else t.name for t in TOPICS), *INSIDE, SETTLED)
+NAMES = (*(f"{t.name}/mapper" if t.is_per_actor else t.name for t in TOPICS), *INSIDE, SETTLED)
 
 
 @dataclass
