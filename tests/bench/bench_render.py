@@ -34,9 +34,9 @@ from ldo_service.evaluation.iteration import (
 )
 from ldo_service.gaussians import render
 from ldo_service.gaussians.render import RenderMemory
-from ldo_service.gaussians.render_reference import render_reference
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _rasterise
+from tests.reference.render import render_reference
 
 SIZES = ((100_000, 640, 480), (100_000, 320, 240), (500_000, 640, 480))
 RATES = np.array([1e-4] * 3 + [1e-3] * 10 + [1e-3] + [0] * 2, np.float32)

@@ -20,11 +20,8 @@ import numpy as np
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
 from ldo_service.semantics.assignment import Regions, assign
-from ldo_service.semantics.assignment_reference import assign_reference
 from ldo_service.semantics.consistency import agree
-from ldo_service.semantics.consistency_reference import agree_reference
 from ldo_service.semantics.foreground import Foreground, foreground, surfaces
-from ldo_service.semantics.foreground_reference import foreground_reference, surfaces_reference
 from ldo_service.semantics.labelling import (
     Claims,
     LabellingConfig,
@@ -32,8 +29,11 @@ from ldo_service.semantics.labelling import (
     observations,
 )
 from ldo_service.semantics.labels import NOT_SEEN, new_labels, observe
-from ldo_service.semantics.labels_reference import observe_reference
 from ldo_service.semantics.nesting import without_nested
+from tests.reference.assignment import assign_reference
+from tests.reference.consistency import agree_reference
+from tests.reference.foreground import foreground_reference, surfaces_reference
+from tests.reference.labels import observe_reference
 
 CAMERA, CONFIG = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), LabellingConfig()
 SIDE_PX, MARGIN_PX = 80, 10

@@ -3,8 +3,8 @@ import pytest
 
 from ldo_service.errors import DataError
 from ldo_service.gaussians import render
-from ldo_service.gaussians.render_reference import render_reference
 from ldo_service.geometry import Camera, se3
+from tests.reference.render import render_reference
 
 CAMERA = Camera(33, 21, 30.0, 32.0, 15.0, 11.0)
 

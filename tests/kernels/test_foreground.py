@@ -9,7 +9,7 @@ import pytest
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
 from ldo_service.semantics.foreground import ForegroundConfig, Surfaces
-from ldo_service.semantics.foreground_reference import foreground_reference, surfaces_reference
+from tests.reference.foreground import foreground_reference, surfaces_reference
 
 CONFIG = ForegroundConfig()
 # whole vectors and words, cut ones, and sides below the nine pixels that a normal's pair reads

@@ -8,8 +8,8 @@ import pytest
 from autograd import grad
 
 from ldo_service.gaussians import Exposure, LossWeights, image_loss
-from ldo_service.gaussians.loss_reference import loss_reference, ssim
 from ldo_service.kernels import _loss
+from tests.reference.loss import loss_reference, ssim
 
 WEIGHTS = (0.8, 0.2, 0.7)
 SIZES = ((23, 37), (48, 64), (5, 3), (250, 17), (1, 1))  # below a window, across a band

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians import Rendering, render
-from ldo_service.gaussians.render_reference import render_reference
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels import _rasterise, isa
+from tests.reference.render import render_reference
 
 from .scenes import camera_of, gaussians
 

@@ -10,9 +10,9 @@ import pytest
 from autograd import grad
 
 from ldo_service.gaussians.rasteriser import Rasteriser
-from ldo_service.gaussians.render_reference import render_reference
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels import _rasterise
+from tests.reference.render import render_reference
 
 from .scenes import camera_of, gaussians
 

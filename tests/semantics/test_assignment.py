@@ -14,8 +14,8 @@ from ldo_service.semantics.assignment import (
     Regions,
     assign,
 )
-from ldo_service.semantics.assignment_reference import assign_reference
 from ldo_service.semantics.foreground import Foreground
+from tests.reference.assignment import assign_reference
 
 CAMERA = Camera(64, 48, 50.0, 55.0, 31.5, 23.5)
 T_CAMERA_MAP = se3.exp(np.array([0.1, -0.2, 0.05, 0.1, 0.05, 0.2]))

@@ -6,7 +6,6 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.semantics import consistency
 from ldo_service.semantics.consistency import ConsistencyConfig, agree
-from ldo_service.semantics.consistency_reference import agree_reference
 from ldo_service.semantics.labels import (
     LabelConfig,
     Observations,
@@ -15,6 +14,7 @@ from ldo_service.semantics.labels import (
     new_labels,
     observe,
 )
+from tests.reference.consistency import agree_reference
 
 CONFIG = ConsistencyConfig()
 

@@ -9,7 +9,6 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.semantics import foreground as foreground_module
-from ldo_service.semantics import foreground_reference as twin
 from ldo_service.semantics.foreground import (
     ForegroundConfig,
     Surfaces,
@@ -17,6 +16,7 @@ from ldo_service.semantics.foreground import (
     pixels_of,
     surfaces,
 )
+from tests.reference import foreground as twin
 
 CAMERA, CONFIG = Camera(160, 120, 140.0, 140.0, 79.5, 59.5), ForegroundConfig()
 CUBE = slice(50, 90), slice(60, 100)

@@ -26,7 +26,7 @@ from ldo_service.semantics.labels import (
     observe,
     top_labels,
 )
-from ldo_service.semantics.labels_reference import observe_dense, observe_reference
+from tests.reference.labels import observe_dense, observe_reference
 
 CONFIGS = [LabelConfig(), LabelConfig(hold_back=0), LabelConfig(ema="paper")]
 

@@ -2,9 +2,10 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import Camera, se3
-from ldo_service.tracking import PyramidConfig, align_reference, build_reference, pyramid_of
+from ldo_service.tracking import PyramidConfig, build_reference, pyramid_of
 from ldo_service.tracking.equations import Appearance, ResidualConfig, normal_equations
 from ldo_service.tracking.pyramid import Level
+from tests.reference import alignment
 
 APPEARANCE = Appearance(gain=1.1, bias=-4.0, intensity_sigma=6.0, depth_noise_scale=1.5)
 T_CAMERA_REFERENCE = se3.exp(np.array([0.02, -0.03, 0.01, 0.04, -0.02, 0.03]))
@@ -21,7 +22,7 @@ def test_kernel_equals_its_plain_twin(room, level: int) -> None:
     points = build_reference(pyramid).points[level]
     guess = se3.exp(np.array([0.004, 0.002, -0.003, 0.01, 0.01, -0.02])) @ T_CAMERA_REFERENCE
     arguments = (points, target, guess, APPEARANCE, ResidualConfig())
-    fast, plain = normal_equations(*arguments), align_reference.normal_equations(*arguments)
+    fast, plain = normal_equations(*arguments), alignment.normal_equations(*arguments)
     scale = np.abs(plain.hessian).max(axis=1)
     assert fast.visible == pytest.approx(plain.visible, abs=2)  # rounding at the image border
     for a, b in ((fast.photometric, plain.photometric), (fast.geometric, plain.geometric)):
@@ -61,9 +62,9 @@ def test_geometric_jacobian_is_the_derivative() -> None:
 
     def residuals(xi: np.ndarray) -> np.ndarray:
         p, n = perturbed(xi, points, normals)
-        return align_reference.geometric(p, n, q)[0]
+        return alignment.geometric(p, n, q)[0]
 
-    _, J = align_reference.geometric(*perturbed(np.zeros(6), points, normals), q)
+    _, J = alignment.geometric(*perturbed(np.zeros(6), points, normals), q)
     np.testing.assert_allclose(J[:, :6], central_differences(residuals), atol=1e-8)
 
 
@@ -78,10 +79,10 @@ def test_photometric_jacobian_is_the_derivative() -> None:
 
     def residuals(xi: np.ndarray, appearance: Appearance = APPEARANCE) -> np.ndarray:
         p, _ = perturbed(xi, points, normals)
-        return align_reference.photometric(level, p, shade, *camera.project(p).T, appearance)[0]
+        return alignment.photometric(level, p, shade, *camera.project(p).T, appearance)[0]
 
     p, _ = perturbed(np.zeros(6), points, normals)
-    _, J = align_reference.photometric(level, p, shade, *camera.project(p).T, APPEARANCE)
+    _, J = alignment.photometric(level, p, shade, *camera.project(p).T, APPEARANCE)
     np.testing.assert_allclose(J[:, :6], central_differences(residuals), atol=1e-5)
     brighter = Appearance(APPEARANCE.gain + 1, APPEARANCE.bias + 2)
     change = residuals(np.zeros(6), brighter) - residuals(np.zeros(6))

@@ -3,8 +3,7 @@
 import numpy as np
 
 from ldo_service.geometry import se3
-
-from .equations import (
+from ldo_service.tracking.equations import (
     DEGREES_OF_FREEDOM,
     INLIER_SIGMA,
     Appearance,
@@ -12,7 +11,7 @@ from .equations import (
     ResidualConfig,
     Term,
 )
-from .pyramid import Level
+from ldo_service.tracking.pyramid import Level
 
 
 def normal_equations(

@@ -4,7 +4,15 @@ from math import exp, log
 
 import numpy as np
 
-from .labels import BACKGROUND, MISS, OTHER, SLOTS, LabelConfig, Observations, fields
+from ldo_service.semantics.labels import (
+    BACKGROUND,
+    MISS,
+    OTHER,
+    SLOTS,
+    LabelConfig,
+    Observations,
+    fields,
+)
 
 
 def observe_reference(labels: np.ndarray, seen: Observations, config: LabelConfig) -> None:

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.gaussians.render import Contributions, Rendering
 from ldo_service.geometry import Camera
-
-from .render import Contributions, Rendering
 
 
 def rotations(quats: Any, xp: Any = np) -> Any:

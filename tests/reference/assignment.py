@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ldo_service.gaussians.render_reference import project
 from ldo_service.geometry import Camera
+from ldo_service.semantics.assignment import HIDDEN, UNMATCHED, Assigned, AssignmentConfig
 
-from .assignment import HIDDEN, UNMATCHED, Assigned, AssignmentConfig
+from .render import project
 
 
 def assign_reference(
