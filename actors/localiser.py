@@ -16,8 +16,8 @@ import numpy as np
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.errors import DataError
 from ldo_service.geometry import RgbdFrame
-from ldo_service.runtime.state_store import decode_state
 from ldo_service.schemas import Keyframe, TrackedPose
+from ldo_service.storage.state_codec import decode_state
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.localiser import Fix, Localiser
 from ldo_service.tracking.places import Place, Places

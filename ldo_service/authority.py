@@ -31,10 +31,10 @@ from ldo_service.certificates import (
     read_key,
 )
 from ldo_service.errors import ConfigError
-from ldo_service.plain_yaml import plain_text
 from ldo_service.runtime.access import EVERY_ROBOT, Grantee, Role, read_access
 from ldo_service.runtime.keys import ACCESS, CA, CERTIFICATE, KEY
 from ldo_service.runtime.network import require_robot
+from ldo_service.storage.yaml_io import plain_text
 
 CA_KEY = "ca.key"
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")  # with its number 64, a common name's most

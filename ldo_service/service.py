@@ -35,12 +35,12 @@ from ldo_service.runtime.process import (
 )
 from ldo_service.runtime.recording import prepare_recording
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.supervision import Runner, Stop, supervise
 from ldo_service.runtime.watchdog import Watchdog
 from ldo_service.runtime.worker import Worker
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
+from ldo_service.storage.state_store import FolderStore
 
 log = logging.getLogger(__name__)
 

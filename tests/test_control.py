@@ -6,9 +6,9 @@ from contextlib import asynccontextmanager
 from ldo_service.control import Control
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.state_store import MemoryStore, StateStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
+from ldo_service.storage.state_store import MemoryStore, StateStore
 from tests.runtime.cast import (
     LATEST_NUMBER,
     NUMBERS,

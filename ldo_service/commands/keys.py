@@ -9,10 +9,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.plain_yaml import plain_text
 from ldo_service.runtime.access import EVERY_ROBOT, Access, Role, read_access
 from ldo_service.runtime.keys import ACCESS, router_settings
 from ldo_service.runtime.network import CLOSED, MAX_MESSAGE_MB
+from ldo_service.storage.yaml_io import plain_text
 
 Folder = Annotated[
     Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of the authority")

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.storage.checksummed_folder import SealedFolder
 
 from .keyframe_images import KeyframeImages, packed, unpacked
-from .sealed_folder import SealedFolder
 
 log = logging.getLogger(__name__)
 

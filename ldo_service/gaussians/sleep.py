@@ -10,11 +10,11 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import se3
+from ldo_service.storage.checksummed_folder import SealedFolder
 
 from .anchor_spheres import AnchorSpheres, PlacedCamera
 from .chunk import Chunk, packed, unpacked
 from .model import ROW, GaussianMap, Piece, new_labels
-from .sealed_folder import SealedFolder
 
 log = logging.getLogger(__name__)
 

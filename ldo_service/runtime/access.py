@@ -22,7 +22,6 @@ import msgspec
 import yaml
 
 from ldo_service.errors import ConfigError
-from ldo_service.plain_yaml import plain_values
 from ldo_service.schemas.topics import (
     CONTROL,
     FROM_ODOMETRY,
@@ -32,6 +31,7 @@ from ldo_service.schemas.topics import (
     TOPICS,
     Topic,
 )
+from ldo_service.storage.yaml_io import plain_values
 
 from .links import ALIVE
 

@@ -6,14 +6,11 @@ from typing import Any, ClassVar
 
 from ldo_service.schemas import Message
 from ldo_service.schemas.topics import Topic
+from ldo_service.storage.state_store import State
 
 from .ports import In, Out
 
 UNLIMITED = 1 << 30
-
-# Named parts of an actor's state, each of plain values, bytes and NumPy arrays. A part that did not
-# change since the last step is the same object: only new objects are written.
-State = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True)

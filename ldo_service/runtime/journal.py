@@ -16,7 +16,9 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
-from .actor import Situation, State
+from ldo_service.storage.state_store import State
+
+from .actor import Situation
 from .inlet import Delivery
 from .step import Produced
 

@@ -3,10 +3,11 @@
 import logging
 from collections.abc import Callable, Mapping
 
-from .actor import Actor, State
+from ldo_service.storage.state_store import State, StateStore
+
+from .actor import Actor
 from .ledger import Ledger, Past, Taken, successor
 from .links import InletPast, OutletPast
-from .state_store import StateStore
 
 log = logging.getLogger(__name__)
 

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 
 from ldo_service.schemas import decode
 from ldo_service.schemas.topics import Topic
+from ldo_service.storage.state_store import State
 
-from .actor import Actor, Situation, State
+from .actor import Actor, Situation
 from .links import InletPast, OutletPast, Sent
 from .step import produce
 

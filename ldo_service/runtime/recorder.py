@@ -10,12 +10,13 @@ from threading import Lock
 from msgspec.structs import replace
 
 from ldo_service.schemas.topics import Topic
+from ldo_service.storage.state_codec import encode_state
+from ldo_service.storage.state_store import State
 
-from .actor import Situation, State
+from .actor import Situation
 from .inlet import Delivery
 from .journal import Gap, Journal, Kind, Started, Step, checksum, digest_of, outputs_of
 from .recording_file import RecordConfig, RecordingFile
-from .state_store import encode_state
 from .step import Produced
 from .worker import Worker
 

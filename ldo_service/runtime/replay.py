@@ -12,12 +12,12 @@ import msgspec
 
 from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.schemas import Message, decode
+from ldo_service.storage.state_codec import decode_state
 
 from .actor import Actor, Situation
 from .journal import Gap, Output, Started, Step, checksum, digest_of, outputs_of
 from .ledger import Past, counts_by_topic, successor
 from .recording import JournalFile
-from .state_store import decode_state
 from .step import Produced, produce
 
 Make = Callable[[Mapping[str, str]], Actor]  # from what a file says about itself

@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator, Mapping
 from ldo_service.errors import StageStalled
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import HEALTH
+from ldo_service.storage.state_store import MemoryStore, State, StateStore
 
 from . import links
-from .actor import Actor, Situation, State
+from .actor import Actor, Situation
 from .inlet import Delivery
 from .journal import Journal, Kind
 from .keeper import Keeper
@@ -23,7 +24,6 @@ from .ports import Lossless
 from .reader import Reader
 from .restart import RestartBudget
 from .stage_config import StageConfig
-from .state_store import MemoryStore, StateStore
 from .step import Produced, produce
 from .transport import Transport
 from .vitals import Vitals

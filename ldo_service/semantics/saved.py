@@ -16,8 +16,8 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.gaussians.model import new_labels
+from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
-from .arrays_file import UNREADABLE, read_arrays
 from .labels import MOST_LABELS, ROW, fields
 
 COLUMNS = ROW.names or ()

@@ -10,7 +10,7 @@ import yaml
 from msgspec import field
 
 from ldo_service.errors import ConfigError
-from ldo_service.plain_yaml import plain_values
+from ldo_service.storage.yaml_io import plain_values
 
 from .figures import FIGURES
 

@@ -11,8 +11,8 @@ from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import TrackedPose
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.wire import transform
 
 

@@ -12,7 +12,6 @@ from ldo_service.loops import LoopsConfig
 from ldo_service.loops.memory import RetrievalConfig
 from ldo_service.loops.plausibility import PlausibilityConfig
 from ldo_service.loops.verification import Proposal, VerificationConfig, Verifier
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Array,
     Detection,
@@ -23,6 +22,7 @@ from ldo_service.schemas import (
     Message,
     encode,
 )
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.wire import (
     camera_message,

@@ -17,7 +17,6 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.map_follower import MapFollower
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.ledger import Past, Taken, successor
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Detection,
     DetectionBoxes,
@@ -33,6 +32,7 @@ from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.semantics.labelling import LabellingConfig
 from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.semantic_map import SemanticMapConfig
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.wire import (
     correction_message,
     keyframe_poses_of,

@@ -8,7 +8,6 @@ import numpy as np
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.geometry import se3
 from ldo_service.geometry.relative_pose import RelativePose
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Array,
     CameraModel,
@@ -18,6 +17,7 @@ from ldo_service.schemas import (
     Message,
     ObjectObservation,
 )
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.wire import keyframe_poses_of, matrix6_message, measured_message, pose_message
 
 CAMERA = CameraModel(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)

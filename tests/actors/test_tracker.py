@@ -12,7 +12,6 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.runtime.actor import Situation
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import (
     Array,
     Correction,
@@ -25,6 +24,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.segments import SegmentConfig

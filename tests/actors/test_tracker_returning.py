@@ -10,9 +10,9 @@ from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import se3
 from ldo_service.runtime.actor import Situation
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas import FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.topics import KEYFRAME_NEW
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.returning import ReturnConfig
 from ldo_service.wire import correction_message, transform

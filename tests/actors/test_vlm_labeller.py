@@ -18,7 +18,6 @@ from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.state_store import MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
 from ldo_service.schemas.labels import MOST_OTHERS
@@ -26,6 +25,7 @@ from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL
 from ldo_service.semantics.labellers import Opinion
 from ldo_service.semantics.labellers.endpoint import EndpointConfig
 from ldo_service.semantics.labellers.http_labeller import HttpConfig
+from ldo_service.storage.state_store import MemoryStore
 from tests.runtime.cast import QUICK, eventually, running, send
 from tests.semantics.labellers.encoders import ColorPair, embeddings, plain, vocabulary
 from tests.semantics.labellers.server import hangs, says, sends, serving

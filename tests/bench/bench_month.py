@@ -30,8 +30,8 @@ from ldo_service.config import load_config
 from ldo_service.runtime import Actor
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.runtime.process import give_back_free_memory, resident_mb
-from ldo_service.runtime.state_store import encode_state
 from ldo_service.schemas import CameraRgbd, Keyframe, Message
+from ldo_service.storage.state_codec import encode_state
 from tests.faults.camera import PERIOD_NS, frames
 
 LIGHT = ("mapper.iterations=2", "mapper.threads=1")

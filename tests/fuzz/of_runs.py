@@ -23,10 +23,11 @@ from ldo_service.runs.loops_file import read_loops
 from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
 from ldo_service.runtime.journal import Started, Step, checksum
 from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
-from ldo_service.runtime.state_store import FolderStore, decode_state, encode_state
 from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.saved import read_semantics, write_semantics
 from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.storage.state_codec import decode_state, encode_state
+from ldo_service.storage.state_store import FolderStore
 from ldo_service.tracking.places import Place
 from tests.schemas.examples import EXAMPLES
 

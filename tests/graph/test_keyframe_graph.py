@@ -10,7 +10,7 @@ from ldo_service.geometry.relative_pose import RelativePose
 from ldo_service.graph.condensing import group_to_condense
 from ldo_service.graph.factors import NoiseConfig
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
-from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.storage.state_codec import decode_state, encode_state
 
 from .walks import REFINED, ate_m, closures, kitchen, odometry, round_trips, walked
 

@@ -11,7 +11,7 @@ from ldo_service.graph.factors import NoiseConfig, odometry_information
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
 from ldo_service.graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
 from ldo_service.graph.solver import point_key, solved
-from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.storage.state_codec import decode_state, encode_state
 
 from .walks import ate_m, kitchen, odometry, walked
 

@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import Any
 
 from ldo_service.runtime import Actor, In, Lossless, Out
-from ldo_service.runtime.actor import State
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.recorder import Recorder
 from ldo_service.runtime.recording import JournalFile, new_path, recorded_actors
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.replay import Replayed, replay
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.state_store import FolderStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Message
+from ldo_service.storage.state_store import FolderStore, State
 
 from .cast import (
     DOUBLES,

@@ -9,14 +9,14 @@ from typing import cast
 import pytest
 
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
-from ldo_service.runtime.actor import Situation, State
+from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.ledger import MOST_TAKEN, Past, Taken, successor
 from ldo_service.runtime.links import InletPast, OutletPast, Sent
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, new_epoch
-from ldo_service.runtime.state_store import FolderStore, MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Message, encode
+from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 
 from .cast import (
     DOUBLES,

@@ -9,16 +9,15 @@ import pytest
 
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime import orders as orders_module
-from ldo_service.runtime.actor import State
 from ldo_service.runtime.ledger import Past
 from ldo_service.runtime.links import OUTSIDE, encode
 from ldo_service.runtime.orders import ORDER_KEY, Commander, Order
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.state_store import FolderStore, MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
+from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 
 from .cast import (
     DOUBLES,

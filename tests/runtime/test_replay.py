@@ -10,11 +10,11 @@ from mcap.writer import CompressionType, Writer
 
 from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.runtime import recording_file
-from ldo_service.runtime.actor import State
 from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.runtime.mcap_index import McapIndex
 from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.schemas import Message
+from ldo_service.storage.state_store import State
 
 from .cast import DOUBLES, NUMBERS, PIECES, Double
 from .journals import UNLUCKY, Tally, files, recorded, replayed

@@ -10,12 +10,11 @@ import pytest
 
 from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
-from ldo_service.runtime.actor import State
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, StageConfig, new_epoch
-from ldo_service.runtime.state_store import FolderStore, MemoryStore
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Health, Message, decode
+from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 
 from .cast import (
     DOUBLES,

@@ -7,7 +7,6 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.schemas.labels import MOST_CROPS
 from ldo_service.semantics.foreground import Foreground
 from ldo_service.semantics.region_views import (
@@ -25,6 +24,7 @@ from ldo_service.semantics.regions_to_name import (
     RegionsToName,
 )
 from ldo_service.semantics.trigger import Candidate
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.wire import crops_of, label_request_message
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)

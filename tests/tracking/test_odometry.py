@@ -9,7 +9,7 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
-from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
 from ldo_service.tracking.keyframes import KeyframeConfig
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.runtime.state_store import decode_state, encode_state
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, Prior, PriorConfig, Status, Tracked
 from ldo_service.tracking.prior import KEPT, Anchor, Reading, Verdict
 from ldo_service.tracking.relocalisation import RelocalisationConfig

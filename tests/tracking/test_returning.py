@@ -8,8 +8,8 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.runtime.state_store import decode_state, encode_state
 from ldo_service.semantics.movable import Box
+from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import (
     Odometry,
     OdometryConfig,

@@ -7,10 +7,10 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from ldo_service.errors import ModelError
-from ldo_service.semantics.arrays_file import UNREADABLE, read_arrays
 from ldo_service.semantics.class_names import is_name, normalised
 from ldo_service.semantics.network import Network
 from ldo_service.semantics.synonyms import canonical
+from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
 from .byte_pairs import BytePairs
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import DataError
-from ldo_service.runtime import state_store
-from ldo_service.runtime.state_store import FolderStore, MemoryStore
+from ldo_service.storage import state_codec, state_store
+from ldo_service.storage.state_store import FolderStore, MemoryStore
 
 RICH: dict[str, Any] = {
     "counters": {"frames": 3, "names": ["a", "b"], "nothing": None},
@@ -239,7 +239,7 @@ def test_what_could_not_be_read_is_kept_beside_what_is_saved_next(tmp_path: Path
         assert FolderStore(tmp_path).load("mapper") is None
         assert FolderStore(tmp_path).load("mapper") is None, "as if nothing had been saved"
         kept = (tmp_path / "mapper.unreadable" / "one.a").read_bytes()
-        assert state_store.decode_state(kept) == [step]
+        assert state_codec.decode_state(kept) == [step]
 
 
 def test_a_missing_file_is_left_out_and_said(

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.errors import DataError
-from ldo_service.gaussians.sealed_folder import SealedFolder
+from ldo_service.storage.checksummed_folder import SealedFolder
 
 BODY = bytes(range(40))
 

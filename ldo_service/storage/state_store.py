@@ -13,19 +13,18 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import msgspec
-import numpy as np
 
 from ldo_service.errors import DataError
 
-from .actor import State
+from .state_codec import decode_state, encode_state
 
 log = logging.getLogger(__name__)
-ARRAY_CODE = 1  # MessagePack extension type of a NumPy array
+
+
+# Named parts of an actor's state, each of plain values, bytes and NumPy arrays. A part that did not
+# change since the last step is the same object: only new objects are written.
+State = Mapping[str, Any]
 CONTENTS = "contents.msgpack"
-UNREADABLE = (
-    *(ValueError, RecursionError),
-    *(TypeError, SyntaxError, OverflowError, MemoryError),  # what NumPy thinks of a dtype and shape
-)
 
 
 class StateStore(Protocol):
@@ -176,35 +175,3 @@ def sync(path: Path) -> None:
         os.fsync(number)
     finally:
         os.close(number)
-
-
-def encode_state(value: object) -> bytes:
-    """Plain values, bytes and NumPy arrays as MessagePack."""
-    return msgspec.msgpack.encode(value, enc_hook=_array_to_ext)
-
-
-def decode_state(body: bytes) -> Any:
-    """The inverse. Raises msgspec.DecodeError, whatever the bytes are."""
-    try:
-        return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
-    except UNREADABLE as error:
-        raise msgspec.DecodeError(f"cannot be decoded: {error}") from error
-
-
-def _array_to_ext(value: object) -> msgspec.msgpack.Ext:
-    if isinstance(value, np.generic):
-        value = np.asarray(value)
-    if not isinstance(value, np.ndarray):
-        raise NotImplementedError(f"{type(value).__name__} in an actor's state")
-    if value.dtype.hasobject:
-        raise NotImplementedError("an array of Python objects in an actor's state")
-    packed = (value.dtype.str, value.shape, value.tobytes())
-    return msgspec.msgpack.Ext(ARRAY_CODE, msgspec.msgpack.encode(packed))
-
-
-def _array_from_ext(code: int, data: memoryview) -> Any:
-    if code != ARRAY_CODE:
-        raise ValueError(f"unknown extension {code} in a saved state")
-    dtype, shape, raw = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...], bytes])
-    array = np.frombuffer(raw, dtype).reshape(shape).copy()
-    return array if shape else array[()]
