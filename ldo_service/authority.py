@@ -12,7 +12,6 @@ import os
 import re
 import secrets
 import shutil
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -34,6 +33,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.runtime.access import EVERY_ROBOT, Grantee, Role, read_access
 from ldo_service.runtime.keys import ACCESS, CA, CERTIFICATE, KEY
 from ldo_service.runtime.network import require_robot
+from ldo_service.storage.atomic_write import folder_made_atomically, write_atomically
 from ldo_service.storage.yaml_io import plain_text
 
 CA_KEY = "ca.key"
@@ -79,7 +79,7 @@ class Authority:
             folder.mkdir(mode=0o700, parents=True)
             _write_secret(folder / CA_KEY, key_pem(key))
             (folder / CA).write_bytes(certificate_pem(certificate))
-            _replace(folder / ACCESS, HEAD + "{}\n")
+            write_atomically(folder / ACCESS, (HEAD + "{}\n").encode())
         except OSError as error:
             raise ConfigError(f"{folder} cannot be written: {error}.") from error
         return cls(folder)
@@ -139,13 +139,11 @@ class Authority:
             self._certificate, self._key, common_name, key.public_key(), days, now, hosts
         )
         try:
-            with tempfile.TemporaryDirectory(prefix=".new-", dir=self.folder) as unfinished:
-                made = Path(unfinished) / name
+            with folder_made_atomically(self.folder / name) as made:
                 made.mkdir(mode=0o700)
                 _write_secret(made / KEY, key_pem(key))
                 (made / CERTIFICATE).write_bytes(certificate_pem(certificate))
                 shutil.copyfile(self.folder / CA, made / CA)
-                made.rename(self.folder / name)
         except OSError as error:
             raise ConfigError(f"{self.folder} cannot be written: {error}.") from error
         return certificate
@@ -157,7 +155,7 @@ class Authority:
         services = {entry.name for entry in self.entries if entry.grantee.role == "service"}
         for folder in (self.folder, *(self.folder / name for name in sorted(services))):
             if folder.is_dir():  # a service's may have been moved away
-                _replace(folder / ACCESS, text)
+                write_atomically(folder / ACCESS, text.encode())
 
 
 def _require_name(name: str) -> None:
@@ -181,9 +179,3 @@ def _write_secret(path: Path, body: bytes) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(body)
-
-
-def _replace(path: Path, text: str) -> None:
-    unfinished = path.with_name(path.name + ".new")
-    unfinished.write_text(text)
-    unfinished.replace(path)

@@ -14,7 +14,6 @@ The folder is LDO_MODELS, or ldo/models where XDG_DATA_HOME says that data of pr
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from ldo_service.errors import ConfigError, ModelError
 from ldo_service.semantics.detectors import NetworkConfig, OnnxDetector
 from ldo_service.semantics.labellers.dual_encoder import DualEncoder, DualEncoderConfig, Pair
 from ldo_service.semantics.network import sha256
+from ldo_service.storage.atomic_write import folder_made_atomically
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 FILE, ABOUT = "model.onnx", "about.json"
@@ -110,9 +110,8 @@ class Models:
                 raise ModelError(f"{file} is no file: name an ONNX file.")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(prefix=".new-", dir=self.folder) as unfinished:
-                about = fill(Path(unfinished) / name)
-                (Path(unfinished) / name).rename(self.folder / name)
+            with folder_made_atomically(self.folder / name) as folder:
+                about = fill(folder)
         except OSError as error:
             raise ConfigError(
                 f"{self.folder} cannot be written: {error}. LDO_MODELS names another folder."

@@ -16,12 +16,13 @@ from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
 
+from .atomic_write import UNFINISHED, write_atomically
+
 log = logging.getLogger(__name__)
 
 _HEADER = struct.Struct("<4sI")  # magic, CRC-32 of the rest
 _MAGIC = b"LDO1"
 _OF_PROCESS = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # limits that say nothing of a file
-_UNFINISHED = ".new"  # added to the name while a file is written
 
 
 class SealedFolder:
@@ -41,7 +42,7 @@ class SealedFolder:
         self.not_written = 0
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            for unfinished in self._folder.glob(f"*.{suffix}{_UNFINISHED}"):
+            for unfinished in self._folder.glob(f"*.{suffix}{UNFINISHED}"):
                 unfinished.unlink()
             self._sizes = self._found()
         except OSError as error:
@@ -58,7 +59,8 @@ class SealedFolder:
         """Write or replace a file. False when the disk does not take it, which is counted, and
         logged once until it takes one again."""
         try:
-            self._sizes[number] = _write_whole(self._path(number), body)
+            header = _HEADER.pack(_MAGIC, zlib.crc32(body))
+            self._sizes[number] = write_atomically(self._path(number), header, body)
         except OSError as error:
             self.not_written += 1
             if not self._is_refusing:
@@ -97,20 +99,6 @@ class SealedFolder:
     def _found(self) -> dict[int, int]:
         files = self._folder.glob(f"*.{self._suffix}")
         return {int(file.stem): file.stat().st_size for file in files if file.stem.isdecimal()}
-
-
-def _write_whole(path: Path, body: bytes) -> int:
-    """Size in bytes. Raises OSError, and then leaves nothing new."""
-    unfinished = path.with_name(path.name + _UNFINISHED)
-    try:
-        with unfinished.open("wb") as file:
-            file.write(_HEADER.pack(_MAGIC, zlib.crc32(body)))
-            file.write(body)
-        unfinished.replace(path)
-    except OSError:
-        unfinished.unlink(missing_ok=True)
-        raise
-    return _HEADER.size + len(body)
 
 
 def _temporary_folder(owner: object, name: str) -> Path:

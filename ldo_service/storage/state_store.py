@@ -5,7 +5,6 @@ not be changed afterwards.
 """
 
 import logging
-import os
 import shutil
 from collections.abc import Mapping
 from contextlib import suppress
@@ -16,6 +15,7 @@ import msgspec
 
 from ldo_service.errors import DataError
 
+from .atomic_write import sync, write_atomically
 from .state_codec import decode_state, encode_state
 
 log = logging.getLogger(__name__)
@@ -85,12 +85,9 @@ class FolderStore:
                 self._write(folder / new[part], encode_state(value))
         new = {part: new[part] for part in state}
         if new != old:
-            temporary = folder / f"{CONTENTS}.new"
-            self._write(temporary, msgspec.msgpack.encode(new))
             self._saved.pop(actor, None)  # these files may be named from now on, whatever fails
-            temporary.rename(folder / CONTENTS)
-            if self._syncs:
-                sync(folder)
+            body = msgspec.msgpack.encode(new)
+            write_atomically(folder / CONTENTS, body, syncs=self._syncs)
         for file in set(old.values()) - set(new.values()):
             _remove(folder / file)
         self._saved[actor], self._files[actor] = dict(state), new
@@ -166,12 +163,3 @@ def _read_contents_or_nothing(folder: Path) -> dict[str, str]:
         return _read_contents(folder)
     except msgspec.DecodeError:
         return {}
-
-
-def sync(path: Path) -> None:
-    """Return when a file, or the names in a folder, are on the disk."""
-    number = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)

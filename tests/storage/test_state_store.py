@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import DataError
-from ldo_service.storage import state_codec, state_store
+from ldo_service.storage import atomic_write, state_codec, state_store
 from ldo_service.storage.state_store import FolderStore, MemoryStore
 
 RICH: dict[str, Any] = {
@@ -107,14 +107,14 @@ def test_files_that_are_named_are_not_written_to_when_what_came_after_their_nami
     """The next save may be cut off in the middle by a kill, as `break_off` does."""
     store, folder, same = FolderStore(tmp_path, syncs=True), tmp_path / "mapper", [0]
     store.save("mapper", {"same": same, "step": [1], "old": [1]})
-    sync = state_store.sync
+    sync = atomic_write.sync
 
     def fail(path: Path) -> None:
         if path == folder:
             raise OSError("fsync failed")
         sync(path)
 
-    monkeypatch.setattr(state_store, "sync", fail)
+    monkeypatch.setattr(atomic_write, "sync", fail)
     with pytest.raises(OSError, match="fsync failed"):
         store.save("mapper", {"same": same, "step": [2]})
     monkeypatch.undo()
@@ -128,7 +128,7 @@ def test_files_that_are_named_are_not_written_to_when_what_came_after_their_nami
     assert len(list(folder.iterdir())) == 3, "what was to be removed is"
 
 
-@pytest.mark.parametrize("call", ["rename", "unlink"])
+@pytest.mark.parametrize("call", ["replace", "unlink"])
 def test_what_the_disk_may_have_done_all_the_same_is_looked_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
@@ -262,13 +262,14 @@ def test_what_must_outlive_a_power_cut_is_synced_before_it_is_named(
 ) -> None:
     """And nothing of the old state goes before the new one's name is on the disk."""
     synced: list[tuple[str, list[str]]] = []
-    folder, sync = tmp_path / "mapper", state_store.sync
+    folder, sync = tmp_path / "mapper", atomic_write.sync
 
     def noted(path: Path) -> None:
         sync(path)
         synced.append((path.name, sorted(file.name for file in folder.iterdir())))
 
-    monkeypatch.setattr(state_store, "sync", noted)
+    for module in (atomic_write, state_store):
+        monkeypatch.setattr(module, "sync", noted)
     store, same = FolderStore(tmp_path, syncs=True), [0]
     store.save("mapper", {"same": same, "step": [1]})
     assert synced[0][0] == tmp_path.name, "the name of its folder"

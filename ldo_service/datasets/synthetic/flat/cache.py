@@ -5,7 +5,6 @@ import logging
 import os
 import shutil
 import struct
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import zstandard
 
 from ldo_service.errors import FrameError
 from ldo_service.geometry import codecs
+from ldo_service.storage.atomic_write import write_atomically
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +69,7 @@ class FrameCache:
         try:
             self._make_room()
             self.folder.mkdir(parents=True, exist_ok=True)
-            _write_whole(self._path(index), _packed(frame))
+            write_atomically(self._path(index), _packed(frame), unique=True)
         except OSError as error:
             log.warning("frame %s cannot be cached in %s: %s", index, self.folder, error)
 
@@ -107,18 +107,6 @@ class FrameCache:
 
     def _plane(self, data: memoryview, dtype: type) -> np.ndarray:
         return np.frombuffer(zstandard.decompress(data), dtype).reshape(self._size)
-
-
-def _write_whole(path: Path, data: bytes) -> None:
-    """Write beside it first: nobody sees half a file, and a failure leaves none behind."""
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        try:
-            file.write(data)
-            file.flush()
-            os.replace(file.name, path)
-        except BaseException:
-            os.unlink(file.name)
-            raise
 
 
 def _packed(frame: StoredFrame) -> bytes:

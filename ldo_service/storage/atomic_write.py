@@ -1,0 +1,70 @@
+"""Files and folders that appear whole or not at all.
+
+The content goes to a temporary neighbor first, which is renamed when it is complete. A reader sees
+the old content or the new one, never a part, and a failed write leaves no temporary file behind. A
+killed process may leave one; its name ends in `UNFINISHED`.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+UNFINISHED = ".new"  # added to the name while a file is written
+
+
+def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: bool = False) -> int:
+    """Write or replace a file.
+
+    Args:
+        path: The file; its folder must exist.
+        parts: The content, one after the other.
+        syncs: Wait until the content and the name are on the disk, so a power cut loses nothing.
+        unique: Use a temporary name of its own, for a file that several processes may write at
+            the same time.
+
+    Returns:
+        The size of the file in bytes.
+
+    Raises:
+        OSError: The file cannot be written; the old content is unchanged.
+    """
+    unfinished = path.with_name(path.name + UNFINISHED)
+    if unique:
+        number, name = tempfile.mkstemp(UNFINISHED, path.name, path.parent)
+        os.close(number)
+        unfinished = Path(name)
+    try:
+        size = unfinished.write_bytes(b"".join(parts))
+        if syncs:
+            sync(unfinished)
+        unfinished.replace(path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
+    if syncs:
+        sync(path.parent)
+    return size
+
+
+@contextmanager
+def folder_made_atomically(path: Path) -> Iterator[Path]:
+    """Give a temporary path at which the block makes the folder; it becomes `path` at the end.
+
+    Raises:
+        OSError: The folder cannot be made; nothing of it is left.
+    """
+    with tempfile.TemporaryDirectory(prefix=f"{UNFINISHED}-", dir=path.parent) as temporary:
+        made = Path(temporary) / path.name
+        yield made
+        made.rename(path)
+
+
+def sync(path: Path) -> None:
+    """Return when a file, or the names in a folder, are on the disk."""
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
