@@ -16,9 +16,9 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import codecs
-from ldo_service.geometry.pairing import Pairing
-from ldo_service.geometry.rectify import RawFrame, Rectifier, in_metres
+from ldo_service.geometry.frames import RawFrame, Rectifier, in_metres
 from ldo_service.geometry.registration import register_depth
+from ldo_service.geometry.stamps import Pairing
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.pose import IDENTITY

@@ -19,8 +19,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import (
     Array,

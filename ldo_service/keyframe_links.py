@@ -7,7 +7,7 @@ import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.geometry.records import Records
+from ldo_service.geometry.point_records import Records
 from ldo_service.schemas import Keyframe, KeyframeRefinement, MeasuredPose
 from ldo_service.schemas.pose import Matrix6
 from ldo_service.wire import pose_message

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
-from ldo_service.geometry.blending import quaternions
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
+from ldo_service.geometry.se3 import quaternions
 from ldo_service.loops import Finding
 from ldo_service.schemas import (
     Array,

@@ -9,7 +9,7 @@ import numpy as np
 from pair import NO_NAME, NO_THINGS
 from scores import Naming
 
-from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES, COCO_COUNT
+from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES, COCO_COUNT
 
 OTHERS = tuple(
     name for name in encoder.NAMES if name not in (*CLASS_NAMES[:COCO_COUNT], *BUILDING.split())

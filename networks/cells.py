@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ldo_service.datasets.synthetic.flat.catalogue import CATALOGUE
-from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES, COCO_COUNT
+from ldo_service.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.synthetic.flat.scene_object import CLASS_NAMES, COCO_COUNT
 
 INPUT_PX = (320, 256)  # width, height
 STRIDES_PX = (8, 16, 32)

@@ -20,8 +20,8 @@ from layers import Graph, Live, Statistics, Weights, merged, residual
 from views import Seen, Views
 from wear import repainted, worsened
 
-from ldo_service.datasets.synthetic.flat.catalogue import CATALOGUE
-from ldo_service.datasets.synthetic.flat.labels import BUILDING, CLASS_NAMES
+from ldo_service.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 
 DIMENSIONS = 96
 NAMES = tuple(name for name in CLASS_NAMES if name in CATALOGUE or name in BUILDING.split())

@@ -10,7 +10,7 @@ from cells import ID_COUNT, INPUT_PX, THINGS, told, visible
 from views import Seen, Views
 from wear import BLUR_PX, repainted, worsened
 
-from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES
+from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
 
 BATCH = 8
 PADDING = 114

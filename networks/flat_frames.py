@@ -4,7 +4,7 @@ import numpy as np
 import views
 from views import Seen
 
-from ldo_service.datasets.synthetic.flat import FlatSequence
+from ldo_service.synthetic.flat import FlatSequence
 
 
 def flat_frames(stride: int) -> tuple[list[np.ndarray], Seen]:

@@ -21,10 +21,10 @@ from inventory import (
     TABLES,
 )
 
-from ldo_service.datasets.synthetic.flat.building import HEIGHT_M
-from ldo_service.datasets.synthetic.flat.catalogue import CATALOGUE
-from ldo_service.datasets.synthetic.flat.paint import Paints
-from ldo_service.datasets.synthetic.flat.thing import Heading, Placement, Thing
+from ldo_service.synthetic.flat.building import HEIGHT_M
+from ldo_service.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.synthetic.flat.paint import Paints
+from ldo_service.synthetic.flat.scene_object import Heading, Placement, Thing
 
 Point = tuple[float, float, float]
 

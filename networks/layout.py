@@ -9,17 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 from furnishing import Builder, furnish
 
-from ldo_service.datasets.synthetic.flat.building import (
-    DOOR_HEIGHT_M,
-    DOOR_WIDTH_M,
-    HEIGHT_M,
-    WALL_M,
-    Panel,
-)
-from ldo_service.datasets.synthetic.flat.labels import CEILING, FLOOR, WALL
-from ldo_service.datasets.synthetic.flat.paint import Paints, materials
-from ldo_service.datasets.synthetic.flat.scene import Flat
-from ldo_service.datasets.synthetic.solids import Solid
+from ldo_service.synthetic.flat.building import DOOR_HEIGHT_M, DOOR_WIDTH_M, HEIGHT_M, WALL_M, Panel
+from ldo_service.synthetic.flat.paint import Paints, materials
+from ldo_service.synthetic.flat.scene import Flat
+from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
+from ldo_service.synthetic.solids import Solid
 
 VERSION = 3  # raise it with every change that alters a room
 LAMP = 2  # index of the renderer's lamp above the origin

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import numpy as np
 from wear import worsened
 
-from ldo_service.datasets.synthetic.flat.render import Rendering
-from ldo_service.datasets.synthetic.flat.sensor import measured_depth_m
 from ldo_service.geometry import Camera
 from ldo_service.semantics.segments import segments
 from ldo_service.semantics.trigger import TriggerConfig, regions_of_image
+from ldo_service.synthetic.flat.render import Rendering
+from ldo_service.synthetic.flat.sensor import measured_depth_m
 
 TRIGGER = TriggerConfig(min_side_px=12)  # of frames half as wide as those that it is made for
 BLUR_PX = 4.0

@@ -13,7 +13,7 @@ from crops import planes
 from views import Seen
 
 import examples
-from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES
+from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
 
 SCORE_MIN, NMS_IOU = 0.01, 0.45  # of boxes that precision and recall are measured over
 HIT_IOU = 0.5

@@ -8,12 +8,12 @@ import layout
 import numpy as np
 from regions import regions
 
-from ldo_service.datasets.synthetic.flat.labels import CEILING, FLOOR, WALL
-from ldo_service.datasets.synthetic.flat.render import FlatRenderer
-from ldo_service.datasets.synthetic.flat.scene import Flat
-from ldo_service.datasets.synthetic.flat.sequence import FOCAL_PER_WIDTH
-from ldo_service.datasets.synthetic.path import look_at
 from ldo_service.geometry import Camera
+from ldo_service.synthetic.flat.render import FlatRenderer
+from ldo_service.synthetic.flat.scene import Flat
+from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
+from ldo_service.synthetic.flat.sequence import FOCAL_PER_WIDTH
+from ldo_service.synthetic.path import look_at
 
 VERSION = 2  # of what is kept of a room: to be raised when `regions` or the segments change
 WIDTH_PX, HEIGHT_PX = 320, 240

@@ -14,7 +14,7 @@ from threading import Condition
 import zenoh
 
 from ldo_service.errors import ConfigError, FrameError
-from ldo_service.geometry.pairing import Pairing
+from ldo_service.geometry.stamps import Pairing
 from ldo_service.schemas import CameraModel, CameraRgbd
 
 from .ros_messages import (

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError
-from ldo_service.geometry.image_header import announced_size
+from ldo_service.geometry.codecs import announced_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 

@@ -11,8 +11,6 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.datasets.synthetic import FlatSequence
-from ldo_service.datasets.synthetic.flat.prerender import prerender
 from ldo_service.evaluation.results import Results, evaluate_run, work
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
@@ -21,6 +19,8 @@ from ldo_service.runs.objects_file import read_objects
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Selection
 from ldo_service.schemas import MapObjects
+from ldo_service.synthetic import FlatSequence
+from ldo_service.synthetic.flat.sequence import prerender
 
 from .options import Overwrite
 from .progress import progress

@@ -12,8 +12,8 @@ from rich.console import Console
 from ldo_service.cameras import realsense
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
-from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
+from ldo_service.geometry.sequence import Sequence
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.source import Selection
 from ldo_service.runtime.keys import Keys

@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import Config, load_config
-from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
+from ldo_service.geometry.sequence import Sequence
 from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.folder import RunFolder, prepare
 from ldo_service.runs.front_end import FrontEnd

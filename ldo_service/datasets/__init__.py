@@ -3,13 +3,13 @@
 from pathlib import Path
 
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry.sequence import Cached, Sequence
+from ldo_service.synthetic import open_synthetic
 
 from .replica import ReplicaSequence
 from .rig import SequenceOptions
 from .scannet import ScanNetSequence
-from .sequence import Cached, Sequence
 from .seven_scenes import SevenScenesSequence
-from .synthetic import open_synthetic
 from .tum import TumSequence
 
 __all__ = ["Cached", "Sequence", "SequenceOptions", "open_sequence"]

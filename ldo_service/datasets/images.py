@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from ldo_service.errors import FrameError
-from ldo_service.geometry.image_header import announced_size
+from ldo_service.geometry.codecs import announced_size
 
 # The last bytes of a complete file. OpenCV decodes what is there of a cut one without complaint.
 _ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}

@@ -8,7 +8,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.registration import register_depth
 
-from .matrices import is_rigid
+from .files import is_rigid
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,13 +20,12 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory, se3
-from ldo_service.geometry.resampling import resample_color
+from ldo_service.geometry.registration import resample_color
+from ldo_service.geometry.sequence import Sequence
 
+from .files import numbered, paired, read_intrinsics, read_trajectory, read_transform
 from .images import first_size, read_color, read_depth
-from .matrices import read_intrinsics, read_trajectory, read_transform
-from .numbered import numbered, paired
 from .rig import Rig, SequenceOptions
-from .sequence import Sequence
 
 DEPTH_SCALE = 1000.0  # units per metre in every export
 

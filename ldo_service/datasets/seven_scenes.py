@@ -19,12 +19,11 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.geometry import Camera, RawFrame, Trajectory
+from ldo_service.geometry.sequence import Sequence
 
+from .files import numbered, paired, read_intrinsics, read_trajectory
 from .images import first_size, read_color, read_depth
-from .matrices import read_intrinsics, read_trajectory
-from .numbered import numbered, paired
 from .rig import Rig, SequenceOptions
-from .sequence import Sequence
 
 DEPTH_SCALE = 1000.0  # units per metre
 NOT_MEASURED = 65535  # beside 0, as the data set's page says

@@ -15,10 +15,10 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory, associate
+from ldo_service.geometry.sequence import Sequence
 
-from .calibration import Calibration, number, pinhole, read_json
+from .files import Calibration, number, pinhole, read_json
 from .images import read_color, read_depth
-from .sequence import Sequence
 
 log = logging.getLogger(__name__)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.geometry import Trajectory
+from ldo_service.geometry.sequence import Sequence
 from ldo_service.semantics.saved import SavedSemantics
 
 from .loops import FoundLoops

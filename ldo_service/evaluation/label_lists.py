@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.datasets.labels import VOID_NAMES
 from ldo_service.errors import DataError
+from ldo_service.geometry.sequence import VOID_NAMES
 from ldo_service.semantics.class_names import COCO, normalised
 from ldo_service.semantics.synonyms import canonical, coco_class
 

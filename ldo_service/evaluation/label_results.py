@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.datasets import Sequence
+from ldo_service.geometry.sequence import Sequence
 
 from .finished_run import FinishedRun
 from .label_sheet import LabelPicture, label_sheet

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.datasets import Sequence as Frames
 from ldo_service.geometry import Camera, Trajectory, associate, se3
+from ldo_service.geometry.sequence import Sequence as Frames
 
 from .trajectory import ASSOCIATION_TOLERANCE_S
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Trajectory
+from ldo_service.geometry.sequence import Sequence
 
 from . import loops, semantics, trajectory, views
 from .finished_run import FinishedRun, at_stamps

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service import datasets
-from ldo_service.datasets.labels import FrameLabels
 from ldo_service.errors import DataError
 from ldo_service.gaussians.render import render
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
+from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.semantics.label_images import label_image
 from ldo_service.semantics.saved import SavedSemantics
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Trajectory, associate, se3
-from ldo_service.geometry.umeyama import align
+from ldo_service.geometry.se3 import align
 
 ASSOCIATION_TOLERANCE_S = 0.020
 RPE_INTERVAL_S = 1.0

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ldo_service.datasets import Sequence
 from ldo_service.gaussians.exposure import Exposure, fitted_exposure
 from ldo_service.gaussians.render import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry.sequence import Sequence
 
 from .finished_run import PosedMap, RunFrame
 from .rendering import depth_error, psnr, ssim

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.geometry import Camera
-from ldo_service.geometry.records import PoseTable
+from ldo_service.geometry.point_records import PoseTable
 
 from .anchor_spheres import PlacedCamera
 from .exposure import Exposure

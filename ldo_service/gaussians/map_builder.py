@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.geometry.records import PoseTable
+from ldo_service.geometry.point_records import PoseTable
 
 from .anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
 from .changes import ChangeLog, Changes

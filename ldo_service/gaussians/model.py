@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry.blending import quaternions
+from ldo_service.geometry.se3 import quaternions
 from ldo_service.kernels._rasterise import Bounds
 
 ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused

@@ -16,10 +16,9 @@ Tangents    6-vectors and 6x6 matrices are ordered rotation (rad), then translat
 Shapes      batches lead. N Gaussians or points, K keyframes, H W image, C classes, M matches.
 """
 
-from .association import associate
 from .camera import Camera
-from .rectify import RawFrame, Rectifier, rectify, undistortion_maps
-from .rgbd import RgbdFrame
+from .frames import RawFrame, Rectifier, RgbdFrame, rectify, undistortion_maps
+from .stamps import associate
 from .trajectory import Trajectory
 
 __all__ = [

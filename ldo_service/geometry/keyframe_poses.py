@@ -1,13 +1,17 @@
-"""Where keyframes are in the map, as one receiver knows it. Conventions: `ldo_service.geometry`."""
+"""Keyframe poses in the map, as one receiver knows them, and measured poses between keyframes.
+
+Conventions: `ldo_service.geometry`.
+"""
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from . import se3
-from .records import Records
+from .point_records import Records
 
 APART_M = 100.0  # between segments that are not joined: farther than depth cameras see
 NO_REFERENCE = -1
@@ -160,3 +164,13 @@ class KeyframePoses:
     def restore(self, state: Mapping[str, Any]) -> None:
         self.version = state["version"]
         self._known.restore(state)
+
+
+@dataclass(frozen=True, slots=True)
+class RelativePose:
+    """Measured T_a_b [4, 4] with its information [6, 6]: rotation, then translation, at b."""
+
+    a: int
+    b: int
+    T_a_b: np.ndarray
+    information: np.ndarray

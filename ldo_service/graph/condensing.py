@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .factors import (
     NoiseConfig,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ldo_service.geometry.blending import blended
+from ldo_service.geometry.se3 import blended
 
 
 @dataclass(frozen=True, slots=True)

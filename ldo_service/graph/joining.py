@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .closures import Pair, Verdict, pair_of
 from .measurements import Measurements

@@ -9,7 +9,6 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.geometry.triangulation import meeting_point
 
 from .closures import Pair
 from .factors import NoiseConfig, Sight
@@ -19,6 +18,20 @@ from .packing import pack_sights, unpack_sights
 
 CLASSES = 256  # C_max of the paper, III.B
 BORDER_PX = 2.0  # a box so near to the border of the image is cut by it
+
+
+def meeting_point(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float]:
+    """The point [3] nearest to all rays, and the widest angle in rad between two of them.
+
+        min_x sum_i |(I - d_i d_i^T) (x - o_i)|^2
+
+    origins [N, 3], in metres; rays [N, 3] of any length, N >= 2. Raises LinAlgError when all are
+    parallel.
+    """
+    d = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    across = np.eye(3) - d[:, :, None] * d[:, None, :]
+    point = np.linalg.solve(across.sum(axis=0), (across @ origins[:, :, None])[..., 0].sum(axis=0))
+    return point, float(np.arccos(np.clip((d @ d.T).min(), -1, 1)))
 
 
 @dataclass(frozen=True, slots=True)

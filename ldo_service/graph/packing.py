@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .factors import Sight
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.umeyama import align
+from ldo_service.geometry.se3 import align
 
 SPREAD = 0.1  # m, of three points about their line: below, nothing fixes the turn about it
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.tracking.align import AlignConfig
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.places import Place, PlacesConfig

@@ -10,10 +10,11 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig, joined
-from ldo_service.datasets import Sequence, SequenceOptions, open_sequence
+from ldo_service.datasets import SequenceOptions, open_sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
-from ldo_service.geometry.pairing import Pairing
+from ldo_service.geometry.sequence import Sequence
+from ldo_service.geometry.stamps import Pairing
 from ldo_service.runtime.mcap_index import Place
 from ldo_service.runtime.recording import JournalFile, recorded_actors
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, Message, decode

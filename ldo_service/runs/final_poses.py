@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.blending import blended
+from ldo_service.geometry.se3 import blended
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,8 +22,8 @@ from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
 from ldo_service.config import Config
-from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry.sequence import Sequence
 from ldo_service.runtime.mcap_index import McapIndex, Place
 from ldo_service.runtime.recording_file import ABOUT, RecordingFile
 from ldo_service.schemas import Message, decode

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Protocol
 
 from ldo_service.config import Config
-from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
+from ldo_service.geometry.sequence import Sequence
 
 from .front_end import FrontEnd
 from .source import Selection, Warn, require_overlap

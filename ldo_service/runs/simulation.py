@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 from ldo_service.actors.graph import make_actors
 from ldo_service.config import Config
-from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
+from ldo_service.geometry.sequence import Sequence
 from ldo_service.runtime.journal import digest
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Message, encode

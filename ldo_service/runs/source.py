@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Trajectory
+from ldo_service.geometry.sequence import Sequence
 from ldo_service.schemas import CameraRgbd, Message, OdometryPrior
 from ldo_service.wire import camera_rgbd_message, pose_message
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
+from ldo_service.geometry.codecs import shrunk
 
 from .foreground import Foreground, pixels_of
 
@@ -110,13 +111,3 @@ def facing_factor(
         return config.least
     cosines = np.abs((normals * rays).sum(-1)[usable]) / lengths[usable]
     return config.least + (1 - config.least) * float(cosines.mean())
-
-
-def shrunk(crop: np.ndarray, side_px: int) -> np.ndarray:
-    """With its longer side at most `side_px`."""
-    height, width = crop.shape[:2]
-    scale = side_px / max(height, width)
-    if scale >= 1:
-        return np.ascontiguousarray(crop)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    return cv2.resize(crop, size, interpolation=cv2.INTER_AREA)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .align import AlignConfig
 from .candidates import Candidate, apart_rad, attempt

@@ -13,7 +13,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .align import Alignment
 from .keyframes import Keyframe

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .align import AlignConfig, Alignment, align
 from .equations import Appearance

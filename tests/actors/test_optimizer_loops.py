@@ -7,7 +7,7 @@ import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.schemas import (
     Array,
     CameraModel,

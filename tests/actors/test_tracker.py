@@ -9,8 +9,7 @@ from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.geometry.keyframe_poses import T_map_segment
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose, T_map_segment
 from ldo_service.runtime.actor import Situation
 from ldo_service.schemas import (
     Array,

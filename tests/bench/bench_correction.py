@@ -18,8 +18,7 @@ import numpy as np
 from ldo_service.gaussians.merging import doubled
 from ldo_service.gaussians.model import GaussianMap, aligned_rows
 from ldo_service.geometry import se3
-from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.graph.keyframe_graph import KeyframeGraph
 from ldo_service.schemas import Correction, decode, encode
 from ldo_service.wire import correction_message, keyframe_poses_of

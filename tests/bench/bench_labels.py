@@ -28,7 +28,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from ldo_service.datasets.labels import FrameLabels, TrueLabels
 from ldo_service.evaluation.cross_view import Correspondences, correspondences
 from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
 from ldo_service.evaluation.label_sheet import LabelPicture, label_sheet
@@ -36,6 +35,7 @@ from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelJud
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.render import Rendering
 from ldo_service.geometry import RgbdFrame, se3
+from ldo_service.geometry.sequence import FrameLabels, TrueLabels
 from ldo_service.models import open_detector
 from ldo_service.recordings.sequence import open_source
 from ldo_service.semantics.assignment import AssignmentConfig

@@ -14,7 +14,7 @@ from ldo_service.cameras.realsense import (
     messages,
 )
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.geometry import Camera, lens
+from ldo_service.geometry import Camera, camera
 from ldo_service.wire import camera_of
 
 rs = pytest.importorskip("pyrealsense2", reason="needs `pip install 'ldo-slam[realsense]'`")
@@ -119,7 +119,7 @@ def test_opencv_s_lens_sees_what_the_device_s_own_does(name: str) -> None:
         else:
             point = [(pixel[0] - 31) / 50, (pixel[1] - 23) / 50, 1.0]
             seen = rs.rs2_project_point_to_pixel(theirs, point)
-        u, v = lens.project(np.array([[point[0]]]), np.array([[point[1]]]), ours)
+        u, v = camera.project(np.array([[point[0]]]), np.array([[point[1]]]), ours)
         assert (float(u[0, 0]), float(v[0, 0])) == pytest.approx(tuple(seen), abs=0.05)
 
 

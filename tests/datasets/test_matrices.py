@@ -3,12 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.datasets.matrices import (
-    read_intrinsics,
-    read_matrix,
-    read_trajectory,
-    read_transform,
-)
+from ldo_service.datasets.files import read_intrinsics, read_matrix, read_trajectory, read_transform
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera, se3
 

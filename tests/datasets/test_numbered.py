@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.datasets.numbered import numbered, paired
+from ldo_service.datasets.files import numbered, paired
 from ldo_service.errors import DataError
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import onnxruntime
 import pytest
 
-from ldo_service.datasets.synthetic.flat import CLASS_NAMES, COCO_COUNT
 from ldo_service.demo_networks import DETECTOR, IMAGE_ENCODER, TEXT_EMBEDDINGS
+from ldo_service.synthetic.flat import CLASS_NAMES, COCO_COUNT
 
 SEED, FRAMES = 172, 14  # the first of the rooms kept apart
 LARGE_PX = 1000  # visible of an object, in 320x240

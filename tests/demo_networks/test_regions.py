@@ -8,9 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ldo_service.datasets.synthetic.flat import CLASS_NAMES
-from ldo_service.datasets.synthetic.flat.render import Rendering
 from ldo_service.demo_networks import NOTHING
+from ldo_service.synthetic.flat import CLASS_NAMES
+from ldo_service.synthetic.flat.render import Rendering
 
 pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --group train")
 

@@ -1,6 +1,5 @@
 import pytest
 
-from ldo_service.datasets.synthetic.flat import CLASS_NAMES
 from ldo_service.errors import DataError
 from ldo_service.evaluation.label_lists import (
     UNKNOWN,
@@ -9,6 +8,7 @@ from ldo_service.evaluation.label_lists import (
     full_list,
     object_labels,
 )
+from ldo_service.synthetic.flat import CLASS_NAMES
 
 SOURCE = ("undefined", "wall", "sofa", "desk", "table", "cushion", "fire-extinguisher")
 MAP = ("background", "other", "couch", "dining table", "fire extinguisher", "person", "wall")

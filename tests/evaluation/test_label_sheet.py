@@ -1,6 +1,5 @@
 import numpy as np
 
-from ldo_service.datasets.labels import FrameLabels
 from ldo_service.evaluation.label_lists import UNKNOWN, VOID, full_list
 from ldo_service.evaluation.label_sheet import (
     BEYOND,
@@ -18,6 +17,7 @@ from ldo_service.evaluation.label_sheet import (
 from ldo_service.evaluation.pictures import legend
 from ldo_service.evaluation.semantics import LabelView
 from ldo_service.geometry import Camera, RgbdFrame
+from ldo_service.geometry.sequence import FrameLabels
 
 SOURCE = ("undefined", "wall", "chair", "ladder")
 MAP = ("background", "other", "chair", "couch")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence, open_sequence
-from ldo_service.datasets.labels import FrameLabels
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import FinishedRun, RunFrame
 from ldo_service.evaluation.label_results import frames_to_show, plain_labels
@@ -20,6 +19,7 @@ from ldo_service.evaluation.semantics import GATES, LabelErrors, ListErrors, eva
 from ldo_service.evaluation.views import Judged
 from ldo_service.gaussians.model import new_labels
 from ldo_service.geometry import se3
+from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import SEMANTICS
 from ldo_service.runs.over_file import run_over_file

@@ -12,7 +12,7 @@ import zenoh
 from ldo_service.client import Client
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import Camera
-from ldo_service.geometry.rectify import RawFrame
+from ldo_service.geometry.frames import RawFrame
 from ldo_service.schemas import CameraRgbd
 from ldo_service.wire import camera_rgbd_message
 

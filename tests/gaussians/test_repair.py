@@ -8,7 +8,7 @@ import numpy as np
 from ldo_service.gaussians.repair import MapRepair, RepairConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.geometry.records import PoseTable
+from ldo_service.geometry.point_records import PoseTable
 
 CONFIG = RepairConfig(
     mending_min_m=0.01,

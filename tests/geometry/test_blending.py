@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.blending import blended, quaternions
+from ldo_service.geometry.se3 import blended, quaternions
 
 RNG = np.random.default_rng(3)
 

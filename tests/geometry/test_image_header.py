@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import FrameError
-from ldo_service.geometry.codecs import decode_color, decode_depth, encode_jpeg
-from ldo_service.geometry.image_header import announced_size
+from ldo_service.geometry.codecs import announced_size, decode_color, decode_depth, encode_jpeg
 
 COLOR = np.random.default_rng(0).integers(0, 255, (37, 53, 3)).astype(np.uint8)
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import Camera
-from ldo_service.geometry.lens import project, rays
+from ldo_service.geometry.camera import project, rays
 
 FREIBURG1 = (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)
 AZURE_KINECT = (0.52, -2.71, 0.0009, -0.0002, 1.56, 0.40, -2.53, 1.49)

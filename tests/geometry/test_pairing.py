@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError, FrameError
 from ldo_service.geometry import associate
-from ldo_service.geometry.pairing import Pairing
+from ldo_service.geometry.stamps import Pairing
 
 MS = 1_000_000
 

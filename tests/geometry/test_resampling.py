@@ -3,7 +3,7 @@ import pytest
 
 from ldo_service.errors import FrameError
 from ldo_service.geometry import Camera
-from ldo_service.geometry.resampling import resample_color
+from ldo_service.geometry.registration import resample_color
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.0, 24.0)
 FINER = Camera(130, 97, 101.2, 101.4, 64.7, 48.4)  # as ScanNet's colour to its depth

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.graph.closures import Closures, ClosuresConfig, Verdict
 from ldo_service.graph.keyframe_graph import KeyframeGraph
 

@@ -6,7 +6,7 @@ import pytest
 import scipy.optimize
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.graph.condensing import group_to_condense
 from ldo_service.graph.factors import NoiseConfig
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig

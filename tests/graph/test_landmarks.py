@@ -6,10 +6,15 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import Camera, se3
-from ldo_service.geometry.triangulation import meeting_point
 from ldo_service.graph.factors import NoiseConfig, odometry_information
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
-from ldo_service.graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
+from ldo_service.graph.landmarks import (
+    CLASSES,
+    Landmarks,
+    LandmarksConfig,
+    Observation,
+    meeting_point,
+)
 from ldo_service.graph.solver import point_key, solved
 from ldo_service.storage.state_codec import decode_state, encode_state
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
 
 ODOMETRY = np.diag([2e3**2] * 3 + [5e2**2] * 3)  # as alignment states it: 0.5 mrad, 2 mm

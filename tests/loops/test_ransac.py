@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.umeyama import align
+from ldo_service.geometry.se3 import align
 from ldo_service.loops.ransac import rigid_among
 
 

@@ -12,7 +12,7 @@ from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.config import Config
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.geometry.relative_pose import RelativePose
+from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandidate, LoopClosure
 from ldo_service.tracking.odometry import Odometry, OdometryConfig

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.datasets.synthetic.flat import FlatSequence
 from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.schemas import CameraRgbd, TrackedPose
+from ldo_service.synthetic.flat import FlatSequence
 from ldo_service.wire import camera_rgbd_message
 from tests.semantics.labellers.server import serving
 from tests.service.conftest import PATIENCE, live_service, wait_until

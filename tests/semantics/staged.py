@@ -9,9 +9,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ldo_service.datasets.synthetic.cast import View
-from ldo_service.datasets.synthetic.path import look_at
-from ldo_service.datasets.synthetic.solids import Solid
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.semantics.association import MapView
@@ -19,6 +16,9 @@ from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyfr
 from ldo_service.semantics.labels import new_labels
 from ldo_service.semantics.objects import Objects, Observed
 from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.synthetic.path import look_at
+from ldo_service.synthetic.ray_casting import View
+from ldo_service.synthetic.solids import Solid
 
 CAMERA = Camera(128, 96, 104.0, 104.0, 63.5, 47.5)
 SHELL = Solid("box", (0, 0, 1.25), (4.4, 4.0, 2.5), "")

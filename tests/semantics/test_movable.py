@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from ldo_service.datasets.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import RgbdFrame
 from ldo_service.semantics.labelling import Claims
 from ldo_service.semantics.labels import top_labels
 from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
 
 MIDWAY = 70  # the frame in which the person is in the middle of the way
 PERSON = Vocabulary().index("person")

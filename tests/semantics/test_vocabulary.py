@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldo_service.datasets.synthetic.flat.labels import CLASS_NAMES, COCO_COUNT
 from ldo_service.errors import ConfigError
 from ldo_service.semantics.class_names import COCO
 from ldo_service.semantics.vocabulary import BACKGROUND, OTHER, Vocabulary
+from ldo_service.synthetic.flat.scene_object import CLASS_NAMES, COCO_COUNT
 
 
 def test_it_starts_with_background_other_and_the_names_of_coco_in_order() -> None:

@@ -13,13 +13,13 @@ from threading import Semaphore
 
 import numpy as np
 
-from ldo_service.datasets.synthetic.flat import FlatSequence
 from ldo_service.gaussians.model import GaussianMap
 from ldo_service.geometry import codecs, se3
+from ldo_service.geometry.codecs import shrunk
 from ldo_service.schemas import LabelRequest
 from ldo_service.semantics.labellers.http_labeller import HttpConfig
 from ldo_service.semantics.labels import top_labels
-from ldo_service.semantics.region_views import shrunk
+from ldo_service.synthetic.flat import FlatSequence
 from ldo_service.wire import crops_of
 from tests.semantics.labellers.server import says
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.datasets.synthetic.flat import FlatSequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.schemas import LabelNames, MapDelta, MapObject, MapObjects
 from ldo_service.schemas.topics import LABEL_NAMES
+from ldo_service.synthetic.flat import FlatSequence
 from tests.semantics.labellers.encoders import ColorPair, vocabulary
 from tests.semantics.labellers.server import hangs, says, serving
 from tests.service.conftest import LDO, live_service, wait_until

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence, open_sequence
-from ldo_service.datasets.synthetic.furniture import furnished_room
-from ldo_service.datasets.synthetic.kinect import kinect_depth
-from ldo_service.datasets.synthetic.path import look_at
-from ldo_service.datasets.synthetic.render import Renderer
 from ldo_service.geometry import Camera, RgbdFrame, se3
+from ldo_service.synthetic.path import look_at
+from ldo_service.synthetic.room import furnished_room
+from ldo_service.synthetic.room_render import Renderer
+from ldo_service.synthetic.room_sequence import kinect_depth
 from ldo_service.tracking import Status
 from tests.tracking.degraded import (
     Degrader,

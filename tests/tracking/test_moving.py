@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import open_sequence
-from ldo_service.datasets.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
 from ldo_service.semantics.movable import Box, MovableConfig, movable_pixels
 from ldo_service.storage.state_codec import decode_state, encode_state
+from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
 from ldo_service.tracking.moving import MovingConfig, Watched, gap_m, spread, watch
 from ldo_service.tracking.noise import DepthNoise

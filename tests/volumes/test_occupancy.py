@@ -8,10 +8,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from ldo_service.datasets import Sequence
-from ldo_service.datasets.synthetic.furniture import furnished_room
-from ldo_service.datasets.synthetic.solids import vector
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, se3
+from ldo_service.synthetic.room import furnished_room
+from ldo_service.synthetic.solids import vector
 from ldo_service.volumes import OccupancyConfig, OccupancyGrid, Viewpoint, occupancy
 from ldo_service.volumes.occupancy import FREE, OCCUPIED, UNKNOWN, occupied_voxels
 

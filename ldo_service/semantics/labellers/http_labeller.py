@@ -11,8 +11,8 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, EndpointError
 from ldo_service.geometry import codecs
+from ldo_service.geometry.codecs import shrunk
 from ldo_service.semantics.class_names import LONGEST, is_name
-from ldo_service.semantics.region_views import shrunk
 from ldo_service.semantics.synonyms import canonical
 
 from . import Opinion, fused_over_views

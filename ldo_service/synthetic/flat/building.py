@@ -1,0 +1,106 @@
+"""Walls, floors and ceilings of the flat, and which lamp lights them."""
+
+from dataclasses import dataclass
+
+from ldo_service.synthetic.solids import Solid
+
+from .scene_object import CEILING, FLOOR, WALL, Placement
+
+WALL_M = 0.06  # each room has its own layer; two make a wall
+HEIGHT_M = 2.5
+DOOR_WIDTH_M, DOOR_HEIGHT_M = 0.9, 2.05
+ROOM_SIZE_M = (4.4, 3.8)
+CORRIDOR_SIZE_M = (6.4, 1.6)
+DOOR_X_M = -0.1  # in a room's frame, from the middle of its door wall
+LAMP_SIDE_M = 0.5
+SHELL = Solid("box", (0.0, 0.0, 1.2), (8.0, 11.0, 4.0), "")  # around everything, never seen
+
+# Frames of the rooms: origin on the floor below the middle of the door wall, y into the room.
+ROOM_A = Placement((-1.0, CORRIDOR_SIZE_M[1] / 2 + 2 * WALL_M, 0.0))
+ROOM_B = Placement((1.0, -CORRIDOR_SIZE_M[1] / 2 - 2 * WALL_M, 0.0), (-1.0, 0.0))
+CORRIDOR = Placement((0.0, 0.0, 0.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A slab of the building; shadows fall on the one face that its room sees.
+
+    face   0-5 for the own sides -x, +x, -y, +y, -z, +z
+    room   0-2, index of the lamp that lights it
+    """
+
+    solid: Solid
+    class_id: int
+    face: int
+    room: int
+
+
+def lamp_centers_m() -> tuple[tuple[float, float, float], ...]:
+    """One lamp in the middle of room A, room B and the corridor."""
+    height_m = HEIGHT_M - 0.15
+    middle = Solid("box", (0.0, ROOM_SIZE_M[1] / 2, height_m), (1, 1, 1), "")
+    return ROOM_A(middle).center_m, ROOM_B(middle).center_m, (0.0, 0.0, height_m)
+
+
+def panels() -> tuple[Panel, ...]:
+    """All slabs of the building."""
+    return (
+        *_room(ROOM_A, 0, "wall_a", "floor_a"),
+        *_room(ROOM_B, 1, "wall_b", "floor_b"),
+        *_corridor(),
+    )
+
+
+def _room(placed: Placement, room: int, paint: str, floor: str) -> list[Panel]:
+    width, depth = ROOM_SIZE_M
+    slabs = [
+        *((slab, 3) for slab in _door_wall(width, -WALL_M / 2, DOOR_X_M, paint)),
+        (_slab((0, depth + WALL_M / 2), (width, WALL_M), paint), 2),
+        (_slab((-(width + WALL_M) / 2, depth / 2), (WALL_M, depth), paint), 1),
+        (_slab(((width + WALL_M) / 2, depth / 2), (WALL_M, depth), paint), 0),
+    ]
+    walls = [Panel(placed(slab), WALL, face, room) for slab, face in slabs]
+    return [*walls, *_level(placed, room, (0, depth / 2), (width, depth), floor)]
+
+
+def _corridor() -> list[Panel]:
+    """A side with a door and an end; half a turn gives the other two."""
+    length, width = CORRIDOR_SIZE_M
+    door_m = ROOM_A.origin_m[0] + DOOR_X_M
+    slabs = [
+        *((slab, 2) for slab in _door_wall(length, (width + WALL_M) / 2, door_m, "wall_c")),
+        (_slab(((length + WALL_M) / 2, 0), (WALL_M, width), "wall_c"), 0),
+    ]
+    turned = Placement((0.0, 0.0, 0.0), (-1.0, 0.0))
+    walls = [Panel(put(slab), WALL, face, 2) for put in (CORRIDOR, turned) for slab, face in slabs]
+    return [*walls, *_level(CORRIDOR, 2, (0, 0), CORRIDOR_SIZE_M, "floor_c")]
+
+
+def _door_wall(length_m: float, y_m: float, door_m: float, paint: str) -> list[Solid]:
+    """A wall along x with a doorway about x = door_m: what is left, right and above of it."""
+    left, right, end = door_m - DOOR_WIDTH_M / 2, door_m + DOOR_WIDTH_M / 2, length_m / 2
+    lintel_m = HEIGHT_M - DOOR_HEIGHT_M
+    above_m = (door_m, y_m, HEIGHT_M - lintel_m / 2)
+    return [
+        _slab(((left - end) / 2, y_m), (left + end, WALL_M), paint),
+        _slab(((right + end) / 2, y_m), (end - right, WALL_M), paint),
+        Solid("box", above_m, (DOOR_WIDTH_M, WALL_M, lintel_m), paint),
+    ]
+
+
+def _slab(center_m: tuple[float, float], size_m: tuple[float, float], paint: str) -> Solid:
+    return Solid("box", (*center_m, HEIGHT_M / 2), (*size_m, HEIGHT_M), paint)
+
+
+def _level(
+    placed: Placement,
+    room: int,
+    center_m: tuple[float, float],
+    size_m: tuple[float, float],
+    floor: str,
+) -> list[Panel]:
+    """Floor and ceiling, reaching under the walls so that doorways have them too."""
+    extent = (size_m[0] + 2 * WALL_M, size_m[1] + 2 * WALL_M, 0.1)
+    below = placed(Solid("box", (*center_m, -0.05), extent, floor))
+    above = placed(Solid("box", (*center_m, HEIGHT_M + 0.05), extent, "ceiling"))
+    return [Panel(below, FLOOR, 5, room), Panel(above, CEILING, 4, room)]

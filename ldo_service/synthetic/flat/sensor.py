@@ -1,0 +1,168 @@
+"""What a Kinect-like camera makes of an exact frame: blur, exposure and noise; a worse depth."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY_STEP_PER_M
+
+from .render import Rendering
+from .walk import FRAMES, RATE_HZ, Walk, closed_spline
+
+SHUTTER_S = 0.02  # indoors in the evening: 11 pixels of blur at 60 degrees per second
+BLUR_TAPS = 7
+EXPOSURE_S, EXPOSURE_SPREAD = 3.0, 0.2  # the gain drifts by +-20 % within seconds
+NOISE = 0.008  # of full scale: 2 grey levels
+
+NEAREST_M, FARTHEST_M = 0.4, 5.0
+BASELINE_PX_M = 0.075  # of projector and camera, times the focal length in pixels
+DARK = 0.12  # below this brightness the projected pattern begins to be lost
+PATCH_PX = 8  # holes on dark surfaces come in patches
+WINDOW_PX = 6  # the pattern is matched in windows: neighbours err alike
+SHARED_NOISE, OWN_NOISE = 0.8, 0.6  # of a disparity's noise; their squares add up to 1
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A camera on a walk; `seed` draws its gain and its noise."""
+
+    camera: Camera
+    walk: Walk
+    seed: int
+
+    def color(self, frame: int, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
+        """Light [H, W, 3] as recorded: moved while the shutter is open, amplified, noisy.
+
+        Motion during the exposure is taken as linear: a pixel averages the sharp image along the
+        way its surface takes. What is uncovered behind an edge meanwhile is not seen.
+        """
+        gain = 1 + EXPOSURE_SPREAD * self._drift(frame)
+        blurred = blur(rendering.light, *self.motion_px(frame, rendering.depth_m))
+        return gain * blurred + NOISE * normal(rng, blurred.shape)
+
+    def depth_m(self, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
+        """Depth [H, W] as measured; 0 where nothing is."""
+        return measured_depth_m(rendering, self.camera.fx, rng)
+
+    def motion_px(self, frame: int, depth_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far [H, W] the surface at each pixel moves in u and v while the shutter is open."""
+        half = SHUTTER_S * RATE_HZ / 2
+        T_world_camera = self.walk.pose(frame)
+        opened, closed = (
+            _projected(self.camera, self.walk.pose(frame + step), T_world_camera, depth_m)
+            for step in (-half, half)
+        )
+        return closed[0] - opened[0], closed[1] - opened[1]
+
+    def _drift(self, frame: int) -> float:
+        """Slow, between -1 and 1."""
+        count = int(FRAMES / RATE_HZ / EXPOSURE_S)
+        knots = np.random.default_rng([self.seed, 3]).random((count, 1)) * 2 - 1
+        drift = closed_spline(knots, np.array([frame / FRAMES * count]))[0, 0]
+        return float(min(max(drift, -1.0), 1.0))
+
+
+def measured_depth_m(rendering: Rendering, focal_px: float, rng: np.random.Generator) -> np.ndarray:
+    """Depth [H, W] of a Kinect-like camera; 0 where it measures none.
+
+    Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step that
+    neighbours share, ragged edges, no measurement in the projector's shadow, on dark patches
+    and outside 0.4-5 m.
+    """
+    exact = rendering.depth_m
+    disparity = 1 / (_ragged(exact, rng) * DISPARITY_STEP_PER_M)
+    disparity = disparity + DISPARITY_SIGMA_STEPS * _matching_noise(rng, exact.shape)
+    measured = 1 / (np.maximum(np.floor(disparity + 0.5), 1.0) * DISPARITY_STEP_PER_M)
+    seen = (measured >= NEAREST_M) & (measured <= FARTHEST_M)
+    seen &= ~is_shadowed(exact, BASELINE_PX_M * focal_px)
+    return np.where(seen & ~_is_too_dark(rendering.light, rng), measured, 0.0)
+
+
+def normal(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Nearly normal numbers of unit variance, by sums alone: the same bits on every machine."""
+    total = rng.random(shape) + rng.random(shape) + rng.random(shape)  # variance 3 / 12
+    return 2 * (total - 1.5)
+
+
+def blur(light: np.ndarray, du_px: np.ndarray, dv_px: np.ndarray) -> np.ndarray:
+    """The mean [H, W, 3] of the image along a segment about each pixel."""
+    v, u = np.mgrid[: light.shape[0], : light.shape[1]]
+    total = np.zeros(light.shape)
+    for tap in range(BLUR_TAPS):
+        share = (tap + 0.5) / BLUR_TAPS - 0.5
+        total += _sampled(light, u + share * du_px, v + share * dv_px)
+    return total / BLUR_TAPS
+
+
+def is_shadowed(depth_m: np.ndarray, baseline_px_m: float) -> np.ndarray:
+    """Pixels [H, W] that the projector, to the left of the camera, does not reach.
+
+    It sees pixel u of depth z at u + b f / z; of all that it sees there, only the nearest is lit.
+    """
+    height, width = depth_m.shape
+    shift = baseline_px_m / np.maximum(depth_m, NEAREST_M)
+    column = np.floor(np.arange(width) + shift + 0.5).astype(np.int64)
+    row = np.broadcast_to(np.arange(height)[:, None], depth_m.shape)
+    nearest_m = np.full((height, int(column.max()) + 1), np.inf)
+    np.minimum.at(nearest_m, (row, column), depth_m)
+    return depth_m > 1.05 * nearest_m[row, column]
+
+
+def _ragged(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Depth of a neighbour in the row, up to a pixel or two away: edges are not matched sharply."""
+    shift = np.floor(0.7 * normal(rng, depth_m.shape) + 0.5).astype(np.int64)
+    column = np.clip(np.arange(depth_m.shape[1]) + shift, 0, depth_m.shape[1] - 1)
+    return np.take_along_axis(depth_m, column, axis=1)
+
+
+def _is_too_dark(light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Patches [H, W] that are lost, the more the darker the surface is."""
+    brightness = (light[..., 0] + light[..., 1] + light[..., 2]) / 3
+    patches = _enlarged(rng.random(_coarse(brightness.shape, PATCH_PX)), PATCH_PX, brightness.shape)
+    return brightness < DARK * patches * (0.5 + rng.random(brightness.shape))
+
+
+def _matching_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Unit variance [H, W], most of it shared within a window."""
+    shared = _enlarged(normal(rng, _coarse(shape, WINDOW_PX)), WINDOW_PX, shape)
+    # interpolation keeps 2/3 of the variance along each axis, hence 1.5
+    return SHARED_NOISE * 1.5 * shared + OWN_NOISE * normal(rng, shape)
+
+
+def _coarse(shape: tuple[int, ...], cell_px: int) -> tuple[int, int]:
+    return shape[0] // cell_px + 2, shape[1] // cell_px + 2
+
+
+def _enlarged(coarse: np.ndarray, cell_px: int, shape: tuple[int, ...]) -> np.ndarray:
+    """A coarse grid, interpolated to an image [H, W] with cells of `cell_px`."""
+    v, u = np.mgrid[: shape[0], : shape[1]] / cell_px
+    return _sampled(coarse[..., None], u, v)[..., 0]
+
+
+def _projected(
+    camera: Camera, T_world_other: np.ndarray, T_world_camera: np.ndarray, depth_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where [H, W] another pose sees the surfaces of this one. Sums in a fixed order."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    ray = ((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0)
+    T, S = T_world_camera, T_world_other
+    world = [depth_m * _dot(T[i, :3], ray) + (T[i, 3] - S[i, 3]) for i in range(3)]
+    x, y, z = (_dot(S[:3, i], world) for i in range(3))
+    return x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
+
+
+def _dot(a: np.ndarray, b: tuple | list) -> np.ndarray:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _sampled(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Bilinear values [H, W, C] of an image at pixels, those beyond its border taken from it."""
+    height, width = image.shape[:2]
+    u, v = np.clip(u, 0, width - 1.001), np.clip(v, 0, height - 1.001)
+    left, top = u.astype(np.int64), v.astype(np.int64)
+    fu, fv = (u - left)[..., None], (v - top)[..., None]
+    texel, corner = image.reshape(-1, image.shape[2]).take, top * width + left
+    upper = texel(corner, 0) * (1 - fu) + texel(corner + 1, 0) * fu
+    lower = texel(corner + width, 0) * (1 - fu) + texel(corner + width + 1, 0) * fu
+    return upper * (1 - fv) + lower * fv

@@ -1,0 +1,136 @@
+"""A walk with a hand-held camera: each room twice, by way of the corridor, and back."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.synthetic.path import closed_spline
+
+RATE_HZ = 15
+FRAMES = 640
+
+# Eye x, y, z in metres and gaze x, y, z; from room A's door to room B's. Half a turn about the
+# world's z axis makes the way back from B to A of them.
+FIRST_HALF = np.array(
+    [
+        # room A, from left to right
+        [-1.15, 1.00, 1.42, -0.72, 0.69, -0.12],
+        [-1.34, 1.55, 1.45, -0.42, 0.91, -0.16],
+        [-1.30, 2.10, 1.48, 0.10, 0.99, -0.20],
+        [-0.92, 2.45, 1.46, 0.60, 0.80, -0.20],
+        [-0.48, 2.25, 1.42, 0.95, 0.31, -0.18],
+        [-0.55, 1.70, 1.42, 0.97, -0.26, -0.16],
+        [-0.92, 1.20, 1.45, 0.62, -0.78, -0.12],
+        # corridor
+        [-1.02, 0.60, 1.48, 0.50, -0.86, -0.10],
+        [-0.72, 0.12, 1.50, 0.87, -0.50, -0.08],
+        [-0.15, -0.03, 1.46, 0.99, -0.10, -0.08],
+        [0.45, -0.05, 1.44, 0.99, -0.14, -0.10],
+        [0.92, -0.38, 1.42, 0.90, -0.44, -0.12],
+    ]
+)
+SECOND_HALF = np.array(
+    [
+        # room A, from right to left
+        [-1.05, 1.05, 1.40, -0.18, 0.98, -0.16],
+        [-0.80, 1.55, 1.38, -0.10, 0.99, -0.20],
+        [-0.82, 2.10, 1.42, -0.50, 0.86, -0.20],
+        [-1.20, 2.42, 1.46, -0.86, 0.50, -0.16],
+        [-1.58, 2.15, 1.48, -0.99, -0.10, -0.16],
+        [-1.50, 1.60, 1.50, -0.72, -0.68, -0.16],
+        [-1.22, 1.10, 1.46, -0.10, -0.98, -0.14],
+        # corridor
+        [-1.00, 0.55, 1.42, 0.22, -0.97, -0.08],
+        [-0.66, 0.10, 1.44, 0.78, -0.62, -0.10],
+        [-0.10, 0.05, 1.48, 0.98, -0.20, -0.08],
+        [0.48, 0.02, 1.50, 0.98, -0.20, -0.08],
+        [0.95, -0.35, 1.46, 0.60, -0.80, -0.12],
+    ]
+)
+HALF_TURN = np.array([-1, -1, 1, -1, -1, 1])
+KNOTS = np.concatenate([FIRST_HALF, FIRST_HALF * HALF_TURN, SECOND_HALF, SECOND_HALF * HALF_TURN])
+
+WALK_M_S, TURN_RAD_S = 0.63, 1.02  # paces: walking or turning, what is slower sets the time
+STEPS_PER_KNOT = 64  # of the table that turns time into a place on the way
+
+SWAY_S, SWAY_EYE_M, SWAY_GAZE = 0.6, 0.012, 0.022  # a hand's drift, and
+TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004  # its quick tremor
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """The camera's motion as a function of time, a closed curve that `FRAMES` frames sample.
+
+    along   [M + 1] place on the knots at times of equal steps
+    shakes  closed splines [K, 7] of eye, gaze and roll
+    """
+
+    along: np.ndarray
+    shakes: tuple[np.ndarray, ...]
+
+    def pose(self, frame: float) -> np.ndarray:
+        """T_world_camera [4, 4] at `frame`, which may lie between two."""
+        turn = frame / FRAMES % 1.0
+        x = turn * (len(self.along) - 1)
+        cell = int(x)
+        place = self.along[cell] + (x - cell) * (self.along[cell + 1] - self.along[cell])
+        state = np.append(_at(KNOTS, place), 0.0)
+        for knots in self.shakes:
+            state = state + _at(knots, turn * len(knots))
+        return _looking(state[:3], state[3:6], state[6])
+
+
+def hand_held(seed: int) -> Walk:
+    """The walk with the sway and tremor of a hand drawn from `seed`."""
+    rng = np.random.default_rng([seed, 2])
+    sway = _shake(rng, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
+    tremor = _shake(rng, TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE)
+    return Walk(_timed(), (sway, tremor))
+
+
+def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float) -> np.ndarray:
+    count = int(FRAMES / RATE_HZ / period_s)
+    return (rng.random((count, 7)) * 2 - 1) * ([eye_m] * 3 + [gaze] * 4)
+
+
+def _timed() -> np.ndarray:
+    """Place on the knots at equal steps of time, so that no pace is exceeded for long."""
+    place = np.arange(len(KNOTS) * STEPS_PER_KNOT + 1) / STEPS_PER_KNOT
+    state = closed_spline(KNOTS, place[:-1])
+    state = np.concatenate([state, state[:1]])
+    walked = _length(np.diff(state[:, :3], axis=0)) / WALK_M_S
+    gaze = state[:, 3:] / _length(state[:, 3:])[:, None]
+    turned = _length(np.diff(gaze, axis=0)) / TURN_RAD_S
+    time = np.concatenate([[0.0], np.cumsum(np.sqrt(walked * walked + turned * turned))])
+    wanted = np.arange(len(time)) * (time[-1] / (len(time) - 1))
+    cell = np.clip(np.searchsorted(time, wanted, side="right") - 1, 0, len(time) - 2)
+    share = (wanted - time[cell]) / (time[cell + 1] - time[cell])
+    return place[cell] + share * (place[cell + 1] - place[cell])
+
+
+def _length(v: np.ndarray) -> np.ndarray:
+    x, y, z = v.T
+    return np.sqrt(x * x + y * y + z * z)
+
+
+def _at(knots: np.ndarray, place: float) -> np.ndarray:
+    return closed_spline(knots, np.array([place % len(knots)]))[0]
+
+
+def _looking(eye: np.ndarray, gaze: np.ndarray, roll: float) -> np.ndarray:
+    """T_world_camera [4, 4] with z along the gaze, rolled by a small angle off the horizon."""
+    z = gaze / _length(gaze[None])[0]
+    level = np.array([z[1], -z[0], 0.0])
+    level = level / _length(level[None])[0]
+    down = _cross(z, level)
+    x = level + roll * down
+    x = x / _length(x[None])[0]
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = x, _cross(z, x), z, eye
+    return T
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.array(
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    )

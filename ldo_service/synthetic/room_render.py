@@ -1,0 +1,89 @@
+"""Ray casting of a lit, furnished room: colour and exact depth per ray."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+
+from .light import interpolated, light_on_face, plane_axes, shade
+from .ray_casting import Hits, View, outline
+from .room import Room
+from .solids import Solid, Vector, vector
+
+SHELL_FACES = 6  # number the first surfaces that a cast can meet
+# Four rays for a pixel on an outline, each in the middle of a quarter of it.
+QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
+
+
+@dataclass(frozen=True, slots=True)
+class Rendering:
+    """color [H, W, 3] uint8; depth_m [H, W] float64, z, exact at pixel centres; is_visitor [H, W]
+    bool, whether the pixel shows a visitor."""
+
+    color: np.ndarray
+    depth_m: np.ndarray
+    is_visitor: np.ndarray
+
+
+class Renderer:
+    """Frames of one room. The light on its walls is computed once, when this is made."""
+
+    def __init__(self, room: Room) -> None:
+        self._room = room
+        self._light = [light_on_face(room, face) for face in range(6)]
+
+    def render(
+        self, camera: Camera, T_world_camera: np.ndarray, visitors: tuple[Solid, ...] = ()
+    ) -> Rendering:
+        """Pixels on an outline average four rays in colour; depth never mixes surfaces. `visitors`
+        are solids beside the furniture; they cast no shadow."""
+        v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
+        solids = (*self._room.furniture, *visitors)
+        view = View(self._room.shell, solids, camera, T_world_camera)
+        hits = view.cast(u, v)
+        color = self._color(view, solids, u, v, hits)
+        edge = outline(hits.surface.reshape(camera.height, camera.width)).ravel()
+        color[edge] = self._antialiased(view, solids, u[edge], v[edge])
+        image = np.floor(color * 255 + 0.5).astype(np.uint8)
+        size = (camera.height, camera.width)
+        is_visitor = hits.surface >= SHELL_FACES + len(self._room.furniture)
+        return Rendering(
+            image.reshape(*size, 3), hits.depth_m.reshape(size), is_visitor.reshape(size)
+        )
+
+    def _antialiased(
+        self, view: View, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray
+    ) -> np.ndarray:
+        total = np.zeros((len(u), 3))
+        for du, dv in QUARTERS_PX:
+            total += self._color(view, solids, u + du, v + dv, view.cast(u + du, v + dv))
+        return total / len(QUARTERS_PX)
+
+    def _color(
+        self, view: View, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray, hits: Hits
+    ) -> np.ndarray:
+        """Reflected light [P, 3] in 0..1: albedo times diffuse shading."""
+        color = np.empty((len(u), 3))
+        for surface, rays in hits.by_surface():
+            point = view.points(u[rays], v[rays], hits.depth_m[rays])
+            footprint_m = hits.depth_m[rays] / view.camera.fx
+            if surface < SHELL_FACES:
+                color[rays] = self._wall_color(surface, point, footprint_m)
+            else:
+                solid = solids[surface - SHELL_FACES]
+                color[rays] = self._solid_color(solid, point, footprint_m)
+        return np.clip(color, 0.0, 1.0)
+
+    def _wall_color(self, face: int, point: Vector, footprint_m: np.ndarray) -> np.ndarray:
+        a, b = plane_axes(face // 2)
+        shell = self._room.shell
+        corner = [c - s / 2 for c, s in zip(shell.center_m, shell.size_m, strict=True)]
+        u_m, v_m = point[a] - corner[a], point[b] - corner[b]
+        albedo = self._room.textures[self._room.faces[face]].sample(u_m, v_m, footprint_m)
+        return albedo * interpolated(self._light[face], u_m, v_m)[:, None]
+
+    def _solid_color(self, solid: Solid, point: Vector, footprint_m: np.ndarray) -> np.ndarray:
+        normal, u_m, v_m = solid.surface(point)
+        albedo = self._room.textures[solid.texture].sample(u_m, v_m, footprint_m)
+        return albedo * shade(vector(self._room.lamp_center_m), point, normal, 1.0)[:, None]

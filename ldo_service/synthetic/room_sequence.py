@@ -1,0 +1,120 @@
+"""The synthetic room as a sequence, optionally with the depth errors of a Kinect."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ldo_service.errors import ConfigError, DataError
+from ldo_service.geometry import Camera, RawFrame, Trajectory
+from ldo_service.geometry.sequence import Sequence
+
+from . import path
+from .person import person_at
+from .room import furnished_room
+from .room_render import Renderer, Rendering
+
+# Khoshelham and Elberink, Sensors 2012: depth is 1 / (step * disparity), with disparity in whole
+# steps, so a step in depth is 2.85e-3 z^2 m; the matching errs by half a step.
+DISPARITY_STEP_PER_M = 2.85e-3
+DISPARITY_SIGMA_STEPS = 0.5
+NEAREST_M, FARTHEST_M = 0.4, 8.0
+
+RATE_HZ = 30
+FOCAL_PER_WIDTH = 0.8125  # 63 degrees wide, as a Kinect's colour camera
+
+PATHS = {"look_around": path.LOOK_AROUND, "tour": path.TOUR, "linger": path.LINGER}
+
+
+def kinect_depth(depth_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Depth [H, W] in metres as a Kinect measures it; 0 outside its range and beside outlines.
+
+    The error grows with the square of depth: 3 mm steps at 1 m, 26 mm at 3 m.
+    """
+    disparity = 1 / (depth_m * DISPARITY_STEP_PER_M)
+    disparity = disparity + DISPARITY_SIGMA_STEPS * rng.standard_normal(depth_m.shape)
+    measured = 1 / (np.maximum(np.floor(disparity + 0.5), 1.0) * DISPARITY_STEP_PER_M)
+    seen = (measured >= NEAREST_M) & (measured <= FARTHEST_M) & ~_is_shadowed(depth_m)
+    return np.where(seen, measured, 0.0)
+
+
+def _is_shadowed(depth_m: np.ndarray) -> np.ndarray:
+    """The far side [H, W] of a jump in depth along the row, which the projector does not reach."""
+    jump = np.diff(depth_m, axis=1, prepend=depth_m[:, :1])
+    return jump > 0.05 * depth_m
+
+
+@dataclass(frozen=True, slots=True)
+class SyntheticConfig:
+    """What is rendered. The same values give the same bytes."""
+
+    frames: int = 120
+    width_px: int = 320
+    height_px: int = 240
+    path: Literal["look_around", "tour", "linger"] = "look_around"
+    noise: bool = False  # Kinect-like depth; exact otherwise
+    person: bool = False  # somebody walks through
+    seed: int = 0  # of textures, of the hand's sway and of the noise
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.width_px < 8 or self.height_px < 8:
+            raise ConfigError(
+                f"synthetic sequence of {self.frames} frames of {self.width_px}x{self.height_px} "
+                "pixels: at least 1 frame of 8x8 is needed."
+            )
+        if self.path not in PATHS:
+            raise ConfigError(f"path {self.path!r} is not one of {', '.join(PATHS)}.")
+
+
+NAMED = {
+    "room": SyntheticConfig(),
+    "room-noisy": SyntheticConfig(noise=True),
+    "tour": SyntheticConfig(frames=360, path="tour"),
+    "tour-noisy": SyntheticConfig(frames=360, path="tour", noise=True),
+    "person": SyntheticConfig(frames=240, path="linger", person=True),
+    "person-noisy": SyntheticConfig(frames=240, path="linger", person=True, noise=True),
+}
+
+
+class SyntheticSequence(Sequence):
+    """Frames of the furnished room, rendered when they are read; depth is float32 in metres."""
+
+    def __init__(self, config: SyntheticConfig | None = None, name: str = "synthetic") -> None:
+        self.config = config = config or SyntheticConfig()
+        focal_px = FOCAL_PER_WIDTH * config.width_px
+        center_px = ((config.width_px - 1) / 2, (config.height_px - 1) / 2)
+        camera = Camera(config.width_px, config.height_px, focal_px, focal_px, *center_px)
+        stamps_ns = np.arange(config.frames, dtype=np.int64) * 10**9 // RATE_HZ
+        super().__init__(name, camera, stamps_ns)
+        self._T_world_camera = path.poses(PATHS[config.path], config.frames, config.seed)
+        self._renderer = Renderer(furnished_room(config.seed))
+
+    @staticmethod
+    def named(name: str, **changes: int | bool) -> "SyntheticSequence":
+        """The sequence `synthetic:name`, its config changed by keywords. Raises DataError."""
+        if name not in NAMED:
+            known = ", ".join(f"synthetic:{known}" for known in NAMED)
+            raise DataError(f"there is no synthetic:{name}. There is {known}.")
+        config = replace(NAMED[name], **changes)
+        seed = f"@{config.seed}" if config.seed else ""
+        return SyntheticSequence(config, f"synthetic:{name}{seed}")
+
+    def read(self, index: int) -> RawFrame:
+        exact = self._rendering(index)
+        depth_m = exact.depth_m
+        if self.config.noise:
+            depth_m = kinect_depth(depth_m, np.random.default_rng([self.config.seed, index]))
+        depth = depth_m.astype(np.float32)
+        stamp_ns = int(self.stamps_ns[index])
+        return RawFrame(index, stamp_ns, exact.color, depth, 1.0, self.raw_camera)
+
+    def person(self, index: int) -> np.ndarray:
+        """Whether each pixel [H, W] of frame `index` shows the person, exact at pixel centres."""
+        return self._rendering(index).is_visitor
+
+    def _rendering(self, index: int) -> Rendering:
+        visitors = person_at(index / RATE_HZ) if self.config.person else ()
+        return self._renderer.render(self.raw_camera, self._T_world_camera[index], visitors)
+
+    def truth(self) -> Trajectory:
+        return Trajectory(self.stamps_ns / 1e9, self._T_world_camera.copy())
