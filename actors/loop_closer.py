@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.detection.dynamic_classes import MovableConfig, movable_pixels
+from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.loops import Finding, LoopsConfig, Recogniser
 from ldo_service.loops.landmarks import Sightings, sightings_of
@@ -36,8 +38,6 @@ from ldo_service.schemas.topics import (
     LOOP_CANDIDATE,
     LOOP_CLOSURE,
 )
-from ldo_service.semantics.movable import MovableConfig, movable_pixels
-from ldo_service.semantics.vocabulary import Vocabulary
 from ldo_service.tracking.places import Place, place_of
 from ldo_service.wire import (
     boxes_in,

@@ -30,6 +30,7 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.keyframe_links import KeyframeLinks
 from ldo_service.map_teller import MapTeller, Occasion, Pace
 from ldo_service.objects_teller import ObjectsTeller
+from ldo_service.regions.region import Answer
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     AnchorMotion,
@@ -61,7 +62,6 @@ from ldo_service.schemas.topics import (
     MAP_VIEW,
     OBJECT_OBSERVATION,
 )
-from ldo_service.semantics.regions import Answer
 from ldo_service.semantics.semantic_map import Learnt, SemanticMap, SemanticMapConfig
 from ldo_service.wire import (
     claims_of,

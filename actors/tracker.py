@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.detection.dynamic_classes import Box
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
@@ -40,7 +41,6 @@ from ldo_service.schemas.topics import (
     ODOMETRY_PRIOR,
     POSE_TRACKED,
 )
-from ldo_service.semantics.movable import Box
 from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.prior import Prior, Reading, Verdict

@@ -19,16 +19,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ldo_service.detection.labellers import Labeller, Opinion
+from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
+from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
+from ldo_service.detection.model_registry import open_labeller
+from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, EndpointError, FrameError, ModelError
-from ldo_service.models import open_labeller
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import LabelAdd, LabelNames, LabelOpen, LabelRequest
 from ldo_service.schemas.labels import MOST_NAMES, MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
-from ldo_service.semantics.class_names import read_names
-from ldo_service.semantics.labellers import Labeller, Opinion
-from ldo_service.semantics.labellers.dual_encoder import DualEncoderConfig
-from ldo_service.semantics.labellers.http_labeller import HttpConfig, HttpLabeller
 from ldo_service.storage.state_store import State
 from ldo_service.wire import crops_of
 

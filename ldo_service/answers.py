@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.schemas import MapObjects, Pose
-from ldo_service.semantics.search import Encode, NotCompared, nearest_names, search
+from ldo_service.semantics.text_search import Encode, NotCompared, nearest_names, search
 
 
 @dataclass(frozen=True, slots=True)

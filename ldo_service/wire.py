@@ -5,10 +5,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import cv2
 import numpy as np
 
+from ldo_service.detection.detectors import Detections
+from ldo_service.detection.dynamic_classes import Box as MovableBox
+from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.geometry.se3 import quaternions
 from ldo_service.loops import Finding
+from ldo_service.regions.foreground import Claims
+from ldo_service.regions.region import Region
 from ldo_service.schemas import (
     Array,
     CameraModel,
@@ -32,14 +37,9 @@ from ldo_service.schemas import (
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
 from ldo_service.schemas.objects import Box, Distribution
-from ldo_service.semantics.detectors import Detections
 from ldo_service.semantics.distributions import entropy, sparse
-from ldo_service.semantics.labelling import Claims
-from ldo_service.semantics.landmarks import distributions, labels_of
-from ldo_service.semantics.movable import Box as MovableBox
+from ldo_service.semantics.object_landmarks import distributions, labels_of
 from ldo_service.semantics.objects import Observed
-from ldo_service.semantics.regions import Region
-from ldo_service.semantics.vocabulary import Vocabulary
 from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
 from ldo_service.tracking.moving import resized
 from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of

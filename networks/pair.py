@@ -18,7 +18,7 @@ from layers import Live
 from regions import NO_THING
 from views import Seen, Views
 
-from ldo_service.semantics.region_views import ViewConfig
+from ldo_service.regions.region_views import ViewConfig
 from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 
 NO_NAME = "background"  # of a region that is no thing

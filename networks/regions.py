@@ -10,8 +10,8 @@ import numpy as np
 from wear import worsened
 
 from ldo_service.geometry import Camera
-from ldo_service.semantics.segments import segments
-from ldo_service.semantics.trigger import TriggerConfig, regions_of_image
+from ldo_service.regions.geometric_segmentation import segments
+from ldo_service.regions.region_proposals import TriggerConfig, regions_of_image
 from ldo_service.synthetic.flat.render import Rendering
 from ldo_service.synthetic.flat.sensor import measured_depth_m
 

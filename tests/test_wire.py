@@ -4,7 +4,7 @@ import numpy as np
 
 from ldo_service.objects_teller import ObjectsTeller
 from ldo_service.schemas import MapObjects, decode, encode
-from ldo_service.semantics.landmarks import distributions, entropies
+from ldo_service.semantics.object_landmarks import distributions, entropies
 from ldo_service.wire import observation_messages, transform
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
 

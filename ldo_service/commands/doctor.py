@@ -15,9 +15,9 @@ from rich.console import Console
 from ldo_service import __version__, kernels
 from ldo_service.actors.graph import GRAPH
 from ldo_service.client import connect
+from ldo_service.detection.model_registry import Models
 from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.errors import ConfigError, LdoError, ModelError
-from ldo_service.models import Models
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH

@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service import demo_networks
+from ldo_service.detection.detectors import NetworkConfig
+from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, Pair
+from ldo_service.detection.model_registry import Model, Models
+from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, LdoError, ModelError
-from ldo_service.models import Model, Models
-from ldo_service.semantics.class_names import read_names
-from ldo_service.semantics.detectors import NetworkConfig
-from ldo_service.semantics.labellers.dual_encoder import DualEncoderConfig, Pair
 
 Name = Annotated[
     str,

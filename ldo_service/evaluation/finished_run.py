@@ -10,7 +10,7 @@ from ldo_service.errors import DataError
 from ldo_service.gaussians.exposure import Exposure
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.semantics.saved import SavedSemantics
+from ldo_service.semantics.semantics_file import SavedSemantics
 
 from .loops import FoundLoops
 

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ldo_service.detection.vocabulary import COCO, canonical, coco_class, normalised
 from ldo_service.errors import DataError
 from ldo_service.geometry.sequence import VOID_NAMES
-from ldo_service.semantics.class_names import COCO, normalised
-from ldo_service.semantics.synonyms import canonical, coco_class
 
 BACKGROUND = "background"
 BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # what no map names

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ldo_service.semantics.class_names import COCO
+from ldo_service.detection.vocabulary import COCO
 
 from .label_lists import UNKNOWN, VOID, LabelList, full_list
 from .pictures import Color, contact_sheet, legend

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ldo_service.detection.vocabulary import COCO
 from ldo_service.geometry.sequence import FrameLabels
-from ldo_service.semantics.class_names import COCO
 
 from .label_lists import BACKGROUND, VOID, LabelList, place_of_object
 

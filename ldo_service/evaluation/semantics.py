@@ -10,8 +10,8 @@ from ldo_service.errors import DataError
 from ldo_service.gaussians.render import render
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.geometry.sequence import FrameLabels
-from ldo_service.semantics.label_images import label_image
-from ldo_service.semantics.saved import SavedSemantics
+from ldo_service.semantics.semantic_fusion import label_image
+from ldo_service.semantics.semantics_file import SavedSemantics
 
 from .cross_view import Agreement, Correspondences, agreement, correspondences
 from .finished_run import FinishedRun, PosedMap, RunFrame
@@ -28,7 +28,7 @@ PROTOCOL = """\
 Labels are rendered for the frames of A and B above, at the same poses: a pixel has the label s of
 the largest sum_i w_i p_i(s) over its Gaussians. Pixels of all frames are pooled. Those whose truth
 is void do not count; a name that is not in the list is wrong wherever it is shown.
-COCO: background and the classes of COCO among those of the source, by semantics/synonyms.yaml; all
+COCO: background and the classes of COCO among those of the source, by detection/synonyms.yaml; all
 other classes are background. All names: background (wall, floor, ceiling) and every object of the
 source by its own name, or by COCO's where COCO has one. mIoU, accuracy and IoU by frequency are
 means over classes: those with 0.2 % of the pixels, and all that occur. Pixel accuracy is of all

@@ -16,7 +16,7 @@ def surfaces(
 
     Pieces are numbered in the order of their first pixels, row by row. Releases the GIL. Raises
     ValueError for arrays that do not fit. One thread; where a cosine is at its threshold the
-    outcome may differ between instruction sets. `ldo_service.semantics.foreground` says more.
+    outcome may differ between instruction sets. `ldo_service.regions.foreground` says more.
     """
 
 def foreground(
@@ -39,5 +39,5 @@ def foreground(
     `labels` [H, W] and `sizes` [S] as `surfaces` returns them. Releases the GIL. Raises ValueError
     for arrays that do not fit and windows that are empty or beyond the image. One thread; where a
     depth is at the edge of a bin of the mode the outcome may differ between instruction sets.
-    `ldo_service.semantics.foreground` says more.
+    `ldo_service.regions.foreground` says more.
     """

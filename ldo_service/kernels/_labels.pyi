@@ -28,7 +28,7 @@ def assign(
     `boxes` [M, 4]; `scores` [M]; `rects` [M, 4] column, row, width, height of the rectangle whose
     summed-area table [height + 1, width + 1] is the next in `sums`; width 0: all of the box.
     Releases the GIL. Raises ValueError for arrays that do not fit and indices that do not ascend.
-    Bitwise equal for any number of threads. `ldo_service.semantics.assignment` says more.
+    Bitwise equal for any number of threads. `ldo_service.semantics.label_assignment` says more.
     """
 
 def update(
@@ -50,7 +50,7 @@ def update(
     `observed` [V]: a label, -1 for a miss, -2 for none; `confidence` [V] of labels; `extent_m` [V]
     of the label's object, or of the smallest object that is worth missing. Releases the GIL.
     Raises ValueError for arrays that do not fit and indices that do not ascend. Bitwise equal for
-    any number of threads. `ldo_service.semantics.labels` says more.
+    any number of threads. `ldo_service.semantics.gaussian_labels` says more.
     """
 
 def agree(
@@ -67,5 +67,5 @@ def agree(
 
     `rows` [N, 16] float32; `labels` [N, 32] bytes. Releases the GIL. Raises ValueError for arrays
     that do not fit and indices that do not ascend. Bitwise equal for any number of threads.
-    `ldo_service.semantics.consistency` says more.
+    `ldo_service.semantics.gaussian_labels` says more.
     """

@@ -8,9 +8,9 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
+from ldo_service.regions.foreground import ForegroundConfig, foreground, surfaces
 from ldo_service.semantics.distributions import dense, divergence, entropy, sparse
-from ldo_service.semantics.foreground import ForegroundConfig, foreground, surfaces
-from ldo_service.semantics.labels import MOST_LABELS, OTHER
+from ldo_service.semantics.gaussian_labels import MOST_LABELS, OTHER
 
 LAYOUT_WORDS = 512  # pairs of names and their distances are spread over so many
 DISTANCE_BIN_M = 0.5  # of the distances; each counts in the two bins that it lies between

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from ldo_service.errors import ConfigError
-from ldo_service.semantics.labels import MOST_LABELS
+from ldo_service.semantics.gaussian_labels import MOST_LABELS
 from ldo_service.tracking.places import gaps
 
 from .landmarks import LAYOUT_WORDS

@@ -50,8 +50,8 @@ from ldo_service.schemas import (
     Message,
     TrackedPose,
 )
-from ldo_service.semantics.labels import top_labels
-from ldo_service.semantics.saved import write_semantics
+from ldo_service.semantics.gaussian_labels import top_labels
+from ldo_service.semantics.semantics_file import write_semantics
 from ldo_service.wire import keyframe_poses_of, transform
 
 from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame

@@ -5,7 +5,7 @@ Kept and sent they are sparse: the eight heaviest labels; what the others had is
 
 import numpy as np
 
-from .labels import BACKGROUND, MOST_LABELS, OTHER, background, fields
+from .gaussian_labels import BACKGROUND, MOST_LABELS, OTHER, background, fields
 
 KEPT = 8  # labels of a sparse distribution: the five of a Gaussian, and those of its neighbours
 FLOOR = 1e-6  # of what a distribution holds impossible, so that divergences are finite
@@ -21,7 +21,7 @@ def pooled(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
     One that is wholly label 2 and weighs 3, and one that is half of it and weighs 1:
 
-    >>> from ldo_service.semantics.labels import new_labels
+    >>> from ldo_service.semantics.gaussian_labels import new_labels
     >>> labels = new_labels(2)
     >>> fields(labels)["ids"][:, 0], fields(labels)["weights"][:, 0] = 2, (1, 0.5)
     >>> pooled(labels[None], np.array([[3.0, 1.0]]))[0, :3].tolist()  # (3 + 0.5) / 4

@@ -9,7 +9,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 
-from .association import (
+from .data_association import (
     AssociationConfig,
     Found,
     Looks,
@@ -22,8 +22,8 @@ from .association import (
     with_whole_things,
 )
 from .distributions import divergence, entropy
-from .labels import BACKGROUND
-from .landmarks import (
+from .gaussian_labels import BACKGROUND
+from .object_landmarks import (
     LANDMARK,
     NO_MEMBER,
     derive,
@@ -35,8 +35,7 @@ from .landmarks import (
     new_landmarks,
     within,
 )
-from .merging import absorb, coincide, inside, neighbours
-from .sightings import one_each, remember, voted
+from .observations import absorb, coincide, inside, neighbours, one_each, remember, voted
 
 CANDIDATE = -1  # in place of an id
 _AT_A_TIME = 128  # landmarks that are derived together, to stay in cache

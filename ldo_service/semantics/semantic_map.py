@@ -6,21 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
+from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.render import Contributions
 from ldo_service.gaussians.views import View
+from ldo_service.regions.foreground import Claims
+from ldo_service.regions.open_vocabulary import Naming, NamingConfig
+from ldo_service.regions.region import Answer, Region
 
-from .association import MapView
-from .consistency import Disagreement
-from .label_images import reliable_image
-from .labelling import Claims, Labelled, LabellingConfig, label_keyframe
-from .labels import BACKGROUND, MOST_LABELS, top_labels
-from .movable import Box, MovableConfig, movable_pixels
-from .naming import Naming, NamingConfig
+from .data_association import MapView
+from .gaussian_labels import BACKGROUND, MOST_LABELS, Disagreement, top_labels
 from .objects import Objects, ObjectsConfig, Observed
-from .regions import Answer, Region
-from .vocabulary import Vocabulary
+from .semantic_fusion import Labelled, LabellingConfig, label_keyframe, reliable_image
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
-from ldo_service.semantics.movable import Box, MovableConfig, movable_pixels
 
 from .features import FeatureConfig, Features, detect
 from .pyramid import Pyramid, PyramidConfig, build_pyramid

@@ -25,10 +25,10 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.detection.dynamic_classes import Box, MovableConfig
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
-from ldo_service.semantics.movable import Box, MovableConfig
 
 from .align import AlignConfig, Alignment
 from .candidates import Candidate, CandidateConfig

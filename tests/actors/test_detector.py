@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.detector import Detector, DetectorConfig, require_detector
+from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.schemas import Array, CameraModel, DetectionBoxes, Keyframe, encode
-from ldo_service.semantics.detectors import NetworkConfig
-from tests.semantics.networks import SQUARES, changed, squares_image
+from tests.detection.networks import SQUARES, changed, squares_image
 
 SIZE = 128, 96
 

@@ -29,8 +29,8 @@ from ldo_service.schemas import (
     encode,
 )
 from ldo_service.schemas.topics import KEYFRAME_NEW
-from ldo_service.semantics.labelling import LabellingConfig
-from ldo_service.semantics.labels import top_labels
+from ldo_service.semantics.gaussian_labels import top_labels
+from ldo_service.semantics.semantic_fusion import LabellingConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.wire import (

@@ -13,6 +13,9 @@ import pytest
 from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.geometry import se3
 from ldo_service.map_follower import MapFollower
+from ldo_service.regions.open_vocabulary import Naming, NamingConfig
+from ldo_service.regions.region_proposals import TriggerConfig
+from ldo_service.regions.region_tracker import RegionConfig
 from ldo_service.schemas import (
     Array,
     Detection,
@@ -29,13 +32,9 @@ from ldo_service.schemas import (
     ObjectObservation,
     encode,
 )
-from ldo_service.semantics.fusion import FusionConfig
-from ldo_service.semantics.labelling import LabellingConfig
-from ldo_service.semantics.labels import top_labels
-from ldo_service.semantics.naming import Naming, NamingConfig
-from ldo_service.semantics.regions_to_name import RegionConfig
+from ldo_service.semantics.gaussian_labels import top_labels
+from ldo_service.semantics.semantic_fusion import FusionConfig, LabellingConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
-from ldo_service.semantics.trigger import TriggerConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.wire import camera_message, correction_message, matrix6_message, pose_message
 from tests.semantics.staged import CAMERA, THINGS, Shot, Thing, poses, shoot, true_things

@@ -11,6 +11,9 @@ import pytest
 
 from ldo_service.actors.vlm_labeller import VlmLabeller, VlmLabellerConfig, require_labeller
 from ldo_service.config import Config
+from ldo_service.detection.labellers import Opinion
+from ldo_service.detection.labellers.chat_completion import HttpConfig
+from ldo_service.detection.labellers.http_endpoint import EndpointConfig
 from ldo_service.errors import ConfigError, EndpointError, ModelError, ReplayDiverged
 from ldo_service.geometry import codecs
 from ldo_service.recordings.replay import open_recording
@@ -22,13 +25,10 @@ from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
 from ldo_service.schemas.labels import MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
-from ldo_service.semantics.labellers import Opinion
-from ldo_service.semantics.labellers.endpoint import EndpointConfig
-from ldo_service.semantics.labellers.http_labeller import HttpConfig
 from ldo_service.storage.state_store import MemoryStore
+from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
+from tests.detection.labellers.server import hangs, says, sends, serving
 from tests.runtime.cast import QUICK, eventually, running, send
-from tests.semantics.labellers.encoders import ColorPair, embeddings, plain, vocabulary
-from tests.semantics.labellers.server import hangs, says, sends, serving
 
 
 def crop_message(color: np.ndarray) -> Image:

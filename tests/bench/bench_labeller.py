@@ -35,7 +35,7 @@ from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas import CameraRgbd, TrackedPose, decode
 from ldo_service.synthetic.flat import FlatSequence
 from ldo_service.wire import camera_rgbd_message, transform
-from tests.semantics.labellers.server import serving
+from tests.detection.labellers.server import serving
 from tests.service.conftest import LiveService, live_service
 from tests.service.exhibits import Guide, Placed, flat, placed
 from tests.service.heard import Heard

@@ -28,6 +28,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ldo_service.detection.detectors import NetworkConfig
+from ldo_service.detection.model_registry import open_detector
+from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.evaluation.cross_view import Correspondences, correspondences
 from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
 from ldo_service.evaluation.label_sheet import LabelPicture, label_sheet
@@ -36,23 +39,24 @@ from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.render import Rendering
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import FrameLabels, TrueLabels
-from ldo_service.models import open_detector
 from ldo_service.recordings.sequence import open_source
-from ldo_service.semantics.assignment import AssignmentConfig
-from ldo_service.semantics.detectors import NetworkConfig
-from ldo_service.semantics.foreground import (
+from ldo_service.regions.foreground import (
+    Claims,
     ForegroundConfig,
     Surfaces,
     foreground,
     pixels_of,
     surfaces,
 )
-from ldo_service.semantics.fusion import FusionConfig
-from ldo_service.semantics.label_images import label_image
-from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
-from ldo_service.semantics.labels import BACKGROUND, LabelConfig, new_labels, top_labels
-from ldo_service.semantics.trigger import TriggerConfig
-from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.regions.region_proposals import TriggerConfig
+from ldo_service.semantics.gaussian_labels import BACKGROUND, LabelConfig, new_labels, top_labels
+from ldo_service.semantics.label_assignment import AssignmentConfig
+from ldo_service.semantics.semantic_fusion import (
+    FusionConfig,
+    LabellingConfig,
+    label_image,
+    label_keyframe,
+)
 
 NETWORKS = {"YOLOX-Nano": "yolox_nano.onnx", "YOLOv5n": "yolov5n_480x640_w16.onnx"}
 TRUE_BOXES, LEAST_SHARE = "true boxes", 0.005

@@ -48,7 +48,7 @@ from ldo_service.loops.plausibility import Plausibility, PlausibilityConfig
 from ldo_service.runs.source import Reader, Selection
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopClosure, Message
-from ldo_service.semantics.labels import MOST_LABELS
+from ldo_service.semantics.gaussian_labels import MOST_LABELS
 from ldo_service.wire import transform
 
 SUBGRAPHS = 1000

@@ -16,17 +16,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from ldo_service.detection.vocabulary import COCO, Vocabulary
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera, se3
 from ldo_service.objects_teller import ObjectsTeller
 from ldo_service.schemas import encode
-from ldo_service.semantics.assignment import AssignmentConfig, Regions, assign
-from ldo_service.semantics.association import MapView
-from ldo_service.semantics.class_names import COCO
-from ldo_service.semantics.labels import fields, new_labels
+from ldo_service.semantics.data_association import MapView
+from ldo_service.semantics.gaussian_labels import fields, new_labels
+from ldo_service.semantics.label_assignment import AssignmentConfig, Regions, assign
 from ldo_service.semantics.objects import Objects
-from ldo_service.semantics.search import search
-from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.semantics.text_search import search
 
 CAMERA, OBJECTS, EACH, WALL = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), 1000, 400, 76_000
 ROOM_M, AWAY_M = 20.0, 3.0

@@ -19,17 +19,10 @@ import numpy as np
 
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
-from ldo_service.semantics.assignment import Regions, assign
-from ldo_service.semantics.consistency import agree
-from ldo_service.semantics.foreground import Foreground, foreground, surfaces
-from ldo_service.semantics.labelling import (
-    Claims,
-    LabellingConfig,
-    label_keyframe,
-    observations,
-)
-from ldo_service.semantics.labels import NOT_SEEN, new_labels, observe
-from ldo_service.semantics.nesting import without_nested
+from ldo_service.regions.foreground import Claims, Foreground, foreground, surfaces, without_nested
+from ldo_service.semantics.gaussian_labels import NOT_SEEN, agree, new_labels, observe
+from ldo_service.semantics.label_assignment import Regions, assign
+from ldo_service.semantics.semantic_fusion import LabellingConfig, label_keyframe, observations
 from tests.reference.assignment import assign_reference
 from tests.reference.consistency import agree_reference
 from tests.reference.foreground import foreground_reference, surfaces_reference

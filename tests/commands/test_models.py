@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from ldo_service.commands import doctor
-from ldo_service.models import Models
+from ldo_service.detection.model_registry import Models
 from tests.commands.test_cli import assert_one_paragraph, ldo
-from tests.semantics.labellers.encoders import ColorPair, vocabulary
-from tests.semantics.networks import SQUARES
+from tests.detection.labellers.encoders import ColorPair, vocabulary
+from tests.detection.networks import SQUARES
 
 
 @pytest.fixture(autouse=True)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence, open_sequence
+from ldo_service.detection.vocabulary import Vocabulary, coco_class
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import FinishedRun, RunFrame
 from ldo_service.evaluation.label_results import frames_to_show, plain_labels
@@ -23,10 +24,8 @@ from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import SEMANTICS
 from ldo_service.runs.over_file import run_over_file
-from ldo_service.semantics.labels import fields
-from ldo_service.semantics.saved import write_semantics
-from ldo_service.semantics.synonyms import coco_class
-from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.semantics.gaussian_labels import fields
+from ldo_service.semantics.semantics_file import write_semantics
 from tests.commands.test_cli import ldo
 from tests.runs.jobs import job
 from tests.semantics import staged

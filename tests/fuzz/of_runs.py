@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.localiser import PLACES, places_of
+from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.errors import DataError, LdoError
 from ldo_service.gaussians import chunk, keyframe_images
 from ldo_service.gaussians.model import new_labels
@@ -24,8 +25,7 @@ from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
 from ldo_service.runtime.journal import Started, Step, checksum
 from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
 from ldo_service.schemas import CameraRgbd, MapObjects
-from ldo_service.semantics.saved import read_semantics, write_semantics
-from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.tracking.places import Place

@@ -14,16 +14,15 @@ from safetensors.numpy import save
 
 from ldo_service.authority import Authority
 from ldo_service.config import config_of, config_yaml, load_config
-from ldo_service.models import Models
+from ldo_service.detection.detectors import OnnxDetector
+from ldo_service.detection.labellers.text_embeddings import BytePairs, CachedEmbeddings
+from ldo_service.detection.model_registry import Models
+from ldo_service.detection.vocabulary import class_names, read_names
 from ldo_service.runtime.access import access_control, read_access
 from ldo_service.runtime.keys import CA, CERTIFICATE, KEY, Keys
 from ldo_service.runtime.network import Network
-from ldo_service.semantics.class_names import class_names, read_names
-from ldo_service.semantics.detectors import OnnxDetector
-from ldo_service.semantics.labellers.byte_pairs import BytePairs
-from ldo_service.semantics.labellers.text_space import CachedEmbeddings
 from ldo_service.suites import load_suite
-from tests.semantics.networks import SQUARES
+from tests.detection.networks import SQUARES
 
 from .of_runs import bytes_of
 from .target import Read, Target, as_file, in_folder

@@ -8,7 +8,7 @@ import pytest
 
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
-from ldo_service.semantics.foreground import ForegroundConfig, Surfaces
+from ldo_service.regions.foreground import ForegroundConfig, Surfaces
 from tests.reference.foreground import foreground_reference, surfaces_reference
 
 CONFIG = ForegroundConfig()
@@ -17,7 +17,7 @@ SIZES = ((120, 160), (64, 128), (97, 131), (9, 70), (33, 5), (4, 4), (3, 8), (2,
 SIZES += ((40, 1), (1, 1))
 COMPARE_ALL = """
 from ldo_service.geometry import Camera
-from ldo_service.semantics.foreground import ForegroundConfig, Surfaces, foreground, surfaces
+from ldo_service.regions.foreground import ForegroundConfig, Surfaces, foreground, surfaces
 for name in {key.split("/")[0] for key in given}:
     depth_m, plain = given[f"{name}/depth_m"], given[f"{name}/labels"]
     h, w = depth_m.shape

@@ -10,8 +10,8 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ReplayDiverged
 from ldo_service.recordings.replay import open_recording
 from ldo_service.testing import replay_recording
+from tests.detection.networks import changed
 from tests.runs.jobs import ROUGH
-from tests.semantics.networks import changed
 
 from .conftest import live
 

@@ -10,8 +10,8 @@ from ldo_service.runtime.journal import Step
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import LabelOpen, decode
 from ldo_service.testing import replay_recording
+from tests.detection.labellers.server import says, serving
 from tests.runs.jobs import ROUGH
-from tests.semantics.labellers.server import says, serving
 
 from .conftest import live
 

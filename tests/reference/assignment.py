@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ldo_service.geometry import Camera
-from ldo_service.semantics.assignment import HIDDEN, UNMATCHED, Assigned, AssignmentConfig
+from ldo_service.semantics.label_assignment import HIDDEN, UNMATCHED, Assigned, AssignmentConfig
 
 from .render import project
 

@@ -4,8 +4,13 @@ from itertools import product
 
 import numpy as np
 
-from ldo_service.semantics.consistency import ConsistencyConfig, Disagreement
-from ldo_service.semantics.labels import MOST_LABELS, distribution, top_labels
+from ldo_service.semantics.gaussian_labels import (
+    MOST_LABELS,
+    ConsistencyConfig,
+    Disagreement,
+    distribution,
+    top_labels,
+)
 
 SAME_VOXEL, MOST = 8, 16
 STEPS = sorted(product((-1, 0, 1), repeat=3), key=lambda s: (sum(x * x for x in s), s))

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera
-from ldo_service.semantics.foreground import Foreground, ForegroundConfig, Surfaces, pixels_of
+from ldo_service.regions.foreground import Foreground, ForegroundConfig, Surfaces, pixels_of
 
 BLUR_PX = 1.5  # before normals are taken: `kernels/smoothness.hpp` says why
 _3X3 = np.ones((3, 3), np.uint8)

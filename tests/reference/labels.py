@@ -4,7 +4,7 @@ from math import exp, log
 
 import numpy as np
 
-from ldo_service.semantics.labels import (
+from ldo_service.semantics.gaussian_labels import (
     BACKGROUND,
     MISS,
     OTHER,

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Cached, Sequence
+from ldo_service.detection.vocabulary import FIRST_NAMES
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import Judged, evaluate_rendering
@@ -18,10 +19,9 @@ from ldo_service.runs.finished import MapFolder, read_run
 from ldo_service.runs.folder import RunFolder
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.source import Warn
-from ldo_service.semantics.labels import top_labels
-from ldo_service.semantics.saved import write_semantics
-from ldo_service.semantics.vocabulary import FIRST_NAMES
-from tests.semantics.networks import changed
+from ldo_service.semantics.gaussian_labels import top_labels
+from ldo_service.semantics.semantics_file import write_semantics
+from tests.detection.networks import changed
 
 from .jobs import job
 

@@ -19,7 +19,7 @@ from ldo_service.runs.source import Selection
 from ldo_service.schemas import Keyframe
 from tests.actors.conftest import frames, keyframes, tracked  # noqa: F401
 from tests.commands.test_cli import ldo
-from tests.semantics.networks import changed
+from tests.detection.networks import changed
 
 from .jobs import ROUGH
 

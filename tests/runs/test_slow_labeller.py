@@ -17,7 +17,7 @@ from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.schemas import CameraRgbd, TrackedPose
 from ldo_service.synthetic.flat import FlatSequence
 from ldo_service.wire import camera_rgbd_message
-from tests.semantics.labellers.server import serving
+from tests.detection.labellers.server import serving
 from tests.service.conftest import PATIENCE, live_service, wait_until
 from tests.service.exhibits import Guide, flat, placed
 from tests.service.heard import Heard

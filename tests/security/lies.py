@@ -18,18 +18,17 @@ from mcap.writer import MCAP0_MAGIC
 from ldo_service.actors.graph import box_named
 from ldo_service.authority import Authority
 from ldo_service.datasets import open_sequence
+from ldo_service.detection.detectors import NetworkConfig
+from ldo_service.detection.labellers import text_embeddings
+from ldo_service.detection.labellers.text_embeddings import BytePairs, CachedEmbeddings
+from ldo_service.detection.model_registry import Models
 from ldo_service.errors import LdoError
 from ldo_service.gaussians.ply import read_ply
 from ldo_service.geometry import codecs
-from ldo_service.models import Models
 from ldo_service.runtime.mcap_index import McapIndex
 from ldo_service.runtime.network import Network
-from ldo_service.semantics.detectors import NetworkConfig
-from ldo_service.semantics.labellers import text_space
-from ldo_service.semantics.labellers.byte_pairs import BytePairs
-from ldo_service.semantics.labellers.text_space import CachedEmbeddings
-from ldo_service.semantics.saved import read_semantics
-from tests.semantics.networks import SQUARES
+from ldo_service.semantics.semantics_file import read_semantics
+from tests.detection.networks import SQUARES
 
 from .attempt import Attempt, kept_in
 
@@ -169,7 +168,7 @@ def large_arrays(folder: Path) -> str:
         archive.writestr("names.npy", names)
         archive.writestr("embeddings.npy", npy_header((1 << 39,)))
     np.savez_compressed(packed, names=np.array(["a"]), embeddings=np.ones((1, 1 << 22), "f4"))
-    with patch.object(text_space, "LARGEST_BYTES", 1_000_000):
+    with patch.object(text_embeddings, "LARGEST_BYTES", 1_000_000):
         of_embeddings = told(lambda: CachedEmbeddings(lying), lambda: CachedEmbeddings(packed))
     return of_embeddings if of_embeddings != REFUSED else told(lambda: read_semantics(lying))
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.semantics.association import MapView
-from ldo_service.semantics.labelling import Claims, LabellingConfig, label_keyframe
-from ldo_service.semantics.labels import new_labels
+from ldo_service.regions.foreground import Claims
+from ldo_service.semantics.data_association import MapView
+from ldo_service.semantics.gaussian_labels import new_labels
 from ldo_service.semantics.objects import Objects, Observed
-from ldo_service.semantics.vocabulary import Vocabulary
+from ldo_service.semantics.semantic_fusion import LabellingConfig, label_keyframe
 from ldo_service.synthetic.path import look_at
 from ldo_service.synthetic.ray_casting import View
 from ldo_service.synthetic.solids import Solid

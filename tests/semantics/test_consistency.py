@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.semantics import consistency
-from ldo_service.semantics.consistency import ConsistencyConfig, agree
-from ldo_service.semantics.labels import (
+from ldo_service.semantics import gaussian_labels
+from ldo_service.semantics.gaussian_labels import (
+    ConsistencyConfig,
     LabelConfig,
     Observations,
+    agree,
     background,
     distribution,
     new_labels,
@@ -33,7 +34,7 @@ def crowd(n: int, side_m: float, classes: int = 4) -> tuple[np.ndarray, np.ndarr
 
 
 def test_examples_in_the_docstring_hold() -> None:
-    assert doctest.testmod(consistency).failed == 0
+    assert doctest.testmod(gaussian_labels).failed == 0
 
 
 @pytest.mark.parametrize("side_m", [0.1, 0.3, 1.0])

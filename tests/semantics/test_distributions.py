@@ -17,7 +17,13 @@ from ldo_service.semantics.distributions import (
     shared,
     sparse,
 )
-from ldo_service.semantics.labels import MOST_LABELS, OTHER, distribution, fields, new_labels
+from ldo_service.semantics.gaussian_labels import (
+    MOST_LABELS,
+    OTHER,
+    distribution,
+    fields,
+    new_labels,
+)
 
 CHAIR, LAMP = 58, 90
 

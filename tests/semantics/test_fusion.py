@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError
-from ldo_service.semantics import fusion
-from ldo_service.semantics.fusion import Fused, FusionConfig, fused
+from ldo_service.semantics import semantic_fusion
+from ldo_service.semantics.semantic_fusion import Fused, FusionConfig, fused
 
 SHARES = st.floats(0, 1, width=32)
 
@@ -19,7 +19,7 @@ def of(overlap: float, detector: float, labeller: float, rule: str = "adaptive")
 
 
 def test_examples_in_the_docstring_hold() -> None:
-    assert doctest.testmod(fusion).failed == 0
+    assert doctest.testmod(semantic_fusion).failed == 0
 
 
 @given(SHARES, SHARES)

@@ -7,9 +7,9 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.semantics.association import AssociationConfig
-from ldo_service.semantics.labels import fields
-from ldo_service.semantics.landmarks import believed, entropies, rows_of
+from ldo_service.semantics.data_association import AssociationConfig
+from ldo_service.semantics.gaussian_labels import fields
+from ldo_service.semantics.object_landmarks import believed, entropies, rows_of
 from ldo_service.semantics.objects import Objects, ObjectsConfig
 
 from .staged import (

@@ -12,8 +12,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
 from ldo_service.gaussians.sleep_choice import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.semantics.labelling import Claims, LabellingConfig
-from ldo_service.semantics.labels import top_labels
+from ldo_service.regions.foreground import Claims
+from ldo_service.semantics.gaussian_labels import top_labels
+from ldo_service.semantics.semantic_fusion import LabellingConfig
 from ldo_service.semantics.semantic_map import SemanticMap, SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 from tests.gaussians.conftest import halved

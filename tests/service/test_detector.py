@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.schemas import DetectionBoxes
-from tests.semantics.networks import changed
+from tests.detection.networks import changed
 from tests.service.conftest import live_service, wait_until
 
 APART = ("--set", "service.spawned=[detector]", "--set", "mapper.iterations=2")

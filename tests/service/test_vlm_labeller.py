@@ -11,8 +11,8 @@ from ldo_service.geometry import se3
 from ldo_service.schemas import LabelNames, MapDelta, MapObject, MapObjects
 from ldo_service.schemas.topics import LABEL_NAMES
 from ldo_service.synthetic.flat import FlatSequence
-from tests.semantics.labellers.encoders import ColorPair, vocabulary
-from tests.semantics.labellers.server import hangs, says, serving
+from tests.detection.labellers.encoders import ColorPair, vocabulary
+from tests.detection.labellers.server import hangs, says, serving
 from tests.service.conftest import LDO, live_service, wait_until
 
 

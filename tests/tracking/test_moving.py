@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import open_sequence
+from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
-from ldo_service.semantics.movable import Box, MovableConfig, movable_pixels
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked

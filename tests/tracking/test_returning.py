@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ldo_service.detection.dynamic_classes import Box
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.semantics.movable import Box
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import (
     Odometry,

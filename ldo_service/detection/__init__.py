@@ -1,0 +1,1 @@
+"""Networks that find and name objects in images, their vocabulary, and the model registry."""

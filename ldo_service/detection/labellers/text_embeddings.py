@@ -1,0 +1,249 @@
+"""Embeddings of names in the space that images and texts share: computed, or read from a file.
+
+CLIP's text encoder reads byte pairs (Sennrich, ACL 2016): a word begins as its UTF-8 bytes, the
+last one marked as an end; the pair of neighbors that stands first in the list of merges becomes
+one, until none is in the list.
+"""
+
+import gzip
+import re
+import zlib
+from collections.abc import Iterator, Sequence
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from ldo_service.detection.onnx_network import Network
+from ldo_service.detection.vocabulary import canonical, is_name, normalised
+from ldo_service.errors import ModelError
+from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
+
+END = "</w>"
+# CLIP's vocabulary of 49,408 less the 512 bytes and the two marks; its file goes on beyond.
+MOST_MERGES = 49_408 - 512 - 2
+LARGEST_VOCABULARY_BYTES = 1 << 26  # unpacked; CLIP's has 3 MB
+_WORDS = re.compile(r"'(?:s|t|re|ve|m|ll|d)|[^\W\d_]+|\d|(?:[^\s\w]|_)+")
+
+LARGEST_BYTES = 1 << 30  # of 260,000 names in 1024 dimensions
+CONTEXT = 77  # tokens of a text, where a network takes any number: CLIP's
+
+
+Pair = tuple[str, str]
+
+
+class BytePairs:
+    """A tokenizer, from the merges in order of their rank.
+
+    The bytes are numbered as GPT-2 has it, first those that print; then the same as ends of words,
+    the merges, and the marks of start and end of a text.
+    """
+
+    def __init__(self, merges: list[Pair]) -> None:
+        letters = list(_letters().values())
+        symbols = [*letters, *(letter + END for letter in letters), *map("".join, merges)]
+        self._ranks = {pair: rank for rank, pair in enumerate(merges)}
+        self._ids = {symbol: number for number, symbol in enumerate(symbols)}
+        self.start, self.end = len(symbols), len(symbols) + 1
+
+    @staticmethod
+    def read(path: Path) -> "BytePairs":
+        """From a file as CLIP's bpe_simple_vocab_16e6.txt.gz: a line about itself, then a pair a
+        line. Raises ModelError."""
+        _, *lines = _text(path).splitlines() or [""]
+        merges = [tuple(line.split()) for line in lines[:MOST_MERGES] if line.strip()]
+        if not merges or any(len(pair) != 2 for pair in merges):
+            raise ModelError(
+                f"{path} is no list of byte pairs: a line about itself is expected, then two "
+                "symbols a line, as in CLIP's bpe_simple_vocab_16e6.txt.gz."
+            )
+        return BytePairs([(pair[0], pair[1]) for pair in merges])
+
+    def __len__(self) -> int:
+        return self.end + 1
+
+    def encode(self, text: str, length: int) -> np.ndarray:
+        """[length] int64: start, the text, end, zeros. What is too long loses its last words."""
+        inner = [number for word in _words(text) for number in self._of_word(word)]
+        marked = [self.start, *inner[: length - 2], self.end]
+        return np.array(marked + [0] * (length - len(marked)), np.int64)
+
+    def _of_word(self, word: str) -> list[int]:
+        letters = _letters()
+        symbols = [letters[byte] for byte in word.encode()]
+        symbols[-1] += END
+        while pair := self._first_pair(symbols):
+            symbols = list(_merged(symbols, pair))
+        return [self._ids[symbol] for symbol in symbols]
+
+    def _first_pair(self, symbols: list[str]) -> Pair | None:
+        known = [pair for pair in pairwise(symbols) if pair in self._ranks]
+        return min(known, key=self._ranks.__getitem__, default=None)
+
+
+def _words(text: str) -> list[str]:
+    return _WORDS.findall(text.lower())
+
+
+def _merged(symbols: list[str], pair: Pair) -> Iterator[str]:
+    place = 0
+    while place < len(symbols):
+        is_pair = tuple(symbols[place : place + 2]) == pair
+        yield "".join(pair) if is_pair else symbols[place]
+        place += 2 if is_pair else 1
+
+
+@cache
+def _letters() -> dict[int, str]:
+    """A printing character for each byte: its own where Latin-1 has one, else from 256 on."""
+    printing = [*range(33, 127), *range(161, 173), *range(174, 256)]
+    others = [byte for byte in range(256) if byte not in printing]
+    return {byte: chr(byte) for byte in printing} | {
+        byte: chr(256 + number) for number, byte in enumerate(others)
+    }
+
+
+def _text(path: Path) -> str:
+    try:
+        body = path.read_bytes()
+        if body.startswith(b"\x1f\x8b"):
+            with gzip.open(path) as file:
+                body = file.read(LARGEST_VOCABULARY_BYTES + 1)
+        if len(body) > LARGEST_VOCABULARY_BYTES:
+            raise ModelError(f"{path} unpacks to more than {LARGEST_VOCABULARY_BYTES} bytes.")
+        return body.decode("utf-8")
+    except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
+        raise ModelError(f"the byte pairs in {path} cannot be read: {error}.") from error
+
+
+class TextEncoder:
+    """Places any name: the mean of what a network makes of each prompt, brought to length 1.
+
+    Raises ModelError for a file that is no text encoder.
+    """
+
+    def __init__(self, network: Network, pairs: BytePairs, prompts: Sequence[str]) -> None:
+        self._network, self._pairs, self._prompts = network, pairs, tuple(prompts)
+        self._inputs, self._context = _text_inputs(network)
+        self.dimensions = len(self._of_text("a"))
+
+    def embed(self, name: str) -> np.ndarray:
+        rows = [unit(self._of_text(prompt.format(name))) for prompt in self._prompts]
+        return unit(np.mean(rows, axis=0))
+
+    def _of_text(self, text: str) -> np.ndarray:
+        tokens = self._pairs.encode(text, self._context)
+        mask = np.arange(self._context) <= np.flatnonzero(tokens == self._pairs.end)[0]
+        values = {name: (mask if "mask" in name else tokens) for name in self._inputs}
+        inputs = {name: values[name].astype(kind)[None] for name, kind in self._inputs.items()}
+        return only_embedding(self._network.run(**inputs))
+
+
+class CachedEmbeddings:
+    """Places the names in a file, .npz or .safetensors: `embeddings` [C, D], `names` [C], and
+    perhaps `logit_scale`.
+
+    Names in .safetensors are its metadata entry `names`, a name a line. Raises ModelError.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            names, arrays = _safetensors(path) if path.suffix == ".safetensors" else _npz(path)
+            embeddings = np.asarray(arrays["embeddings"], np.float32)
+        except (*UNREADABLE, SafetensorError) as error:
+            raise ModelError(
+                f"{path} holds no embeddings ({error}): `names` and `embeddings` are expected, "
+                ".npz or .safetensors."
+            ) from error
+        if embeddings.ndim != 2 or len(embeddings) != len(names) or not all(map(is_name, names)):
+            raise ModelError(
+                f"{path} has {len(names)} names and embeddings {list(embeddings.shape)}: a row for "
+                "each name is expected."
+            )
+        if not (np.isfinite(embeddings).all() and np.linalg.norm(embeddings, axis=1).all()):
+            raise ModelError(f"{path} has embeddings that are zero, NaN or infinite.")
+        self.names = names
+        self.dimensions = embeddings.shape[1]
+        self.logit_scale = _scale(arrays.get("logit_scale"), path)
+        rows = list(zip(names, embeddings, strict=True))
+        self._rows = {canonical(name): row for name, row in reversed(rows)}
+        self._rows |= {normalised(name): row for name, row in rows}
+
+    def find(self, name: str) -> np.ndarray | None:
+        """[D] float32 of length 1, of this word or one that means the same; None when there is
+        none in the file."""
+        row = self._rows.get(normalised(name), self._rows.get(canonical(name)))
+        return None if row is None else unit(row)
+
+
+class Texts:
+    """The text half of a pair: what is in the file is read, anything else is computed."""
+
+    def __init__(self, cached: CachedEmbeddings | None, encoder: TextEncoder | None) -> None:
+        self.cached, self.encoder = cached, encoder
+
+    def find(self, text: str) -> np.ndarray | None:
+        """[D] float32 of length 1; None where it is not in the file and there is no encoder."""
+        row = self.cached.find(text) if self.cached else None
+        if row is None and self.encoder is not None:
+            row = self.encoder.embed(normalised(text))
+        return row
+
+    def encode(self, texts: Sequence[str]) -> np.ndarray:
+        """[T, D]; zeros, which are like nothing, where `find` finds nothing."""
+        rows = [self.find(text) for text in texts]
+        (dimensions,) = {space.dimensions for space in (self.cached, self.encoder) if space}
+        nowhere = np.zeros(dimensions, np.float32)
+        return np.array([nowhere if row is None else row for row in rows])
+
+
+def unit(vector: np.ndarray) -> np.ndarray:
+    """Raises ModelError for one of no length."""
+    length = np.linalg.norm(vector)
+    if not length > 0:
+        raise ModelError("it yields an embedding of zeros: its weights are damaged.")
+    return (vector / length).astype(np.float32)
+
+
+def only_embedding(outputs: Sequence[np.ndarray]) -> np.ndarray:
+    """[D] of the one output that is [1, D]; exporters add hidden states. Raises ModelError."""
+    found = [output for output in outputs if output.ndim == 2 and len(output) == 1]
+    if len(found) != 1 or found[0].shape[1] < 2:
+        shapes = ", ".join(str(list(output.shape)) for output in outputs)
+        raise ModelError(f"its outputs are {shapes}. Expected: one embedding, [N, D].")
+    return found[0][0].astype(np.float32)
+
+
+def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
+    """Type of each input by name, and how many tokens they take."""
+    kinds: dict[str, type[np.integer]] = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
+    inputs, shapes = network.inputs, [shape for _, _, shape in network.inputs]
+    tokens = [name for name, _, _ in inputs if "mask" not in name]
+    fits = all(kind in kinds and len(shape) == 2 for _, kind, shape in inputs)
+    lengths = {shape[1] for shape in shapes if fits and isinstance(shape[1], int)}
+    if not fits or len(tokens) != 1 or len(lengths) > 1 or min(lengths, default=CONTEXT) < 3:
+        told = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
+        raise ModelError(f"its inputs are {told}. Expected: tokens, int64 or int32 [N, length].")
+    return {name: kinds[kind] for name, kind, _ in inputs}, int(min(lengths, default=CONTEXT))
+
+
+def _npz(path: Path) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
+    arrays = read_arrays(path, LARGEST_BYTES)
+    return tuple(map(str, arrays.pop("names").tolist())), arrays
+
+
+def _safetensors(path: Path) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
+    with safe_open(path, "numpy") as file:
+        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return tuple((file.metadata() or {})["names"].splitlines()), arrays
+
+
+def _scale(value: np.ndarray | None, path: Path) -> float | None:
+    if value is None:
+        return None
+    scale = float(np.asarray(value).reshape(-1)[0]) if np.size(value) == 1 else float("nan")
+    if not 0 < scale < float("inf"):
+        raise ModelError(f"{path} has logit_scale {value}: one positive number is expected.")
+    return scale

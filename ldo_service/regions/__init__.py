@@ -1,0 +1,1 @@
+"""Image regions of keyframes, tracked over keyframes until they have a name."""

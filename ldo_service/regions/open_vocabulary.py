@@ -1,0 +1,277 @@
+"""What an open-vocabulary labeller is asked, and what its answers are about (paper, III.B).
+
+An answer comes late. It speaks of the pixels that a keyframe showed of a region, so these are kept
+until then; and it stays with the region, as a vote for its name beside those of the detector's
+boxes: where a later keyframe shows that again, it still has the name.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ldo_service.detection.vocabulary import Vocabulary, normalised
+from ldo_service.errors import ConfigError
+from ldo_service.gaussians.views import View
+
+from .foreground import Claims, Foreground
+from .geometric_segmentation import segments
+from .region import Answer
+from .region_proposals import Candidate, TriggerConfig, candidates, named_objects, regions_of_image
+from .region_tracker import Opinion, Question, RegionConfig, RegionsToName
+
+
+@dataclass(frozen=True, slots=True)
+class NamingConfig:
+    trigger: TriggerConfig = field(default_factory=TriggerConfig)
+    regions: RegionConfig = field(default_factory=RegionConfig)
+    reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
+    least_sure: float = 0.3  # of an answer: with 0.5 the flat's recall is 7 points less, and of
+    # labellers that tell what is no thing little else is below
+    structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")  # no objects, whoever
+    # says so: they stay background
+    most_open: int = 96  # questions without an answer, some 10 kB each: the labeller has 32 regions
+    # waiting, and may be asked three times about each
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.reliable <= 1 and 0 <= self.least_sure <= 1) or self.most_open < 1:
+            raise ConfigError(f"{self}: reliable must be within 0..1, most_open at least 1.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Asked:
+    """What a question was about: a part of a box in a keyframe, the detector's word on it, and the
+    kind of the region."""
+
+    box_px: np.ndarray
+    part: Foreground
+    label: str
+    score: float
+    kind: str = ""
+
+
+class Naming:
+    """Chooses what to ask, and knows what was asked. Bounded; the same calls give the same bits,
+    also after `unpacked`."""
+
+    def __init__(self, config: NamingConfig | None = None, *, is_heard: bool = True) -> None:
+        """`is_heard`: names are claimed; else they are learnt, and boxes stay as they are."""
+        self.config, self._is_heard = config or NamingConfig(), is_heard
+        self._regions = RegionsToName(self.config.regions)
+        self._open: dict[tuple[int, int], Asked] = {}  # by region and keyframe, the oldest first
+        self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
+        self._outvoted = 0
+
+    # --- questions --------------------------------------------------------------------------------
+    def see(
+        self,
+        view: View,
+        claims: Claims,
+        vocabulary: Vocabulary,
+        is_labelled: np.ndarray,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> tuple[Claims, list[Question]]:
+        """The detector's claims of a keyframe with what is known of its regions, and what is to be
+        asked about them now.
+
+        is_labelled [H, W] bool: the map has a reliable name for this pixel
+        T_map_keyframe: where all keyframes are now
+        """
+        config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
+        labels = [vocabulary.name(int(label)) for label in claims.labels]
+        color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
+        shown = segments(color, depth_m, camera, config.segments)
+        found = regions_of_image(shown, depth_m.shape, config)
+        room = [one.part for one in shown if one.kind == "room"]
+        doubtful = candidates(
+            *(claims.boxes, labels, claims.confidences),
+            *(depth_m, camera, is_labelled, found, room, config),
+        )
+        named = named_objects(claims.boxes, is_labelled, found, config)
+        sightings = self._regions.see(
+            view.keyframe, doubtful, color, depth_m, camera, T_map_keyframe, named
+        )
+        for question in sightings.questions:
+            self._remember(question)
+        claims = replace(claims, parts=fitting_parts(len(claims.boxes), doubtful))
+        opinions = sightings.opinions if self._is_heard else []
+        told = with_opinions(claims, opinions, vocabulary, self._boxes_vote)
+        return told, sightings.questions
+
+    def _remember(self, question: Question) -> None:
+        region, of = question.region, question.candidate
+        self._questions += 1
+        asked = Asked(of.box_px, of.part, of.label, of.score, of.kind)
+        self._open[region.id, region.keyframe] = asked
+        while len(self._open) > self.config.most_open:
+            del self._open[next(iter(self._open))]
+            self._overdue += 1
+
+    # --- answers ----------------------------------------------------------------------------------
+    def answered(
+        self, region: int, keyframe: int, answer: Answer, vocabulary: Vocabulary
+    ) -> Claims | None:
+        """What the labeller claims of that keyframe, with what the detector said of the same part.
+        None where it names nothing, or nobody asked."""
+        asked = self._open.pop((region, keyframe), None)
+        if asked is None:
+            self._unknown += 1
+            return None
+        answer = self._believed(answer, asked)
+        name, confidence = answer.label, answer.sure
+        before = self._regions.get(region)
+        known_as = self._regions.answered(region, answer)
+        is_name = bool(name) and confidence > 0
+        self._named += is_name
+        self._unnamed += not is_name
+        if not is_name:
+            return None
+        if known_as != name:
+            self._outvoted += 1
+            return None
+        said = vocabulary.index(name)
+        return Claims(
+            np.reshape(asked.box_px, (1, 4)).astype(np.float32),
+            np.array([vocabulary.index(asked.label) if asked.label else said]),
+            np.array([asked.score], np.float32),
+            np.array([said]),
+            np.array([confidence], np.float32),
+            (asked.part,),
+            # until now it was a part of what it stands on, for all that was said
+            anew=asked.kind == "standing"
+            and confidence >= self.config.regions.settled
+            and before is not None
+            and not before.votes
+            and not before.label,
+        )
+
+    def shown_in(self, region: int) -> tuple[int, ...]:
+        """The keyframes whose views of a region the labeller was shown; see `RegionsToName`."""
+        return self._regions.shown_in(region)
+
+    def carried(
+        self,
+        region: int,
+        view: View,
+        vocabulary: Vocabulary,
+        T_map_keyframe: Mapping[int, np.ndarray],
+    ) -> Claims | None:
+        """What a region is, as an earlier keyframe shows it; None where it has no name, or is not
+        seen."""
+        place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
+        opinion = self._regions.carried(region, *place)
+        return opinion and with_opinions(Claims.none(), [opinion], vocabulary, self._boxes_vote)
+
+    def _believed(self, answer: Answer, asked: Asked) -> Answer:
+        """Without a label that is no object's, or is told too unsurely of what no box is about."""
+        others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
+        if not self._is_object(answer.label):
+            return Answer("", answer.sure)
+        is_sure = answer.sure >= self.config.least_sure or bool(asked.label)
+        return replace(answer, others=others) if is_sure else Answer("", 0.0)
+
+    @property
+    def _boxes_vote(self) -> bool:
+        return self.config.regions.boxes_vote
+
+    def _is_object(self, name: str) -> bool:
+        return normalised(name) not in self.config.structure
+
+    # --- state ------------------------------------------------------------------------------------
+    @property
+    def packed(self) -> dict[str, Any]:
+        """Plain values and arrays, for a state."""
+        return {
+            "regions": self._regions.packed,
+            "open": [[*key, *_packed(asked)] for key, asked in self._open.items()],
+        }
+
+    @staticmethod
+    def unpacked(
+        packed: Mapping[str, Any], config: NamingConfig | None = None, *, is_heard: bool = True
+    ) -> "Naming":
+        """As it was."""
+        out = Naming(config, is_heard=is_heard)
+        out._regions = RegionsToName.unpacked(packed["regions"], out.config.regions)
+        out._open = {
+            (region, keyframe): _unpacked(*row) for region, keyframe, *row in packed["open"]
+        }
+        return out
+
+    def statistics(self) -> dict[str, float]:
+        return {
+            "regions_to_name": len(self._regions),
+            "questions": self._questions,
+            "questions_open": len(self._open),
+            "questions_overdue": self._overdue,  # given up for newer ones
+            "answers_named": self._named,
+            "answers_unnamed": self._unnamed,  # no opinion, or nobody could look
+            "answers_outvoted": self._outvoted,  # boxes of the region say otherwise
+            "answers_unknown": self._unknown,  # to questions given up, or said again
+        }
+
+
+def fitting_parts(boxes: int, found: Sequence[Candidate]) -> tuple[Foreground | None, ...]:
+    """Of each box of the detector the thing that depth and creases set apart there, or what of it
+    is no room, or None where nobody looked. What colour sets apart has the rim of what it lies
+    on."""
+    parts: list[Foreground | None] = [None] * boxes
+    for one in found:
+        if one.number is not None and one.kind != "flat":
+            parts[one.number] = one.part
+    return tuple(parts)
+
+
+def with_opinions(
+    claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocabulary, boxes_vote: bool
+) -> Claims:
+    """Claims of a detector with the names of the same regions: of other regions alone, of a box of
+    the detector beside its label, or in place of it where it has a vote in the name."""
+    labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
+    by_detector, parts = claims.confidences.copy(), claims.parts or (None,) * len(claims.boxes)
+    for opinion in opinions:
+        if (number := opinion.of.number) is not None:
+            labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
+            if boxes_vote:
+                by_detector[number] = 0  # its word is a part of the opinion
+    alone = [
+        opinion
+        for opinion in opinions
+        if opinion.of.number is None and not _is_part_of_one(opinion, opinions)
+    ]
+    said = np.array([vocabulary.index(opinion.label) for opinion in alone], np.int64)
+    boxes = np.array([opinion.of.box_px for opinion in alone], np.float32).reshape(-1, 4)
+    return Claims(
+        np.concatenate([claims.boxes, boxes]),
+        np.concatenate([claims.labels, said]),
+        np.concatenate([by_detector, np.zeros(len(alone), np.float32)]),
+        np.concatenate([labels, said]),
+        np.concatenate([confidences, np.array([one.sure for one in alone], np.float32)]),
+        (*parts, *[opinion.of.part for opinion in alone]),
+    )
+
+
+def _is_part_of_one(opinion: Opinion, opinions: Sequence[Opinion]) -> bool:
+    """Most of its box lies in that of a larger region of the same name: one thing, not two."""
+    box_px = opinion.of.box_px
+    for other in opinions:
+        sides = np.minimum(box_px[2:], other.of.box_px[2:])
+        sides = sides - np.maximum(box_px[:2], other.of.box_px[:2])
+        shared_px = float(np.prod(np.maximum(sides, 0)))
+        is_larger = _area_px(other.of.box_px) > _area_px(box_px)
+        if is_larger and other.label == opinion.label and shared_px > 0.7 * _area_px(box_px):
+            return True
+    return False
+
+
+def _area_px(box_px: np.ndarray) -> float:
+    return float(np.prod(box_px[2:] - box_px[:2]))
+
+
+def _packed(asked: Asked) -> list[Any]:
+    return [asked.box_px, *asked.part.packed, asked.label, asked.score, asked.kind]
+
+
+def _unpacked(box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any) -> Asked:
+    return Asked(box_px, Foreground.unpacked(place, bits), *seen)

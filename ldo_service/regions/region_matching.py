@@ -1,0 +1,252 @@
+"""Matching of a keyframe's regions to known ones, by masks propagated between keyframes."""
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ldo_service.geometry import Camera, se3
+
+from .foreground import Foreground
+from .region import Region, Sighting
+
+STRIDE_PX = 4  # of the pixels that are looked at, and the edge of what each stands for
+MARGIN_PX = 24  # around the points seen: they are few, and end within their region
+LEAST = 12  # pixels looked at that are its own
+SPACING = 1.5  # of its points, as they would lie on a square: what is farther from all is behind
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Projected:
+    """Those points of R regions that a keyframe sees: rows, columns and of [P] which region."""
+
+    rows: np.ndarray
+    columns: np.ndarray
+    of: np.ndarray
+    counts: np.ndarray
+
+    def only(self, regions: Sequence[int]) -> "Projected":
+        """Those of some of the R regions, each once, numbered as they come."""
+        places = np.full(len(self.counts), -1)
+        places[regions] = np.arange(len(regions))
+        of = places[self.of]
+        is_theirs = of >= 0
+        points = self.rows[is_theirs], self.columns[is_theirs], of[is_theirs]
+        return Projected(*points, self.counts[regions])
+
+    def shares_in(self, part: Foreground) -> np.ndarray:
+        """[R] of the points of each region that it sees."""
+        inside = is_in(part, self.rows, self.columns)
+        hits = np.bincount(self.of[inside], minlength=len(self.counts))
+        return hits / np.maximum(self.counts, 1)
+
+
+def projected(
+    regions: Sequence[Region],
+    depth_m: np.ndarray,
+    camera: Camera,
+    T_camera_map: np.ndarray,
+    T_map_keyframe: Mapping[int, np.ndarray],
+    max_gap_m: float,
+) -> Projected:
+    """What a keyframe, depth [H, W], sees of the regions' points."""
+    points, of = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for i, region in enumerate(regions):
+        T = T_camera_map @ T_map_keyframe[region.shape.keyframe]
+        points.append(region.shape.p_camera @ T[:3, :3].T + T[:3, 3])
+        of.append(np.full(len(region.shape.p_camera), i))
+    p_camera, numbers = np.concatenate(points), np.concatenate(of)
+    rows, columns, is_inside = pixels(p_camera, camera, depth_m.shape)
+    measured = depth_m[rows, columns]
+    is_seen = is_inside & (measured > 0) & (np.abs(measured - p_camera[:, 2]) < max_gap_m)
+    counts = np.bincount(numbers[is_seen], minlength=len(regions))
+    return Projected(rows[is_seen], columns[is_seen], numbers[is_seen], counts)
+
+
+def share_back(
+    seen: Sighting,
+    region: Region,
+    shape: tuple[int, ...],
+    camera: Camera,
+    T_map_keyframe: Mapping[int, np.ndarray],
+    least: int,
+) -> float:
+    """Of the points of a sighting that lie in the image of the region's: the share in its part.
+
+    What something hid there counts against it: a thing that is seen whole now, and was mostly
+    hidden at its best so far, is a new region."""
+    known = region.shape
+    T = se3.inverse(T_map_keyframe[known.keyframe]) @ T_map_keyframe[seen.keyframe]
+    rows, columns, is_inside = pixels(seen.p_camera @ T[:3, :3].T + T[:3, 3], camera, shape)
+    if np.count_nonzero(is_inside) < least:
+        return 0.0
+    return float(is_in(known.candidate.part, rows[is_inside], columns[is_inside]).mean())
+
+
+def pixels(
+    p_camera: np.ndarray, camera: Camera, shape: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows and columns [P] of points [P, 3], and which lie in the image."""
+    z = p_camera[:, 2]
+    far = np.maximum(z, 1e-6)
+    u = np.rint(camera.fx * p_camera[:, 0] / far + camera.cx)
+    v = np.rint(camera.fy * p_camera[:, 1] / far + camera.cy)
+    is_inside = (z > 0) & (u >= 0) & (v >= 0) & (u < shape[1]) & (v < shape[0])
+    rows, columns = (np.where(is_inside, x, 0).astype(np.int64) for x in (v, u))
+    return rows, columns, is_inside
+
+
+def is_in(part: Foreground, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """[P] bool"""
+    height, width = part.mask.shape
+    r, c = rows - part.row, columns - part.column
+    inside = (r >= 0) & (c >= 0) & (r < height) & (c < width)
+    inside[inside] = part.mask[r[inside], c[inside]]
+    return inside
+
+
+def carried(
+    seen: Sighting,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    depth_m: np.ndarray,
+    camera: Camera,
+    T_seen_now: np.ndarray,
+    max_gap_m: float,
+) -> Foreground | None:
+    """The pixels of depth [H, W] whose points lie in the mask of a sighting, and on its surface.
+
+    rows, columns [P]  where points of that surface are seen now
+    T_seen_now [4, 4]  from the camera of now to that of the sighting
+    max_gap_m          from its surface, or more where its points are farther apart
+    Every fourth pixel of a row and of a column is looked at. None where next to nothing is seen.
+    """
+    row, column, p_now = _points(rows, columns, depth_m, camera)
+    p_seen = p_now @ T_seen_now[:3, :3].T + T_seen_now[:3, 3]
+    there, across, is_inside = pixels(p_seen, camera, depth_m.shape)
+    is_own = is_inside & (p_now[:, 2] > 0) & is_in(seen.candidate.part, there, across)
+    near = KDTree(seen.p_camera).query(p_seen[is_own])[0]
+    is_own[is_own] = near < max(max_gap_m, SPACING * _spacing_m(seen, camera))
+    if np.count_nonzero(is_own) < LEAST:
+        return None
+    return _enlarged(row[is_own], column[is_own], depth_m.shape)
+
+
+def _points(
+    rows: np.ndarray, columns: np.ndarray, depth_m: np.ndarray, camera: Camera
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows, columns [N] and points [N, 3] of the grid about what is seen; z 0 where depth is
+    missing."""
+    grid = np.meshgrid(
+        *(
+            np.arange(
+                max(int(at.min()) - MARGIN_PX, 0) // STRIDE_PX * STRIDE_PX,
+                min(int(at.max()) + MARGIN_PX + 1, size),
+                STRIDE_PX,
+            )
+            for at, size in zip((rows, columns), depth_m.shape, strict=True)
+        ),
+        indexing="ij",
+    )
+    row, column = (axis.ravel() for axis in grid)
+    z = depth_m[row, column].astype(np.float64)
+    x, y = (column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z
+    return row, column, np.stack([x, y, z], axis=1)
+
+
+def _spacing_m(seen: Sighting, camera: Camera) -> float:
+    """Of a sighting's points, were its area a square full of them."""
+    m_per_px = float(np.median(seen.p_camera[:, 2])) / camera.fx
+    return float(np.sqrt(seen.size_px / len(seen.p_camera))) * m_per_px
+
+
+def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> Foreground:
+    """Squares of STRIDE_PX at those pixels."""
+    top, left = int(rows.min()), int(columns.min())
+    small = np.zeros(
+        ((int(rows.max()) - top) // STRIDE_PX + 1, (int(columns.max()) - left) // STRIDE_PX + 1),
+        bool,
+    )
+    small[(rows - top) // STRIDE_PX, (columns - left) // STRIDE_PX] = True
+    mask = small.repeat(STRIDE_PX, axis=0).repeat(STRIDE_PX, axis=1)
+    return Foreground(top, left, mask[: shape[0] - top, : shape[1] - left])
+
+
+class KnownRegions:
+    """Those whose keyframe is known, as they were before this one: depth [H, W], T_map_keyframe
+    [4, 4] by keyframe, this one's too. Points of a region are seen within max_gap_m of their depth,
+    and fewer than `least_points` tell nothing."""
+
+    def __init__(
+        self,
+        regions: Sequence[Region],
+        keyframe: int,
+        depth_m: np.ndarray,
+        camera: Camera,
+        T_map_keyframe: Mapping[int, np.ndarray],
+        max_gap_m: float,
+        least_points: int,
+    ) -> None:
+        self._regions = [r for r in regions if r.shape.keyframe in T_map_keyframe]
+        self._depth_m, self._camera, self._T_map_keyframe = depth_m, camera, T_map_keyframe
+        self._keyframe, self._max_gap_m, self._least = keyframe, max_gap_m, least_points
+        T_camera_map = se3.inverse(T_map_keyframe[keyframe])
+        args = depth_m, camera, T_camera_map, T_map_keyframe, max_gap_m
+        self._seen = projected(self._regions, *args)
+
+    def same(self, sighting: Sighting, overlap: float, taken: Collection[int]) -> int | None:
+        """The id of the region that it is most of, and that is most of it; but for those taken."""
+        shares = self._seen.shares_in(sighting.candidate.part)
+        shares[self._seen.counts < self._least] = 0
+        place = self._depth_m.shape, self._camera, self._T_map_keyframe
+        best, most = None, overlap
+        for i in np.flatnonzero(shares >= overlap):
+            region = self._regions[int(i)]
+            if region.id in taken:
+                continue
+            back = share_back(sighting, region, *place, self._least)
+            if min(back, shares[i]) >= most:
+                best, most = region.id, min(back, float(shares[i]))
+        return best
+
+    def seen(self) -> Iterator[int]:
+        """The ids of those that it sees."""
+        for i, region in enumerate(self._regions):
+            if self._is_seen(i):
+                yield region.id
+
+    def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
+        """[M, M], intersection over union of what it shows of regions: of the points of each, the
+        share in the other's pixels. 1 of each with itself; 0 of what it sees too little of.
+
+        shown  [M] their ids, each once, and their pixels in it
+        """
+        places = {region.id: i for i, region in enumerate(self._regions)}
+        inside = np.zeros((len(shown), len(shown)))
+        columns = [k for k, (id_, _) in enumerate(shown) if self._is_seen(places.get(id_))]
+        seen = self._seen.only([places[shown[k][0]] for k in columns])
+        for row, (_, part) in zip(inside, shown, strict=True):
+            row[columns] = seen.shares_in(part)
+        both = inside * inside.T
+        iou = both / np.maximum(inside + inside.T - both, 1e-9)
+        np.fill_diagonal(iou, 1)
+        return iou
+
+    def carried(self, region: int) -> Foreground | None:
+        """The pixels of a region that it sees; see `carried`."""
+        i = next(i for i, one in enumerate(self._regions) if one.id == region)
+        shape, is_its = self._regions[i].shape, self._seen.of == i
+        T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))
+        return carried(
+            shape,
+            self._seen.rows[is_its],
+            self._seen.columns[is_its],
+            self._depth_m,
+            self._camera,
+            se3.inverse(T_map_seen) @ T_map_now,
+            self._max_gap_m,
+        )
+
+    def _is_seen(self, place: int | None) -> bool:
+        return place is not None and bool(self._seen.counts[place] >= self._least)

@@ -1,0 +1,254 @@
+"""Objects of the map: a table of landmarks, each a sample of its Gaussians and what follows of it.
+
+What a landmark knows of its Gaussians are the ids of at most 256 members and a vote for each. The
+members are those of all its Gaussians that come first when ids are shuffled by a fixed rule: a
+uniform sample, the same in whatever order they come in. Where they are and what they are called
+follows from the rows and labels of the map, and follows these when they change.
+"""
+
+import numpy as np
+
+from ldo_service.geometry import Camera
+
+from .distributions import KEPT, dense, entropy, pooled, sparse
+from .gaussian_labels import BACKGROUND
+
+MEMBERS = 256  # of each landmark: centroids of samples are within 1/16 of an object's spread
+VIEWS = 3  # best views that are remembered
+NO_MEMBER = -1
+MOST_VOTES = 8  # so that a member that is one no more is out after as many keyframes
+TRIM = 0.02  # of the members at each end are strays: beyond the box
+
+LANDMARK = np.dtype(
+    [
+        ("id", "<i8"),  # what other programs know it by; -1 of a candidate
+        ("seen", "<i4"),  # keyframes
+        ("missed", "<i4"),  # keyframes that should have seen it, and did not
+        ("misses", "<i4"),  # of those, since it was last seen
+        ("first", "<i8"),  # keyframes that saw it
+        ("last", "<i8"),
+        ("anchor", "<i8"),  # the keyframe that most of its members hang on
+        ("centroid", "<f8", 3),  # m, map frame
+        ("covariance", "<f8", (3, 3)),  # m^2
+        ("T_map_object", "<f8", (4, 4)),  # its box: centre and axes,
+        ("size", "<f8", 3),  # and extents along them, m
+        ("weights", "<f4", KEPT),  # sparse distribution over labels
+        ("labels", "u1", KEPT),
+        ("members", "<i8", MEMBERS),  # ids of Gaussians, in shuffled order, then NO_MEMBER
+        ("votes", "i1", MEMBERS),
+        ("view_keyframes", "<i8", VIEWS),  # best first; -1 of none
+        ("view_scores", "<f4", VIEWS),
+        ("view_boxes", "<f4", (VIEWS, 4)),  # x0 y0 x1 y1, px
+    ]
+)
+
+
+def new_landmarks(n: int, keyframe: int) -> np.ndarray:
+    """Candidates [n] that nothing is known of but when they were first seen."""
+    table = np.zeros(n, LANDMARK)
+    table["id"] = table["view_keyframes"] = NO_MEMBER
+    table["members"], table["T_map_object"] = NO_MEMBER, np.eye(4)
+    table["first"] = table["last"] = table["anchor"] = keyframe
+    return table
+
+
+def distributions(table: np.ndarray) -> np.ndarray:
+    """[K, C], dense."""
+    return dense(table["labels"], table["weights"])
+
+
+def labels_of(table: np.ndarray) -> np.ndarray:
+    """[K] uint8: what each is, the heaviest label but background."""
+    first = table["labels"][:, 0]
+    return np.where(first == BACKGROUND, table["labels"][:, 1], first)
+
+
+def entropies(table: np.ndarray) -> np.ndarray:
+    """[K] nats."""
+    return entropy(distributions(table))
+
+
+# --- members --------------------------------------------------------------------------------------
+def shuffled(ids: np.ndarray) -> np.ndarray:
+    """[...] uint64, a place for each id, two of which are never equal; NO_MEMBER comes last.
+
+    A multiplication by an odd number turns 64 bits about; that by the golden ratio spreads ids that
+    follow each other.
+    """
+    places = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
+    return np.where(ids == NO_MEMBER, np.uint64(2**64 - 1), places)
+
+
+def joined(
+    members: np.ndarray, votes: np.ndarray, others: np.ndarray, other_votes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Members [K, 256] and votes of the unions of members [K, M] and others [K, L], by row. Who is
+    in both keeps the votes of the first; who has none left goes."""
+    both = np.concatenate([np.where(votes > 0, members, NO_MEMBER), others], axis=1)
+    counts = np.concatenate([votes, other_votes], axis=1)
+    both, counts = _in_order(both, counts)
+    both[:, 1:][both[:, 1:] == both[:, :-1]] = NO_MEMBER
+    both, counts = _in_order(both, counts)
+    return both[:, :MEMBERS], np.where(both >= 0, counts, 0)[:, :MEMBERS].astype(np.int8)
+
+
+def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    order = np.argsort(shuffled(ids), axis=1, kind="stable")
+    return np.take_along_axis(ids, order, axis=1), np.take_along_axis(votes, order, axis=1)
+
+
+def believed(table: np.ndarray) -> np.ndarray:
+    """[K, 256] bool: members with a third of the votes of the one that has most, or more. Edges of
+    regions lie beside objects now and then, and never in the same place for long."""
+    return (table["votes"] > 0) & (3 * table["votes"] >= table["votes"].max(axis=1, keepdims=True))
+
+
+def rows_of(members: np.ndarray, ids: np.ndarray) -> np.ndarray:
+    """[...] where members are in the map's ids [N], ascending; -1 of those that are not awake."""
+    if len(ids) == 0:
+        return np.full(members.shape, -1)
+    order = np.argsort(members, axis=None)  # neighbours are found side by side: four times faster
+    at = np.empty(members.size, np.int64)
+    at[order] = np.searchsorted(ids, members.ravel()[order])
+    at = np.minimum(at, len(ids) - 1).reshape(members.shape)
+    return np.where(ids[at] == members, at, -1)
+
+
+# --- what follows from them -----------------------------------------------------------------------
+def derive(
+    table: np.ndarray,
+    rows: np.ndarray,
+    labels: np.ndarray,
+    ids: np.ndarray,
+    anchors: np.ndarray,
+    least: int,
+) -> None:
+    """Where landmarks [K] are and what they are, from the map [N], in place. Those of which
+    fewer than `least` members are awake, and believed, stay as they were."""
+    where = np.where(believed(table), rows_of(table["members"], ids), -1)
+    known = np.flatnonzero(np.count_nonzero(where >= 0, axis=1) >= max(least, 1))
+    if len(known) == 0:
+        return
+    where = where[known]
+    weights = _opacities(rows, where)
+    p_map = rows[np.maximum(where, 0), :3].astype(float)
+    spread = moments(p_map, weights)
+    T_map_object, size = boxes(p_map, weights > 0, spread[1])
+    label_ids, label_weights = sparse(pooled(labels[np.maximum(where, 0)], weights))
+    for name, values in {
+        "centroid": spread[0],
+        "covariance": spread[1],
+        "T_map_object": T_map_object,
+        "size": size,
+        "labels": label_ids,
+        "weights": label_weights,
+        "anchor": _commonest(anchors[np.maximum(where, 0)], where >= 0),
+    }.items():
+        table[name][known] = values
+
+
+def _opacities(rows: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """[K, M], 0 of members that are not there."""
+    opacity = 1 / (1 + np.exp(-rows[np.maximum(where, 0), 10].astype(float)))
+    return np.where(where >= 0, opacity, 0)
+
+
+def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted means [K, 3] and covariances [K, 3, 3] of points [K, M, 3], without the strays that
+    lie beyond 2 % of the others along an axis. Paper, III.C (landmarks).
+
+        mu = sum_m w_m x_m / sum_m w_m,  Sigma = sum_m w_m (x_m - mu) (x_m - mu)' / sum_m w_m
+
+    Two on the x axis, the one at 4 three times as heavy: mu = 12 / 4, Sigma = (9 + 3) / 4.
+
+    >>> mean, covariance = moments(np.array([[[0.0, 0, 0], [4, 0, 0]]]), np.array([[1.0, 3.0]]))
+    >>> mean[0].tolist(), covariance[0].diagonal().tolist()
+    ([3.0, 0.0, 0.0], [3.0, 0.0, 0.0])
+    """
+    low, high = trimmed(p_map, weights > 0)
+    is_inside = np.all((p_map >= low[:, None]) & (p_map <= high[:, None]), axis=2)
+    kept = np.where(np.any(is_inside & (weights > 0), axis=1, keepdims=True), is_inside, True)
+    w = weights * kept
+    w = (w / w.sum(axis=1, keepdims=True))[..., None]
+    mean = np.sum(w * p_map, axis=1)
+    offset = p_map - mean[:, None]
+    return mean, np.swapaxes(w * offset, 1, 2) @ offset
+
+
+def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest [K, D] of values [K, M, D] where `valid` [K, M], but for 2 % at each end;
+    infinity and minus infinity of none."""
+    count = np.count_nonzero(valid, axis=1)[:, None]
+    ordered = np.where(valid[:, None], np.swapaxes(values, 1, 2), np.inf)
+    ordered.sort(axis=2)
+    cut = (TRIM * count).astype(int)
+    k, d = np.ogrid[: len(values), : values.shape[2]]
+    low, high = ordered[k, d, cut], ordered[k, d, np.maximum(count - 1 - cut, 0)]
+    return low, np.where(count > 0, high, -np.inf)
+
+
+SAVING = 0.8  # an own orientation must make a box smaller by so much
+
+
+def boxes(
+    p_map: np.ndarray, valid: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """T_map_object [K, 4, 4] and sizes [K, 3] of boxes about points [K, M, 3]: along the axes of
+    the map, or along the main axes of the points where that saves a fifth of the volume."""
+    _, main = np.linalg.eigh(covariance)
+    main = main[..., ::-1] * np.sign(_largest(main[..., ::-1]))[:, None]  # signs are arbitrary
+    main[..., 2] *= np.linalg.det(main)[:, None]
+    upright = np.broadcast_to(np.eye(3), main.shape)
+    (low, high), (turned_low, turned_high) = (
+        trimmed(p_map @ axes, valid) for axes in (upright, main)
+    )
+    is_turned = np.prod(turned_high - turned_low, axis=1) < SAVING * np.prod(high - low, axis=1)
+    low, high = (
+        np.where(is_turned[:, None], turned, plain)
+        for turned, plain in ((turned_low, low), (turned_high, high))
+    )
+    T = np.tile(np.eye(4), (len(p_map), 1, 1))
+    T[:, :3, :3] = np.where(is_turned[:, None, None], main, upright)
+    T[:, :3, 3] = (T[:, :3, :3] @ ((low + high) / 2)[..., None])[..., 0]
+    return T, high - low
+
+
+def _largest(axes: np.ndarray) -> np.ndarray:
+    """[K, 3]: of each axis, a column of [K, 3, 3], the component of largest size."""
+    at = np.argmax(np.abs(axes), axis=1)[:, None]
+    return np.take_along_axis(axes, at, axis=1)[:, 0]
+
+
+def _commonest(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """[K] of [K, M]; of equals the smallest."""
+    ordered = np.sort(np.where(valid, values, np.iinfo(np.int32).max).astype(np.int64), axis=1)
+    width = ordered.shape[1]
+    starts = np.concatenate(
+        [np.ones((len(ordered), 1), bool), ordered[:, 1:] != ordered[:, :-1]], axis=1
+    )
+    first = np.maximum.accumulate(np.where(starts, np.arange(width), 0), axis=1)
+    run = np.where(ordered < np.iinfo(np.int32).max, np.arange(width) - first, -1)
+    return np.take_along_axis(ordered, np.argmax(run, axis=1)[:, None], axis=1)[:, 0]
+
+
+def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
+    """Move landmarks [K] by T_new_old [K, 4, 4], in place."""
+    R, t = T_new_old[:, :3, :3], T_new_old[:, :3, 3]
+    table["centroid"] = (R @ table["centroid"][..., None])[..., 0] + t
+    table["covariance"] = R @ table["covariance"] @ np.swapaxes(R, 1, 2)
+    table["T_map_object"] = T_new_old @ table["T_map_object"]
+
+
+# --- as a camera sees them ------------------------------------------------------------------------
+def within(table: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
+    """[K] bool: whose spheres reach into the view of a camera."""
+    p = table["centroid"] @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
+    radius = np.linalg.norm(table["size"], axis=1)  # twice that of the box: members stray
+    low = (-0.5 - camera.cx) / camera.fx, (-0.5 - camera.cy) / camera.fy
+    out = p[:, 2] > -radius
+    for axis, (first, side) in enumerate(
+        zip(low, (camera.width / camera.fx, camera.height / camera.fy), strict=True)
+    ):
+        for edge, sign in ((first, 1), (first + side, -1)):
+            out &= sign * (p[:, axis] - edge * p[:, 2]) > -radius * np.hypot(1, edge)
+    return out

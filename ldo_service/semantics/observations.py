@@ -1,0 +1,93 @@
+"""Updates of object landmarks from a keyframe: views, votes, and merges of duplicates."""
+
+import numpy as np
+
+from .data_association import MapView
+from .label_assignment import HIDDEN
+from .object_landmarks import MOST_VOTES, NO_MEMBER, VIEWS, believed, joined, labels_of, rows_of
+
+
+def one_each(members: np.ndarray) -> np.ndarray:
+    return (members != NO_MEMBER).astype(np.int8)
+
+
+def voted(votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray) -> np.ndarray:
+    """Votes [K, 256] one higher for members, in `rows` of the map, that lie in the region `numbers`
+    [K] of their landmark, and one lower for those that were seen beside it or are no more."""
+    wanted = np.maximum(rows, 0).astype(view.indices.dtype)  # or all of `indices` is converted
+    at = np.minimum(np.searchsorted(view.indices, wanted), len(view.indices) - 1)
+    is_shown = view.indices[at] == rows
+    region = np.where(is_shown, view.regions[at], HIDDEN)
+    is_in = region == numbers[:, None]
+    is_out = (rows < 0) | ((region != HIDDEN) & ~is_in)
+    change = is_in.astype(np.int8) - is_out.astype(np.int8)
+    return np.where(votes > 0, np.clip(votes + change, 0, MOST_VOTES), 0).astype(np.int8)
+
+
+def remember(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
+    """Large boxes with much of the object in them are good views."""
+    scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
+    add_view(table, np.full(len(table), keyframe), scores, boxes)
+
+
+def add_view(
+    table: np.ndarray, keyframes: np.ndarray, scores: np.ndarray, boxes: np.ndarray
+) -> None:
+    """The best of the views that landmarks [K] have and one more of each, in place."""
+    all_scores = np.concatenate([table["view_scores"], scores[:, None]], axis=1).astype(np.float32)
+    order = np.argsort(-all_scores, axis=1, kind="stable")[:, :VIEWS]
+    for name, new in (
+        ("view_keyframes", keyframes),
+        ("view_scores", scores),
+        ("view_boxes", boxes),
+    ):
+        values = np.concatenate([table[name], np.asarray(new)[:, None]], axis=1)
+        at = order.reshape(*order.shape, *[1] * (values.ndim - 2))
+        table[name] = np.take_along_axis(values, at, axis=1)
+
+
+def neighbours(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
+    """Pairs of one of `near` [K] that was `matched` and one that was not, of the same name, whose
+    boxes are close enough to meet."""
+    here, is_matched = table[near], np.isin(near, matched)
+    name, place = labels_of(here), here["T_map_object"][:, :3, 3]
+    reach = np.linalg.norm(here["size"], axis=1) / 2
+    one, other = np.nonzero((name[:, None] == name) & is_matched[:, None] & ~is_matched)
+    close = np.linalg.norm(place[one] - place[other], axis=1) < reach[one] + reach[other]
+    return list(zip(near[one[close]].tolist(), near[other[close]].tolist(), strict=True))
+
+
+def coincide(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
+    """Whether that share of one, of two tables [1], lies in the box of the other."""
+    shares = inside(other[0], awake(one, view)), inside(one[0], awake(other, view))
+    return max(shares) >= least
+
+
+def absorb(one: np.ndarray, gone: np.ndarray) -> None:
+    """Give one landmark what another was, both tables [1], in place; what follows of its members
+    is to be derived anew."""
+    one["members"], one["votes"] = joined(
+        one["members"], one["votes"], gone["members"], gone["votes"]
+    )
+    for name in ("seen", "last"):
+        one[name] = np.maximum(one[name], gone[name])
+    for name in ("missed", "misses", "first"):
+        one[name] = np.minimum(one[name], gone[name])
+    for i in range(VIEWS):
+        seen = gone["view_keyframes"][:, i]
+        add_view(one, seen, gone["view_scores"][:, i], gone["view_boxes"][:, i])
+
+
+def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
+    """Share of points [M, 3] within the box of a landmark; 0 of none."""
+    T = landmark["T_map_object"]
+    local = (p_map - T[:3, 3]) @ T[:3, :3]
+    return (
+        float(np.mean(np.all(np.abs(local) <= landmark["size"] / 2, axis=1))) if len(local) else 0
+    )
+
+
+def awake(landmark: np.ndarray, view: MapView) -> np.ndarray:
+    """Where the Gaussians [M, 3] of one, in a table [1], are."""
+    where = rows_of(landmark["members"][believed(landmark)], view.ids)
+    return view.rows[where[where >= 0], :3].astype(float)

@@ -1,0 +1,280 @@
+"""Fusion of a keyframe's regions into the labels of the map, one step a line.
+
+Detections and open-vocabulary labels of a region are fused first (paper, III.B). Label images show
+what the map says of each pixel.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.gaussians.model import aligned_rows
+from ldo_service.gaussians.render import Rendering, render
+from ldo_service.geometry import Camera, se3
+from ldo_service.regions.foreground import (
+    Claims,
+    ForegroundConfig,
+    NestingConfig,
+    foreground,
+    surfaces,
+    without_nested,
+)
+
+from .gaussian_labels import (
+    BACKGROUND,
+    MISS,
+    NOT_SEEN,
+    ConsistencyConfig,
+    Disagreement,
+    LabelConfig,
+    Observations,
+    agree,
+    background,
+    fields,
+    forget,
+    observe,
+    top_labels,
+    without_misses,
+)
+from .label_assignment import HIDDEN, Assigned, AssignmentConfig, Regions, assign
+
+
+@dataclass(frozen=True, slots=True)
+class FusionConfig:
+    rule: Literal["adaptive", "fixed", "detector"] = "adaptive"
+    beta: float = 2.0  # III.B
+    epsilon: float = 1e-6  # III.B
+    fixed_alpha: float = 0.5  # of `fixed`, an ablation (IV.C)
+
+    def __post_init__(self) -> None:
+        if self.rule not in ("adaptive", "fixed", "detector"):
+            raise ConfigError(f"rule={self.rule!r} must be 'adaptive', 'fixed' or 'detector'.")
+        if not (self.beta > 0 and self.epsilon > 0 and 0 <= self.fixed_alpha <= 1):
+            raise ConfigError(f"{self}: beta and epsilon positive, fixed_alpha in 0..1.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Fused:
+    """labels [V] int16; confidences [V] float32, SemConf; alpha [V] float32, the detector's part;
+    by_detector [V] float32, alpha Conf_YOLO"""
+
+    labels: np.ndarray
+    confidences: np.ndarray
+    alpha: np.ndarray
+    by_detector: np.ndarray
+
+
+def fused(
+    detector_labels: np.ndarray,
+    detector_confidences: np.ndarray,
+    overlaps: np.ndarray,
+    open_labels: np.ndarray,
+    open_confidences: np.ndarray,
+    config: FusionConfig,
+) -> Fused:
+    """Label and confidence of V Gaussians, or regions.
+
+        r_YOLO = overlap Conf_YOLO,  r_VLM = Conf_VLM
+        alpha = r_YOLO^beta / (r_YOLO^beta + r_VLM^beta + epsilon)
+        SemConf = alpha Conf_YOLO + (1 - alpha) Conf_VLM
+
+    detector_labels, open_labels            [V] int
+    detector_confidences, open_confidences  [V], 0..1; 0: not invoked, or it found nothing
+    overlaps                                [V], 0..1, IoU or coverage of region and Gaussian
+
+    The label is the detector's if alpha Conf_YOLO >= (1 - alpha) Conf_VLM. Where the labeller was
+    not invoked alpha is 1. `fixed` has the same alpha wherever it was; `detector` ignores it.
+
+    A box of 0.8 over half of a splat, and a labeller that is 0.6 sure: r = 0.4 and 0.6,
+    alpha = 0.16 / (0.16 + 0.36), SemConf = 0.308 * 0.8 + 0.692 * 0.6; 0.246 loses against 0.415:
+
+    >>> one = fused(*np.array([[7], [0.8], [0.5], [9], [0.6]]), FusionConfig())
+    >>> int(one.labels[0]), round(float(one.alpha[0]), 3), round(float(one.confidences[0]), 3)
+    (9, 0.308, 0.662)
+    """
+    confidences = np.asarray(detector_confidences, np.float32)
+    open_confidences = np.asarray(open_confidences, np.float32)
+    invoked = (open_confidences > 0) & (config.rule != "detector")
+    alpha = np.where(invoked, _alpha(overlaps * confidences, open_confidences, config), 1)
+    alpha = alpha.astype(np.float32)
+    by_detector, by_labeller = alpha * confidences, (1 - alpha) * open_confidences
+    labels = np.where(by_detector >= by_labeller, detector_labels, open_labels)
+    return Fused(labels.astype(np.int16), by_detector + by_labeller, alpha, by_detector)
+
+
+def _alpha(r_detector: np.ndarray, r_open: np.ndarray, config: FusionConfig) -> np.ndarray:
+    if config.rule != "adaptive":
+        return np.full(r_open.shape, config.fixed_alpha)
+    ours = r_detector.astype(float) ** config.beta
+    return ours / (ours + r_open.astype(float) ** config.beta + config.epsilon)
+
+
+def reliable_image(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
+    """[H, W] bool, where the Gaussian that made most of a pixel, `top` [H, W], has a label but
+    background with that probability, or more."""
+    rows = labels[np.maximum(top, 0).ravel()]
+    is_named = (fields(rows)["weights"][:, 0] >= least) & (top_labels(rows) != BACKGROUND)
+    return is_named.reshape(top.shape) & (top >= 0)
+
+
+def label_image(
+    rows: np.ndarray,
+    labels: np.ndarray,
+    shown: Rendering,
+    camera: Camera,
+    T_camera_map: np.ndarray,
+    *,
+    threads: int = 1,
+) -> np.ndarray:
+    """[H, W] uint8, per pixel the label s of the largest sum_i w_i p_i(s) over the Gaussians, of
+    equals the lower number; background where there is none.
+
+    Three labels a rendering, of the Gaussians that `shown` found to have made the image: for
+    evaluation and pictures.
+    """
+    assert shown.contributions is not None
+    made_by = shown.contributions.indices
+    visible, said = aligned_rows(len(made_by)), labels[made_by]
+    visible[:] = rows[made_by]
+    records = fields(said)
+    known = np.unique(records["ids"][records["weights"] > 0]).tolist()
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    most = np.zeros(image.shape, np.float32)
+    for three in (known[k : k + 3] for k in range(0, len(known), 3)):
+        visible[:, 11:14] = 0
+        for column, label in enumerate(three, 11):
+            visible[:, column] = np.sum(records["weights"] * (records["ids"] == label), axis=1)
+        sums = render(visible, camera, T_camera_map, threads=threads).color
+        for channel, label in enumerate(three):
+            image[sums[..., channel] > most] = label
+            most = np.maximum(most, sums[..., channel])
+    visible[:, 11:14] = background(said)[:, None]
+    nothing = render(visible, camera, T_camera_map, threads=threads).color[..., 0]
+    return np.where(nothing >= most, np.uint8(BACKGROUND), image)
+
+
+@dataclass(frozen=True, slots=True)
+class LabellingConfig:
+    region: Literal["foreground", "box"] = "foreground"
+    foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
+    nesting: NestingConfig = field(default_factory=NestingConfig)
+    assignment: AssignmentConfig = field(default_factory=AssignmentConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    labels: LabelConfig = field(default_factory=LabelConfig)
+    consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
+
+    def __post_init__(self) -> None:
+        if self.region not in ("foreground", "box"):
+            raise ConfigError(f"region={self.region!r} must be 'foreground' or 'box'.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Labelled:
+    assigned: Assigned
+    seen: Observations
+    disagreement: Disagreement
+
+
+def label_keyframe(
+    rows: np.ndarray,
+    labels: np.ndarray,
+    indices: np.ndarray,
+    camera: Camera,
+    T_map_camera: np.ndarray,
+    depth_m: np.ndarray,
+    claims: Claims,
+    config: LabellingConfig,
+    *,
+    is_late: bool = False,
+    spared: np.ndarray | None = None,
+    threads: int = 1,
+) -> Labelled:
+    """Fold what is claimed of a keyframe into the labels [N, 32] of the map, in place.
+
+    rows [N, 16]; indices [V] uint32, the Gaussians that made its image; depth_m [H, W] as it was
+    measured. `is_late`: the claims are some of a keyframe that was folded in before, so that what
+    they leave out is no miss, and where the detector's word is the heavier one it was counted.
+    `spared` [256] bool: labels that the detector does not know, and cannot miss. Raises ValueError
+    for arrays that do not fit.
+    """
+    # which Gaussians are where
+    regions = regions_of(claims, depth_m, camera, config)
+    T_camera_map = se3.inverse(T_map_camera)
+    where = assign(
+        rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
+    )
+    # what they were seen as
+    seen = observations(where, indices, camera, claims, config, is_late=is_late)
+    if spared is not None:
+        # what the detector does not know it could not miss, before or now
+        is_spared = spared[top_labels(labels[indices])] & (seen.labels == MISS)
+        seen.labels[is_spared] = NOT_SEEN
+        is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
+        without_misses(labels, indices[is_named])
+    if claims.anew and config.region == "foreground":
+        forget(labels, indices[seen.labels >= 0])
+    observe(labels, seen, config.labels, threads=threads)
+    # what their neighbours say
+    touched = indices[seen.labels != NOT_SEEN]
+    return Labelled(where, seen, agree(rows, labels, touched, config.consistency, threads=threads))
+
+
+def regions_of(
+    claims: Claims, depth_m: np.ndarray, camera: Camera, config: LabellingConfig
+) -> Regions:
+    """The boxes, or the objects in them, each without those that lie on it."""
+    if config.region == "box" or len(claims.boxes) == 0:
+        return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
+    known = claims.parts or (None,) * len(claims.boxes)
+    parts = [part for part in known if part is not None]
+    if len(parts) < len(known):
+        found = surfaces(depth_m, camera, config.foreground)
+        parts = [
+            part or foreground(box, depth_m, found, camera, config.foreground)
+            for box, part in zip(claims.boxes, known, strict=True)
+        ]
+    parts = without_nested(parts, claims.scores(), config.nesting)
+    return Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
+
+
+def observations(
+    where: Assigned,
+    indices: np.ndarray,
+    camera: Camera,
+    claims: Claims,
+    config: LabellingConfig,
+    *,
+    is_late: bool = False,
+) -> Observations:
+    """Labels and confidences of the Gaussians that a region got; misses of the others in view. The
+    side of an object is that of a square like its box, at the depth of the Gaussian."""
+    # by the outcome: hidden, in no region, in region 0, 1, ...
+    outcome = np.subtract(where.regions, HIDDEN, dtype=np.intp)  # as `take` would have it
+    said = np.where((claims.confidences > 0) & (not is_late), claims.labels, NOT_SEEN)
+    miss = NOT_SEEN if is_late else MISS
+    labels = np.array([NOT_SEEN, miss, *said], np.int16).take(outcome)
+    confidences = np.array([0, 0, *claims.confidences], np.float32).take(outcome)
+    corners, least_px = np.reshape(claims.boxes, (-1, 2, 2)), config.labels.least_px
+    sides_px = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))
+    # where a labeller has spoken too, by the Gaussian
+    is_fused = np.array([False, False, *(claims.open_confidences > 0)])
+    if is_fused.any():
+        both = np.flatnonzero(is_fused.take(outcome))
+        of = where.regions[both]
+        one = fused(
+            claims.labels.take(of),
+            claims.confidences.take(of),
+            where.overlaps[both],
+            claims.open_labels.take(of),
+            claims.open_confidences.take(of),
+            config.fusion,
+        )
+        is_told = one.confidences > (2 * one.by_detector if is_late else 0)
+        labels[both] = np.where(is_told, one.labels, NOT_SEEN)
+        confidences[both] = one.confidences
+    extents_m = np.fmax(where.depths_m, 0)  # NaN is hidden, and has none
+    extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))
+    extents_m *= np.array([least_px, least_px, *sides_px], np.float32).take(outcome)
+    return Observations(indices, labels, confidences, extents_m)

@@ -1,0 +1,237 @@
+"""Registered networks: whole or not at all, and what was registered is what is run."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ldo_service.detection.detectors import NetworkConfig
+from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, Pair
+from ldo_service.detection.model_registry import (
+    Models,
+    default_folder,
+    open_detector,
+    open_labeller,
+)
+from ldo_service.errors import ConfigError, ModelError
+from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
+
+from .networks import SQUARES, changed, squares_image
+
+CONFIG = NetworkConfig()
+ENCODERS = DualEncoderConfig()
+
+
+@pytest.fixture
+def models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Models:
+    monkeypatch.setenv("LDO_MODELS", str(tmp_path / "models"))
+    return Models()
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return SQUARES["yolox"].write(tmp_path / "squares.onnx")
+
+
+def test_what_is_registered_is_a_copy_with_all_that_is_known(models: Models, file: Path) -> None:
+    models.add("squares", file, CONFIG, licence="do what you like")
+    file.unlink()
+    assert models.names == ["squares"]
+    about = Models().get("squares").about
+    assert (about.layout, about.classes) == ("yolox", ("red", "green", "blue"))
+    assert (about.licence, about.source) == ("do what you like", "squares.onnx")
+    detector = open_detector("squares", CONFIG)
+    assert len(detector.find(squares_image([("red", 16, 48, 16)]))) == 1
+    assert detector.identity == f"squares {about.sha256[:12]}"
+
+
+def test_names_given_when_it_is_registered_are_kept(models: Models, tmp_path: Path) -> None:
+    file = changed("yolov8", metadata=None).write(tmp_path / "net.onnx")
+    (tmp_path / "names.txt").write_text("sofa\ncup\nglobe\n")
+    models.add("mine", file, NetworkConfig(names=str(tmp_path / "names.txt"), layout="yolov8"))
+    (tmp_path / "names.txt").unlink()
+    detector = open_detector("mine", CONFIG)
+    assert detector.names == ("sofa", "cup", "globe")
+    assert detector.labels == ("couch", "cup", "globe")
+
+
+def test_a_file_may_be_used_without_registering_it(models: Models, file: Path) -> None:
+    assert open_detector(str(file), CONFIG).identity.startswith("squares ")
+    assert models.names == []
+
+
+@pytest.mark.parametrize("name", ["", ".hidden", "../up", "a/b", "a b", "x" * 65])
+def test_a_name_that_is_no_name_is_refused(models: Models, file: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match="no name for a model"):
+        models.add(name, file, CONFIG)
+
+
+def test_a_taken_name_is_refused_and_its_model_stays(models: Models, file: Path) -> None:
+    models.add("one", file, CONFIG)
+    other = SQUARES["yolov8"].write(file.with_name("other.onnx"))
+    with pytest.raises(ConfigError, match="there is a model 'one' already"):
+        models.add("one", other, CONFIG)
+    assert models.get("one").about.layout == "yolox"
+
+
+def test_what_is_no_detector_leaves_nothing_behind(models: Models, file: Path) -> None:
+    file.write_bytes(b"garbage")
+    with pytest.raises(ModelError, match="no network in ONNX") as caught:
+        models.add("one", file, CONFIG)
+    assert ".new-" not in str(caught.value), "the file that the user named, not the copy"
+    assert list(models.folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("damage", ["file", "about", "file gone"])
+def test_a_damaged_model_is_refused_and_can_be_removed(
+    models: Models, file: Path, damage: str
+) -> None:
+    model = models.add("one", file, CONFIG)
+    if damage == "file":
+        body = bytearray(model.file.read_bytes())
+        body[len(body) // 2] ^= 1
+        model.file.write_bytes(body)
+    elif damage == "file gone":
+        model.file.unlink()
+    else:
+        (model.folder / "about.json").write_text(json.dumps({"sha256": 3}))
+    with pytest.raises(ModelError, match="add it again"):
+        open_detector("one", CONFIG)
+    models.remove("one")
+    assert models.names == []
+
+
+def test_an_unknown_name_says_which_there_are(models: Models, file: Path) -> None:
+    models.add("one", file, CONFIG)
+    with pytest.raises(ConfigError, match="there are: one"):
+        open_detector("two", CONFIG)
+    with pytest.raises(ConfigError, match="registered: one"):
+        models.remove("two")
+
+
+def test_a_folder_that_cannot_be_written_is_said(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "no_folder").write_text("")
+    monkeypatch.setenv("LDO_MODELS", str(tmp_path / "no_folder"))
+    with pytest.raises(ConfigError, match="LDO_MODELS names another folder"):
+        Models().add("one", file, CONFIG)
+    assert Models().names == []
+
+
+def test_models_live_where_programs_keep_their_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LDO_MODELS", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", "/data")
+    assert default_folder() == Path("/data/ldo/models")
+    monkeypatch.delenv("XDG_DATA_HOME")
+    monkeypatch.setenv("HOME", "/home/ada")
+    assert default_folder() == Path("/home/ada/.local/share/ldo/models")
+
+
+def test_the_configuration_may_overrule_the_names(models: Models, file, tmp_path: Path) -> None:
+    models.add("one", file, CONFIG)
+    (tmp_path / "names.txt").write_text("a\nb\nc\n")
+    detector = open_detector("one", NetworkConfig(names=str(tmp_path / "names.txt")))
+    assert detector.labels == ("a", "b", "c")
+    assert np.isfinite(detector.find(squares_image([])).scores).all()
+
+
+# --- pairs that name regions ----------------------------------------------------------------------
+@pytest.fixture
+def pair(tmp_path: Path) -> Pair:
+    colors = ColorPair()
+    return Pair(
+        colors.image(tmp_path / "visual.onnx"),
+        colors.text(tmp_path / "textual.onnx"),
+        vocabulary(tmp_path / "merges.gz"),
+    )
+
+
+def test_a_pair_is_registered_with_all_its_files(models: Models, pair: Pair) -> None:
+    about = models.add_pair("colours", pair, ENCODERS, ("Red", "sofa", "green")).about
+    for file in (pair.image, pair.text, pair.vocabulary):
+        assert file is not None
+        file.unlink()
+    assert (about.layout, about.classes) == ("clip", ("Red", "sofa", "green"))
+    assert set(about.parts) == {"text.onnx", "bpe.txt.gz"}
+    labeller = open_labeller("colours", ENCODERS)
+    assert labeller.names == ("red", "couch", "green")
+    assert labeller.label([plain("green")])[0][0] == "green"
+    assert open_labeller("colours", ENCODERS, ("blue",)).names == ("blue",)
+    assert labeller.identity == f"colours {about.sha256[:12]}"
+
+
+def test_embeddings_are_registered_under_words_of_the_same_meaning(
+    models: Models, pair: Pair, tmp_path: Path
+) -> None:
+    path = embeddings(tmp_path / "e.npz", names=np.array(["sofa", "green", "blue"]))
+    models.add_pair("cached", Pair(pair.image, embeddings=path), ENCODERS)
+    for names in ((), ("couch", "green")):
+        labeller = open_labeller("cached", ENCODERS, names)
+        assert labeller.label([plain("red")])[0][0] == "couch"
+
+
+@pytest.mark.parametrize("part", ["model.onnx", "text.onnx", "bpe.txt.gz"])
+def test_a_pair_with_a_damaged_file_is_refused(models: Models, pair: Pair, part: str) -> None:
+    model = models.add_pair("colours", pair, ENCODERS)
+    (model.folder / part).write_bytes(b"garbage")
+    with pytest.raises(ModelError, match=f"{part} is not what was registered"):
+        open_labeller("colours", ENCODERS)
+
+
+def test_a_pair_that_does_not_fit_leaves_nothing_behind(
+    models: Models, pair: Pair, tmp_path: Path
+) -> None:
+    (tmp_path / "merges.gz").write_bytes(b"garbage")
+    with pytest.raises(ModelError, match=r"merges\.gz") as caught:
+        models.add_pair("colours", pair, ENCODERS)
+    assert ".new-" not in str(caught.value)
+    assert list(models.folder.iterdir()) == []
+
+
+def test_detectors_and_pairs_are_not_taken_for_each_other(
+    models: Models, file: Path, pair: Pair
+) -> None:
+    models.add("squares", file, CONFIG)
+    models.add_pair("colours", pair, ENCODERS)
+    with pytest.raises(ModelError, match=r"vlm_labeller\.model takes it"):
+        open_detector("colours", CONFIG)
+    with pytest.raises(ModelError, match=r"detector\.model takes it"):
+        open_labeller("squares", ENCODERS)
+    with pytest.raises(ConfigError, match="there are: colours, squares"):
+        open_labeller("other", ENCODERS)
+
+
+def test_a_folder_of_a_pair_may_be_used_without_registering_it(
+    models: Models, tmp_path: Path
+) -> None:
+    ColorPair().image(tmp_path / "image_encoder.onnx")
+    embeddings(tmp_path / "text_embeddings.npz")
+    labeller = open_labeller(str(tmp_path), ENCODERS)
+    assert labeller.label([plain("blue")])[0][0] == "blue"
+    assert models.names == []
+
+
+def test_the_networks_of_the_package_open_by_their_name(models: Models) -> None:
+    detector, labeller = open_detector("demo", CONFIG), open_labeller("demo", ENCODERS)
+    assert detector.layout == "yolov8"
+    assert detector.identity.startswith("demo ")
+    assert {"couch", "cup"} <= set(detector.names)
+    assert {"couch", "radiator"} <= set(labeller.names)
+    assert "wall" not in labeller.names
+    assert models.names == []
+
+
+def test_the_built_in_pair_takes_names_of_its_table_while_it_runs(models: Models) -> None:
+    labeller = open_labeller("demo", ENCODERS, ("lamp", "chair"))
+    labeller.add("radiator")
+    assert labeller.names == ("lamp", "chair", "radiator")
+    with pytest.raises(ConfigError, match="no text encoder"):
+        labeller.add("zebra")
+    assert models.names == []
+
+
+def test_the_name_of_the_built_in_networks_is_taken(models: Models, file: Path) -> None:
+    with pytest.raises(ConfigError, match="choose another name"):
+        models.add("demo", file, CONFIG)

@@ -1,0 +1,182 @@
+import doctest
+
+import numpy as np
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, se3
+from ldo_service.regions.foreground import Foreground
+from ldo_service.semantics import label_assignment
+from ldo_service.semantics.label_assignment import (
+    HIDDEN,
+    UNMATCHED,
+    Assigned,
+    AssignmentConfig,
+    Regions,
+    assign,
+)
+from tests.reference.assignment import assign_reference
+
+CAMERA = Camera(64, 48, 50.0, 55.0, 31.5, 23.5)
+T_CAMERA_MAP = se3.exp(np.array([0.1, -0.2, 0.05, 0.1, 0.05, 0.2]))
+BOXES = np.array([[5.2, 4.1, 40.7, 30.3], [20.0, 10.0, 60.0, 45.0], [30.0, 2.0, 34.0, 6.5]])
+SCORES = np.array([0.6, 0.55, 0.9])
+
+
+def scattered(n: int) -> np.ndarray:
+    rng = np.random.default_rng(n)
+    rows = rng.normal(size=(n, 16)).astype(np.float32)
+    p_camera = np.stack([*rng.uniform(-1.2, 1.2, (2, n)), rng.uniform(0.5, 3, n)], axis=1)
+    rows[:, :3] = se3.transform(se3.inverse(T_CAMERA_MAP), p_camera)
+    rows[:, 3:6] = rng.uniform(-5, -2, (n, 3))
+    return rows
+
+
+def depth_image() -> np.ndarray:
+    depth_m = np.random.default_rng(0).uniform(0.5, 3, (48, 64)).astype(np.float32)
+    depth_m[:, ::9] = 0
+    return depth_m
+
+
+def parts() -> list[Foreground]:
+    rng = np.random.default_rng(1)
+    return [
+        Foreground(5, 6, rng.random((24, 30)) < 0.6),
+        Foreground(10, 20, rng.random((30, 40)) < 0.8),
+        Foreground(2, 30, np.zeros((0, 4), bool)),
+    ]
+
+
+def ours(
+    rows: np.ndarray, regions: Regions, config: AssignmentConfig, threads: int = 1
+) -> Assigned:
+    indices = np.arange(len(rows), dtype=np.uint32)
+    where = indices, CAMERA, T_CAMERA_MAP, depth_image(), regions, config
+    return assign(rows, *where, threads=threads)
+
+
+def test_examples_in_the_docstring_hold() -> None:
+    assert doctest.testmod(label_assignment).failed == 0
+
+
+@pytest.mark.parametrize("rule", ["coverage", "iou"])
+@pytest.mark.parametrize("is_masked", [False, True])
+def test_kernel_does_what_its_twin_does(rule, is_masked) -> None:
+    rows, config = scattered(3000), AssignmentConfig(rule, 0.02 if rule == "iou" else 0.3, 1.0)
+    masks = [part.image((48, 64)) for part in parts()] if is_masked else None
+    regions = (
+        Regions.of_foregrounds(BOXES, SCORES, parts())
+        if is_masked
+        else Regions.of_boxes(BOXES, SCORES)
+    )
+    kernel = ours(rows, regions, config)
+    boxes, scores = BOXES.astype(np.float32).astype(float), SCORES.astype(np.float32)
+    twin = assign_reference(rows, CAMERA, T_CAMERA_MAP, depth_image(), boxes, scores, masks, config)
+    differ = kernel.regions != twin.regions  # by rounding, at a threshold
+    assert np.count_nonzero(differ) <= 3
+    np.testing.assert_allclose(kernel.overlaps[~differ], twin.overlaps[~differ], atol=2e-4)
+    np.testing.assert_allclose(kernel.depths_m, twin.depths_m, atol=1e-5)
+    for wanted in (HIDDEN, UNMATCHED, 0, 1):
+        assert np.count_nonzero(kernel.regions == wanted) > 10
+
+
+@pytest.mark.parametrize("count", [16, 17, 40])
+def test_many_regions_are_tried_as_few_are(count: int) -> None:
+    """More than a vector has lanes, over each other and beside the image."""
+    rng, rows = np.random.default_rng(5), scattered(1500)
+    low = rng.uniform(-10, 50, (count, 2))
+    boxes = np.concatenate([low, low + rng.uniform(2, 25, (count, 2))], axis=1).astype(np.float32)
+    scores = rng.uniform(0.2, 1, count).astype(np.float32)
+    config = AssignmentConfig(max_depth_gap_m=1.0)
+    kernel = ours(rows, Regions.of_boxes(boxes, scores), config)
+    view = CAMERA, T_CAMERA_MAP, depth_image(), boxes.astype(float), scores, None, config
+    twin = assign_reference(rows, *view)
+    assert np.count_nonzero(kernel.regions != twin.regions) <= 3
+    assert kernel.regions.max() >= count - 4, "the last ones have some too"
+
+
+def test_a_mask_that_fills_its_box_is_the_box() -> None:
+    rows, box = scattered(2000), np.array([[9.5, 7.5, 40.5, 30.5]])
+    full = [Foreground(8, 10, np.ones((23, 31), bool))]
+    config = AssignmentConfig(max_depth_gap_m=1.0)
+    as_box = ours(rows, Regions.of_boxes(box, np.ones(1)), config)
+    as_mask = ours(rows, Regions.of_foregrounds(box, np.ones(1), full), config)
+    np.testing.assert_array_equal(as_box.regions, as_mask.regions)
+    np.testing.assert_allclose(as_box.overlaps, as_mask.overlaps, atol=1e-4)
+
+
+def test_of_equal_regions_the_first_wins_and_a_surer_one_before_it() -> None:
+    rows, box = scattered(2000), np.array([[0, 0, 63, 47]] * 3, float)
+    config = AssignmentConfig(max_depth_gap_m=1.0)
+    equal = ours(rows, Regions.of_boxes(box, np.array([0.5, 0.5, 0.5])), config).regions
+    surer = ours(rows, Regions.of_boxes(box, np.array([0.5, 0.5, 0.6])), config).regions
+    assert set(equal) == {HIDDEN, UNMATCHED, 0} or set(equal) == {HIDDEN, 0}
+    np.testing.assert_array_equal(surer[equal == 0], 2)
+
+
+def test_a_gaussian_behind_the_surface_is_hidden() -> None:
+    rows = np.zeros((2, 16), np.float32)
+    rows[:, 2], rows[:, 3:6], rows[:, 6] = [1.0, 1.2], -4, 1
+    regions = Regions.of_boxes(np.array([[0, 0, 63, 47]], float), np.ones(1))
+    indices, depth_m = np.arange(2, dtype=np.uint32), np.ones((48, 64), np.float32)
+    seen = assign(rows, indices, CAMERA, np.eye(4), depth_m, regions, AssignmentConfig())
+    assert seen.regions.tolist() == [0, HIDDEN]
+
+
+def test_without_regions_all_that_is_seen_is_unmatched() -> None:
+    none = Regions.of_boxes(np.zeros((0, 4)), np.zeros(0))
+    seen = ours(scattered(500), none, AssignmentConfig(max_depth_gap_m=1.0))
+    assert set(seen.regions.tolist()) == {HIDDEN, UNMATCHED}
+
+
+def test_gaussians_that_are_not_finite_are_hidden() -> None:
+    rows = scattered(100)
+    rows[::2, 4], rows[1::4, 0] = np.nan, np.inf
+    seen = ours(rows, Regions.of_boxes(BOXES, SCORES), AssignmentConfig(max_depth_gap_m=9.0))
+    assert np.all(seen.regions[::2] == HIDDEN)
+    assert np.all(seen.regions[1::4] == HIDDEN)
+
+
+def test_a_point_that_rounds_to_behind_the_image_is_its_last_pixel() -> None:
+    """The last float below 0.5, plus a half, is 1: what lies behind is not of the image."""
+    rows, memory = np.zeros((1, 16), np.float32), np.array([[1.0, 9.0]], np.float32)
+    rows[0, 2], rows[0, 3:6], rows[0, 6] = 1.0, -4, 1
+    just_short = float(np.nextafter(np.float32(0.5), np.float32(0)))
+    camera = Camera(1, 1, 50.0, 50.0, just_short, 0.0)
+    regions = Regions.of_boxes(np.array([[0.0, 0.0, 0.0, 0.0]]), np.ones(1))
+    look = rows, np.zeros(1, np.uint32), camera, np.eye(4), memory.ravel()[:1].reshape(1, 1)
+    assert assign(*look, regions, AssignmentConfig()).regions.tolist() != [HIDDEN]
+
+
+def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+    rows, regions = scattered(20_000), Regions.of_foregrounds(BOXES, SCORES, parts())
+    alone, many = (ours(rows, regions, AssignmentConfig(), threads) for threads in (1, 3))
+    assert alone.regions.tobytes() == many.regions.tobytes()
+    assert alone.overlaps.tobytes() == many.overlaps.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("boxes", "scores", "message"),
+    [
+        ([[0, 0, np.nan, 1]], [1], "finite"),
+        ([[5, 0, 1, 1]], [1], "x0 <= x1"),
+        ([[0, 0, 1, 1]], [2], "0..1"),
+        ([[0, 0, 1, 1]], [1, 1], "shape"),
+    ],
+)
+def test_regions_that_do_not_fit_are_refused(boxes, scores, message) -> None:
+    regions = Regions.of_boxes(np.array(boxes, float), np.array(scores, float))
+    with pytest.raises(ValueError, match=message):
+        ours(scattered(10), regions, AssignmentConfig())
+
+
+def test_tables_that_do_not_fit_are_refused() -> None:
+    good = Regions.of_foregrounds(BOXES, SCORES, parts())
+    short = Regions(good.boxes, good.scores, good.rects, good.sums[:-1])
+    with pytest.raises(ValueError, match="sums must hold"):
+        ours(scattered(10), short, AssignmentConfig())
+
+
+def test_unknown_rules_are_refused() -> None:
+    with pytest.raises(ConfigError, match="coverage"):
+        AssignmentConfig(rule="all")  # type: ignore[arg-type]
