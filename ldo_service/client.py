@@ -25,7 +25,7 @@ import zenoh
 
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.keys import Keys
-from ldo_service.runtime.links import ALIVE, Header, encode
+from ldo_service.runtime.links import ALIVE, Header, encode_link
 from ldo_service.runtime.numbers import Numbers
 from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
 from ldo_service.schemas import (
@@ -142,7 +142,7 @@ class Client:
         message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_odom_base=T_odom_base)
         header = Header("odometry", self._epoch, self._priors, message.stamp_ns)
         body = msgspec.msgpack.encode(message)
-        self._publisher(OdometryPrior).put(body, attachment=encode(header))
+        self._publisher(OdometryPrior).put(body, attachment=encode_link(header))
         self._priors += 1
 
     def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
@@ -150,7 +150,7 @@ class Client:
         and is dropped when the network is congested."""
         kind = type(frame)
         header = Header("camera", self._epoch, self._numbers[kind], frame.stamp_ns)
-        self._publisher(kind).put(msgspec.msgpack.encode(frame), attachment=encode(header))
+        self._publisher(kind).put(msgspec.msgpack.encode(frame), attachment=encode_link(header))
         self._sent += 1
         self._numbers[kind] += 1
 
@@ -308,7 +308,7 @@ class Client:
                 raise self._nobody("listens", topic)
             time.sleep(0.02)
         header = Header("operator", self._epoch, self._asked, message.stamp_ns)
-        publisher.put(msgspec.msgpack.encode(message), attachment=encode(header))
+        publisher.put(msgspec.msgpack.encode(message), attachment=encode_link(header))
         self._asked += 1
 
     def _nobody(self, does: str, topic: Topic) -> ConfigError:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from ldo_service.recordings.replay import RecordedActor, open_recording
+from ldo_service.runs.replayed import RecordedActor, open_recording
 from ldo_service.runtime.recording import recorded_actors
 from ldo_service.runtime.replay import Replayed
 

@@ -17,8 +17,8 @@ from ldo_service.evaluation.lpips import Lpips
 from ldo_service.evaluation.results import Results, evaluate_run, plain, work
 from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import RenderingErrors
-from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.finished import read_run, written
+from ldo_service.runs.source import open_source
 
 from .label_tables import label_table, open_table
 from .options import Json, Source

@@ -14,8 +14,7 @@ from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.recordings.sequence import open_source
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import Selection, open_source
 from ldo_service.runtime.keys import Keys
 from ldo_service.runtime.network import DEFAULT_ENDPOINT, Network
 from ldo_service.wire import camera_rgbd_message

@@ -14,13 +14,12 @@ from ldo_service.config import Config, load_config
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.folder import RunFolder, prepare
 from ldo_service.runs.front_end import FrontEnd
 from ldo_service.runs.job import Advance, Job
 from ldo_service.runs.over_file import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import Selection, open_source
 
 from .options import (
     ConfigFile,

@@ -9,7 +9,8 @@ import tyro
 from ldo_service.config import load_config
 from ldo_service.runtime.keys import Keys
 from ldo_service.runtime.network import DEFAULT_ENDPOINT, Network
-from ldo_service.service import Service, state_folder
+from ldo_service.service.service import Service
+from ldo_service.service.state_folder import state_folder
 
 from .options import (
     ConfigFile,

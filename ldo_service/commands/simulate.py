@@ -9,9 +9,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import load_config
-from ldo_service.recordings.sequence import open_source
 from ldo_service.runs.simulation import Made, simulate_graph
-from ldo_service.runs.source import Selection
+from ldo_service.runs.source import Selection, open_source
 
 from .options import (
     ConfigFile,

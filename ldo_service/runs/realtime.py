@@ -10,8 +10,7 @@ from ldo_service.actors.graph import GRAPH, Box
 from ldo_service.config import config_yaml
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.graph import lossless_consumers
-from ldo_service.runtime.links import Header, data_key
-from ldo_service.runtime.links import encode as encode_header
+from ldo_service.runtime.links import Header, data_key, encode_link
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import Stop, supervise
 from ldo_service.runtime.transport import MemoryTransport
@@ -98,10 +97,10 @@ class _RealTimeRun:
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
             for pose in prior:
                 header = Header("odometry", 1, poses, pose.stamp_ns)
-                await odometry.send(encode_header(header), encode(pose))
+                await odometry.send(encode_link(header), encode(pose))
                 poses += 1
             header = Header("camera", 1, number, frame.stamp_ns)
-            await camera.send(encode_header(header), encode(frame))
+            await camera.send(encode_link(header), encode(frame))
             number += 1
             self._advance(number + self._reader.rejected)
 

@@ -92,7 +92,7 @@ class InletPast(NamedTuple):
     handled: int
 
 
-encode = msgspec.msgpack.Encoder().encode
+encode_link = msgspec.msgpack.Encoder().encode
 
 
 def decode_request(body: memoryview) -> Join | Grant:

@@ -20,7 +20,7 @@ from .links import (
     Welcome,
     again_key,
     data_key,
-    encode,
+    encode_link,
     grant_key,
     welcome_key,
 )
@@ -215,7 +215,7 @@ class Mailbox:
     def _send_grant(self, inlet: LosslessInlet) -> None:
         with self._lock:
             grant = inlet.grant(self._consumer, waits_for_disk=self.waits_for_disk)
-        self._grants[inlet.port.topic.name].post(b"", encode(grant))
+        self._grants[inlet.port.topic.name].post(b"", encode_link(grant))
 
     def close(self) -> None:
         """Take nothing more in; what waits can still be taken."""

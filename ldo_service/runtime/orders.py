@@ -19,7 +19,7 @@ import msgspec
 
 from ldo_service.schemas import decode
 
-from .links import encode
+from .links import encode_link
 from .transport import Transport, call_soon
 
 ORDER_KEY, REPORT_KEY = "link/order", "link/report"
@@ -53,7 +53,7 @@ class OrderTaker:
 
     def report(self, order: Order, error: str) -> None:
         self._done = Report(order.number, self._stage, error)
-        self._reports.post(b"", encode(self._done))
+        self._reports.post(b"", encode_link(self._done))
 
     def close(self) -> None:
         self._reports.close()
@@ -67,7 +67,7 @@ class OrderTaker:
 
     def _take_once(self, order: Order) -> None:
         if self._done is not None and order.number == self._done.number:
-            self._reports.post(b"", encode(self._done))
+            self._reports.post(b"", encode_link(self._done))
         elif order.number != self._under_way:
             self._under_way = order.number
             self._take(order)
@@ -89,7 +89,7 @@ class Commander:
         try:
             async with asyncio.timeout(timeout_s):
                 while not report.done():
-                    await self._orders.send(b"", encode(order))
+                    await self._orders.send(b"", encode_link(order))
                     await asyncio.wait({report}, timeout=REPEAT_AFTER_S)
                 return report.result()
         except TimeoutError:

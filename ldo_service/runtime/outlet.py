@@ -20,7 +20,7 @@ from .links import (
     again_key,
     data_key,
     decode_request,
-    encode,
+    encode_link,
     grant_key,
     welcome_key,
 )
@@ -96,7 +96,7 @@ class Outlet:
     def hold(self, message: Message, body: bytes) -> None:
         """Number a message, to be sent with the next `release`."""
         key = str(getattr(message, self.topic.key)) if self.topic.key else ""
-        header = encode(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
+        header = encode_link(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
         held = Sent(self._seq, header, body)
         self._unsent.append(held)
         if self._consumers:
@@ -189,7 +189,7 @@ class Outlet:
         self._post_welcomes()
 
     def _post_welcomes(self) -> None:
-        self._welcomes.post(b"", encode(Welcome(self._epoch, self._consumers.starts())))
+        self._welcomes.post(b"", encode_link(Welcome(self._epoch, self._consumers.starts())))
 
     def _granted(self, grant: Grant) -> None:
         if grant.arrived > self._seq:

@@ -10,12 +10,12 @@ from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.storage.state_store import MemoryStore, State, StateStore
 
-from . import links
 from .actor import Actor, Situation
 from .inlet import Delivery
 from .journal import Journal, Kind
 from .keeper import Keeper
 from .ledger import Taken
+from .links import Header, encode_link
 from .mailbox import Mailbox
 from .orders import Order, OrderTaker
 from .outlet import Outlet
@@ -383,8 +383,8 @@ class Stage:
         while True:
             mailbox.send_grants()
             self._outlets.check_windows()
-            header = links.Header(self.name, self._epoch, 0, self._vitals.last_stamp_ns)
-            self._health.post(links.encode(header), encode(self.health()))
+            header = Header(self.name, self._epoch, 0, self._vitals.last_stamp_ns)
+            self._health.post(encode_link(header), encode(self.health()))
             if self._vitals.busy_s > self._config.stall_after_s:
                 raise StageStalled(self.name, self._vitals.busy_s)
             await asyncio.sleep(self._config.heartbeat_s)

@@ -16,8 +16,7 @@ from ldo_service.detection.labellers.chat_completion import HttpConfig
 from ldo_service.detection.labellers.http_endpoint import EndpointConfig
 from ldo_service.errors import ConfigError, EndpointError, ModelError, ReplayDiverged
 from ldo_service.geometry import codecs
-from ldo_service.recordings.replay import open_recording
-from ldo_service.recordings.write import open_recorder
+from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime import Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
@@ -25,6 +24,7 @@ from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
 from ldo_service.schemas.labels import MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
+from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
 from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
 from tests.detection.labellers.server import hangs, says, sends, serving

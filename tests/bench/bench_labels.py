@@ -39,7 +39,6 @@ from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.render import Rendering
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import FrameLabels, TrueLabels
-from ldo_service.recordings.sequence import open_source
 from ldo_service.regions.foreground import (
     Claims,
     ForegroundConfig,
@@ -49,6 +48,7 @@ from ldo_service.regions.foreground import (
     surfaces,
 )
 from ldo_service.regions.region_proposals import TriggerConfig
+from ldo_service.runs.source import open_source
 from ldo_service.semantics.gaussian_labels import BACKGROUND, LabelConfig, new_labels, top_labels
 from ldo_service.semantics.label_assignment import AssignmentConfig
 from ldo_service.semantics.semantic_fusion import (

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from ldo_service.runtime.links import Header
-from ldo_service.runtime.links import encode as encode_header
+from ldo_service.runtime.links import Header, encode_link
 from ldo_service.runtime.network import Network
 from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas import encode
@@ -30,7 +29,7 @@ def test_poses_become_transforms() -> None:
         heard = session.declare_subscriber("tf", zenoh.handlers.FifoChannel(9))
         with subprocess.Popen([sys.executable, "-c", program, "1"]) as process:
             while process.poll() is None:
-                header = encode_header(Header("tracker", 1, 0, pose.stamp_ns))
+                header = encode_link(Header("tracker", 1, 0, pose.stamp_ns))
                 session.put("ldo/robot/pose/tracked", encode(pose), attachment=header)
                 time.sleep(0.05)
         sample = heard.try_recv()

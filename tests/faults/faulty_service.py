@@ -16,11 +16,12 @@ from random import Random
 from threading import Timer
 from typing import Any
 
-from ldo_service import cli, service
+from ldo_service import cli
 from ldo_service.runtime import Actor
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.transport import OnMessage
 from ldo_service.runtime.zenoh_transport import ZenohTransport
+from ldo_service.service.service import service
 
 FOLDER = Path(os.environ["FAULT_FOLDER"])
 BAD_NETWORK, BAD_DISK = FOLDER / "bad_network", FOLDER / "bad_disk"

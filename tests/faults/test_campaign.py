@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.runtime.links import Grant, Header, encode
+from ldo_service.runtime.links import Grant, Header, encode_link
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
 from ldo_service.wire import correction_message
@@ -43,8 +43,8 @@ KEYFRAMES = [msgspec.structs.replace(KEYFRAME, keyframe=k, reference=None) for k
 def hear(
     witness: Witness, topic: str, message: Message | Grant, seq: int = 0, epoch: int = 1
 ) -> None:
-    body = encode(message) if isinstance(message, Grant) else encode_message(message)
-    witness._heard.append((topic, encode(Header("somebody", epoch, seq, 0)), body))
+    body = encode_link(message) if isinstance(message, Grant) else encode_message(message)
+    witness._heard.append((topic, encode_link(Header("somebody", epoch, seq, 0)), body))
     witness.update()
 
 

@@ -12,7 +12,7 @@ from ldo_service.cameras.ros2 import RosCamera, RosTopics
 from ldo_service.detection.labellers.chat_completion import read_answer
 from ldo_service.geometry import codecs
 from ldo_service.geometry.codecs import encode_jpeg
-from ldo_service.runtime.links import Grant, Header, Join, Welcome, decode_request, encode
+from ldo_service.runtime.links import Grant, Header, Join, Welcome, decode_request, encode_link
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, decode
 from tests.cameras import ros
 from tests.cameras.ros import camera_info, cdr, compressed, image
@@ -112,9 +112,9 @@ LINKS = (
     partial(decode, kind=Welcome),
 )
 LINK_BODIES = [
-    encode(Grant("mapper", 1, 3, 4, 12)),
-    encode(Header("camera", 1, 2, 3)),
-    encode(Welcome(1, {"mapper": 3})),
+    encode_link(Grant("mapper", 1, 3, 4, 12)),
+    encode_link(Header("camera", 1, 2, 3)),
+    encode_link(Welcome(1, {"mapper": 3})),
 ]
 
 TARGETS = [
@@ -124,7 +124,7 @@ TARGETS = [
     Target(
         "links",
         chosen(*LINKS),
-        [*numbered(LINK_BODIES), b"\0" + encode(Join("mapper"))],
+        [*numbered(LINK_BODIES), b"\0" + encode_link(Join("mapper"))],
         (msgspec.DecodeError,),
     ),
     Target("ROS 2", of_ros, numbered(good[topic] for _, topic, good in ROS), ()),

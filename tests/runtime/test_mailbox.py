@@ -2,7 +2,7 @@
 
 from ldo_service.runtime import In, Latest, Lossless
 from ldo_service.runtime.inlet import Delivery
-from ldo_service.runtime.links import Header, encode
+from ldo_service.runtime.links import Header, encode_link
 from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import encode as encode_message
@@ -20,7 +20,7 @@ class Feed:
         header = Header("feed", 1, self._seq, value, key)
         self._seq += 1
         body = encode_message(number(value, region=key))
-        self._transport.deliver(self._topic, encode(header), body)
+        self._transport.deliver(self._topic, encode_link(header), body)
 
 
 async def take_all(mailbox: Mailbox) -> list[tuple[str, int]]:
@@ -91,8 +91,8 @@ async def test_a_message_whose_header_cannot_be_read_is_rejected_and_counted() -
     for noise in (
         b"\xff",
         b"\x96\xa1a\x01\x00\x00\xa0" + b"\x91" * 9999,
-        encode(["feed", 0, 0, 0]),
-        encode(["feed", 1, -1, 0]),
+        encode_link(["feed", 0, 0, 0]),
+        encode_link(["feed", 1, -1, 0]),
     ):
         transport.deliver(NUMBERS.name, noise, b"")
         transport.deliver(DOUBLES.name, noise, b"")
@@ -110,7 +110,7 @@ async def test_a_foreign_program_may_send_to_a_latest_input_without_a_header() -
 async def test_a_flood_into_a_lossless_input_stays_within_its_window() -> None:
     transport = MemoryTransport()
     mailbox = Mailbox("me", (In(NUMBERS, Lossless(3)),), transport)
-    transport.deliver("link/welcome/test/number", b"", encode([1, {"me": 0}]))
+    transport.deliver("link/welcome/test/number", b"", encode_link([1, {"me": 0}]))
     feed = Feed(transport)
     for value in range(100):
         feed.send(value)
@@ -158,7 +158,7 @@ async def test_what_never_came_is_counted_by_the_numbers_of_what_did() -> None:
 
     def arrives(epoch: int, *numbers: int) -> int:
         for seq in numbers:
-            header = encode(Header("source", epoch, seq, 0))
+            header = encode_link(Header("source", epoch, seq, 0))
             transport.deliver(NUMBERS.name, header, encode_message(number(seq)))
         return mailbox.statistics()[0].lost
 

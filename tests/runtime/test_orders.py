@@ -10,7 +10,7 @@ import pytest
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime import orders as orders_module
 from ldo_service.runtime.ledger import Past
-from ldo_service.runtime.links import OUTSIDE, encode
+from ldo_service.runtime.links import OUTSIDE, encode_link
 from ldo_service.runtime.orders import ORDER_KEY, Commander, Order
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
@@ -63,7 +63,7 @@ class Counter(Actor):
 
 def feed(transport: MemoryTransport, *values: int) -> None:
     for value in values:
-        transport.deliver(LATEST_NUMBER.name, encode(OUTSIDE), encode_message(number(value)))
+        transport.deliver(LATEST_NUMBER.name, encode_link(OUTSIDE), encode_message(number(value)))
 
 
 async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
@@ -73,7 +73,7 @@ async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
 
     def arrive(*values: int) -> None:
         for value in values:
-            transport.deliver(NUMBERS.name, encode(OUTSIDE), encode_message(number(value)))
+            transport.deliver(NUMBERS.name, encode_link(OUTSIDE), encode_message(number(value)))
 
     async with running(stage):
         arrive(1)
@@ -110,7 +110,7 @@ async def test_a_hold_waits_for_the_step_under_way() -> None:
     stage = collector(transport, seen, lambda _value: go.wait(10) and None, policy=Latest(1))
     commander = Commander(transport)
     async with running(stage):
-        transport.deliver(NUMBERS.name, encode(OUTSIDE), encode_message(number(1)))
+        transport.deliver(NUMBERS.name, encode_link(OUTSIDE), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
         holding = asyncio.create_task(commander.order("hold", "collector", 5))
         await asyncio.sleep(0.05)
@@ -240,6 +240,6 @@ async def test_who_does_not_answer_is_said() -> None:
 async def test_bytes_that_are_no_order_are_left_alone() -> None:
     transport, seen = MemoryTransport(), []
     async with running(collector(transport, seen, policy=Lossless(4))):
-        for body in (b"", b"\xc1", encode(("x", 1)), encode(Order(1, "hold", "another"))):
+        for body in (b"", b"\xc1", encode_link(("x", 1)), encode_link(Order(1, "hold", "another"))):
             transport.deliver(ORDER_KEY, b"", body)
         await asyncio.sleep(0.01)

@@ -15,7 +15,7 @@ import zenoh
 
 from ldo_service.errors import ConfigError
 from ldo_service.runtime import Latest
-from ldo_service.runtime.links import data_key, encode
+from ldo_service.runtime.links import data_key, encode_link
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.ports import Out
 from ldo_service.runtime.stage import Stage
@@ -262,7 +262,7 @@ def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Network, clien
     other = client()
     while not arrived.wait(0.02):
         for key in ("test/number", "link/welcome/test/number", "link/alive/x"):
-            other.put(network.expression(key), encode([1, {"collector": 5}]), attachment=b"x")
+            other.put(network.expression(key), encode_link([1, {"collector": 5}]), attachment=b"x")
     assert seen == []
 
 

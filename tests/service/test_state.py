@@ -9,7 +9,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.service import claim_state
+from ldo_service.service.state_folder import claim_state
 from ldo_service.storage.state_store import CONTENTS, FolderStore
 
 ACTORS = {"tracker": Tracker, "mapper": Mapper, "optimizer": Optimizer}

@@ -11,10 +11,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from ldo_service import cli, service
+from ldo_service import cli
 from ldo_service.actors import graph
 from ldo_service.actors.tracker import Tracker
 from ldo_service.schemas import Correction, FrameRgbd
+from ldo_service.service.service import service
 
 TROUBLE, FRAME = os.environ["TROUBLE"], 20
 HUNG = Path(os.environ["TROUBLE_FOLDER"]) / "has_hung"

@@ -9,13 +9,12 @@ import pytest
 
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError, FrameError
-from ldo_service.recordings.sequence import RecordingSequence, open_source
+from ldo_service.runs.source import RecordingSequence, open_source
 from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
 from ldo_service.schemas import CameraColor, CameraDepth
 from ldo_service.wire import camera_rgbd_message
 from tests.commands.test_cli import ldo
-
-from .conftest import FRAMES, ROUGH
+from tests.runs.conftest import FRAMES, ROUGH
 
 
 def test_the_frames_are_those_of_the_camera(recording: Path, room: Sequence) -> None:

@@ -8,12 +8,11 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ReplayDiverged
-from ldo_service.recordings.replay import open_recording
+from ldo_service.runs.replayed import open_recording
 from ldo_service.testing import replay_recording
 from tests.detection.networks import changed
+from tests.runs.conftest import live
 from tests.runs.jobs import ROUGH
-
-from .conftest import live
 
 FRAMES = 8
 

@@ -16,13 +16,12 @@ from ldo_service import kernels
 from ldo_service.actors.graph import GRAPH
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
-from ldo_service.recordings.replay import open_recording
+from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime.journal import Step, checksum
 from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
 from tests.commands.test_cli import assert_one_paragraph, ldo
-
-from .conftest import FRAMES, live
+from tests.runs.conftest import FRAMES, live
 
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "replay_test.py"
 

@@ -6,34 +6,33 @@ the same folder for its state.
 """
 
 import asyncio
-import fcntl
+import json
 import logging
 import os
 import signal
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
+from ldo_service import kernels
 from ldo_service.actors.graph import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.control import Control
 from ldo_service.errors import ConfigError, StageError
 from ldo_service.metrics import HealthCollector, exported
-from ldo_service.recordings.write import open_recorder
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.graph import lossless_consumers
 from ldo_service.runtime.journal import Journal
-from ldo_service.runtime.ledger import Past
 from ldo_service.runtime.process import (
     ChildProcess,
     leave_with_parent,
     python_command,
 )
-from ldo_service.runtime.recording import prepare_recording
+from ldo_service.runtime.recorder import Recorder
+from ldo_service.runtime.recording import new_path, prepare_recording
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import Runner, Stop, supervise
 from ldo_service.runtime.watchdog import Watchdog
@@ -41,11 +40,29 @@ from ldo_service.runtime.worker import Worker
 from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
+from ldo_service.versions import versions
+
+from .state_folder import claim_state
 
 log = logging.getLogger(__name__)
 
 LEAVE_WITHIN_S = 1.0  # for a step under way when everything else has ended
-ENTANGLED = ("tracker", "mapper", "optimizer")  # have state before the first keyframe is made
+
+
+def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recorder:
+    """A new file for the actor's life in this process. Raises ConfigError."""
+    about = {
+        "actor": actor,
+        "robot": robot,
+        "config": config_yaml(config),
+        "isa": kernels.isa(),
+        "versions": json.dumps(versions()),
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return Recorder(new_path(folder, actor), about, config.record)
+    except OSError as error:
+        raise ConfigError(f"{folder} cannot be recorded to: {error.strerror}.") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,71 +224,6 @@ class Service:
     def _require_known(self, names: Sequence[str]) -> None:
         for name in names:
             box_named(name)
-
-
-def state_folder(folder: Path | None, stack: ExitStack) -> Path:
-    """The given folder, or a temporary one that goes with the process. Raises ConfigError where it
-    cannot be written, and where a run or a recording lies in it."""
-    if folder is None:
-        return Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldo-")))
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if not os.access(folder, os.W_OK):
-            raise ConfigError(f"{folder} cannot be written: choose another with --state.")
-        found = {path.name for path in folder.iterdir()}
-    except OSError as error:
-        raise ConfigError(f"{folder} cannot be used for state: {error.strerror}.") from error
-    if "state" not in found and "frames.csv" in found:
-        raise ConfigError(
-            f"{folder} is what `ldo run` wrote, and holds no state of a service: choose another "
-            f"folder with --state. To track in its map: --localise {folder}."
-        )
-    if "state" not in found and any(name.endswith(".mcap") for name in found):
-        raise ConfigError(
-            f"{folder} is a recording, and holds no state of a service: choose another folder with "
-            "--state."
-        )
-    return folder
-
-
-def claim_state(folder: Path, stack: ExitStack) -> None:
-    """Keep the folder to this service, and see that the states in it belong together.
-
-    Keyframe ids and versions run through all of them: going on from a part would join keyframes of
-    two different journeys. Raises ConfigError, and DataError where the disk does not let them be
-    read.
-    """
-    lock = stack.enter_context((folder / "lock").open("w"))
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise ConfigError(
-            f"another service keeps its state in {folder}: choose another with --state."
-        ) from error
-    store = FolderStore(folder / "state")
-    pasts = {name: Past.of(store.load(name)) for name in ENTANGLED}
-    missing = [name for name, past in pasts.items() if past.is_none]
-    if missing and any(past.has_passed for past in pasts.values()):
-        raise ConfigError(
-            f"{folder} has no readable state of {', '.join(missing)} beside that of the others. "
-            "Choose another folder with --state, or delete this one to start anew."
-        )
-    for topic, producer, consumer in _ahead(pasts):
-        raise ConfigError(
-            f"in {folder} the state of {consumer} is newer than that of {producer}: it has had "
-            f"messages of {topic} that were not made yet. Bring all of the folder back from one "
-            "copy, choose another with --state, or delete this one to start anew."
-        )
-
-
-def _ahead(pasts: Mapping[str, Past]) -> Iterator[tuple[str, str, str]]:
-    """Topics of which a consumer had more than its producer made, and both their names."""
-    for producer, past in pasts.items():
-        for topic, made in past.outputs.items():
-            for consumer, other in pasts.items():
-                had = other.inputs.get(topic)
-                if had and had.epoch == made.epoch and had.handled > made.seq:
-                    yield topic, producer, consumer
 
 
 def _is_fed_from_outside(box: Box) -> bool:

@@ -8,9 +8,8 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.testing import replay_recording
+from tests.runs.conftest import live
 from tests.runs.jobs import AWAY, BACK, HERE, ROUGH, SOON, Rearranged
-
-from .conftest import live
 
 
 @pytest.mark.slow

@@ -5,15 +5,14 @@ from pathlib import Path
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
-from ldo_service.recordings.replay import open_recording
+from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime.journal import Step
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import LabelOpen, decode
 from ldo_service.testing import replay_recording
 from tests.detection.labellers.server import says, serving
+from tests.runs.conftest import live
 from tests.runs.jobs import ROUGH
-
-from .conftest import live
 
 FRAMES = 12
 REGIONS = "mapper.semantics.naming.regions"
