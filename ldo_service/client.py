@@ -24,10 +24,6 @@ import numpy as np
 import zenoh
 
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.keys import Keys
-from ldo_service.runtime.links import ALIVE, Header, encode_link
-from ldo_service.runtime.numbers import Numbers
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
 from ldo_service.schemas import (
     CameraColor,
     CameraDepth,
@@ -61,6 +57,9 @@ from ldo_service.schemas.topics import (
     TOPICS,
     Topic,
 )
+from ldo_service.transport.flow_control import ALIVE, Header, Numbers, encode_link
+from ldo_service.transport.keys import Keys
+from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
 
 M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)

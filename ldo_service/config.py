@@ -34,11 +34,10 @@ from ldo_service.actors.tracker import TrackerConfig
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.datasets import SequenceOptions
 from ldo_service.errors import ConfigError
-from ldo_service.metrics import LOOPBACK
-from ldo_service.runtime.network import MAX_MESSAGE_MB
-from ldo_service.runtime.recording_file import RecordConfig
+from ldo_service.recordings.mcap_file import RecordConfig
 from ldo_service.runtime.stage import StageConfig
 from ldo_service.storage.yaml_io import plain_text, plain_values
+from ldo_service.transport.endpoint import LOOPBACK, MAX_MESSAGE_MB
 from ldo_service.viewer.config import ViewerConfig
 
 

@@ -23,8 +23,8 @@ from prometheus_client.registry import Collector
 
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
+from ldo_service.transport.endpoint import LOOPBACK
 
-LOOPBACK = "127.0.0.1"  # anyone who may read them may also see where the robot is at work
 MOST_ACTORS = 64  # that are kept; a name is what a message says
 COMES_BACK_S = 5.0  # an actor, once it was killed for its silence
 

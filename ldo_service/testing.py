@@ -15,9 +15,9 @@ from typing import Any
 
 import pytest
 
+from ldo_service.recordings.recording import recorded_actors
+from ldo_service.recordings.replay import Replayed
 from ldo_service.runs.replayed import RecordedActor, open_recording
-from ldo_service.runtime.recording import recorded_actors
-from ldo_service.runtime.replay import Replayed
 
 __all__ = ["RecordedActor", "Replayed", "recorded", "replay_recording"]
 

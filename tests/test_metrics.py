@@ -15,8 +15,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from ldo_service.errors import ConfigError
 from ldo_service.metrics import COMES_BACK_S, HealthCollector, exported
 from ldo_service.schemas import encode
-from tests.runtime.conftest import free_port
 from tests.schemas.examples import EXAMPLES
+from tests.transport.conftest import free_port
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import tyro
 
 from ldo_service.client import Client, connect
 from ldo_service.errors import ConfigError, StageError
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas.map import MOST_ITERATIONS
+from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
 from .options import Endpoint, KeysFolder, Robot
 

@@ -9,10 +9,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.runtime.access import EVERY_ROBOT, Access, Role, read_access
-from ldo_service.runtime.keys import ACCESS, router_settings
-from ldo_service.runtime.network import CLOSED, MAX_MESSAGE_MB
 from ldo_service.storage.yaml_io import plain_text
+from ldo_service.transport.access_control import EVERY_ROBOT, Access, Role, read_access
+from ldo_service.transport.endpoint import CLOSED, MAX_MESSAGE_MB
+from ldo_service.transport.keys import ACCESS, router_settings
 
 Folder = Annotated[
     Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of the authority")
@@ -113,7 +113,7 @@ def keys(verb: Verb) -> None:
         access = read_access(verb.folder / ACCESS)
         print(router_yaml(access, verb.keys, verb.port), end="")
         return
-    from ldo_service.authority import Authority  # the extra `keys`
+    from ldo_service.transport.certificate_authority import Authority
 
     match verb:
         case New():

@@ -14,9 +14,9 @@ from ldo_service.cameras.ros2 import RosCamera, RosTopics
 from ldo_service.client import Client
 from ldo_service.errors import ConfigError
 from ldo_service.runs.source import Selection
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas import CameraRgbd
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.zenoh_transport import open_session
 
 REALSENSE, ROS2 = "realsense", "ros2"
 Say = Callable[[str], None]

@@ -20,10 +20,10 @@ from ldo_service.detection.model_registry import open_labeller
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.objects_file import read_objects
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.semantics.text_search import Encode, NotCompared
+from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.wire import transform
 
 from .options import Endpoint, Json, KeysFolder, Robot

@@ -9,8 +9,8 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from ldo_service.recordings.replay import Replayed
 from ldo_service.runs.replayed import RecordedActor, open_recording
-from ldo_service.runtime.replay import Replayed
 
 from .options import Recording
 from .progress import progress

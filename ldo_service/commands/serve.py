@@ -7,10 +7,10 @@ from typing import Annotated
 import tyro
 
 from ldo_service.config import load_config
-from ldo_service.runtime.keys import Keys
-from ldo_service.runtime.network import DEFAULT_ENDPOINT, Network
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
+from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Network
+from ldo_service.transport.keys import Keys
 
 from .options import (
     ConfigFile,

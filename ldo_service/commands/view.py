@@ -13,7 +13,7 @@ from rich.console import Console
 from ldo_service.client import connect
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.zenoh_transport import DEFAULT_ENDPOINT
+from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live import live
 from ldo_service.viewer.run_folder import RunFolder

@@ -1,1 +1,1 @@
-"""Recordings of the service: written by its stages, replayed actor by actor, run over as data."""
+"""Recordings of a service: the inputs and outputs of each actor on disk, and their replay."""

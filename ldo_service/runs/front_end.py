@@ -24,8 +24,7 @@ from ldo_service.actors.tracker import Tracker
 from ldo_service.config import Config
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.runtime.mcap_index import McapIndex, Place
-from ldo_service.runtime.recording_file import ABOUT, RecordingFile
+from ldo_service.recordings.mcap_file import ABOUT, McapIndex, Place, RecordingFile
 from ldo_service.schemas import Message, decode
 from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW, POSE_TRACKED
 from ldo_service.versions import versions

@@ -9,13 +9,13 @@ from tempfile import TemporaryDirectory
 from ldo_service.actors.graph import GRAPH, Box
 from ldo_service.config import config_yaml
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.graph import lossless_consumers
-from ldo_service.runtime.links import Header, data_key, encode_link
+from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.supervision import Stop, supervise
-from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Health, decode, encode
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR, Topic
+from ldo_service.transport.flow_control import Header, data_key, encode_link
+from ldo_service.transport.interface import MemoryTransport
 
 from .folder import RunFolder
 from .job import Advance, Job

@@ -13,9 +13,9 @@ from ldo_service import kernels
 from ldo_service.actors.graph import box_named
 from ldo_service.config import Config, config_of
 from ldo_service.errors import ConfigError, DataError
+from ldo_service.recordings.recording import JournalFile, recorded_actors
+from ldo_service.recordings.replay import Replayed, replay
 from ldo_service.runtime import Actor
-from ldo_service.runtime.recording import JournalFile, recorded_actors
-from ldo_service.runtime.replay import Replayed, replay
 from ldo_service.storage.yaml_io import plain_values
 from ldo_service.versions import versions
 

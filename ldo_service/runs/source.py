@@ -16,8 +16,8 @@ from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.geometry.stamps import Pairing
-from ldo_service.runtime.mcap_index import Place
-from ldo_service.runtime.recording import JournalFile, recorded_actors
+from ldo_service.recordings.mcap_file import Place
+from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, Message, OdometryPrior, decode
 from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD

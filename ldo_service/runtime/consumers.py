@@ -3,8 +3,9 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from ldo_service.transport.flow_control import Grant
+
 from .actor import UNLIMITED
-from .links import Grant
 
 
 @dataclass

@@ -4,10 +4,9 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from ldo_service.schemas import InputCount
+from ldo_service.transport.flow_control import OUTSIDE, Grant, Header, InletPast, Join, Numbers
 
-from .links import OUTSIDE, Grant, Header, InletPast, Join
-from .numbers import Numbers
-from .ports import In, Latest, Lossless
+from .actor import In, Latest, Lossless
 
 
 @dataclass(frozen=True, slots=True, eq=False)

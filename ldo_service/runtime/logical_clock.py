@@ -18,7 +18,7 @@ from ldo_service.errors import StageError
 from ldo_service.schemas import Message
 
 from .actor import Actor
-from .graph import check_graph
+from .actor_graph import check_graph
 
 Observer = Callable[[str, Message, float], None]  # actor, what it made, milliseconds of the step
 

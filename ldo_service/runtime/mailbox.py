@@ -11,9 +11,7 @@ import msgspec
 
 from ldo_service.schemas import InputCount, decode
 from ldo_service.schemas.topics import Topic
-
-from .inlet import Delivery, Inlet, LosslessInlet
-from .links import (
+from ldo_service.transport.flow_control import (
     OUTSIDE,
     Header,
     InletPast,
@@ -24,9 +22,11 @@ from .links import (
     grant_key,
     welcome_key,
 )
-from .orders import Order
-from .ports import In, Lossless
-from .transport import Publisher, Transport, call_soon
+from ldo_service.transport.interface import Publisher, Transport, call_soon
+
+from .actor import In, Lossless
+from .inlet import Delivery, Inlet, LosslessInlet
+from .stage_commands import Order
 
 log = logging.getLogger(__name__)
 

@@ -9,8 +9,9 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from .restart import RestartBudget
-from .transport import Transport
+from ldo_service.transport.interface import Transport
+
+from .supervision_policy import RestartBudget
 
 log = logging.getLogger(__name__)
 

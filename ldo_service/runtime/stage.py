@@ -9,25 +9,21 @@ from ldo_service.errors import StageStalled
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.storage.state_store import MemoryStore, State, StateStore
+from ldo_service.transport.flow_control import Header, encode_link
+from ldo_service.transport.interface import Transport
+from ldo_service.transport.worker import Worker
 
-from .actor import Actor, Situation
+from .actor import Actor, Lossless, Situation
+from .checkpointer import Keeper
+from .delivery_state import Taken
 from .inlet import Delivery
 from .journal import Journal, Kind
-from .keeper import Keeper
-from .ledger import Taken
-from .links import Header, encode_link
 from .mailbox import Mailbox
-from .orders import Order, OrderTaker
-from .outlet import Outlet
-from .outlets import Outlets
-from .ports import Lossless
-from .reader import Reader
-from .restart import RestartBudget
-from .stage_config import StageConfig
-from .step import Produced, produce
-from .transport import Transport
-from .vitals import Vitals
-from .worker import Worker
+from .outlet import Outlet, Outlets
+from .stage_commands import Order, OrderTaker
+from .stage_metrics import Vitals
+from .step import Produced, Reader, produce
+from .supervision_policy import RestartBudget, StageConfig
 
 log = logging.getLogger(__name__)
 

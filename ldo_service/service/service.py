@@ -20,26 +20,25 @@ import zenoh
 from ldo_service import kernels
 from ldo_service.actors.graph import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
-from ldo_service.control import Control
 from ldo_service.errors import ConfigError, StageError
 from ldo_service.metrics import HealthCollector, exported
+from ldo_service.recordings.recorder import Recorder
+from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
-from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     ChildProcess,
     leave_with_parent,
     python_command,
 )
-from ldo_service.runtime.recorder import Recorder
-from ldo_service.runtime.recording import new_path, prepare_recording
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.supervision import Runner, Stop, supervise
-from ldo_service.runtime.watchdog import Watchdog
-from ldo_service.runtime.worker import Worker
-from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
+from ldo_service.runtime.stage_commands import Control
+from ldo_service.runtime.supervision import Runner, Stop, Watchdog, supervise
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
+from ldo_service.transport.worker import Worker
+from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.versions import versions
 
 from .state_folder import claim_state

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.ledger import Past
+from ldo_service.runtime.delivery_state import Past
 from ldo_service.storage.state_store import FolderStore
 
 ENTANGLED = ("tracker", "mapper", "optimizer")  # have state before the first keyframe is made

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ldo_service.errors import ConfigError
-from ldo_service.metrics import LOOPBACK
+from ldo_service.transport.endpoint import LOOPBACK
 
 
 @dataclass(frozen=True, slots=True)

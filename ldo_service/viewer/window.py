@@ -14,8 +14,8 @@ import viser
 
 from ldo_service.answers import Answer, answer
 from ldo_service.errors import ConfigError, LdoError
-from ldo_service.metrics import LOOPBACK
 from ldo_service.schemas import MapObject
+from ldo_service.transport.endpoint import LOOPBACK
 
 from .config import ViewerConfig
 from .flight import View, flight, overview, up_of, view_of

@@ -5,7 +5,7 @@ import pytest
 from ldo_service.actors.graph import GRAPH, box_named, consumers_of, producer_of
 from ldo_service.errors import ConfigError
 from ldo_service.runtime import check_graph
-from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.schemas import topics as t
 
 

@@ -16,7 +16,7 @@ from ldo_service.gaussians.sleep_choice import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.map_follower import MapFollower
 from ldo_service.runtime.actor import Situation
-from ldo_service.runtime.ledger import Past, Taken, successor
+from ldo_service.runtime.delivery_state import Past, Taken, successor
 from ldo_service.schemas import (
     Detection,
     DetectionBoxes,

@@ -20,12 +20,12 @@ from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime import Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
 from ldo_service.schemas.labels import MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
 from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
+from ldo_service.transport.interface import MemoryTransport
 from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
 from tests.detection.labellers.server import hangs, says, sends, serving
 from tests.runtime.cast import QUICK, eventually, running, send

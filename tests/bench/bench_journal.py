@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ldo_service.recordings.mcap_file import RecordConfig
+from ldo_service.recordings.recorder import Recorder
 from ldo_service.runtime import In, Latest
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.inlet import Delivery
-from ldo_service.runtime.links import Header
-from ldo_service.runtime.recorder import Recorder
-from ldo_service.runtime.recording_file import RecordConfig
 from ldo_service.runtime.step import Produced
 from ldo_service.schemas import Array, CameraModel, FrameRgbd, encode
 from ldo_service.schemas.topics import FRAME_RGBD
+from ldo_service.transport.flow_control import Header
 
 FRAMES = 150
 HEIGHT, WIDTH = 480, 640

@@ -26,7 +26,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.evaluation.pictures import save_picture
 from ldo_service.runs.source import open_source
 from ldo_service.runtime.logical_clock import LogicalClock
-from ldo_service.runtime.vitals import resident_mb
+from ldo_service.runtime.stage_metrics import resident_mb
 from ldo_service.schemas import (
     CameraRgbd,
     Correction,

@@ -33,9 +33,9 @@ import zenoh
 
 from ldo_service.client import Client, connect
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas import CameraRgbd, Health, TrackedPose, decode
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.zenoh_transport import open_session
 from tests.faults.camera import frames
 from tests.service.conftest import free_endpoint
 

@@ -19,9 +19,9 @@ from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.process import resident_mb
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.schemas import Message, encode
 from ldo_service.schemas.topics import Topic
+from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
 
 MESSAGES, MESSAGE_BYTES, STEP_S, WINDOW = 300, 1_000_000, 0.010, 4
 

@@ -12,8 +12,8 @@ from contextlib import ExitStack
 
 import zenoh
 
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.zenoh_transport import open_session
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.zenoh_transport import open_session
 
 TOPICS: tuple[str, ...] = (
     "ldo/*/pose/tracked",

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from ldo_service.runtime.links import Header, encode_link
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas import encode
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.flow_control import Header, encode_link
+from ldo_service.transport.zenoh_transport import open_session
 from tests.schemas.examples import EXAMPLES
 from tests.service.conftest import free_endpoint
 

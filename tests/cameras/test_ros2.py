@@ -14,9 +14,9 @@ import zenoh
 from ldo_service.cameras.ros2 import KEEP, Inbox, RosCamera, RosTopics, key_of
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas import CameraRgbd, TrackedPose, decode
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.zenoh_transport import open_session
 from tests.service.conftest import LDO, free_endpoint, live_service
 
 from .ros import COLOR, DEPTH_MM, camera_info, cdr, header, image

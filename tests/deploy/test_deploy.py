@@ -16,17 +16,17 @@ import yaml
 import zenoh
 
 from ldo_service import cli
-from ldo_service.authority import Authority
 from ldo_service.client import connect
 from ldo_service.commands.keys import router_yaml
 from ldo_service.metrics import HealthCollector
 from ldo_service.metrics import exported as exporting
-from ldo_service.runtime.access import read_access, rules_of
 from ldo_service.schemas import encode
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CONTROL, ODOMETRY_PRIOR, TOPICS
-from tests.runtime.conftest import free_port
+from ldo_service.transport.access_control import read_access, rules_of
+from ldo_service.transport.certificate_authority import Authority
 from tests.schemas.examples import EXAMPLES
+from tests.transport.conftest import free_port
 
 DEPLOY = Path(__file__).parent.parent.parent / "deploy"
 UNIT = DEPLOY / "ldo@.service"

@@ -19,9 +19,9 @@ from typing import Any
 from ldo_service import cli
 from ldo_service.runtime import Actor
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.transport import OnMessage
-from ldo_service.runtime.zenoh_transport import ZenohTransport
 from ldo_service.service.service import service
+from ldo_service.transport.interface import OnMessage
+from ldo_service.transport.zenoh_transport import ZenohTransport
 
 FOLDER = Path(os.environ["FAULT_FOLDER"])
 BAD_NETWORK, BAD_DISK = FOLDER / "bad_network", FOLDER / "bad_disk"

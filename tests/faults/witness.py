@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 import zenoh
 
 from ldo_service.map_follower import MapFollower
-from ldo_service.runtime.links import Grant, Header, decode_request
-from ldo_service.runtime.network import Network
 from ldo_service.schemas import (
     Correction,
     Health,
@@ -21,6 +19,8 @@ from ldo_service.schemas import (
     TrackedPose,
     decode,
 )
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.flow_control import Grant, Header, decode_request
 
 TAKERS = ("detector", "mapper", "loop_closer", "optimizer")  # of keyframes
 KINDS: dict[str, type[Message]] = {

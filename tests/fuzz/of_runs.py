@@ -17,13 +17,13 @@ from ldo_service.gaussians import chunk, keyframe_images
 from ldo_service.gaussians.model import new_labels
 from ldo_service.gaussians.ply import read_ply, write_ply
 from ldo_service.geometry import Camera, codecs
+from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
 from ldo_service.runs.finished import MapFolder, read_run, vlm_calls
 from ldo_service.runs.loops_file import read_loops
 from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
 from ldo_service.runs.replayed import open_recording
 from ldo_service.runs.source import RecordingSequence
 from ldo_service.runtime.journal import Started, Step, checksum
-from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
 from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state

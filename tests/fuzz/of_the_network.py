@@ -12,8 +12,15 @@ from ldo_service.cameras.ros2 import RosCamera, RosTopics
 from ldo_service.detection.labellers.chat_completion import read_answer
 from ldo_service.geometry import codecs
 from ldo_service.geometry.codecs import encode_jpeg
-from ldo_service.runtime.links import Grant, Header, Join, Welcome, decode_request, encode_link
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, decode
+from ldo_service.transport.flow_control import (
+    Grant,
+    Header,
+    Join,
+    Welcome,
+    decode_request,
+    encode_link,
+)
 from tests.cameras import ros
 from tests.cameras.ros import camera_info, cdr, compressed, image
 from tests.schemas.examples import EXAMPLES

@@ -12,16 +12,16 @@ import numpy as np
 import yaml
 from safetensors.numpy import save
 
-from ldo_service.authority import Authority
 from ldo_service.config import config_of, config_yaml, load_config
 from ldo_service.detection.detectors import OnnxDetector
 from ldo_service.detection.labellers.text_embeddings import BytePairs, CachedEmbeddings
 from ldo_service.detection.model_registry import Models
 from ldo_service.detection.vocabulary import class_names, read_names
-from ldo_service.runtime.access import access_control, read_access
-from ldo_service.runtime.keys import CA, CERTIFICATE, KEY, Keys
-from ldo_service.runtime.network import Network
 from ldo_service.suites import load_suite
+from ldo_service.transport.access_control import access_control, read_access
+from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.keys import CA, CERTIFICATE, KEY, Keys
 from tests.detection.networks import SQUARES
 
 from .of_runs import bytes_of

@@ -11,13 +11,13 @@ from ldo_service.config import Config, load_config
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import Trajectory
 from ldo_service.runtime import Out
-from ldo_service.runtime.graph import lossless_consumers
+from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import OdometryPrior
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR
 from ldo_service.service.service import open_recorder
+from ldo_service.transport.interface import MemoryTransport
 from ldo_service.wire import camera_rgbd_message, pose_message
 from tests.runtime.cast import eventually, running, send
 

@@ -151,7 +151,7 @@ def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -
     tight = "record.max_gb=0.0000001"
     asked = job(Rearranged(room, AND_BACK), tmp_path / "out", tight)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("ldo_service.runtime.recording_file.CHECK_EVERY_BYTES", 1000)
+        patch.setattr("ldo_service.recordings.mcap_file.CHECK_EVERY_BYTES", 1000)
         record = run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
     assert record.summary["frames"] == len(AND_BACK)  # the run goes on
     assert not (tmp_path / "out" / FRONT_END).exists()

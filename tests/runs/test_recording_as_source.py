@@ -9,8 +9,8 @@ import pytest
 
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError, FrameError
+from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
 from ldo_service.runs.source import RecordingSequence, open_source
-from ldo_service.runtime.recording_file import RecordConfig, RecordingFile
 from ldo_service.schemas import CameraColor, CameraDepth
 from ldo_service.wire import camera_rgbd_message
 from tests.commands.test_cli import ldo

@@ -7,12 +7,12 @@ from contextlib import asynccontextmanager
 from typing import Any, Protocol
 
 from ldo_service.runtime import Actor, In, Lossless, Out
+from ldo_service.runtime.actor import Policy
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.ports import Policy
 from ldo_service.runtime.stage import Stage, StageConfig
-from ldo_service.runtime.transport import Transport
 from ldo_service.schemas import Message, encode
 from ldo_service.schemas.topics import Topic
+from ldo_service.transport.interface import Transport
 
 PATIENCE_S = 60.0  # before a test gives up; no test passes or fails by how long something takes
 

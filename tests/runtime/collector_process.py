@@ -12,9 +12,9 @@ from ldo_service.runtime import Actor, In, Lossless
 from ldo_service.runtime.process import leave_with_parent
 from ldo_service.runtime.stage import Stage, StageConfig
 from ldo_service.runtime.supervision import Stop, supervise
-from ldo_service.runtime.zenoh_transport import Network, ZenohTransport, open_session
 from ldo_service.schemas import Message
 from ldo_service.schemas.topics import Topic
+from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
 
 
 class Number(Message, frozen=True, kw_only=True):

@@ -1,6 +1,6 @@
 from ldo_service.runtime.actor import UNLIMITED
 from ldo_service.runtime.consumers import Consumers
-from ldo_service.runtime.links import Grant
+from ldo_service.transport.flow_control import Grant
 
 
 def test_room_is_that_of_the_consumer_with_the_least() -> None:

@@ -2,10 +2,10 @@
 
 from ldo_service.runtime import In, Latest, Lossless
 from ldo_service.runtime.inlet import Delivery
-from ldo_service.runtime.links import Header, encode_link
 from ldo_service.runtime.mailbox import Mailbox
-from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import encode as encode_message
+from ldo_service.transport.flow_control import Header, encode_link
+from ldo_service.transport.interface import MemoryTransport
 
 from .cast import DOUBLES, NUMBERS, collector, eventually, number, running
 

@@ -15,8 +15,8 @@ import pytest
 import zenoh
 
 from ldo_service.errors import RestartsExhausted
+from ldo_service.runtime.actor import Out
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.ports import Out
 from ldo_service.runtime.process import (
     PARENT_VARIABLE,
     ChildProcess,
@@ -25,8 +25,8 @@ from ldo_service.runtime.process import (
     resident_mb,
 )
 from ldo_service.runtime.supervision import Stop, supervise
-from ldo_service.runtime.transport import MemoryTransport
-from ldo_service.runtime.zenoh_transport import Network, ZenohTransport
+from ldo_service.transport.interface import MemoryTransport
+from ldo_service.transport.zenoh_transport import Network, ZenohTransport
 
 from .cast import NUMBERS, eventually, number, running, send
 

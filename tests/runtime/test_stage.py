@@ -12,9 +12,9 @@ from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, StageConfig, new_epoch
-from ldo_service.runtime.transport import MemoryTransport
 from ldo_service.schemas import Health, Message, decode
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
+from ldo_service.transport.interface import MemoryTransport
 
 from .cast import (
     DOUBLES,

@@ -8,12 +8,12 @@ from threading import Event
 import pytest
 
 from ldo_service.errors import RestartsExhausted
-from ldo_service.runtime.links import data_key
+from ldo_service.runtime.actor import Out
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.ports import Out
 from ldo_service.runtime.stage import Stage, StageConfig
 from ldo_service.runtime.supervision import Stop, supervise
-from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.transport.flow_control import data_key
+from ldo_service.transport.interface import MemoryTransport
 
 from .cast import (
     DOUBLES,
@@ -130,7 +130,7 @@ from ldo_service.errors import StageStalled
 from ldo_service.runtime import Actor, In, Latest
 from ldo_service.runtime.stage import Stage, StageConfig
 from ldo_service.runtime.supervision import Stop, supervise
-from ldo_service.runtime.transport import MemoryTransport
+from ldo_service.transport.interface import MemoryTransport
 from ldo_service.schemas import Health, encode
 from ldo_service.schemas.topics import Topic
 

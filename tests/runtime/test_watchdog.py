@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.runtime.watchdog import Watchdog
+from ldo_service.runtime.supervision import Watchdog
 
 from .cast import eventually
 

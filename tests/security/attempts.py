@@ -10,16 +10,16 @@ from unittest.mock import patch
 
 import zenoh
 
-from ldo_service.authority import Authority
 from ldo_service.errors import ConfigError
-from ldo_service.runtime import zenoh_transport
-from ldo_service.runtime.keys import Keys
-from ldo_service.runtime.links import ALIVE
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.ports import Latest
-from ldo_service.runtime.zenoh_transport import ZenohTransport, open_session
+from ldo_service.runtime.actor import Latest
 from ldo_service.schemas import encode
 from ldo_service.schemas.topics import CAMERA_RGBD, CONTROL, TOPICS
+from ldo_service.transport import zenoh_transport
+from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.flow_control import ALIVE
+from ldo_service.transport.keys import Keys
+from ldo_service.transport.zenoh_transport import ZenohTransport, open_session
 from tests.runtime import cast
 
 from .attempt import Attempt, kept_in

@@ -12,13 +12,13 @@ from typing import Any
 
 import zenoh
 
-from ldo_service.authority import Authority
-from ldo_service.runtime.access import Role
-from ldo_service.runtime.keys import Keys
-from ldo_service.runtime.network import Network
-from ldo_service.runtime.zenoh_transport import open_session
 from ldo_service.schemas.topics import CONTROL, TOPICS
-from tests.runtime.conftest import free_port
+from ldo_service.transport.access_control import Role
+from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.keys import Keys
+from ldo_service.transport.zenoh_transport import open_session
+from tests.transport.conftest import free_port
 
 ROBOT, OTHER_ROBOT = "mule", "goat"
 LARGEST_MB = 1

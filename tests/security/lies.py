@@ -16,7 +16,6 @@ from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
 from ldo_service.actors.graph import box_named
-from ldo_service.authority import Authority
 from ldo_service.datasets import open_sequence
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers import text_embeddings
@@ -25,9 +24,10 @@ from ldo_service.detection.model_registry import Models
 from ldo_service.errors import LdoError
 from ldo_service.gaussians.ply import read_ply
 from ldo_service.geometry import codecs
-from ldo_service.runtime.mcap_index import McapIndex
-from ldo_service.runtime.network import Network
+from ldo_service.recordings.mcap_file import McapIndex
 from ldo_service.semantics.semantics_file import read_semantics
+from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.endpoint import Network
 from tests.detection.networks import SQUARES
 
 from .attempt import Attempt, kept_in

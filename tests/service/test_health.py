@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.graph import GRAPH
-from tests.runtime.conftest import free_port
 from tests.service.conftest import LDO, live_service, wait_until
+from tests.transport.conftest import free_port
 
 
 def doctor(endpoint: str) -> subprocess.CompletedProcess[str]:

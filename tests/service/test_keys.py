@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.authority import Authority
 from ldo_service.client import connect
 from ldo_service.schemas import TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
+from ldo_service.transport.certificate_authority import Authority
 from tests.service.conftest import LDO, free_endpoint, wait_until
 
 

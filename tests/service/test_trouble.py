@@ -13,8 +13,8 @@ import pytest
 import zenoh
 
 from ldo_service.datasets import Sequence
-from ldo_service.runtime.zenoh_transport import Network, open_session
 from ldo_service.schemas import CameraRgbd, TrackedPose, encode
+from ldo_service.transport.zenoh_transport import Network, open_session
 from ldo_service.wire import camera_rgbd_message
 from tests.service.conftest import LiveService, live_service, wait_until
 

@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 import zenoh
 
-from ldo_service.authority import Authority
 from ldo_service.client import connect
-from ldo_service.runtime.keys import Keys
-from ldo_service.runtime.zenoh_transport import Network, open_session
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
@@ -27,6 +24,9 @@ from ldo_service.schemas.topics import (
     POSE_TRACKED,
     Topic,
 )
+from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.keys import Keys
+from ldo_service.transport.zenoh_transport import Network, open_session
 from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live import Live, live
 from tests.schemas.examples import EXAMPLES

@@ -10,7 +10,7 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.metrics import LOOPBACK
+from ldo_service.transport.endpoint import LOOPBACK
 from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.splats import splats_of
 from ldo_service.viewer.window import Server, Window, open_window

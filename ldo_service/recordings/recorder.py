@@ -1,0 +1,195 @@
+"""A journal in a file. Writing happens in a thread of its own: no step waits for a disk."""
+
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+
+from msgspec.structs import replace
+
+from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.inlet import Delivery
+from ldo_service.runtime.journal import (
+    Gap,
+    Journal,
+    Kind,
+    Started,
+    Step,
+    checksum,
+    digest_of,
+    outputs_of,
+)
+from ldo_service.runtime.step import Produced
+from ldo_service.schemas.topics import Topic
+from ldo_service.storage.state_codec import encode_state
+from ldo_service.storage.state_store import State
+from ldo_service.transport.worker import Worker
+
+from .mcap_file import RecordConfig, RecordingFile
+
+log = logging.getLogger(__name__)
+
+ENTRY_BYTES = 1000  # of memory that an entry takes beside its body
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    number: int
+    stamp_ns: int
+    delivery: Delivery
+
+
+class Recorder(Journal):
+    """One actor's journal in a file.
+
+    At most `queue_mb` wait to be written. A message that finds no place is left out, steps and
+    all, and the gap is marked and said once: the recording suffers, not the robot.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
+        """Raises OSError when the file exists or cannot be written."""
+        self._file = RecordingFile(path, about, config)
+        self._max_waiting = int(config.queue_mb * 1e6)
+        self._writer = Worker(f"journal {path.stem}")
+        self._lock = Lock()  # of the bytes that wait
+        self._waiting = 0
+        self._steps = self._numbers = 0
+        self._taken: Taken | None = None  # None: not recorded
+        self._lost = 0  # messages of the gap under way
+        self._lost_before = 0
+        self._closed: Future[None] | None = None
+
+    # --- told by the stage ------------------------------------------------------------------------
+    def started(self, state: State | None) -> None:
+        try:
+            parts = None if state is None else {k: encode_state(v) for k, v in state.items()}
+        except (NotImplementedError, TypeError) as error:
+            log.error("%s: a state cannot be recorded: %s", self._file.path, error)
+            self._submit(0, self._file.add_entry, Gap(step=self._steps, reason="state"))
+            return
+        size = sum(map(len, (parts or {}).values()))
+        self._submit(size, self._file.add_entry, Started(step=self._steps, state=parts))
+
+    def took(self, delivery: Delivery, stamp_ns: int) -> None:
+        size = len(delivery.body)
+        with self._lock:
+            has_place = self._waiting + size <= self._max_waiting
+        if not has_place:
+            self._lose(delivery)
+            return
+        self._mark_gap()
+        self._taken = Taken(self._numbers, stamp_ns, delivery)
+        self._numbers += 1
+        self._submit(size, self._write_message, self._taken)
+
+    def stepped(
+        self,
+        kind: Kind,
+        situation: Situation,
+        produced: Iterable[Produced] = (),
+        error: str = "",
+    ) -> None:
+        takes_none = kind in ("resumed", "finished")
+        taken = None if takes_none else self._taken
+        if taken is None and (not takes_none or self._lost):
+            return  # its message is not recorded
+        made = tuple(produced)
+        step = Step(
+            step=self._steps,
+            kind=kind,
+            taken=-1 if taken is None else taken.number,
+            room=_by_name(situation.room),
+            waiting=_by_name(situation.waiting),
+            error=error,
+        )
+        self._steps += 1
+        self._submit(sum(len(out.body) for out in made), self._write_step, step, taken, made)
+
+    def close(self) -> "Future[None]":
+        if self._closed is None:
+            self._mark_gap()
+            self._closed = self._writer.submit(self._file.close)
+            self._writer.close()
+        return self._closed
+
+    def statistics(self) -> dict[str, float]:
+        return {
+            "journal_is_open": float(self._file.is_open),
+            "journal_steps": self._steps,
+            "journal_lost": self._lost_before + self._lost,
+            "journal_waiting_mb": self._waiting / 1e6,
+        }
+
+    # --- what finds no place ----------------------------------------------------------------------
+    def _lose(self, delivery: Delivery) -> None:
+        if self._lost == 0:
+            log.error(
+                "%s: the disk is too slow, %.0f MB wait: %s #%d and what follows is not recorded. "
+                "A replay ends here; the robot goes on",
+                *(self._file.path, self._waiting / 1e6),
+                *(delivery.port.topic.name, delivery.header.seq),
+            )
+        self._lost += 1
+        self._taken = None
+
+    def _mark_gap(self) -> None:
+        if self._lost:
+            gap = Gap(step=self._steps, reason="slow", lost=self._lost)
+            self._submit(0, self._file.add_entry, gap)
+            log.error("%s: %d messages were not recorded", self._file.path, self._lost)
+            self._lost, self._lost_before = 0, self._lost_before + self._lost
+
+    # --- in the writer's thread -------------------------------------------------------------------
+    def _submit(self, size: int, job: Callable[..., None], *args: object) -> None:
+        size += ENTRY_BYTES
+        with self._lock:
+            self._waiting += size
+        self._writer.submit(self._run, size, job, *args)
+
+    def _run(self, size: int, job: Callable[..., None], *args: object) -> None:
+        try:
+            job(*args)
+        except Exception:
+            log.exception("%s: this recording ends here", self._file.path)
+            self._file.abandon()
+        finally:
+            with self._lock:
+                self._waiting -= size
+
+    def _write_message(self, taken: Taken) -> None:
+        topic, body = taken.delivery.port.topic, taken.delivery.body
+        self._file.add(topic.name, topic.message, body, taken.number, taken.stamp_ns)
+
+    def _write_step(self, step: Step, taken: Taken | None, produced: tuple[Produced, ...]) -> None:
+        if not self._file.is_open:
+            return
+        outputs = outputs_of(produced)
+        step = replace(step, outputs=outputs, digest=digest_of(outputs))
+        if taken is not None:
+            header = taken.delivery.header
+            step = replace(
+                step,
+                topic=taken.delivery.port.topic.name,
+                source=header.source,
+                epoch=header.epoch,
+                seq=header.seq,
+                checksum=checksum(taken.delivery.body),
+            )
+        self._file.add_entry(step)
+        if self._file.is_over_limit():
+            self._end_at_limit(step.step + 1)
+
+    def _end_at_limit(self, step: int) -> None:
+        self._file.add_entry(Gap(step=step, reason="limit"))
+        self._file.close()
+        log.error(
+            "%s: the recording has reached record.max_gb, or the disk record.min_free_gb: it ends "
+            "here; the robot goes on",
+            self._file.path,
+        )
+
+
+def _by_name(counts: Mapping[Topic, int]) -> dict[str, int]:
+    return {topic.name: count for topic, count in counts.items()}

@@ -1,0 +1,227 @@
+"""Commands to the stages of a service: pause, resume, save and reset.
+
+The service sends commands to its stages over a network that may lose messages:
+
+Order    service -> stage   "do this", between two steps; repeated until reported
+Report   stage -> service   "order n is done", or why not; repeated for each repetition
+
+hold      take nothing; messages that arrive at a Latest input are dropped and counted as paused
+release   take again
+renew     start with an empty state and a new epoch
+save      write the whole state now
+
+`Control` gives one answer for the whole service when all its actors have reported. `reset` first
+holds every actor, producers first, so that nothing of the old run is under way when they start
+again: a late correction of 50 keyframes would outdate the first one of the new run.
+"""
+
+import asyncio
+import logging
+import secrets
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from contextlib import suppress
+from typing import Literal
+
+import msgspec
+
+from ldo_service.schemas import ControlAnswer, ControlRequest, decode, encode
+from ldo_service.transport.flow_control import encode_link
+from ldo_service.transport.interface import Transport, call_soon
+
+log = logging.getLogger(__name__)
+
+ORDER_KEY, REPORT_KEY = "link/order", "link/report"
+REPEAT_AFTER_S = 0.25  # an order or its report got lost; a stage at work is asked again in vain
+
+LEAST_S = 2.0  # 3x the slowest step measured
+
+
+What = Literal["hold", "release", "renew", "save"]
+
+
+class Order(msgspec.Struct, frozen=True, array_like=True):
+    number: int  # no other order has it
+    what: What
+    stage: str
+
+
+class Report(msgspec.Struct, frozen=True, array_like=True):
+    number: int
+    stage: str
+    error: str = ""  # empty: done
+
+
+class OrderTaker:
+    """The stage's end: hands over each order once, and repeats its report when asked again."""
+
+    def __init__(self, stage: str, transport: Transport, take: Callable[[Order], None]) -> None:
+        self._stage, self._take = stage, take
+        self._loop = asyncio.get_running_loop()
+        self._under_way = 0
+        self._done: Report | None = None
+        self._reports = transport.publisher(REPORT_KEY)
+        transport.subscribe(ORDER_KEY, self._arrived)
+
+    def report(self, order: Order, error: str) -> None:
+        self._done = Report(order.number, self._stage, error)
+        self._reports.post(b"", encode_link(self._done))
+
+    def close(self) -> None:
+        self._reports.close()
+
+    def _arrived(self, _header: bytes, body: memoryview) -> None:
+        """On any thread."""
+        with suppress(msgspec.DecodeError):
+            order = decode(body, Order)
+            if order.stage == self._stage:
+                call_soon(self._loop, self._take_once, order)
+
+    def _take_once(self, order: Order) -> None:
+        if self._done is not None and order.number == self._done.number:
+            self._reports.post(b"", encode_link(self._done))
+        elif order.number != self._under_way:
+            self._under_way = order.number
+            self._take(order)
+
+
+class Commander:
+    """The service's end."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._reports: dict[int, asyncio.Future[str]] = {}
+        self._orders = transport.publisher(ORDER_KEY)
+        transport.subscribe(REPORT_KEY, self._arrived)
+
+    async def order(self, what: What, stage: str, timeout_s: float) -> str:
+        """Empty when it is done, else why it is not; does not raise for what a stage does."""
+        order = Order(1 + secrets.randbits(62), what, stage)
+        report = self._reports[order.number] = self._loop.create_future()
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not report.done():
+                    await self._orders.send(b"", encode_link(order))
+                    await asyncio.wait({report}, timeout=REPEAT_AFTER_S)
+                return report.result()
+        except TimeoutError:
+            return f"did not answer within {timeout_s:.0f} s"
+        finally:
+            del self._reports[order.number]
+
+    def close(self) -> None:
+        self._orders.close()
+
+    def _arrived(self, _header: bytes, body: memoryview) -> None:
+        """On any thread."""
+        with suppress(msgspec.DecodeError):
+            call_soon(self._loop, self._reported, decode(body, Report))
+
+    def _reported(self, report: Report) -> None:
+        future = self._reports.get(report.number)
+        if future is not None and not future.done():
+            future.set_result(report.error)
+
+
+class ControlFailed(Exception):
+    """Some actor did not obey; the text names it."""
+
+
+class Control:
+    """`actors` in the order of the data, producers first; `sources` are those fed from outside."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        actors: Sequence[str],
+        sources: Sequence[str],
+        saved_where: str,
+        timeout_s: float,
+    ) -> None:
+        self._commander = Commander(transport)
+        self._actors, self._sources = tuple(actors), tuple(sources)
+        self._saved_where, self._timeout_s = saved_where, timeout_s
+        self._is_paused = False
+        self._one_at_a_time = asyncio.Lock()
+        self._tasks: set[asyncio.Task[str]] = set()
+        self._verbs: dict[str, Callable[[], Awaitable[str]]] = {
+            "pause": self._pause,
+            "resume": self._resume,
+            "save": self._save,
+            "reset": self._reset,
+        }
+        transport.watch(self._presence)
+
+    async def answer(self, body: bytes) -> bytes:
+        """The reply to a query's payload, whatever the bytes are."""
+        try:
+            request = decode(body, ControlRequest)
+        except msgspec.DecodeError as error:
+            return encode(_answer(0, False, f"this is no ControlRequest: {error}."))
+        verb = self._verbs.get(request.verb)
+        if verb is None:
+            known = ", ".join(self._verbs)
+            text = f"there is no {request.verb[:40]!r} in this version. There are {known}."
+            return encode(_answer(request.stamp_ns, False, text))
+        async with self._one_at_a_time:
+            try:
+                ok, text = True, await verb()
+            except ControlFailed as failed:
+                ok, text = False, str(failed)
+        log.log(logging.INFO if ok else logging.ERROR, "%s: %s", request.verb, text)
+        return encode(_answer(request.stamp_ns, ok, text))
+
+    def close(self) -> None:
+        self._commander.close()
+
+    # --- verbs ------------------------------------------------------------------------------------
+    async def _pause(self) -> str:
+        self._is_paused = True
+        await self._each("hold", self._sources)
+        return "frames are left out and counted until `resume`."
+
+    async def _resume(self) -> str:
+        self._is_paused = False
+        await self._each("release", self._sources)
+        return "frames are taken again."
+
+    async def _save(self) -> str:
+        await self._each("save", self._actors)
+        return f"{', '.join(self._actors)} saved in {self._saved_where}."
+
+    async def _reset(self) -> str:
+        try:
+            await self._each("hold", self._actors)
+            await self._each("renew", self._actors)
+        finally:
+            held = self._sources if self._is_paused else ()
+            await self._each("release", [actor for actor in self._actors if actor not in held])
+        still = " Frames stay paused." if self._is_paused else ""
+        return f"{', '.join(self._actors)} began anew.{still}"
+
+    async def _each(self, what: What, actors: Sequence[str]) -> None:
+        """One after the other: a producer may have to wait for a consumer that is not held yet. All
+        have `timeout_s` together, and who comes after one that hangs a moment at least.
+
+        Raises ControlFailed, after all have been told, naming those that did not obey.
+        """
+        failures, until_s = [], time.monotonic() + self._timeout_s
+        for actor in actors:
+            within_s = max(until_s - time.monotonic(), min(LEAST_S, self._timeout_s))
+            error = await self._commander.order(what, actor, within_s)
+            failures += [f"{actor} {error}"] if error else []
+        if failures:
+            advice = "`ldo doctor` shows how the actors are; then ask again."
+            raise ControlFailed(f"could not {what} all actors: {'; '.join(failures)}. {advice}")
+
+    # --- actors that were restarted ---------------------------------------------------------------
+    def _presence(self, name: str, alive: bool) -> None:
+        """A process that comes back does not know of the pause."""
+        if alive and self._is_paused and name in self._sources:
+            task = asyncio.ensure_future(self._commander.order("hold", name, self._timeout_s))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
+
+
+def _answer(stamp_ns: int, ok: bool, text: str) -> ControlAnswer:
+    return ControlAnswer(stamp_ns=stamp_ns, ok=ok, text=text)

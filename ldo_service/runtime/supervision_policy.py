@@ -1,0 +1,51 @@
+"""Limits of supervision: step timeouts, restart budgets and back-off."""
+
+from collections import deque
+from dataclasses import dataclass
+
+from ldo_service.errors import ConfigError, RestartsExhausted
+
+
+class RestartBudget:
+    """At most `max_restarts` within `window_s`; each restart in the window waits twice as long."""
+
+    def __init__(
+        self, name: str, max_restarts: int, window_s: float, delay_s: float, delay_max_s: float
+    ) -> None:
+        self._name, self._max_restarts, self._window_s = name, max_restarts, window_s
+        self._delay_s, self._delay_max_s = delay_s, delay_max_s
+        self._failed_at_s: deque[float] = deque()
+
+    def spend(self, now_s: float) -> float:
+        """Count a failure; the delay before the restart. Raises RestartsExhausted."""
+        self._failed_at_s.append(now_s)
+        while self._failed_at_s[0] < now_s - self._window_s:
+            self._failed_at_s.popleft()
+        recent = len(self._failed_at_s)
+        if recent > self._max_restarts:
+            raise RestartsExhausted(self._name, recent, self._window_s)
+        return min(self._delay_s * 2.0 ** min(recent - 1, 60), self._delay_max_s)
+
+
+@dataclass(frozen=True, slots=True)
+class StageConfig:
+    max_restarts: int = 5  # within restart_window_s; more is a fault that a restart does not cure
+    restart_window_s: float = 60.0
+    restart_delay_s: float = 0.05  # doubled with each failure in the window
+    restart_delay_max_s: float = 5.0
+    heartbeat_s: float = 0.5  # a stopped process shows within two of these
+    stall_after_s: float = 60.0  # 100x the slowest step measured (mapper, 1.5 M Gaussians)
+    evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
+    nice: int = 10  # of threads whose work may be late: a tenth of the weight of those that a robot
+    # waits for, where both want the same core (Linux)
+    max_message_mb: float = 64.0  # larger ones are not decoded: raw colour and depth of 8 MP are 58
+
+    def __post_init__(self) -> None:
+        times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
+        if (
+            min(*times, self.max_message_mb) <= 0
+            or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
+        ):
+            raise ConfigError(f"{self}: counts and times must be positive.")
+        if not 0 <= self.nice <= 19:
+            raise ConfigError(f"stage.nice={self.nice}: must be within 0..19.")

@@ -1,0 +1,1 @@
+"""Transport of bytes between processes: Zenoh or memory, flow control, and access control."""

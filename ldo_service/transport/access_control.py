@@ -1,0 +1,136 @@
+"""Who may do what on the network: Zenoh's access control, made from the topics.
+
+    service    everything of its robot
+    camera     puts frames                      odometry   puts priors
+    viewer     reads every topic                operator   reads, controls, refines, adds labels
+
+Whoever is not named may connect and do nothing. What a rule does not cover whole is denied too: a
+viewer that subscribes to `ldo/robot/**` hears nothing, it has to name topics.
+
+`access.yaml` has an entry for each certificate, by its common name:
+
+    front-3f9a1c02: {role: camera, robot: mule, until: 2027-11-22}
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import yaml
+
+from ldo_service.errors import ConfigError
+from ldo_service.schemas.topics import (
+    CONTROL,
+    FROM_ODOMETRY,
+    FROM_OPERATORS,
+    FROM_OUTSIDE,
+    ROBOT_PREFIX,
+    TOPICS,
+    Topic,
+)
+from ldo_service.storage.yaml_io import plain_values
+
+from .flow_control import ALIVE
+
+Role = Literal["service", "camera", "odometry", "viewer", "operator"]
+PUTS: dict[Role, Sequence[Topic]] = {
+    "camera": FROM_OUTSIDE,
+    "odometry": FROM_ODOMETRY,
+    "operator": FROM_OPERATORS,
+}
+READERS: tuple[Role, ...] = ("viewer", "operator")
+CONTROLLERS: tuple[Role, ...] = ("operator",)
+READABLE = tuple(topic for topic in TOPICS if topic is not CONTROL)
+EVERY_ROBOT = "*"
+EVERYTHING = (
+    *("put", "delete", "declare_subscriber", "query", "reply", "declare_queryable"),
+    *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
+)
+
+
+class Grantee(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    role: Role
+    robot: str  # whose topics; EVERY_ROBOT: of each
+    until: date | None = None  # the certificate's last day
+
+
+Access = Mapping[str, Grantee]  # by common name of the certificate
+
+
+def read_access(path: Path) -> dict[str, Grantee]:
+    """Raises ConfigError for a file that cannot be read or says something else."""
+    try:
+        return msgspec.convert(plain_values(path.read_bytes()), dict[str, Grantee])
+    except OSError as error:
+        raise ConfigError(
+            f"{path} cannot be read: {error.strerror}. `ldo keys` writes it for each service."
+        ) from error
+    except (ValueError, yaml.YAMLError) as error:
+        raise ConfigError(
+            f"{path} does not say who may do what: {error}. `ldo keys` writes such a file."
+        ) from error
+
+
+def access_control(access: Access) -> dict[str, Any]:
+    """Zenoh's section `access_control`, for a router."""
+    parts: dict[tuple[Role, str], list[str]] = {}
+    for name, grantee in sorted(access.items()):
+        parts.setdefault((grantee.role, grantee.robot), []).append(name)
+    rules, subjects, policies = [], [], []
+    for (role, robot), names in parts.items():
+        part = f"{role} of {robot}"
+        of_part = [rule.for_robot(robot, part) for rule in rules_of(role)]
+        rules += of_part
+        subjects.append({"id": part, "cert_common_names": names})
+        policies.append({"rules": [rule["id"] for rule in of_part], "subjects": [part]})
+    lists = {"rules": rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **lists}
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """Messages that may pass: "ingress" from who has the role to the router, "egress" back."""
+
+    says: str
+    flows: tuple[str, ...]
+    messages: tuple[str, ...]
+    keys: tuple[str, ...]
+
+    def for_robot(self, robot: str, part: str) -> dict[str, Any]:
+        return {
+            "id": f"{part}: {self.says}",
+            "permission": "allow",
+            "flows": list(self.flows),
+            "messages": list(self.messages),
+            "key_exprs": [f"{ROBOT_PREFIX}/{robot}/{key}" for key in self.keys],
+        }
+
+
+def rules_of(role: Role) -> Iterator[Rule]:
+    if role == "service":
+        yield Rule("do all", ("ingress", "egress"), EVERYTHING, ("**",))
+    if role in PUTS:
+        keys = tuple(topic.name for topic in PUTS[role])
+        yield Rule("put", ("ingress",), ("put",), keys)
+        yield Rule("learn who listens", ("egress",), ("declare_subscriber",), keys)
+    if role in READERS:
+        yield from _rules_of_readers()
+    if role in CONTROLLERS:
+        yield Rule("control", ("ingress",), ("query",), (CONTROL.name,))
+        yield Rule("be answered", ("egress",), ("reply", "declare_queryable"), (CONTROL.name,))
+
+
+def _rules_of_readers() -> Iterator[Rule]:
+    topics = tuple(topic.subscribed_as for topic in READABLE)
+    states = tuple(topic.name for topic in READABLE if topic.is_state)
+    tokens = (f"{ALIVE}/*",)
+    yield Rule("subscribe", ("ingress",), ("declare_subscriber",), topics)
+    yield Rule("hear", ("egress",), ("put",), topics)
+    yield Rule("ask", ("ingress",), ("query",), states)
+    yield Rule("hear answers", ("egress",), ("reply", "declare_queryable"), states)
+    asks_who = ("liveliness_query", "declare_liveliness_subscriber")
+    yield Rule("ask who is alive", ("ingress",), asks_who, tokens)
+    yield Rule("hear who is alive", ("egress",), ("liveliness_token",), tokens)

@@ -1,0 +1,242 @@
+"""The runtime's network in production: Zenoh.
+
+Facts of zenoh-python 1.x that shape this file:
+- Callbacks with `indirect=False` run on Zenoh's own thread; they store and wake, nothing else. A
+  plain `callback=` hides a queue of 256 messages and a thread that keeps the interpreter alive.
+- `put` and `reply` may block, so they run in threads of ours. Everything is sent with congestion
+  control DROP: with BLOCK one stalled subscriber stalls the sender for seconds and then loses
+  messages all the same. What must arrive is sent again by the links above.
+- The default configuration listens on every interface: scouting, gossip and shared memory are
+  switched off here, and the service listens on loopback, or over TLS to those whom it knows.
+"""
+
+import asyncio
+import json
+import logging
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from threading import BoundedSemaphore, Lock
+from typing import Any
+
+import zenoh
+
+from ldo_service.errors import ConfigError
+
+from .endpoint import CLOSED, DEFAULT_ENDPOINT, Network
+from .flow_control import ALIVE
+from .interface import LastValues, OnMessage, OnPresence, call_soon
+from .worker import Worker
+
+log = logging.getLogger(__name__)
+
+MAX_QUERIES = 16  # that may wait for their answer; who asks more often gets an error
+CONNECT_WITHIN_MS = 3000
+LEAVE_WITHIN_S = 2.0  # for what is still being sent when a transport closes
+
+
+def open_session(network: Network, router: bool = False) -> zenoh.Session:
+    """Open the service's router, or a client of it. Use it in a `with` block.
+
+    Raises ConfigError when the port is taken, nobody answers there, or the keys are refused.
+    """
+    try:
+        config = _session_config(network, router)
+    except zenoh.ZError as error:
+        raise ConfigError(
+            f"endpoint {network.endpoint!r}: write it like {DEFAULT_ENDPOINT}."
+        ) from error
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        advice = _why_not_listening(network) if router else _why_not_connected(network)
+        raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from error
+
+
+def _session_config(network: Network, router: bool) -> zenoh.Config:
+    settings = {
+        "mode": "router" if router else "client",
+        "listen/endpoints" if router else "connect/endpoints": [network.endpoint],
+        **CLOSED,
+        "transport/link/rx/max_message_size": network.max_message_mb * 1_000_000,
+        "connect/timeout_ms": CONNECT_WITHIN_MS,
+        **(network.keys.settings(router) if network.keys else {}),
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def _why_not_listening(network: Network) -> str:
+    return (
+        f"cannot listen on {network.endpoint}: is another `ldo serve` running there? "
+        "Stop it, or choose another port with --endpoint."
+    )
+
+
+def _why_not_connected(network: Network) -> str:
+    host, port = network.address
+    if network.keys and port.isdecimal() and (why := network.keys.why_refused(host, int(port))):
+        return (
+            f"{network.endpoint} and the keys in {network.keys.folder} do not accept each other: "
+            f"{why}. `ldo keys list` tells what is valid; keys of one network have one authority."
+        )
+    return (
+        f"nobody answers on {network.endpoint}: start `ldo serve`, "
+        "or name its address with --endpoint."
+    )
+
+
+class ZenohTransport:
+    """Made inside a running event loop, on an open session that outlives it."""
+
+    def __init__(self, session: zenoh.Session, network: Network) -> None:
+        self._session, self._network = session, network
+        self._loop = asyncio.get_running_loop()
+        self._declared: list[Any] = []
+        self._publishers: list[ZenohPublisher] = []
+        self._answering = Worker("answers")
+        self._responding: set[asyncio.Task[None]] = set()
+        self._query_slots = BoundedSemaphore(MAX_QUERIES)
+
+    def publisher(self, key: str) -> "ZenohPublisher":
+        publisher = ZenohPublisher(self._session, self._network.expression(key))
+        self._publishers.append(publisher)
+        return publisher
+
+    def subscribe(self, key: str, on_message: OnMessage) -> None:
+        def store(sample: zenoh.Sample) -> None:
+            attachment = sample.attachment
+            header = attachment.to_bytes() if attachment is not None else b""
+            on_message(header, memoryview(sample.payload.to_bytes()))
+
+        handler = zenoh.handlers.Callback(store, indirect=False)
+        expression = self._network.expression(key)
+        self._declared.append(self._session.declare_subscriber(expression, handler))
+
+    def announce(self, name: str) -> None:
+        expression = self._network.expression(f"{ALIVE}/{name}")
+        self._declared.append(self._session.liveliness().declare_token(expression))
+
+    def watch(self, on_presence: OnPresence) -> None:
+        def changed(sample: zenoh.Sample) -> None:
+            name = str(sample.key_expr).rsplit("/", 1)[1]
+            alive = sample.kind == zenoh.SampleKind.PUT
+            call_soon(self._loop, on_presence, name, alive)
+
+        handler = zenoh.handlers.Callback(changed, indirect=False)
+        expression = self._network.expression(f"{ALIVE}/*")
+        liveliness = self._session.liveliness()
+        self._declared.append(liveliness.declare_subscriber(expression, handler, history=True))
+
+    def answer(self, key: str, last_values: LastValues) -> None:
+        expression = self._network.expression(key)
+
+        def reply(query: zenoh.Query) -> None:
+            try:
+                with query, suppress(zenoh.ZError):  # the asker may be gone
+                    for header, body in last_values():
+                        query.reply(expression, body, attachment=header)
+            finally:
+                self._query_slots.release()
+
+        def asked(query: zenoh.Query) -> None:
+            if self._query_slots.acquire(blocking=False):
+                self._answering.submit(reply, query)
+            else:
+                with query:
+                    query.reply_err(b"too many queries: ask again later")
+
+        handler = zenoh.handlers.Callback(asked, indirect=False)
+        self._declared.append(self._session.declare_queryable(expression, handler))
+
+    def respond(self, key: str, respond: Callable[[bytes], Awaitable[bytes]]) -> None:
+        """Answer each query on a key with what `respond`, on the event loop, makes of its payload.
+
+        For requests that are done before they are answered; `answer` is for values that are there.
+        """
+        expression = self._network.expression(key)
+
+        async def reply(query: zenoh.Query, request: bytes) -> None:
+            try:
+                with query, suppress(zenoh.ZError):  # the asker may be gone
+                    body = await respond(request)
+                    await self._answering.run(query.reply, expression, body)
+            finally:
+                self._query_slots.release()
+
+        def start(query: zenoh.Query, request: bytes) -> None:
+            task = self._loop.create_task(reply(query, request))
+            self._responding.add(task)
+            task.add_done_callback(self._responding.discard)
+
+        def asked(query: zenoh.Query) -> None:
+            if self._query_slots.acquire(blocking=False):
+                payload = query.payload
+                request = payload.to_bytes() if payload is not None else b""
+                call_soon(self._loop, start, query, request)
+            else:
+                with query:
+                    query.reply_err(b"too many queries: ask again later")
+
+        handler = zenoh.handlers.Callback(asked, indirect=False)
+        self._declared.append(self._session.declare_queryable(expression, handler))
+
+    def close(self) -> None:
+        for task in self._responding:
+            task.cancel()
+        for declared in self._declared:
+            with suppress(zenoh.ZError):  # the session may be closed already
+                declared.undeclare()
+        self._declared.clear()
+        self._answering.close()
+        until_s = time.monotonic() + LEAVE_WITHIN_S
+        for leaving in (*self._publishers, self._answering):
+            leaving.close()
+            leaving.join(max(0.0, until_s - time.monotonic()))
+
+
+class ZenohPublisher:
+    """One key, one thread: messages of a key stay in order, and no key waits for another."""
+
+    def __init__(self, session: zenoh.Session, expression: str) -> None:
+        self._publisher = session.declare_publisher(
+            expression, congestion_control=zenoh.CongestionControl.DROP
+        )
+        self._thread = Worker(f"put {expression}")
+        self._lock = Lock()
+        self._posted: tuple[bytes, bytes] | None = None
+
+    def send(self, header: bytes, body: bytes) -> Awaitable[None]:
+        return self._thread.run(self._put, header, body)
+
+    def post(self, header: bytes, body: bytes) -> None:
+        with self._lock:
+            is_under_way, self._posted = self._posted is not None, (header, body)
+        if not is_under_way:
+            self._thread.submit(self._put_posted)
+
+    def _put_posted(self) -> None:
+        with self._lock:
+            posted, self._posted = self._posted, None
+        if posted is not None:
+            self._put(*posted)
+
+    def _put(self, header: bytes, body: bytes) -> None:
+        try:
+            self._publisher.put(body, attachment=header)
+        except zenoh.ZError as error:
+            log.warning("%s: put failed: %s", self._publisher.key_expr, error)
+
+    def close(self) -> None:
+        """What was sent or posted so far still leaves."""
+        self._thread.submit(self._undeclare)
+        self._thread.close()
+
+    def join(self, timeout_s: float) -> None:
+        self._thread.join(timeout_s)
+
+    def _undeclare(self) -> None:
+        with suppress(zenoh.ZError):
+            self._publisher.undeclare()

@@ -1,0 +1,123 @@
+"""A small actor with everything that a recording has to get right, and recordings of its lives."""
+
+import asyncio
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ldo_service.recordings.mcap_file import RecordConfig
+from ldo_service.recordings.recorder import Recorder
+from ldo_service.recordings.recording import JournalFile, new_path, recorded_actors
+from ldo_service.recordings.replay import Replayed, replay
+from ldo_service.runtime import Actor, In, Lossless, Out
+from ldo_service.runtime.outlet import Outlet
+from ldo_service.runtime.stage import Stage
+from ldo_service.schemas import Message
+from ldo_service.storage.state_store import FolderStore, State
+from ldo_service.transport.interface import MemoryTransport
+from tests.runtime.cast import (
+    DOUBLES,
+    NUMBERS,
+    PIECES,
+    QUICK,
+    Double,
+    Number,
+    Piece,
+    eventually,
+    number,
+    running,
+    send,
+)
+
+UNLUCKY = 13
+
+
+class Tally(Actor):
+    """Sums up numbers, fails on 13, and sends a piece when there is room.
+
+    Its state is put away every third step only, so a successor is not where its predecessor was.
+    """
+
+    name = "tally"
+    inputs = (In(NUMBERS, Lossless(4)),)
+    outputs = (Out(DOUBLES), Out(PIECES, never_wait=True))
+
+    def __init__(self, bias: int = 0) -> None:
+        super().__init__()
+        self._sum, self._steps, self._saved = bias, 0, {}
+
+    def handle(self, message: Message) -> Iterator[Message]:
+        assert isinstance(message, Number)
+        self._sum += message.value
+        self._steps += 1
+        if message.value == UNLUCKY:
+            raise ValueError("unlucky")
+        yield Double(stamp_ns=message.stamp_ns, value=self._sum)
+        if self.has_room(PIECES):
+            yield Piece(stamp_ns=message.stamp_ns, version=self._sum, part=0, parts=1)
+
+    def finish(self) -> Iterator[Message]:
+        yield Double(stamp_ns=0, value=-self._sum)
+
+    def snapshot(self) -> State:
+        if self._steps % 3 == 0:
+            self._saved = {"sum": self._sum}
+        return self._saved
+
+    def restore(self, state: State) -> None:
+        self._sum = state["sum"]
+
+
+async def live(
+    folder: Path,
+    values: Sequence[int],
+    *,
+    make: Callable[[], Actor] = Tally,
+    expected: Mapping[str, frozenset[str]] = {},
+    config: RecordConfig | None = None,
+    meanwhile: Callable[[Recorder, int], None] = lambda _recorder, _value: None,
+    is_killed: bool = False,
+) -> Stage:
+    """A life of an actor, recorded: it handles the values one by one.
+
+    `meanwhile` is called before each value. A killed one says no last words.
+    """
+    recording = folder / "recording"
+    recording.mkdir(exist_ok=True)
+    epoch = 1 + len(list(recording.iterdir()))  # the source begins anew with each life
+    recorder = Recorder(
+        new_path(recording, make().name), {"robot": "test"}, config or RecordConfig()
+    )
+    transport = MemoryTransport()
+    stage = Stage(
+        make,
+        transport,
+        config=QUICK,
+        store=FolderStore(folder / "state"),
+        expected=expected,
+        journal=recorder,
+    )
+    numbers = Outlet(Out(NUMBERS), "source", epoch, transport, (stage.name,))
+    async with running(stage) as (task,):
+        for done, value in enumerate(values, 1):
+            meanwhile(recorder, value)
+            await send(numbers, number(value))
+            await eventually(lambda n=done: stage.health().steps + stage.health().set_aside == n)
+        if not is_killed:
+            stage.drain()
+            await task
+    return stage
+
+
+def files(folder: Path, actor: str = "tally") -> list[JournalFile]:
+    return [JournalFile(path) for path in recorded_actors(folder / "recording")[actor]]
+
+
+def replayed(folder: Path, make: Callable[[], Actor] = Tally) -> Replayed:
+    return replay("tally", files(folder), lambda _about: make())
+
+
+def recorded(folder: Path, values: Sequence[int], **options: Any) -> Path:
+    """The recorded file of one life."""
+    asyncio.run(live(folder, values, **options))
+    return recorded_actors(folder / "recording")["tally"][-1]

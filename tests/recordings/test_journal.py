@@ -1,0 +1,285 @@
+"""What a recording holds, and what becomes of the robot when it cannot be written."""
+
+import asyncio
+import json
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from threading import Event
+
+import msgpack
+import pytest
+from mcap.reader import make_reader
+
+from ldo_service.errors import ConfigError
+from ldo_service.recordings import mcap_file
+from ldo_service.recordings.mcap_file import RecordConfig
+from ldo_service.recordings.recorder import Recorder
+from ldo_service.recordings.recording import (
+    JournalFile,
+    new_path,
+    prepare_recording,
+    recorded_actors,
+)
+from ldo_service.runtime import In, Latest
+from ldo_service.runtime.journal import Gap, Started, Step, checksum
+from ldo_service.runtime.stage import Stage
+from ldo_service.schemas import encode
+from ldo_service.transport.interface import MemoryTransport
+from tests.runtime.cast import (
+    DOUBLES,
+    LATEST_NUMBER,
+    NUMBERS,
+    PIECES,
+    QUICK,
+    eventually,
+    number,
+    running,
+)
+
+from .journals import UNLUCKY, Tally, files, live, recorded
+
+
+def entries(folder: Path) -> list[Started | Step | Gap]:
+    return [entry for file in files(folder) for entry in file.entries()]
+
+
+def steps(folder: Path) -> list[Step]:
+    return [entry for entry in entries(folder) if isinstance(entry, Step)]
+
+
+def test_every_step_is_there_in_order(tmp_path: Path) -> None:
+    recorded(tmp_path, [1, 2, 3])
+    found = entries(tmp_path)
+    assert found[0] == Started(step=0, state=None)
+    assert [step.kind for step in steps(tmp_path)] == ["done", "done", "done", "finished"]
+    assert [step.step for step in steps(tmp_path)] == [0, 1, 2, 3]
+    assert [step.seq for step in steps(tmp_path)[:3]] == [0, 1, 2]
+    assert {(step.topic, step.source, step.epoch) for step in steps(tmp_path)[:3]} == {
+        (NUMBERS.name, "source", 1)
+    }
+
+
+def test_a_step_names_each_output_with_its_digest(tmp_path: Path) -> None:
+    recorded(tmp_path, [1, 2])
+    first, second, last = steps(tmp_path)
+    assert [output.topic for output in first.outputs] == [DOUBLES.name, PIECES.name]
+    assert [output.topic for output in last.outputs] == [DOUBLES.name]
+    assert len({first.digest, second.digest, last.digest}) == 3
+
+
+def test_the_message_is_kept_as_it_came(tmp_path: Path) -> None:
+    recorded(tmp_path, [7])
+    (file,), (step, _) = files(tmp_path), steps(tmp_path)
+    body = file.taken(step)
+    assert msgpack.unpackb(body) == {
+        "type": "Number",
+        "stamp_ns": 7,
+        "value": 7,
+        "region": "",
+        "data": b"",
+    }
+    assert checksum(body) == step.checksum
+
+
+def test_a_failed_message_is_kept_once_with_both_attempts_and_both_starts(tmp_path: Path) -> None:
+    recorded(tmp_path, [1, 2, 3, UNLUCKY, 4])
+    kinds = [step.kind for step in steps(tmp_path)]
+    assert kinds == ["done"] * 3 + ["failed", "failed", "set_aside", "done", "finished"]
+    failed = steps(tmp_path)[3]
+    assert failed.error == "ValueError('unlucky')"
+    assert failed.outputs == ()
+    assert len(files(tmp_path)[0].messages) == 5
+    starts = [entry for entry in entries(tmp_path) if isinstance(entry, Started)]
+    assert [(start.step, start.state is None) for start in starts] == [
+        (0, True),
+        (4, False),
+        (5, False),
+    ]
+
+
+def test_the_room_that_a_step_saw_is_kept(tmp_path: Path) -> None:
+    recorded(tmp_path, [1, 2], expected={PIECES.name: frozenset({"absent"})})
+    assert [step.room for step in steps(tmp_path)] == [{PIECES.name: 0}] * 3
+    assert [output.topic for output in steps(tmp_path)[0].outputs] == [DOUBLES.name]
+
+
+def test_what_was_done_is_in_the_file_before_it_is_closed(tmp_path: Path) -> None:
+    """So that a process that is killed leaves it behind."""
+    seen: list[int] = []
+
+    def look(recorder: Recorder, _value: int) -> None:
+        recorder._writer.submit(int).result(10)  # it has caught up
+        seen.append(len(steps(tmp_path)))
+
+    recorded(tmp_path, [1, 2, 3, 4], meanwhile=look)
+    assert seen == [0, 1, 2, 3]
+
+
+def test_a_message_without_a_header_keeps_its_own_stamp(tmp_path: Path) -> None:
+    """As programs send it that know nothing of ours."""
+
+    class FromOutside(Tally):
+        inputs = (In(LATEST_NUMBER, Latest(4)),)
+
+    async def life() -> None:
+        transport = MemoryTransport()
+        recorder = Recorder(tmp_path / "tally.mcap", {}, RecordConfig())
+        stage = Stage(FromOutside, transport, config=QUICK, journal=recorder)
+        async with running(stage):
+            for stamp_ns in (100, 200):
+                transport.deliver(LATEST_NUMBER.name, b"", encode(number(stamp_ns)))
+            await eventually(lambda: stage.health().steps == 2)
+
+    asyncio.run(life())
+    assert [m.stamp_ns for m in JournalFile(tmp_path / "tally.mcap").messages] == [100, 200]
+
+
+def test_other_programs_read_it(tmp_path: Path) -> None:
+    path = recorded(tmp_path, [5, 6])
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        found = list(reader.iter_messages())
+        (about,) = reader.iter_metadata()
+    assert about.metadata == {"robot": "test"}
+    assert {channel.message_encoding for _, channel, _ in found} == {"msgpack"}
+    for schema, _, message in found:
+        assert schema is not None
+        assert "$defs" in json.loads(schema.data)
+        assert isinstance(msgpack.unpackb(message.data), dict)
+    numbers = [message for _, channel, message in found if channel.topic == NUMBERS.name]
+    assert [msgpack.unpackb(message.data)["value"] for message in numbers] == [5, 6]
+    assert [message.publish_time for message in numbers] == [5, 6]
+    times = [message.log_time for _, _, message in found]
+    assert all(one < other for one, other in pairwise(times))
+
+
+# --- when it cannot be written --------------------------------------------------------------------
+class BusyDisk:
+    """Holds up the writer from one value to another."""
+
+    def __init__(self, since: int, until: int) -> None:
+        self._since, self._until, self._free = since, until, Event()
+
+    def __call__(self, recorder: Recorder, value: int) -> None:
+        if value == self._since:
+            recorder._writer.submit(self._free.wait, 10)
+        elif value == self._until:
+            self._free.set()
+            recorder._writer.submit(int).result(10)  # it has caught up
+
+
+def test_a_slow_disk_leaves_a_gap_that_is_marked_and_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    tiny = RecordConfig(queue_mb=0.012)  # six small messages and their steps
+    recorded(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
+    gaps = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
+    (gap,) = gaps
+    assert gap.reason == "slow"
+    assert 5 < gap.lost < 20
+    assert len(steps(tmp_path)) == 31 - gap.lost
+    assert caplog.text.count("the disk is too slow") == 1
+    assert f"{gap.lost} messages were not recorded" in caplog.text
+
+
+def test_the_robot_does_not_wait_for_the_disk(tmp_path: Path) -> None:
+    tiny = RecordConfig(queue_mb=0.012)
+    never = BusyDisk(1, until=40)
+    recorded(tmp_path, range(1, 41), config=tiny, meanwhile=never)  # or `eventually` gives up
+
+
+async def test_what_is_lost_shows_in_health(tmp_path: Path) -> None:
+    tiny = RecordConfig(queue_mb=0.012)
+    stage = await live(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
+    facts = stage.health().facts
+    (gap,) = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
+    assert facts["journal_lost"] == gap.lost
+    last_words = 1
+    assert facts["journal_steps"] == 30 - gap.lost + last_words
+
+
+@contextmanager
+def file_size_limit(bytes_: int) -> Iterator[None]:
+    """What a full disk looks like to a process: writing fails with an OSError."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_robot(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with file_size_limit(6000):
+        path = recorded(tmp_path, range(20, 60))
+    assert path.stat().st_size <= 6000
+    assert 0 < len(steps(tmp_path)) < 40
+    assert caplog.text.count("this recording ends here") == 1
+    assert not files(tmp_path)[0].is_whole
+
+
+def test_a_fault_of_the_recorder_ends_the_recording_and_not_the_robot(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def spoil(recorder: Recorder, value: int) -> None:
+        if value == 3:
+            recorder._submit(0, lambda: 1 // 0)  # type: ignore[arg-type]
+
+    recorded(tmp_path, [1, 2, 3, 4, 5], meanwhile=spoil)
+    assert len(steps(tmp_path)) == 2
+    assert caplog.text.count("this recording ends here") == 1
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_the_recording_ends_at_its_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(mcap_file, "CHECK_EVERY_BYTES", 100)
+    recorded(tmp_path, range(20, 60), config=RecordConfig(max_gb=6e-6))
+    last = entries(tmp_path)[-1]
+    assert isinstance(last, Gap)
+    assert last.reason == "limit"
+    assert last.step == len(steps(tmp_path)) < 40
+    assert caplog.text.count("record.max_gb") == 1
+    assert files(tmp_path)[0].is_whole
+
+
+def test_a_disk_that_is_nearly_full_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_file, "CHECK_EVERY_BYTES", 100)
+    recorded(tmp_path, range(20, 60), config=RecordConfig(min_free_gb=1e6))
+    assert len(steps(tmp_path)) < 10
+
+
+# --- files ----------------------------------------------------------------------------------------
+def test_each_life_has_a_file_in_order(tmp_path: Path) -> None:
+    for _ in range(11):
+        new_path(tmp_path, "mapper").touch()
+    new_path(tmp_path, "tracker").touch()
+    (tmp_path / "notes.txt").touch()
+    names = {actor: [path.name for path in paths] for actor, paths in
+             recorded_actors(tmp_path).items()}  # fmt: skip
+    lives = [f"mapper.{life}.mcap" for life in range(2, 12)]
+    assert names == {"mapper": ["mapper.mcap", *lives], "tracker": ["tracker.mcap"]}
+
+
+def test_a_recording_goes_into_a_folder_of_its_own(tmp_path: Path) -> None:
+    prepare_recording(tmp_path / "new")
+    prepare_recording(tmp_path / "new")
+    (tmp_path / "new" / "tracker.mcap").touch()
+    with pytest.raises(ConfigError, match="not empty"):
+        prepare_recording(tmp_path / "new")
+    with pytest.raises(ConfigError, match="cannot be written"):
+        prepare_recording(Path("/proc/nowhere"))
+
+
+@pytest.mark.parametrize("field", ["max_gb", "queue_mb"])
+def test_a_recording_of_no_size_is_refused(field: str) -> None:
+    with pytest.raises(ConfigError):
+        RecordConfig(**{field: 0})

@@ -1,0 +1,37 @@
+"""A router on a free port of this machine, and clients of it."""
+
+import socket
+from collections.abc import Callable, Iterator
+
+import pytest
+import zenoh
+
+from ldo_service.transport.zenoh_transport import Network, open_session
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    """Of a router that lives as long as the test."""
+    network = Network("test", f"tcp/127.0.0.1:{free_port()}")
+    with open_session(network, router=True):
+        yield network
+
+
+@pytest.fixture
+def client(network: Network) -> Iterator[Callable[[], zenoh.Session]]:
+    """Opens sessions, as other processes would."""
+    sessions: list[zenoh.Session] = []
+
+    def open_client() -> zenoh.Session:
+        sessions.append(open_session(network))
+        return sessions[-1]
+
+    yield open_client
+    for session in sessions:
+        session.close()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

@@ -1,0 +1,11 @@
+"""A router in a process of its own, to be stopped and continued; argument: its endpoint."""
+
+import sys
+import time
+
+from ldo_service.transport.zenoh_transport import Network, open_session
+
+if __name__ == "__main__":
+    with open_session(Network("test", sys.argv[1]), router=True):
+        print("up", flush=True)
+        time.sleep(1e6)

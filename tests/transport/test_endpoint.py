@@ -1,0 +1,77 @@
+"""By default nobody beyond this machine is spoken to."""
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from ldo_service.errors import ConfigError
+from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.keys import Keys
+from ldo_service.transport.zenoh_transport import open_session
+from tests.transport.conftest import free_port
+
+
+def sockets() -> list[tuple[str, int, str]]:
+    """Address, port and kind of all that this process listens on, as the kernel has it."""
+    inodes = set()
+    for link in Path("/proc/self/fd").iterdir():
+        try:
+            inodes.add(link.readlink().name.removeprefix("socket:[").rstrip("]"))
+        except OSError:  # closed meanwhile
+            continue
+    found = []
+    for kind, listening in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
+        for line in Path(f"/proc/self/net/{kind}").read_text().splitlines()[1:]:
+            words = line.split()
+            if words[3] == listening and words[9] in inodes:
+                address, port = words[1].split(":")
+                found.append((address, int(port, 16), kind))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux' /proc")
+def test_a_router_listens_on_loopback_and_scouts_nobody() -> None:
+    before = sockets()
+    network = Network("test", f"tcp/127.0.0.1:{free_port()}")
+    with open_session(network, router=True):
+        opened = [one for one in sockets() if one not in before]
+    loopback = socket.inet_aton("127.0.0.1")[::-1].hex().upper()
+    assert opened == [(loopback, int(network.address[1]), "tcp")]
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/127.0.0.1:7447", "tcp/localhost:7447", "tcp/[::1]:7447", "tcp/127.1.2.3:1"]
+)
+def test_loopback_needs_no_keys(endpoint: str) -> None:
+    Network("mule", endpoint).require_safe()
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/mule.local:7447", "udp/10.0.0.7:7447"]
+)
+def test_a_network_needs_keys(endpoint: str) -> None:
+    with pytest.raises(ConfigError, match="everybody on the network"):
+        Network("mule", endpoint).require_safe()
+
+
+def test_keys_and_tls_go_together(tmp_path: Path) -> None:
+    keys = Keys(Authority.new(tmp_path / "keys", days=2).add("mule", "service", "mule", days=1))
+    with pytest.raises(ConfigError, match="needs keys"):
+        Network("mule", "tls/0.0.0.0:7447")
+    with pytest.raises(ConfigError, match="write tls/"):
+        Network("mule", "tcp/0.0.0.0:7447", keys)
+    Network("mule", "tls/0.0.0.0:7447", keys).require_safe()
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "here"),
+    [
+        ("tcp/0.0.0.0:7447", "tcp/127.0.0.1:7447"),
+        ("tcp/[::]:7447", "tcp/[::1]:7447"),
+        ("tcp/10.0.0.7:7447", "tcp/10.0.0.7:7447"),
+    ],
+)
+def test_processes_of_the_service_reach_it_where_it_listens(endpoint: str, here: str) -> None:
+    assert Network("mule", endpoint).local_endpoint == here

@@ -1,0 +1,323 @@
+"""The runtime over Zenoh, on this machine's loopback."""
+
+import asyncio
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgpack
+import pytest
+import zenoh
+
+from ldo_service.errors import ConfigError
+from ldo_service.runtime import Latest
+from ldo_service.runtime.actor import Out
+from ldo_service.runtime.outlet import Outlet
+from ldo_service.runtime.stage import Stage
+from ldo_service.schemas import Health, decode
+from ldo_service.transport.flow_control import data_key, encode_link
+from ldo_service.transport.zenoh_transport import MAX_QUERIES, Network, ZenohTransport, open_session
+from tests.runtime.cast import (
+    DOUBLES,
+    NUMBERS,
+    PIECES,
+    QUICK,
+    DoubleCollector,
+    Doubler,
+    Number,
+    Piece,
+    collector,
+    eventually,
+    number,
+    running,
+    send,
+)
+from tests.transport.conftest import free_port
+
+Client = Callable[[], zenoh.Session]
+
+
+def outlet(transport: ZenohTransport, *expected: str) -> Outlet:
+    return Outlet(Out(NUMBERS), "producer", 1, transport, expected)
+
+
+async def test_lossless_images_reach_a_slow_consumer_in_order(
+    network: Network, client: Client
+) -> None:
+    seen: list[int] = []
+    source = outlet(ZenohTransport(client(), network), "collector")
+    stage = collector(ZenohTransport(client(), network), seen, lambda _value: time.sleep(0.01))
+    image = bytes(1_000_000)
+    async with running(stage):
+        for value in range(60):
+            await send(source, number(value, data=image))
+        await source.flush()
+        await eventually(lambda: len(seen) == 60)
+        counted = stage.health().inputs[0]
+    assert seen == list(range(60))
+    assert counted.peak <= 4
+    assert counted.dropped == 0
+
+
+async def test_stages_in_different_sessions_form_a_chain(network: Network, client: Client) -> None:
+    seen: list[int] = []
+    expected = {DOUBLES.name: frozenset({"double_collector"})}
+    one, two, three = (ZenohTransport(client(), network) for _ in range(3))
+    numbers = outlet(one, "doubler")
+    async with running(
+        Stage(Doubler, two, config=QUICK, expected=expected),
+        Stage(lambda: DoubleCollector(seen), three, config=QUICK),
+    ):
+        for value in range(100):
+            await send(numbers, number(value))
+        await eventually(lambda: len(seen) == 100)
+    assert seen == [2 * value for value in range(100)]
+
+
+async def test_an_outside_subscriber_that_sleeps_does_not_slow_the_others(
+    network: Network, client: Client
+) -> None:
+    awake, asleep = threading.Event(), []
+
+    def sleep(sample: zenoh.Sample) -> None:
+        asleep.append(len(sample.payload.to_bytes()))
+        awake.wait(10)  # longer than the whole test takes otherwise
+
+    handler = zenoh.handlers.Callback(sleep, indirect=False)
+    client().declare_subscriber(network.expression(NUMBERS.name), handler)
+    seen: list[int] = []
+    source = outlet(ZenohTransport(client(), network), "collector")
+    async with running(collector(ZenohTransport(client(), network), seen)):
+        for value in range(30):
+            await send(source, number(value, data=bytes(1_000_000)))
+        await eventually(lambda: len(seen) == 30)
+        assert len(asleep) <= 1
+        awake.set()
+    assert seen == list(range(30))
+
+
+async def test_a_late_joiner_gets_the_last_value_by_a_query(
+    network: Network, client: Client
+) -> None:
+    transport = ZenohTransport(client(), network)
+    pieces = Outlet(Out(PIECES), "me", 1, transport)
+    for part in range(3):
+        await send(pieces, Piece(stamp_ns=1, version=1, part=part, parts=3))
+    asker = client()
+
+    def ask() -> list[int]:
+        replies = asker.get(
+            network.expression(PIECES.name),
+            timeout=5.0,
+            consolidation=zenoh.ConsolidationMode.NONE,  # else Zenoh keeps one part of a key
+        )
+        return [msgpack.unpackb(reply.ok.payload.to_bytes())["part"] for reply in replies]
+
+    assert await asyncio.to_thread(ask) == [0, 1, 2]
+
+
+async def test_a_query_that_is_answered_slowly_holds_up_nothing(
+    network: Network, client: Client
+) -> None:
+    transport, seen = ZenohTransport(client(), network), []
+    asked, go = threading.Event(), threading.Event()
+
+    def slow_values() -> list[tuple[bytes, bytes]]:
+        asked.set()
+        go.wait(10)
+        return [(b"", b"value")]
+
+    transport.answer("test/slow", slow_values)
+    asker = client()
+    many = range(MAX_QUERIES + 5)
+    replies = [asker.get(network.expression("test/slow"), timeout=10.0) for _ in many]
+    source = outlet(transport)
+    async with running(collector(transport, seen, policy=Latest(8))):
+        await eventually(asked.is_set)
+        await send(source, number(1))
+        await eventually(lambda: seen == [1])
+        go.set()
+        answers = await asyncio.to_thread(lambda: [next(iter(reply)) for reply in replies])
+    assert sum(answer.ok is not None for answer in answers) >= MAX_QUERIES
+    assert any(answer.err is not None for answer in answers)
+    transport.close()
+
+
+async def test_those_who_watch_learn_who_is_there_joins_and_leaves(
+    network: Network, client: Client
+) -> None:
+    seen: list[tuple[str, bool]] = []
+    early, watcher = (ZenohTransport(client(), network) for _ in range(2))
+    early.announce("early")
+    watcher.watch(lambda name, alive: seen.append((name, alive)))
+    await eventually(lambda: ("early", True) in seen)
+    session = client()
+    late = ZenohTransport(session, network)
+    late.announce("late")
+    await eventually(lambda: ("late", True) in seen)
+    session.close()
+    await eventually(lambda: ("late", False) in seen)
+
+
+async def test_a_foreign_program_reads_body_and_header_with_a_plain_library(
+    network: Network, client: Client
+) -> None:
+    samples: list[tuple[dict[str, object], list[object]]] = []
+
+    def keep(sample: zenoh.Sample) -> None:
+        header = msgpack.unpackb(sample.attachment.to_bytes())
+        samples.append((msgpack.unpackb(sample.payload.to_bytes()), header))
+
+    handler = zenoh.handlers.Callback(keep, indirect=False)
+    client().declare_subscriber(network.expression(NUMBERS.name), handler)
+    source = outlet(ZenohTransport(client(), network))
+
+    async def keep_sending() -> None:
+        while not samples:
+            await send(source, number(7, region="door"))
+            await asyncio.sleep(0.01)
+
+    await asyncio.wait_for(keep_sending(), 10)
+    body, header = samples[0]
+    assert body["value"] == 7
+    assert header[:2] == ["producer", 1]
+    assert header[3:] == [7, "door"]
+
+
+async def test_what_a_foreign_program_sends_reaches_a_latest_input(
+    network: Network, client: Client
+) -> None:
+    seen: list[int] = []
+    stage = collector(ZenohTransport(client(), network), seen, policy=Latest(4))
+    foreign = client()
+    body = msgpack.packb({"type": "Number", "stamp_ns": 1, "value": 5})
+
+    def put() -> bool:
+        foreign.put(network.expression(NUMBERS.name), b"noise", attachment=b"\xff")
+        foreign.put(network.expression(NUMBERS.name), body)
+        return bool(seen)
+
+    async with running(stage):
+        await eventually(put)
+        assert stage.health().inputs[0].rejected > 0
+    assert set(seen) == {5}
+
+
+async def test_heartbeats_travel(network: Network, client: Client) -> None:
+    beats: list[Health] = []
+    transport = ZenohTransport(client(), network)
+    transport.subscribe("health/doubler", lambda _header, body: beats.append(decode(body, Health)))
+    async with running(Stage(Doubler, ZenohTransport(client(), network), config=QUICK)):
+        await eventually(lambda: len(beats) >= 3)
+    assert beats[0].actor == "doubler"
+
+
+async def test_a_newer_post_replaces_one_that_has_not_left(
+    network: Network, client: Client
+) -> None:
+    publisher = ZenohTransport(client(), network).publisher("test/post")
+    received: list[bytes] = []
+    receiver = ZenohTransport(client(), network)
+    receiver.subscribe("test/post", lambda _header, body: received.append(bytes(body)))
+
+    def post_many() -> bool:
+        for value in range(1000):
+            publisher.post(b"", str(value).encode())
+        return received[-1:] == [b"999"]
+
+    await eventually(post_many)
+
+
+async def test_closing_twice_or_after_the_session_harms_nothing(
+    network: Network, client: Client
+) -> None:
+    session = client()
+    transport = ZenohTransport(session, network)
+    transport.announce("me")
+    transport.subscribe("test/number", lambda _header, _body: None)
+    publisher = transport.publisher("test/number")
+    session.close()
+    publisher.close()
+    publisher.post(b"", b"late")
+    transport.close()
+    transport.close()
+
+
+def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Network, client: Client) -> None:
+    session, seen = client(), []
+
+    async def live_briefly() -> None:
+        async with running(collector(ZenohTransport(session, network), seen)):
+            await asyncio.sleep(0.05)
+
+    asyncio.run(live_briefly())  # the session and its subscriptions live on
+    arrived = threading.Event()
+    handler = zenoh.handlers.Callback(lambda _sample: arrived.set(), indirect=False)
+    session.declare_subscriber(network.expression(data_key(NUMBERS.name)), handler)
+    other = client()
+    while not arrived.wait(0.02):
+        for key in ("test/number", "link/welcome/test/number", "link/alive/x"):
+            other.put(network.expression(key), encode_link([1, {"collector": 5}]), attachment=b"x")
+    assert seen == []
+
+
+def test_a_taken_port_and_an_absent_service_are_said_plainly(network: Network) -> None:
+    with pytest.raises(ConfigError, match=r"is another `ldo serve` running there\?"):
+        open_session(network, router=True)
+    nobody = Network("test", f"tcp/127.0.0.1:{free_port()}")
+    with pytest.raises(ConfigError, match="nobody answers on"):
+        open_session(nobody)
+
+
+@pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
+def test_a_robot_name_that_breaks_topics_is_refused(robot: str) -> None:
+    with pytest.raises(ConfigError, match="robot name"):
+        Network(robot)
+
+
+def test_a_number_decodes_as_a_number() -> None:
+    """The process of the kill tests declares the message on its own: the bytes must fit."""
+    body = msgpack.packb({"type": "Number", "stamp_ns": 1, "value": 5})
+    assert decode(body, Number) == Number(stamp_ns=1, value=5)
+
+
+@pytest.mark.slow
+async def test_a_network_that_hangs_for_seconds_blocks_no_loop_and_loses_nothing() -> None:
+    network, seen = Network("test", f"tcp/127.0.0.1:{free_port()}"), []
+    program = [sys.executable, str(Path(__file__).with_name("router_process.py"))]
+    router = subprocess.Popen([*program, network.endpoint], stdout=subprocess.PIPE)
+    try:
+        assert router.stdout
+        router.stdout.readline()
+        with open_session(network) as one, open_session(network) as other:
+            source = outlet(ZenohTransport(one, network), "collector")
+            async with running(collector(ZenohTransport(other, network), seen)):
+                await send_images(source, range(20))
+                router.send_signal(signal.SIGSTOP)
+                sending = asyncio.create_task(send_images(source, range(20, 60)))
+                pauses = [await pause() for _ in range(300)]
+                assert not sending.done()
+                router.send_signal(signal.SIGCONT)
+                await sending
+                await eventually(lambda: len(seen) == 60)
+        assert seen == list(range(60))
+        assert max(pauses) < 1.0  # a blocked put would take seconds
+    finally:
+        router.kill()
+        router.communicate()
+
+
+async def send_images(source: Outlet, values: range) -> None:
+    for value in values:
+        await send(source, number(value, data=bytes(1_000_000)))
+
+
+async def pause() -> float:
+    """How long the event loop took for a moment's sleep."""
+    started_s = time.perf_counter()
+    await asyncio.sleep(0.01)
+    return time.perf_counter() - started_s
