@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ldo_service.conversions.objects import boxes_message
 from ldo_service.detection.detectors import Detections, NetworkConfig
 from ldo_service.detection.model_registry import open_detector
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import DetectionBoxes, Keyframe
 from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW
-from ldo_service.wire import boxes_message
 
 log = logging.getLogger(__name__)
 

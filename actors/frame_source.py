@@ -14,6 +14,8 @@ from functools import partial
 
 import numpy as np
 
+from ldo_service.conversions.frames import camera_of, raw_frame_of, rgbd_message
+from ldo_service.conversions.poses import transform
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import codecs
 from ldo_service.geometry.frames import RawFrame, Rectifier, in_metres
@@ -23,7 +25,6 @@ from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, FRAME_RGBD
-from ldo_service.wire import camera_of, raw_frame_of, rgbd_message, transform
 
 log = logging.getLogger(__name__)
 

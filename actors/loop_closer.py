@@ -16,6 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.conversions.frames import keyframe_of
+from ldo_service.conversions.loops import loop_candidate_message, loop_closure_message
+from ldo_service.conversions.objects import boxes_in
+from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.detection.dynamic_classes import MovableConfig, movable_pixels
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry.keyframe_poses import KeyframePoses
@@ -39,14 +43,6 @@ from ldo_service.schemas.topics import (
     LOOP_CLOSURE,
 )
 from ldo_service.tracking.places import Place, place_of
-from ldo_service.wire import (
-    boxes_in,
-    keyframe_of,
-    keyframe_poses_of,
-    loop_candidate_message,
-    loop_closure_message,
-    transform,
-)
 
 log = logging.getLogger(__name__)
 

@@ -22,14 +22,16 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.conversions.frames import mask_of, rgbd_of
+from ldo_service.conversions.objects import claims_of, label_request_message, observation_messages
+from ldo_service.conversions.poses import keyframe_poses_of, pose_message, transform
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
 from ldo_service.gaussians.repair import MapRepair, RepairConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.keyframe_links import KeyframeLinks
-from ldo_service.map_teller import MapTeller, Occasion, Pace
-from ldo_service.objects_teller import ObjectsTeller
+from ldo_service.maps.publisher import MapTeller, ObjectsTeller, Occasion, Pace
+from ldo_service.maps.relative_measurements import KeyframeLinks
 from ldo_service.regions.region import Answer
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
@@ -63,16 +65,6 @@ from ldo_service.schemas.topics import (
     OBJECT_OBSERVATION,
 )
 from ldo_service.semantics.semantic_map import Learnt, SemanticMap, SemanticMapConfig
-from ldo_service.wire import (
-    claims_of,
-    keyframe_poses_of,
-    label_request_message,
-    mask_of,
-    observation_messages,
-    pose_message,
-    rgbd_of,
-    transform,
-)
 
 Output = (
     ModelView

@@ -17,6 +17,14 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ldo_service.conversions.frames import camera_of
+from ldo_service.conversions.objects import dense_distribution, landmark_message
+from ldo_service.conversions.poses import (
+    correction_message,
+    measured_of,
+    measurements_of,
+    transform,
+)
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
@@ -40,15 +48,6 @@ from ldo_service.schemas.topics import (
     KEYFRAME_REFINEMENT,
     LOOP_CLOSURE,
     OBJECT_OBSERVATION,
-)
-from ldo_service.wire import (
-    camera_of,
-    correction_message,
-    dense_distribution,
-    landmark_message,
-    measured_of,
-    measurements_of,
-    transform,
 )
 
 log = logging.getLogger(__name__)

@@ -17,6 +17,14 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.conversions.frames import camera_message, mask_message, rgbd_of
+from ldo_service.conversions.poses import (
+    keyframe_poses_of,
+    matrix6_message,
+    measured_message,
+    pose_message,
+    transform,
+)
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
@@ -46,16 +54,6 @@ from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.prior import Prior, Reading, Verdict
 from ldo_service.tracking.returning import SeenAgain
 from ldo_service.tracking.tracked import Tracked
-from ldo_service.wire import (
-    camera_message,
-    keyframe_poses_of,
-    mask_message,
-    matrix6_message,
-    measured_message,
-    pose_message,
-    rgbd_of,
-    transform,
-)
 
 log = logging.getLogger(__name__)
 

@@ -19,6 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ldo_service.conversions.frames import crops_of
 from ldo_service.detection.labellers import Labeller, Opinion
 from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
@@ -30,7 +31,6 @@ from ldo_service.schemas import LabelAdd, LabelNames, LabelOpen, LabelRequest
 from ldo_service.schemas.labels import MOST_NAMES, MOST_OTHERS
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
 from ldo_service.storage.state_store import State
-from ldo_service.wire import crops_of
 
 log = logging.getLogger(__name__)
 

@@ -12,12 +12,12 @@ from rich.console import Console
 from ldo_service.cameras import realsense
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
+from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.runs.source import Selection, open_source
 from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Network
 from ldo_service.transport.keys import Keys
-from ldo_service.wire import camera_rgbd_message
 
 from .live_camera import (
     REALSENSE,

@@ -12,19 +12,19 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig
-from ldo_service.answers import Answer, answer
 from ldo_service.client import connect
 from ldo_service.config import load_config
+from ldo_service.conversions.poses import transform
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import open_labeller
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
+from ldo_service.maps.object_search import Answer, answer
 from ldo_service.runs.objects_file import read_objects
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.semantics.text_search import Encode, NotCompared
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
-from ldo_service.wire import transform
 
 from .options import Endpoint, Json, KeysFolder, Robot
 

@@ -48,3 +48,22 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
     others = np.bincount(group)[group] - 1
     total = np.bincount(group, values)[group] - values
     return np.where(others > 0, total / np.maximum(others, 1), np.inf)
+
+
+def weights(rows: np.ndarray) -> np.ndarray:
+    """How much of a picture each of the rows [N, 16] makes: opacity times its largest section, m^2,
+    the product of the two larger scales."""
+    log_scales = rows[:, 3:6]
+    return _opacities(rows) * np.exp(log_scales.sum(axis=1) - log_scales.min(axis=1))
+
+
+def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
+    """Mask [N] bool of the `most` rows that make most of the picture, or of all."""
+    mask = np.ones(len(rows), bool)
+    if len(rows) > most:
+        mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False
+    return mask
+
+
+def _opacities(rows: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-rows[:, 10]))

@@ -31,11 +31,12 @@ import numpy as np
 
 from ldo_service.actors.localiser import PLACES
 from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.ply import write_ply
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.map_follower import MapFollower
+from ldo_service.maps.replica import MapFollower
 from ldo_service.schemas import (
     Correction,
     DetectionBoxes,
@@ -52,7 +53,6 @@ from ldo_service.schemas import (
 )
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
-from ldo_service.wire import keyframe_poses_of, transform
 
 from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
 from .front_end import FRONT_END

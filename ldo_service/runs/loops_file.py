@@ -17,10 +17,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from ldo_service.conversions.poses import transform
 from ldo_service.errors import DataError
 from ldo_service.evaluation.loops import FoundLoops, LoopClosed, PairCompared
 from ldo_service.schemas import Correction, LoopCandidate, LoopClosure
-from ldo_service.wire import transform
 
 LOOPS = "loops.json"
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ldo_service.conversions.frames import keyframe_of
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.schemas import Keyframe
 from ldo_service.storage.state_codec import encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.places import Places, place_of
-from ldo_service.wire import keyframe_of
 
 
 class PlaceRecord:

@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig, joined
+from ldo_service.conversions.frames import camera_of, camera_rgbd_message, raw_frame_of
+from ldo_service.conversions.poses import pose_message
 from ldo_service.datasets import SequenceOptions, open_sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
@@ -21,7 +23,6 @@ from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, Message, OdometryPrior, decode
 from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD
-from ldo_service.wire import camera_of, camera_rgbd_message, pose_message, raw_frame_of
 
 READ_AHEAD = 3  # frames decoded before they are needed: one decoding, one waiting, one to spare
 

@@ -9,9 +9,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from ldo_service.conversions.poses import transform
 from ldo_service.geometry import Camera, se3
 from ldo_service.schemas import MapObject
-from ldo_service.wire import transform
 
 from .scene import Sight
 

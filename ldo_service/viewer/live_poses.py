@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.geometry import se3
 from ldo_service.schemas import Correction, TrackedPose
-from ldo_service.wire import keyframe_poses_of, transform
 
 NOWHERE = np.full(3, np.nan)
 

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from itertools import islice
 from typing import get_args
 
+from ldo_service.conversions.frames import camera_of
+from ldo_service.maps.bounded_replica import KnownGaussians
 from ldo_service.schemas import (
     Correction,
     DetectionBoxes,
@@ -16,11 +18,9 @@ from ldo_service.schemas import (
     Message,
     TrackedPose,
 )
-from ldo_service.wire import camera_of
 
 from . import panel
 from .config import ViewerConfig
-from .known_gaussians import KnownGaussians
 from .lines import MOST_SIGHTS
 from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
 from .scene import Layer, Scene, Sight, sights_of

@@ -9,6 +9,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.gaussians.ply import read_ply
+from ldo_service.gaussians.pruning import weightiest
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import has_refined, read_viewpoints
 from ldo_service.runs.folder import REFINED
@@ -18,7 +19,6 @@ from ldo_service.runs.objects_file import OBJECTS, read_objects, refuse_state
 from . import panel
 from .config import ViewerConfig
 from .scene import Layer, Scene, sights_of, thinned
-from .splats import weightiest
 
 Signature = tuple[int, int]  # time of the last change, ns, and size, bytes
 

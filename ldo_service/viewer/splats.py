@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ldo_service.gaussians.pruning import _opacities
 from ldo_service.geometry import se3
 
 
@@ -32,22 +33,3 @@ def splats_of(rows: np.ndarray) -> Splats:
         np.clip(rows[:, 11:14], 0, 1),
         _opacities(rows)[:, None],
     )
-
-
-def weights(rows: np.ndarray) -> np.ndarray:
-    """How much of a picture each of the rows [N, 16] makes: opacity times its largest section, m^2,
-    the product of the two larger scales."""
-    log_scales = rows[:, 3:6]
-    return _opacities(rows) * np.exp(log_scales.sum(axis=1) - log_scales.min(axis=1))
-
-
-def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
-    """Mask [N] bool of the `most` rows that make most of the picture, or of all."""
-    mask = np.ones(len(rows), bool)
-    if len(rows) > most:
-        mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False
-    return mask
-
-
-def _opacities(rows: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-rows[:, 10]))

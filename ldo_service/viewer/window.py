@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import viser
 
-from ldo_service.answers import Answer, answer
 from ldo_service.errors import ConfigError, LdoError
+from ldo_service.maps.object_search import Answer, answer
 from ldo_service.schemas import MapObject
 from ldo_service.transport.endpoint import LOOPBACK
 

@@ -6,9 +6,9 @@ import pytest
 
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
+from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.datasets import Sequence
 from ldo_service.schemas import CameraRgbd, FrameRgbd, Keyframe, Message, TrackedPose
-from ldo_service.wire import camera_rgbd_message
 
 
 def camera_messages(sequence: Sequence, indices: Iterable[int]) -> list[CameraRgbd]:

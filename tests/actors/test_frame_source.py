@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
+from ldo_service.conversions.frames import camera_message, camera_rgbd_message
+from ldo_service.conversions.poses import pose_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, codecs, se3
@@ -18,7 +20,6 @@ from ldo_service.schemas import (
     Message,
     encode,
 )
-from ldo_service.wire import camera_message, camera_rgbd_message, pose_message
 
 
 @pytest.fixture

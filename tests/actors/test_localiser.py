@@ -8,12 +8,12 @@ import pytest
 
 from ldo_service.actors.localiser import PLACES, LocalisingTracker, places_of
 from ldo_service.actors.tracker import Tracker, TrackerConfig
+from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 from ldo_service.schemas import TrackedPose
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.wire import transform
 
 
 def localiser(finished_run: Path) -> LocalisingTracker:

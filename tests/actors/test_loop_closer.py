@@ -7,6 +7,13 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.loop_closer import MOST_WAITING, LoopCloser, LoopCloserConfig
+from ldo_service.conversions.frames import camera_message
+from ldo_service.conversions.poses import (
+    correction_message,
+    matrix6_message,
+    pose_message,
+    transform,
+)
 from ldo_service.geometry import se3
 from ldo_service.loops import LoopsConfig
 from ldo_service.loops.memory import RetrievalConfig
@@ -24,13 +31,6 @@ from ldo_service.schemas import (
 )
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.wire import (
-    camera_message,
-    correction_message,
-    matrix6_message,
-    pose_message,
-    transform,
-)
 
 FIRST_WALK, SECOND_WALK = range(0, 20, 2), range(1, 21, 2)
 DRIFT = se3.exp(np.array([0.02, -0.03, 0.02, 0.15, -0.1, 0.1]))  # 2 degrees and 20 cm

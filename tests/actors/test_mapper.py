@@ -9,12 +9,21 @@ import pytest
 
 from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.actors.optimizer import Optimizer
+from ldo_service.conversions.frames import mask_message, mask_of, rgbd_of
+from ldo_service.conversions.poses import (
+    correction_message,
+    keyframe_poses_of,
+    matrix6_message,
+    measurements_of,
+    pose_message,
+    transform,
+)
 from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.map_builder import MapBuilderConfig
 from ldo_service.gaussians.sleep_choice import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.map_follower import MapFollower
+from ldo_service.maps.replica import MapFollower
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.delivery_state import Past, Taken, successor
 from ldo_service.schemas import (
@@ -33,17 +42,6 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import LabellingConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.wire import (
-    correction_message,
-    keyframe_poses_of,
-    mask_message,
-    mask_of,
-    matrix6_message,
-    measurements_of,
-    pose_message,
-    rgbd_of,
-    transform,
-)
 
 CONFIG = MapperConfig(
     iterations=2,

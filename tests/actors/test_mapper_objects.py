@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.conversions.frames import camera_message
+from ldo_service.conversions.poses import correction_message, matrix6_message, pose_message
 from ldo_service.geometry import se3
-from ldo_service.map_follower import MapFollower
+from ldo_service.maps.replica import MapFollower
 from ldo_service.regions.open_vocabulary import Naming, NamingConfig
 from ldo_service.regions.region_proposals import TriggerConfig
 from ldo_service.regions.region_tracker import RegionConfig
@@ -36,7 +38,6 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import FusionConfig, LabellingConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.wire import camera_message, correction_message, matrix6_message, pose_message
 from tests.semantics.staged import CAMERA, THINGS, Shot, Thing, poses, shoot, true_things
 
 # of an image of 128x96, where walls hold a fifth each and the ball is 20 px wide

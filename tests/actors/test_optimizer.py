@@ -4,10 +4,10 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
+from ldo_service.conversions.poses import keyframe_poses_of, pose_message, transform
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.schemas import Keyframe, MeasuredPose, Pose
-from ldo_service.wire import keyframe_poses_of, pose_message, transform
 
 
 def handled(optimizer: Optimizer, keyframes: list[Keyframe]) -> list:

@@ -6,6 +6,12 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
+from ldo_service.conversions.poses import (
+    keyframe_poses_of,
+    matrix6_message,
+    measured_message,
+    pose_message,
+)
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.schemas import (
@@ -18,7 +24,6 @@ from ldo_service.schemas import (
     ObjectObservation,
 )
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.wire import keyframe_poses_of, matrix6_message, measured_message, pose_message
 
 CAMERA = CameraModel(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
 COLOR, DEPTH = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)

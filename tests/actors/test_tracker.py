@@ -6,6 +6,14 @@ import pytest
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
+from ldo_service.conversions.frames import rgbd_message, rgbd_of
+from ldo_service.conversions.poses import (
+    correction_message,
+    keyframe_poses_of,
+    measured_message,
+    pose_message,
+    transform,
+)
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
@@ -27,15 +35,6 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.segments import SegmentConfig
-from ldo_service.wire import (
-    correction_message,
-    keyframe_poses_of,
-    measured_message,
-    pose_message,
-    rgbd_message,
-    rgbd_of,
-    transform,
-)
 
 
 def poses_of(messages) -> list[TrackedPose]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.tracker import Tracker, TrackerConfig
+from ldo_service.conversions.poses import correction_message, transform
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import se3
 from ldo_service.runtime.actor import Situation
@@ -15,7 +16,6 @@ from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.returning import ReturnConfig
-from ldo_service.wire import correction_message, transform
 
 
 def configured(after: int) -> TrackerConfig:

@@ -15,13 +15,13 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ldo_service.conversions.poses import correction_message, keyframe_poses_of
 from ldo_service.gaussians.merging import doubled
 from ldo_service.gaussians.model import GaussianMap, aligned_rows
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.graph.keyframe_graph import KeyframeGraph
 from ldo_service.schemas import Correction, decode, encode
-from ldo_service.wire import correction_message, keyframe_poses_of
 from tests.graph.walks import REFINED, between, odometry, round_trips
 
 ROOM_M, SPACING_M, OVER_EACH_OTHER = 6.0, 0.02, 12

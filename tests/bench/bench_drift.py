@@ -22,6 +22,7 @@ import numpy as np
 
 from ldo_service.actors.graph import make_actors
 from ldo_service.config import Config, load_config
+from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import Judged, evaluate_rendering
@@ -33,7 +34,6 @@ from ldo_service.runs.over_file import run_over_file, with_all_cores
 from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, Message, TrackedPose
-from ldo_service.wire import transform
 from tests.runs.mistaken import Drift, DriftingTracker, standing_in
 
 NO_LOOPS = "loop_closer.is_on=false"

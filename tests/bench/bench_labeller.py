@@ -28,13 +28,14 @@ import msgspec
 import numpy as np
 import zenoh
 
+from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.poses import transform
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
 from ldo_service.schemas import CameraRgbd, TrackedPose, decode
 from ldo_service.synthetic.flat import FlatSequence
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.zenoh_transport import open_session
-from ldo_service.wire import camera_rgbd_message, transform
 from tests.detection.labellers.server import serving
 from tests.service.conftest import LiveService, live_service
 from tests.service.exhibits import Guide, Placed, flat, placed

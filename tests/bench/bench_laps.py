@@ -22,6 +22,8 @@ import numpy as np
 from ldo_service.actors.graph import make_actors
 from ldo_service.actors.mapper import Mapper, MapperConfig, Output
 from ldo_service.config import load_config
+from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.poses import pose_message
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.pictures import save_picture
 from ldo_service.runs.source import open_source
@@ -35,7 +37,6 @@ from ldo_service.schemas import (
     LabelOpen,
     MapRefine,
 )
-from ldo_service.wire import camera_rgbd_message, pose_message
 
 COLUMNS = (
     *("lap", "keyframes", "CPU ms", "awake", "asleep", "over cap"),

@@ -29,6 +29,7 @@ from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.config import load_config
+from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.loops import (
     FoundLoops,
@@ -49,7 +50,6 @@ from ldo_service.runs.source import Reader, Selection
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopClosure, Message
 from ldo_service.semantics.gaussian_labels import MOST_LABELS
-from ldo_service.wire import transform
 
 SUBGRAPHS = 1000
 Taken = Keyframe | DetectionBoxes | Correction  # by the loop closer

@@ -19,7 +19,7 @@ import numpy as np
 from ldo_service.detection.vocabulary import COCO, Vocabulary
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera, se3
-from ldo_service.objects_teller import ObjectsTeller
+from ldo_service.maps.publisher import ObjectsTeller
 from ldo_service.schemas import encode
 from ldo_service.semantics.data_association import MapView
 from ldo_service.semantics.gaussian_labels import fields, new_labels

@@ -24,13 +24,14 @@ import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
+from ldo_service.conversions.frames import rgbd_message
+from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.kernels import isa
 from ldo_service.schemas import TrackedPose
 from ldo_service.tracking import Odometry, Status
-from ldo_service.wire import keyframe_poses_of, rgbd_message, transform
 from tests.bench.tracking_peers import Step, peers
 
 WARM_UP = 5  # frames left out of the times

@@ -13,9 +13,9 @@ from ldo_service.cameras.realsense import (
     library,
     messages,
 )
+from ldo_service.conversions.frames import camera_of
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, camera
-from ldo_service.wire import camera_of
 
 rs = pytest.importorskip("pyrealsense2", reason="needs `pip install 'ldo-slam[realsense]'`")
 

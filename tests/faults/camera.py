@@ -10,11 +10,11 @@ import numpy as np
 import zenoh
 
 from ldo_service.client import Client
+from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import Camera
 from ldo_service.geometry.frames import RawFrame
 from ldo_service.schemas import CameraRgbd
-from ldo_service.wire import camera_rgbd_message
 
 STRIDE, PERIOD_NS, FIRST_NS = 2, 100_000_000, 1_000_000_000
 

@@ -25,8 +25,9 @@ from typing import Any, TextIO
 import msgspec
 import numpy as np
 
+from ldo_service.conversions.poses import transform
 from ldo_service.geometry import se3
-from ldo_service.map_follower import MapFollower
+from ldo_service.maps.replica import MapFollower
 from ldo_service.schemas import CameraRgbd, Correction, Health, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
@@ -37,7 +38,6 @@ from ldo_service.schemas.topics import (
     MAP_SNAPSHOT,
     OBJECT_OBSERVATION,
 )
-from ldo_service.wire import transform
 
 from .camera import Streaming, frames, number_of, true_poses
 from .life import (

@@ -22,9 +22,10 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
+from ldo_service.conversions.objects import map_objects
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.map_follower import MapFollower
+from ldo_service.maps.replica import MapFollower
 from ldo_service.runtime.delivery_state import Past, successor
 from ldo_service.schemas import Correction, MapObject, MapObjects, MapSnapshot
 from ldo_service.schemas.topics import GRAPH_CORRECTION, MAP_OBJECTS, MAP_SNAPSHOT
@@ -32,7 +33,6 @@ from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.zenoh_transport import open_session
-from ldo_service.wire import map_objects
 
 from .witness import Witness
 

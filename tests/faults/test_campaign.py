@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.conversions.poses import correction_message
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
 from ldo_service.transport.flow_control import Grant, Header, encode_link
-from ldo_service.wire import correction_message
 from tests.faults.camera import frames
 from tests.faults.campaign import Batch, Outcome, table, whole_batches
 from tests.faults.witness import GRANTS, TAKERS, Witness

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import zenoh
 
-from ldo_service.map_follower import MapFollower
+from ldo_service.maps.replica import MapFollower
 from ldo_service.schemas import (
     Correction,
     Health,

@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ldo_service.conversions.frames import crops_of
+from ldo_service.conversions.objects import label_request_message
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
 from ldo_service.regions.foreground import Foreground
@@ -20,7 +22,6 @@ from ldo_service.regions.region_views import (
 )
 from ldo_service.schemas.labels import MOST_CROPS
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.wire import crops_of, label_request_message
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160

@@ -8,6 +8,8 @@ import pytest
 
 from ldo_service.actors.graph import GRAPH
 from ldo_service.config import Config, load_config
+from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.poses import pose_message
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import Trajectory
 from ldo_service.runtime import Out
@@ -18,7 +20,6 @@ from ldo_service.schemas import OdometryPrior
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR
 from ldo_service.service.service import open_recorder
 from ldo_service.transport.interface import MemoryTransport
-from ldo_service.wire import camera_rgbd_message, pose_message
 from tests.runtime.cast import eventually, running, send
 
 FRAMES = 30

@@ -11,6 +11,7 @@ from ldo_service.actors.graph import make_actors
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.config import Config
+from ldo_service.conversions.poses import measured_message
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.runtime import Actor
@@ -18,7 +19,6 @@ from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandid
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.prior import Reading
 from ldo_service.tracking.tracked import Tracked
-from ldo_service.wire import measured_message
 
 UP_ODOM = np.array([0.0, -1.0, 0.0])  # of a camera held level at the start
 ASIDE_ODOM = np.array([1.0, 0.0, 0.0])  # level

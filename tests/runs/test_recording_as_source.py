@@ -7,12 +7,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
 from ldo_service.runs.source import RecordingSequence, open_source
 from ldo_service.schemas import CameraColor, CameraDepth
-from ldo_service.wire import camera_rgbd_message
 from tests.commands.test_cli import ldo
 from tests.runs.conftest import FRAMES, ROUGH
 

@@ -1,5 +1,5 @@
 """Fixtures of the transport's tests that the runtime's tests share."""
 
-from tests.transport.conftest import network
+from tests.transport.conftest import client, network
 
-__all__ = ["network"]
+__all__ = ["client", "network"]

@@ -13,6 +13,7 @@ from threading import Semaphore
 
 import numpy as np
 
+from ldo_service.conversions.frames import crops_of
 from ldo_service.detection.labellers.chat_completion import HttpConfig
 from ldo_service.gaussians.model import GaussianMap
 from ldo_service.geometry import codecs, se3
@@ -20,7 +21,6 @@ from ldo_service.geometry.codecs import shrunk
 from ldo_service.schemas import LabelRequest
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.synthetic.flat import FlatSequence
-from ldo_service.wire import crops_of
 from tests.detection.labellers.server import says
 
 FILLED = 0.7  # of a box, by a thing that it is of

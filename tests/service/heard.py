@@ -4,12 +4,12 @@ from contextlib import ExitStack
 
 import numpy as np
 
+from ldo_service.conversions.poses import keyframe_poses_of
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.gaussians.model import GaussianMap
 from ldo_service.schemas import Correction, InputCount, LabelOpen, LabelRequest, TrackedPose
 from ldo_service.schemas.topics import GRAPH_CORRECTION, POSE_TRACKED
 from ldo_service.storage.state_store import FolderStore
-from ldo_service.wire import keyframe_poses_of
 from tests.service.conftest import LiveService
 from tests.service.exhibits import Guide
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import zenoh
 
+from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.datasets import Sequence
 from ldo_service.schemas import CameraRgbd, TrackedPose, encode
 from ldo_service.transport.zenoh_transport import Network, open_session
-from ldo_service.wire import camera_rgbd_message
 from tests.service.conftest import LiveService, live_service, wait_until
 
 PROGRAM = Path(__file__).with_name("troubled_service.py")

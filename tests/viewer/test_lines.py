@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.conversions.poses import pose_message
 from ldo_service.geometry import Camera, se3
 from ldo_service.schemas import MapObjects
 from ldo_service.viewer.lines import (
@@ -20,7 +21,6 @@ from ldo_service.viewer.lines import (
     sight_lines,
 )
 from ldo_service.viewer.scene import Sight, thinned
-from ldo_service.wire import pose_message
 from tests.schemas.examples import EXAMPLES
 
 CAMERA = Camera(64, 48, 60.0, 50.0, 30.0, 25.0)

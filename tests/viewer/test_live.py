@@ -29,9 +29,9 @@ from ldo_service.transport.keys import Keys
 from ldo_service.transport.zenoh_transport import Network, open_session
 from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live import Live, live
+from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES
 from tests.service.conftest import free_endpoint, wait_until
-from tests.viewer.streams import ChangingMap
 
 
 class Robot:

@@ -4,6 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.conversions.frames import camera_of
+from ldo_service.conversions.poses import correction_message, pose_message
 from ldo_service.geometry import se3
 from ldo_service.schemas import (
     Correction,
@@ -19,9 +21,8 @@ from ldo_service.schemas import (
 )
 from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live_scene import FACTS_EVERY_S, MOST_ACTORS, LiveScene
-from ldo_service.wire import camera_of, correction_message, pose_message
+from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES
-from tests.viewer.streams import ChangingMap
 
 
 class Clock:

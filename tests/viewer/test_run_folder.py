@@ -10,13 +10,13 @@ import pytest
 
 from ldo_service.errors import DataError
 from ldo_service.gaussians.ply import read_ply, write_ply
+from ldo_service.gaussians.pruning import weights
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.objects_file import write_objects
 from ldo_service.schemas import MapObjects, ObjectView
 from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.panel import escaped
 from ldo_service.viewer.run_folder import PARTS, RunFolder
-from ldo_service.viewer.splats import weights
 from tests.schemas.examples import EXAMPLES
 
 CONFIG = ViewerConfig()

@@ -6,9 +6,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ldo_service.gaussians.ply import read_ply
+from ldo_service.gaussians.pruning import weightiest, weights
 from ldo_service.runs.finished import read_viewpoints
-from ldo_service.viewer.splats import splats_of, weightiest, weights
-from tests.viewer.streams import random_rows
+from ldo_service.viewer.splats import splats_of
+from tests.maps.streams import random_rows
 
 
 def test_covariances_are_those_of_scipys_rotations() -> None:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from ldo_service.conversions.objects import map_objects
 from ldo_service.geometry import se3
-from ldo_service.objects_teller import ObjectsTeller
-from ldo_service.wire import map_objects
+from ldo_service.maps.publisher import ObjectsTeller
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
 
 

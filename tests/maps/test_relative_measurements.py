@@ -6,12 +6,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from ldo_service.conversions.poses import matrix6_message, pose_message
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.keyframe_links import KeyframeLinks
+from ldo_service.maps.relative_measurements import KeyframeLinks
 from ldo_service.schemas import Array, Keyframe, MeasuredPose
 from ldo_service.schemas.frames import CameraModel
-from ldo_service.wire import matrix6_message, pose_message
 
 RECENT = 4
 STEP = se3.exp(np.array([0.01, 0.02, 0.0, 0.1, 0.0, 0.02]))

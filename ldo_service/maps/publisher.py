@@ -1,20 +1,28 @@
-"""What followers of a map are told of it, in messages of a bounded size; see `map_follower`."""
+"""Publication of the map and its objects, in messages of a bounded size.
 
-from collections.abc import Iterator
+`replica` holds the receiving side. Objects that did not change are not encoded again.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ldo_service.conversions.objects import map_objects
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.map_messages import (
-    NO_GAUSSIANS,
-    NO_IDS,
-    gaussians_message,
-    parts_of,
-    regrouped,
-)
 from ldo_service.runtime.process import give_back_free_memory
-from ldo_service.schemas import AnchorMotion, Array, Gaussians, MapDelta, MapSnapshot
+from ldo_service.schemas import (
+    AnchorMotion,
+    Array,
+    Gaussians,
+    MapDelta,
+    MapObject,
+    MapObjects,
+    MapSnapshot,
+)
+from ldo_service.semantics.objects import Objects
+
+from .messages import NO_GAUSSIANS, NO_IDS, gaussians_message, parts_of, regrouped
 
 # A successor starts from a checkpoint and must not use a version again that followers may hold:
 # more than a mapper could use up between two checkpoints.
@@ -151,3 +159,33 @@ class MapTeller:
         self._since_changed = state["since_changed"]
         self._since_snapshot, self._in_snapshot = state["since_snapshot"], state["in_snapshot"]
         self._names_told = state["names_told"]
+
+
+class ObjectsTeller:
+    """Makes map/objects: a thousand objects take 50 ms to make, and few change at a time. `names`
+    of the vocabulary may get more."""
+
+    def __init__(self) -> None:
+        self._made: dict[int, tuple[bytes, MapObject]] = {}  # by id: the landmark, and its message
+
+    def message(
+        self,
+        objects: Objects,
+        names: Sequence[str],
+        version: int,
+        graph_version: int,
+        stamp_ns: int,
+    ) -> MapObjects:
+        table = objects.landmarks
+        rows, ids = [row.tobytes() for row in table], table["id"].tolist()
+        known = [self._made.get(id_, (b"",))[0] == row for id_, row in zip(ids, rows, strict=True)]
+        new = np.flatnonzero(~np.array(known, bool))
+        for k, one in zip(new.tolist(), map_objects(table[new], names), strict=True):
+            self._made[one.id] = rows[k], one
+        self._made = {id_: self._made[id_] for id_ in ids}
+        return MapObjects(
+            stamp_ns=stamp_ns,
+            version=version,
+            graph_version=graph_version,
+            objects=tuple(one for _, one in self._made.values()),
+        )

@@ -2,10 +2,11 @@
 
 import numpy as np
 
+from ldo_service.conversions.poses import transform
 from ldo_service.gaussians.model import GaussianMap
-from ldo_service.map_messages import piece_of
 from ldo_service.schemas import MapDelta, MapSnapshot
-from ldo_service.wire import transform
+
+from .messages import piece_of
 
 NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)
 

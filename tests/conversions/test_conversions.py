@@ -2,10 +2,11 @@
 
 import numpy as np
 
-from ldo_service.objects_teller import ObjectsTeller
+from ldo_service.conversions.objects import observation_messages
+from ldo_service.conversions.poses import transform
+from ldo_service.maps.publisher import ObjectsTeller
 from ldo_service.schemas import MapObjects, decode, encode
 from ldo_service.semantics.object_landmarks import distributions, entropies
-from ldo_service.wire import observation_messages, transform
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
 
 

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from ldo_service.map_follower import MapFollower
-from ldo_service.viewer.known_gaussians import ROOM, KnownGaussians
-from ldo_service.viewer.splats import weightiest
-from tests.viewer.streams import ChangingMap
+from ldo_service.gaussians.pruning import weightiest
+from ldo_service.maps.bounded_replica import ROOM, KnownGaussians
+from ldo_service.maps.replica import MapFollower
+
+from .streams import ChangingMap
 
 PLENTY = 1_000_000
 

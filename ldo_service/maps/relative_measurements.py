@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
+from ldo_service.conversions.poses import pose_message
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.point_records import Records
 from ldo_service.schemas import Keyframe, KeyframeRefinement, MeasuredPose
 from ldo_service.schemas.pose import Matrix6
-from ldo_service.wire import pose_message
 
 UPPER = np.triu_indices(6)
 LINK = np.dtype([("id", np.int64), ("reference", np.int64), ("information", np.float32, (21,))])

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from ldo_service.conversions.poses import pose_message
 from ldo_service.gaussians.model import GaussianMap, aligned_rows
 from ldo_service.geometry import se3
-from ldo_service.map_messages import NO_GAUSSIANS, NO_IDS, gaussians_message, regrouped
+from ldo_service.maps.messages import NO_GAUSSIANS, NO_IDS, gaussians_message, regrouped
 from ldo_service.schemas import AnchorMotion, Array, Gaussians, MapDelta, MapSnapshot
-from ldo_service.wire import pose_message
 
 
 def random_rows(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from ldo_service.conversions.poses import transform
 from ldo_service.gaussians.model import GaussianMap, Piece
-from ldo_service.map_messages import piece_of
+from ldo_service.gaussians.pruning import weightiest
 from ldo_service.schemas import MapDelta, MapSnapshot
-from ldo_service.wire import transform
 
-from .splats import weightiest
+from .messages import piece_of
 
 ROOM = 1.25  # of what is to be kept: what is too much goes when this is full, a lot at a time
 

@@ -1,0 +1,1 @@
+"""Conversions between messages and numerics: the only package that knows both."""

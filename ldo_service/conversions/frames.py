@@ -1,0 +1,124 @@
+"""Conversions between messages and numerics: cameras, frames, keyframes and masks."""
+
+import cv2
+import numpy as np
+
+from ldo_service.geometry import Camera, RawFrame, RgbdFrame, codecs
+from ldo_service.schemas import (
+    Array,
+    CameraModel,
+    CameraRgbd,
+    FrameRgbd,
+    Image,
+    Keyframe,
+    LabelRequest,
+)
+from ldo_service.schemas.frames import ImageEncoding
+from ldo_service.schemas.keyframe import NO_MASK
+from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
+from ldo_service.tracking.moving import resized
+from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of
+
+from .poses import transform
+
+
+def camera_message(camera: Camera) -> CameraModel:
+    return CameraModel(
+        width=camera.width,
+        height=camera.height,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        distortion=camera.distortion,
+    )
+
+
+def camera_of(model: CameraModel) -> Camera:
+    return Camera(
+        model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion
+    )
+
+
+def rgbd_message(frame: RgbdFrame) -> FrameRgbd:
+    return FrameRgbd(
+        stamp_ns=frame.stamp_ns,
+        frame=frame.index,
+        camera=camera_message(frame.camera),
+        color=Array.of(frame.color),
+        depth_m=Array.of(frame.depth_m),
+    )
+
+
+def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
+    """The frame of a message; its arrays are read-only views."""
+    return RgbdFrame(
+        color=message.color.numpy(),
+        depth_m=message.depth_m.numpy(),
+        camera=camera_of(message.camera),
+        stamp_ns=message.stamp_ns,
+        index=message.frame,
+    )
+
+
+def keyframe_of(message: Keyframe, config: PyramidConfig) -> TrackedKeyframe:
+    """A keyframe that others can be aligned to, without what moves in it."""
+    view = pyramid_of(rgbd_of(message), config)
+    return TrackedKeyframe(
+        view,
+        transform(message.T_odom_keyframe),
+        message.keyframe,
+        message.segment,
+        left_out=resized(mask_of(message.is_moving), view.levels[0].depth_m.shape),
+    )
+
+
+def mask_message(mask: np.ndarray | None, camera: Camera) -> Array:
+    """A mask [h, w] bool of any size as u1 [H, W] of the camera's; [0, 0] where nothing is set."""
+    if mask is None or not mask.any():
+        return NO_MASK
+    size = camera.width, camera.height
+    return Array.of(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
+
+
+def mask_of(array: Array) -> np.ndarray | None:
+    """[H, W] bool; None where there is none."""
+    return array.numpy() > 0 if array.data.nbytes else None
+
+
+def crops_of(request: LabelRequest) -> list[np.ndarray]:
+    """Each [h, w, 3] uint8 RGB. Raises FrameError for bytes that are no such image."""
+    return [codecs.decode_color(c.encoding, c.width, c.height, c.data) for c in request.crops]
+
+
+def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
+    """A camera's frame for the wire: colour raw, depth raw or compressed with zstd."""
+    height, width = raw.depth.shape
+    depth = np.asarray(raw.depth, np.float32) if raw.depth.dtype == np.float64 else raw.depth
+    encoding: ImageEncoding = "z16" if depth.dtype == np.uint16 else "f32"
+    data = depth.tobytes()
+    if compress_depth:
+        encoding, data = codecs.encode_depth(depth)
+    return CameraRgbd(
+        stamp_ns=raw.stamp_ns,
+        frame=raw.index,
+        camera=camera_message(raw.camera),
+        color=Image(
+            encoding="rgb8", width=width, height=height, data=memoryview(raw.color.tobytes())
+        ),
+        depth=Image(encoding=encoding, width=width, height=height, data=memoryview(data)),
+        depth_scale=raw.depth_scale,
+    )
+
+
+def raw_frame_of(message: CameraRgbd, index: int) -> RawFrame:
+    """The frame as the camera delivered it, decompressed. Raises DataError."""
+    color, depth = message.color, message.depth
+    return RawFrame(
+        index=index,
+        stamp_ns=message.stamp_ns,
+        color=codecs.decode_color(color.encoding, color.width, color.height, color.data),
+        depth=codecs.decode_depth(depth.encoding, depth.width, depth.height, depth.data),
+        depth_scale=message.depth_scale,
+        camera=camera_of(message.camera),
+    )

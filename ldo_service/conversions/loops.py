@@ -1,0 +1,43 @@
+"""Conversions between messages and numerics: loop closures and candidates."""
+
+from ldo_service.loops import Finding
+from ldo_service.schemas import (
+    LoopCandidate,
+    LoopClosure,
+)
+
+from .poses import measured_message
+
+
+def loop_closure_message(finding: Finding) -> LoopClosure:
+    """Raises ValueError for a candidate that was refused."""
+    if finding.closure is None:
+        raise ValueError(f"a candidate that was refused is no closure: {finding.check.refused}")
+    return LoopClosure(
+        stamp_ns=finding.check.proposal.new.stamp_ns,
+        pose=measured_message(finding.closure),
+        overlap=finding.check.overlap,
+        rmse_m=finding.check.rmse_m,
+        entropy=finding.check.proposal.semantics.entropy,
+    )
+
+
+def loop_candidate_message(finding: Finding) -> LoopCandidate:
+    check, old, new = finding.check, finding.likeness.subgraph, finding.new
+    proposal = check.proposal
+    return LoopCandidate(
+        stamp_ns=new.stamp_ns,
+        keyframe=new.keyframes[-1],
+        reference=old.keyframes[-1],
+        keyframes=new.keyframes,
+        references=old.keyframes,
+        similarity=finding.likeness.similarity,
+        appearance=finding.likeness.appearance,
+        evidence=proposal.evidence,
+        inliers=proposal.inliers,
+        divergence=proposal.semantics.divergence,
+        entropy=proposal.semantics.entropy,
+        overlap=check.overlap,
+        rmse_m=check.rmse_m,
+        refused=check.refused,
+    )

@@ -1,0 +1,103 @@
+"""Conversions between messages and numerics: poses, measurements and corrections."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.keyframe_poses import RelativePose
+from ldo_service.geometry.se3 import quaternions
+from ldo_service.schemas import (
+    Array,
+    Correction,
+    GraphLandmark,
+    Keyframe,
+    MeasuredPose,
+    Pose,
+)
+
+
+def pose_message(T: np.ndarray) -> Pose:
+    """T [4, 4] for the wire."""
+    x, y, z = (float(v) for v in T[:3, 3])
+    qw, qx, qy, qz = (float(v) for v in se3.quaternion(T[:3, :3]))
+    return Pose((x, y, z), (qw, qx, qy, qz))
+
+
+def transform(pose: Pose) -> np.ndarray:
+    """T [4, 4] of a pose from the wire."""
+    return se3.from_quaternion(np.array(pose.translation), np.array(pose.quaternion))
+
+
+def matrix6_message(matrix: np.ndarray) -> tuple[float, ...]:
+    return tuple(float(v) for v in np.asarray(matrix).ravel())
+
+
+def measured_message(measured: RelativePose) -> MeasuredPose:
+    return MeasuredPose(
+        reference=measured.a,
+        keyframe=measured.b,
+        T_reference_keyframe=pose_message(measured.T_a_b),
+        information=matrix6_message(measured.information),
+    )
+
+
+def measured_of(message: MeasuredPose) -> RelativePose:
+    return RelativePose(
+        message.reference,
+        message.keyframe,
+        transform(message.T_reference_keyframe),
+        np.array(message.information).reshape(6, 6),
+    )
+
+
+def measurements_of(keyframe: Keyframe) -> list[RelativePose]:
+    """All that a keyframe was measured from, its reference first; none for the first keyframe."""
+    window = [measured_of(pose) for pose in keyframe.window]
+    if keyframe.reference is None:
+        return window
+    T_reference_keyframe = transform(keyframe.T_reference_keyframe)
+    information = np.array(keyframe.information).reshape(6, 6)
+    first = RelativePose(keyframe.reference, keyframe.keyframe, T_reference_keyframe, information)
+    return [first, *window]
+
+
+def correction_message(
+    stamp_ns: int,
+    graph_version: int,
+    T_map_keyframe: dict[int, np.ndarray],
+    refinements: int = 0,
+    joined: Mapping[int, int] | None = None,
+    *,
+    closures: Iterable[tuple[int, int]] = (),
+    not_believed: Iterable[tuple[int, int]] = (),
+    landmarks: Iterable[GraphLandmark] = (),
+) -> Correction:
+    T = np.array(list(T_map_keyframe.values())).reshape(-1, 4, 4)
+    rows = np.concatenate([T[:, :3, 3], quaternions(T[:, :3, :3])], axis=1)
+    return Correction(
+        stamp_ns=stamp_ns,
+        graph_version=graph_version,
+        keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
+        T_map_keyframe=Array.of(rows),
+        refinements=refinements,
+        joined=tuple(sorted((joined or {}).items())),
+        closures=tuple(closures),
+        not_believed=tuple(not_believed),
+        landmarks=tuple(landmarks),
+    )
+
+
+def keyframe_poses_of(
+    correction: Correction, only: Iterable[int] | None = None
+) -> dict[int, np.ndarray]:
+    """T_map_keyframe [4, 4] by keyframe id; of `only` those and the newest one it names."""
+    keyframes = correction.keyframes.numpy()
+    rows = correction.T_map_keyframe.numpy()
+    if only is not None and len(keyframes):
+        chosen = np.isin(keyframes, list(only))
+        chosen[-1] = True
+        keyframes, rows = keyframes[chosen], rows[chosen]
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = se3.rotation(rows[:, 3:]), rows[:, :3]
+    return dict(zip(keyframes.tolist(), T, strict=True))
