@@ -26,8 +26,8 @@ from ldo_service.conversions.frames import mask_of, rgbd_of
 from ldo_service.conversions.objects import claims_of, label_request_message, observation_messages
 from ldo_service.conversions.poses import keyframe_poses_of, pose_message, transform
 from ldo_service.errors import ConfigError
+from ldo_service.gaussians.loop_refit import MapRepair, RepairConfig
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
-from ldo_service.gaussians.repair import MapRepair, RepairConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.maps.publisher import MapTeller, ObjectsTeller, Occasion, Pace

@@ -11,9 +11,7 @@ import tyro
 from rich.console import Console
 
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.gaussians.ply import write_ply
-from ldo_service.gaussians.splat import write_splat
-from ldo_service.gaussians.spz import write_spz
+from ldo_service.gaussians.file_formats import write_ply, write_splat, write_spz
 from ldo_service.geometry import Trajectory, se3
 from ldo_service.runs.finished import MapFolder, newest_map
 from ldo_service.runs.folder import EXPORTED, WRITTEN

@@ -7,7 +7,7 @@ import numpy as np
 
 from ldo_service import datasets
 from ldo_service.errors import DataError
-from ldo_service.gaussians.render import render
+from ldo_service.gaussians.renderer import render
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.semantics.semantic_fusion import label_image

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ldo_service.gaussians.exposure import Exposure, fitted_exposure
-from ldo_service.gaussians.render import Rendering, render
+from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import Sequence
 

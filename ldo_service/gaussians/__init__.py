@@ -1,15 +1,22 @@
 """The map of 3D Gaussians: what it holds, how it is seen, how it grows and how it is optimised."""
 
 from .adam import Adam, AdamConfig
+from .densification import InsertionConfig, insert
 from .exposure import Exposure, estimated_exposure, fitted_exposure
-from .insertion import InsertionConfig, insert
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
-from .optimise import Optimiser, OptimiserConfig
+from .optimizer import Optimiser, OptimiserConfig
 from .pruning import PruningConfig, superfluous
-from .rasteriser import Rasteriser, Reached, RowGradients
-from .render import Contributions, Rendering, RenderMemory, render
-from .views import View
+from .renderer import (
+    Contributions,
+    Rasteriser,
+    Reached,
+    Rendering,
+    RenderMemory,
+    RowGradients,
+    render,
+)
+from .training_views import View
 
 __all__ = [
     "Adam",

@@ -10,9 +10,8 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.kernels import _adam
 
-from .adam_step import AdamStep
 from .model import GaussianMap, aligned_rows
-from .rasteriser import Rasteriser, Reached, RowGradients
+from .renderer import AdamStep, Rasteriser, Reached, RowGradients
 
 
 @dataclass(frozen=True, slots=True)

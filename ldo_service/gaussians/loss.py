@@ -1,5 +1,5 @@
 """How far a rendering is from a frame. The kernel is `kernels/loss.cpp`, its plain twin
-`loss_reference.py`."""
+`tests/reference/loss.py`."""
 
 from dataclasses import dataclass
 from math import log10

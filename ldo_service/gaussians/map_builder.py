@@ -13,21 +13,24 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.point_records import PoseTable
 
-from .anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
-from .changes import ChangeLog, Changes
+from .change_log import ChangeLog, Changes
+from .densification import InsertionConfig, insert
 from .exposure import Exposure, estimated_exposure
-from .horizon import Horizon
-from .insertion import InsertionConfig, insert
-from .keyframe_store import KeyframeStore, KeyframeStoreConfig
-from .keyframe_views import KeyframeViews
-from .merging import MergingConfig, doubled
+from .keyframe_store import KeyframeStore, KeyframeStoreConfig, KeyframeViews
 from .model import GaussianMap, Piece
-from .optimise import Optimiser, OptimiserConfig
-from .pruning import PruningConfig, superfluous
-from .render import Contributions, Rendering, RenderMemory, render
-from .sleep import SleepingGaussians, whole_map
-from .sleep_choice import SleepConfig, choose_sleepers
-from .views import View, sampled_surface, schedule, shared_surface, shown_within
+from .offloading import SleepingGaussians, whole_map
+from .optimizer import Optimiser, OptimiserConfig
+from .pruning import MergingConfig, PruningConfig, doubled, superfluous
+from .renderer import Contributions, Rendering, RenderMemory, render
+from .training_views import View, sampled_surface, schedule, shared_surface, shown_within
+from .visibility import (
+    AnchorSpheres,
+    Horizon,
+    PlacedCamera,
+    SleepConfig,
+    choose_sleepers,
+    clumps_of,
+)
 
 MOST_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
 TRIES_PER_DRAW = 4  # of keyframes at random, where many see what sleeps

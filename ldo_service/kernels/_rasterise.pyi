@@ -19,7 +19,7 @@ def rasterise(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Colour [H, W, 3], weighted depth [H, W], median depth [H, W] and opacity [H, W].
 
-    `rows` [N, 16] and `T_camera_map` [3, 4] are contiguous; `ldo_service.gaussians.render` says
+    `rows` [N, 16] and `T_camera_map` [3, 4] are contiguous; `ldo_service.gaussians.renderer` says
     what they hold. Releases the GIL. Raises ValueError for wrong shapes, types, strides, sizes
     and cameras. Bitwise equal for any number of threads. With `memory`, scratch is kept in it for
     the next call, and what it held of a rendering is lost: fresh pages cost up to half a rendering.

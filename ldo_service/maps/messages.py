@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from ldo_service.gaussians.changes import Changes
+from ldo_service.gaussians.change_log import Changes
 from ldo_service.gaussians.model import ROW, Piece, new_labels
 from ldo_service.schemas import Array, Gaussians
 

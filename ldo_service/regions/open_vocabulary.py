@@ -13,7 +13,7 @@ import numpy as np
 
 from ldo_service.detection.vocabulary import Vocabulary, normalised
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.views import View
+from ldo_service.gaussians.training_views import View
 
 from .foreground import Claims, Foreground
 from .geometric_segmentation import segments

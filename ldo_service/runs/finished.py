@@ -15,7 +15,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap, RunFrame
-from ldo_service.gaussians.ply import read_ply
+from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.geometry import Camera, Trajectory
 from ldo_service.semantics.semantics_file import SavedSemantics, read_semantics
 from ldo_service.volumes import Viewpoint

@@ -33,7 +33,7 @@ from ldo_service.actors.localiser import PLACES
 from ldo_service.actors.tracker import TrackerConfig
 from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.ply import write_ply
+from ldo_service.gaussians.file_formats import write_ply
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.maps.replica import MapFollower

@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.model import aligned_rows
-from ldo_service.gaussians.render import Rendering, render
+from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import (
     Claims,

@@ -10,8 +10,8 @@ from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pi
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.gaussians.render import Contributions
-from ldo_service.gaussians.views import View
+from ldo_service.gaussians.renderer import Contributions
+from ldo_service.gaussians.training_views import View
 from ldo_service.regions.foreground import Claims
 from ldo_service.regions.open_vocabulary import Naming, NamingConfig
 from ldo_service.regions.region import Answer, Region

@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.gaussians.ply import read_ply
+from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.gaussians.pruning import weightiest
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import has_refined, read_viewpoints

@@ -21,7 +21,7 @@ from ldo_service.conversions.poses import (
 from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.map_builder import MapBuilderConfig
-from ldo_service.gaussians.sleep_choice import SleepConfig
+from ldo_service.gaussians.visibility import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.maps.replica import MapFollower
 from ldo_service.runtime.actor import Situation

@@ -16,8 +16,8 @@ from collections.abc import Callable
 import numpy as np
 
 from ldo_service.conversions.poses import correction_message, keyframe_poses_of
-from ldo_service.gaussians.merging import doubled
 from ldo_service.gaussians.model import GaussianMap, aligned_rows
+from ldo_service.gaussians.pruning import doubled
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.graph.keyframe_graph import KeyframeGraph

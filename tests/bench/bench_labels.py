@@ -36,7 +36,7 @@ from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
 from ldo_service.evaluation.label_sheet import LabelPicture, label_sheet
 from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelJudge, LabelView
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.gaussians.render import Rendering
+from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import FrameLabels, TrueLabels
 from ldo_service.regions.foreground import (

@@ -20,7 +20,7 @@ import numpy as np
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.gaussians.render import Rendering
+from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.tracking import Odometry, Status
 from ldo_service.tracking.tracked import Tracked

@@ -33,7 +33,7 @@ from ldo_service.evaluation.iteration import (
     noise_frame,
 )
 from ldo_service.gaussians import render
-from ldo_service.gaussians.render import RenderMemory
+from ldo_service.gaussians.renderer import RenderMemory
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _rasterise
 from tests.reference.render import render_reference

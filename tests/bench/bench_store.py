@@ -16,10 +16,10 @@ import numpy as np
 
 from ldo_service.datasets import open_sequence
 from ldo_service.gaussians import GaussianMap, View, insert
-from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
-from ldo_service.gaussians.keyframe_images import KeyframeImages
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
-from ldo_service.gaussians.sleep import SleepingGaussians
+from ldo_service.gaussians.offloading import SleepingGaussians
+from ldo_service.gaussians.training_views import KeyframeImages
+from ldo_service.gaussians.visibility import AnchorSpheres, PlacedCamera
 
 
 def timed_ms(do: Callable[[], object]) -> tuple[float, float]:

@@ -11,7 +11,7 @@ import yaml
 
 from ldo_service import cli
 from ldo_service.errors import LdoError
-from ldo_service.gaussians.ply import read_ply, write_ply
+from ldo_service.gaussians.file_formats import read_ply, write_ply
 from ldo_service.geometry import Trajectory, se3
 from ldo_service.runs.folder import WRITTEN, prepare
 

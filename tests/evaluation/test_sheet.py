@@ -3,7 +3,7 @@ import pytest
 
 from ldo_service.evaluation.sheet import CAPTIONS, WIDTH_PX, rendering_sheet, some_of
 from ldo_service.evaluation.views import RenderedView, RenderingErrors, ViewErrors
-from ldo_service.gaussians.render import Rendering
+from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import Camera, RgbdFrame
 
 CAMERA = Camera(640, 320, 300.0, 300.0, 320.0, 160.0)

@@ -13,9 +13,9 @@ import numpy as np
 from ldo_service.actors.localiser import PLACES, places_of
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.errors import DataError, LdoError
-from ldo_service.gaussians import chunk, keyframe_images
+from ldo_service.gaussians import chunk, training_views
+from ldo_service.gaussians.file_formats import read_ply, write_ply
 from ldo_service.gaussians.model import new_labels
-from ldo_service.gaussians.ply import read_ply, write_ply
 from ldo_service.geometry import Camera, codecs
 from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
 from ldo_service.runs.finished import MapFolder, read_run, vlm_calls
@@ -86,7 +86,7 @@ def images_of_a_keyframe() -> bytes:
     color = np.arange(3 * 48, dtype=np.uint8).reshape(3, 6, 8)
     depth_m = np.linspace(0.5, 3, 48, dtype=np.float32).reshape(6, 8)
     camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
-    return keyframe_images.packed(keyframe_images.KeyframeImages(3, camera, color, depth_m, None))
+    return training_views.packed(training_views.KeyframeImages(3, camera, color, depth_m, None))
 
 
 def gaussians_of_a_chunk() -> bytes:
@@ -209,7 +209,7 @@ TARGETS = [
     ),
     Target(
         "images of a keyframe",
-        lambda body, _: keyframe_images.unpacked(body),
+        lambda body, _: training_views.unpacked(body),
         [images_of_a_keyframe()],
     ),
     Target("chunk of Gaussians", lambda body, _: chunk.unpacked(body), [gaussians_of_a_chunk()]),

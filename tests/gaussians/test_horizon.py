@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians import render
-from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
-from ldo_service.gaussians.horizon import BEHIND, Horizon
+from ldo_service.gaussians.visibility import BEHIND, AnchorSpheres, Horizon, PlacedCamera
 from ldo_service.geometry import Camera, se3
 
 CAMERA = Camera(160, 120, 120.0, 110.0, 75.0, 62.0)

@@ -11,8 +11,8 @@ import pytest
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.gaussians import Exposure
-from ldo_service.gaussians.keyframe_images import KeyframeImages, packed, unpacked
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
+from ldo_service.gaussians.training_views import KeyframeImages, packed, unpacked
 from ldo_service.geometry import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)

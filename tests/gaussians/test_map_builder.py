@@ -12,7 +12,7 @@ from ldo_service.evaluation.rendering import psnr
 from ldo_service.gaussians import OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, WindowConfig
-from ldo_service.gaussians.sleep_choice import SleepConfig
+from ldo_service.gaussians.visibility import SleepConfig
 from ldo_service.geometry import se3
 
 from .conftest import Posed

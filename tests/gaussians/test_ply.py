@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import DataError
-from ldo_service.gaussians.ply import COLUMNS, PROPERTIES, SH_C0, read_ply, write_ply
+from ldo_service.gaussians.file_formats import COLUMNS, PROPERTIES, SH_C0, read_ply, write_ply
 
 plyfile = pytest.importorskip("plyfile", reason="pip install plyfile")
 

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera
-from ldo_service.gaussians.horizon import Horizon
-from ldo_service.gaussians.sleep_choice import SleepChoice, SleepConfig, choose_sleepers
+from ldo_service.gaussians.visibility import (
+    AnchorSpheres,
+    Horizon,
+    PlacedCamera,
+    SleepChoice,
+    SleepConfig,
+    choose_sleepers,
+)
 from ldo_service.geometry import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.gaussians.splat import write_splat
+from ldo_service.gaussians.file_formats import write_splat
 from ldo_service.geometry import se3
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.spz import write_spz
+from ldo_service.gaussians.file_formats import write_spz
 from ldo_service.geometry import se3
 
 TURN = np.diag([1.0, -1.0, -1.0])  # between x right, y down, z forward and OpenGL's axes

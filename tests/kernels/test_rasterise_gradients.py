@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from autograd import grad
 
-from ldo_service.gaussians.rasteriser import Rasteriser
+from ldo_service.gaussians.renderer import Rasteriser
 from ldo_service.geometry import Camera, se3
 from ldo_service.kernels import _rasterise
 from tests.reference.render import render_reference
@@ -24,7 +24,7 @@ GROUPS = {
     "color": slice(11, 14),
 }
 DIFFERENTIATE_ALL = """
-from ldo_service.gaussians.rasteriser import Rasteriser
+from ldo_service.gaussians.renderer import Rasteriser
 from ldo_service.geometry import Camera
 for name in {key.split("/")[0] for key in given}:
     rows, T, camera, by_planes = (given[f"{name}/{part}"] for part in ("rows", "T", "camera", "by"))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.gaussians.render import Contributions, Rendering
+from ldo_service.gaussians.renderer import Contributions, Rendering
 from ldo_service.geometry import Camera
 
 

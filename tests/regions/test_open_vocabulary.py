@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ldo_service.detection.vocabulary import Vocabulary
-from ldo_service.gaussians.views import View
+from ldo_service.gaussians.training_views import View
 from ldo_service.geometry import Camera
 from ldo_service.regions.foreground import Claims, Foreground
 from ldo_service.regions.open_vocabulary import Naming, fitting_parts, with_opinions

@@ -10,7 +10,7 @@ import pytest
 
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import DataError
-from ldo_service.gaussians.ply import write_ply
+from ldo_service.gaussians.file_formats import write_ply
 from ldo_service.geometry import Camera, Trajectory, se3
 from ldo_service.runs.finished import MapFolder, newest_map, read_run
 from ldo_service.runs.folder import CAMERA, MAP_FILES, prepare

@@ -22,7 +22,7 @@ from ldo_service.detection.labellers import text_embeddings
 from ldo_service.detection.labellers.text_embeddings import BytePairs, CachedEmbeddings
 from ldo_service.detection.model_registry import Models
 from ldo_service.errors import LdoError
-from ldo_service.gaussians.ply import read_ply
+from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.geometry import codecs
 from ldo_service.recordings.mcap_file import McapIndex
 from ldo_service.semantics.semantics_file import read_semantics

@@ -10,7 +10,7 @@ import pytest
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
-from ldo_service.gaussians.sleep_choice import SleepConfig
+from ldo_service.gaussians.visibility import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.regions.foreground import Claims
 from ldo_service.semantics.gaussian_labels import top_labels

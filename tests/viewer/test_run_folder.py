@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import DataError
-from ldo_service.gaussians.ply import read_ply, write_ply
+from ldo_service.gaussians.file_formats import read_ply, write_ply
 from ldo_service.gaussians.pruning import weights
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.objects_file import write_objects

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ldo_service.gaussians.ply import read_ply
+from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.gaussians.pruning import weightiest, weights
 from ldo_service.runs.finished import read_viewpoints
 from ldo_service.viewer.splats import splats_of

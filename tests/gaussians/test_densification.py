@@ -7,7 +7,7 @@ from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation import rendering
 from ldo_service.gaussians import GaussianMap, InsertionConfig, insert, render
-from ldo_service.gaussians.insertion import with_small_holes_filled
+from ldo_service.gaussians.densification import with_small_holes_filled
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 CAMERA = Camera(120, 88, 100.0, 100.0, 59.5, 43.5)

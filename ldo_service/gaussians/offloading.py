@@ -12,9 +12,9 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import se3
 from ldo_service.storage.checksummed_folder import SealedFolder
 
-from .anchor_spheres import AnchorSpheres, PlacedCamera
 from .chunk import Chunk, packed, unpacked
 from .model import ROW, GaussianMap, Piece, new_labels
+from .visibility import AnchorSpheres, PlacedCamera
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,15 @@ from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.gaussians import GaussianMap, render
-from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
 from ldo_service.gaussians.chunk import Chunk, packed, unpacked
-from ldo_service.gaussians.sleep import MOST_MOTIONS, SleepingGaussians, whole_map
-from ldo_service.gaussians.sleep_choice import SleepConfig, choose_sleepers
+from ldo_service.gaussians.offloading import MOST_MOTIONS, SleepingGaussians, whole_map
+from ldo_service.gaussians.visibility import (
+    AnchorSpheres,
+    PlacedCamera,
+    SleepConfig,
+    choose_sleepers,
+    clumps_of,
+)
 from ldo_service.geometry import Camera, se3
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)

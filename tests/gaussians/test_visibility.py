@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians import render
-from ldo_service.gaussians.anchor_spheres import AnchorSpheres, PlacedCamera, clumps_of
+from ldo_service.gaussians.visibility import AnchorSpheres, PlacedCamera, clumps_of
 from ldo_service.geometry import Camera, se3
 
 CAMERA = Camera(64, 48, 50.0, 40.0, 28.0, 27.0)

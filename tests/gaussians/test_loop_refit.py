@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.gaussians.repair import MapRepair, RepairConfig
+from ldo_service.gaussians.loop_refit import MapRepair, RepairConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.point_records import PoseTable

@@ -1,6 +1,6 @@
 import numpy as np
 
-from ldo_service.gaussians.views import View, sampled_surface, schedule, shared_surface
+from ldo_service.gaussians.training_views import View, sampled_surface, schedule, shared_surface
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)

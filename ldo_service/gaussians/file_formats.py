@@ -1,4 +1,18 @@
-"""The PLY file of 3D Gaussian splatting, as its viewers read it and other programs write it."""
+"""Files of Gaussians that other programs read: PLY, .splat and .spz.
+
+.ply    the file of 3D Gaussian splatting, as its viewers read it and other programs write it
+.splat  32 bytes per Gaussian, the weightiest first, no header:
+            position 3 float32 | scale 3 float32, metres | RGBA 4 uint8 | quaternion wxyz 4 uint8
+        A byte of the quaternion is 128 (1 + q), so a rotation is good to about half a degree. Axes
+        are those of the map. Format: https://github.com/antimatter15/splat
+.spz    quantized and compressed, about a tenth of a PLY: means are fixed point (0.24 mm, up to
+        2 km), log scales in steps of 1/16, opacity and color bytes, quaternions good to about a
+        tenth of a degree. Format: https://github.com/nianticlabs/spz
+
+An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not turn what it
+is given, so the map (x right, y down, z forward) is turned here, as Niantic's library turns RDF to
+RUB. (`GSData.save` would write a PLY, whatever the name of the file.)
+"""
 
 import logging
 from collections.abc import Iterator
@@ -8,7 +22,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ldo_service.errors import DataError
+from ldo_service.errors import ConfigError, DataError
 
 from .model import aligned_rows
 
@@ -40,6 +54,13 @@ TYPES = {
     for name in names
 }
 LONGEST_LINE = 4096  # bytes of a header line; more is no header
+
+SPLAT = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)]
+)
+
+OPENGL = np.array([1, -1, -1], np.float32)  # axes of OpenGL in those of the map, and back
+OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # the same mirroring F of a rotation: F R F
 
 
 def write_ply(path: Path, rows: np.ndarray) -> None:
@@ -182,3 +203,40 @@ def _rows(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray:
             "again without them."
         )
     return rows
+
+
+def write_splat(path: Path, rows: np.ndarray) -> None:
+    """Write Gaussian rows [N, 16] (see `gaussians.model`); colours beyond 0..1 are clipped."""
+    scales, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10:11]))
+    quats = rows[:, 6:10] / np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
+    splats = np.zeros(len(rows), SPLAT)
+    splats["mean"], splats["scale"] = rows[:, 0:3], scales
+    splats["rgba"] = _bytes(255 * np.hstack([rows[:, 11:14], opacities]))
+    splats["quaternion"] = _bytes(128 + 128 * quats)
+    # Viewers draw while they load.
+    weights = opacities[:, 0] * scales.prod(axis=1)
+    path.write_bytes(splats[np.argsort(-weights, kind="stable")].tobytes())
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def write_spz(path: Path, rows: np.ndarray) -> None:
+    """Write Gaussian rows [N, 16] (see `gaussians.model`). Raises ConfigError without gsply."""
+    try:
+        import gsply  # takes a third of a second, and is an extra
+    except ImportError as error:
+        raise ConfigError(
+            f"writing .spz needs gsply ({error}). `pip install 'ldo-slam[viewer]'` brings it."
+        ) from error
+    gaussians = gsply.GSData.from_arrays(
+        means=rows[:, 0:3] * OPENGL,
+        scales=np.ascontiguousarray(rows[:, 3:6]),  # logarithms, as in a PLY
+        quats=rows[:, 6:10] * OPENGL_QUAT,  # wxyz
+        opacities=np.ascontiguousarray(rows[:, 10]),  # logits
+        sh0=harmonics(rows[:, 11:14]),
+        shN=None,
+        format="ply",
+    )
+    gsply.write_spz(path, gaussians, version=3)  # the container that every reader knows

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldo_service.gaussians import GaussianMap
-from ldo_service.gaussians.changes import ChangeLog, Changes
+from ldo_service.gaussians.change_log import ChangeLog, Changes
 
 
 def rows(count: int, value: float = 0.0) -> np.ndarray:
