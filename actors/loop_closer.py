@@ -23,8 +23,8 @@ from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.detection.dynamic_classes import MovableConfig, movable_pixels
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.loops import Finding, LoopsConfig, Recogniser
-from ldo_service.loops.landmarks import Sightings, sightings_of
+from ldo_service.loop_closing import Finding, LoopsConfig, Recogniser
+from ldo_service.loop_closing.object_points import Sightings, sightings_of
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     Correction,

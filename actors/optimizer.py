@@ -28,8 +28,8 @@ from ldo_service.conversions.poses import (
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
-from ldo_service.graph.keyframe_graph import KeyframeGraph, KeyframeGraphConfig
-from ldo_service.graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
+from ldo_service.pose_graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
+from ldo_service.pose_graph.pose_graph import KeyframeGraph, KeyframeGraphConfig
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import (
     Correction,

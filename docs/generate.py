@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ldo_service.actors.graph import drawing, topics_table
+from ldo_service.actors.topology import drawing, topics_table
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", ROOT / "docs/architecture.md")

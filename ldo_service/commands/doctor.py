@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 
 from ldo_service import __version__, kernels
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
 from ldo_service.diagnosis import Seen, remarks, troubles

@@ -7,7 +7,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.actors.graph import consumers_of, drawing, producer_of, topics_table
+from ldo_service.actors.topology import consumers_of, drawing, producer_of, topics_table
 from ldo_service.schemas.json_schema import json_schema
 from ldo_service.schemas.topics import TOPICS
 

@@ -1,6 +1,6 @@
 """Conversions between messages and numerics: loop closures and candidates."""
 
-from ldo_service.loops import Finding
+from ldo_service.loop_closing import Finding
 from ldo_service.schemas import (
     LoopCandidate,
     LoopClosure,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ldo_service.actors.graph import make_actors
+from ldo_service.actors.topology import make_actors
 from ldo_service.config import Config, config_yaml
 from ldo_service.errors import DataError
 from ldo_service.runtime.logical_clock import LogicalClock

@@ -6,7 +6,7 @@ from collections.abc import Sequence as Ordered
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ldo_service.actors.graph import GRAPH, Box
+from ldo_service.actors.topology import GRAPH, Box
 from ldo_service.config import config_yaml
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.actor_graph import lossless_consumers

@@ -10,7 +10,7 @@ import msgspec
 import yaml
 
 from ldo_service import kernels
-from ldo_service.actors.graph import box_named
+from ldo_service.actors.topology import box_named
 from ldo_service.config import Config, config_of
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.recordings.recording import JournalFile, recorded_actors

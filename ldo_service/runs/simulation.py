@@ -3,7 +3,7 @@
 import hashlib
 from dataclasses import dataclass
 
-from ldo_service.actors.graph import make_actors
+from ldo_service.actors.topology import make_actors
 from ldo_service.config import Config
 from ldo_service.errors import DataError
 from ldo_service.geometry.sequence import Sequence

@@ -1,6 +1,6 @@
 """Which region of a keyframe each Gaussian belongs to (paper, III.A).
 
-The kernel is `kernels/assignment.hpp`; its plain twin is `assignment_reference.py`.
+The kernel is `kernels/assignment.hpp`; `tests/reference/assignment.py` implements it in NumPy.
 """
 
 from collections.abc import Sequence

@@ -18,7 +18,7 @@ from pathlib import Path
 import zenoh
 
 from ldo_service import kernels
-from ldo_service.actors.graph import GRAPH, Box, box_named
+from ldo_service.actors.topology import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.errors import ConfigError, StageError
 from ldo_service.metrics import HealthCollector, exported

@@ -15,10 +15,10 @@ from ldo_service.conversions.poses import (
     transform,
 )
 from ldo_service.geometry import se3
-from ldo_service.loops import LoopsConfig
-from ldo_service.loops.memory import RetrievalConfig
-from ldo_service.loops.plausibility import PlausibilityConfig
-from ldo_service.loops.verification import Proposal, VerificationConfig, Verifier
+from ldo_service.loop_closing import LoopsConfig
+from ldo_service.loop_closing.consistency_check import PlausibilityConfig
+from ldo_service.loop_closing.place_database import RetrievalConfig
+from ldo_service.loop_closing.verification import Proposal, VerificationConfig, Verifier
 from ldo_service.schemas import (
     Array,
     Detection,

@@ -20,9 +20,9 @@ from ldo_service.gaussians.model import GaussianMap, aligned_rows
 from ldo_service.gaussians.pruning import doubled
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
-from ldo_service.graph.keyframe_graph import KeyframeGraph
+from ldo_service.pose_graph.pose_graph import KeyframeGraph
 from ldo_service.schemas import Correction, decode, encode
-from tests.graph.walks import REFINED, between, odometry, round_trips
+from tests.pose_graph.walks import REFINED, between, odometry, round_trips
 
 ROOM_M, SPACING_M, OVER_EACH_OTHER = 6.0, 0.02, 12
 EVERY = 200  # keyframes, between measurements of a journey

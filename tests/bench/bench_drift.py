@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.actors.graph import make_actors
+from ldo_service.actors.topology import make_actors
 from ldo_service.config import Config, load_config
 from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence, open_sequence

@@ -19,8 +19,8 @@ import cv2
 import msgspec
 import numpy as np
 
-from ldo_service.actors.graph import make_actors
 from ldo_service.actors.mapper import Mapper, MapperConfig, Output
+from ldo_service.actors.topology import make_actors
 from ldo_service.config import load_config
 from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.conversions.poses import pose_message

@@ -42,10 +42,10 @@ from ldo_service.evaluation.loops import (
 )
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.loops import LoopsConfig
-from ldo_service.loops.landmarks import LAYOUT_WORDS
-from ldo_service.loops.memory import Memory, RetrievalConfig, Stages
-from ldo_service.loops.plausibility import Plausibility, PlausibilityConfig
+from ldo_service.loop_closing import LoopsConfig
+from ldo_service.loop_closing.consistency_check import Plausibility, PlausibilityConfig
+from ldo_service.loop_closing.object_points import LAYOUT_WORDS
+from ldo_service.loop_closing.place_database import Memory, RetrievalConfig, Stages
 from ldo_service.runs.source import Reader, Selection
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopClosure, Message

@@ -25,7 +25,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from ldo_service.actors.graph import make_actors
+from ldo_service.actors.topology import make_actors
 from ldo_service.config import load_config
 from ldo_service.runtime import Actor
 from ldo_service.runtime.logical_clock import LogicalClock

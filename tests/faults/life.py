@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.actors.graph import GRAPH
 from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
+from ldo_service.actors.topology import GRAPH
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
 from ldo_service.conversions.objects import map_objects

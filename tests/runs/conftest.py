@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors.topology import GRAPH
 from ldo_service.config import Config, load_config
 from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.conversions.poses import pose_message

@@ -7,8 +7,8 @@ from unittest.mock import patch
 
 import numpy as np
 
-from ldo_service.actors.graph import make_actors
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
+from ldo_service.actors.topology import make_actors
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.config import Config
 from ldo_service.conversions.poses import measured_message

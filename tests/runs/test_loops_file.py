@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors import graph
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors import topology
+from ldo_service.actors.topology import GRAPH
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
@@ -108,5 +108,5 @@ def test_a_run_that_meets_nothing_again_is_what_it_is_without_a_loop_closer(
     whole = simulated()
     assert whole.pop("loop_closer").messages == 0
     others = [box for box in GRAPH if box.name != "loop_closer"]
-    monkeypatch.setattr(graph, "GRAPH", tuple(others))
+    monkeypatch.setattr(topology, "GRAPH", tuple(others))
     assert simulated() == whole

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from ldo_service import kernels
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors.topology import GRAPH
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
 from ldo_service.runs.replayed import open_recording

@@ -15,7 +15,7 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from ldo_service.actors.graph import box_named
+from ldo_service.actors.topology import box_named
 from ldo_service.datasets import open_sequence
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers import text_embeddings

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors.topology import GRAPH
 from ldo_service.client import Client, connect
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, TrackedPose

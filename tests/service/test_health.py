@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors.topology import GRAPH
 from tests.service.conftest import LDO, live_service, wait_until
 from tests.transport.conftest import free_port
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.actors.graph import GRAPH
+from ldo_service.actors.topology import GRAPH
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ldo_service import cli
-from ldo_service.actors import graph
+from ldo_service.actors import topology
 from ldo_service.actors.tracker import Tracker
 from ldo_service.schemas import Correction, FrameRgbd
 from ldo_service.service.service import service
@@ -36,7 +36,7 @@ def meet_trouble(frame: int) -> None:
         raise RuntimeError(f"trouble at frame {frame}")
 
 
-def troubled(box: graph.Box) -> graph.Box:
+def troubled(box: topology.Box) -> topology.Box:
     if box.name != "tracker":
         return box
     return replace(box, make=lambda config: TroubledTracker(config.tracker))

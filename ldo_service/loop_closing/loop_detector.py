@@ -1,0 +1,276 @@
+"""Loop detection: keyframes in, places that were seen before out.
+
+Visual words are clusters of ORB features, learned from the first images on.
+Conventions: `ldo_service.geometry`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
+from ldo_service.tracking.align import AlignConfig
+from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.places import Place, PlacesConfig
+from ldo_service.tracking.pyramid import PyramidConfig
+
+from .consistency_check import Plausibility, PlausibilityConfig
+from .object_points import Sightings, landmarks_of, layout_of
+from .place_database import Likeness, Memory, RetrievalConfig, Stages
+from .subgraph import Subgraph, SubgraphConfig, View, follows, is_whole, spread
+from .verification import Check, Proposal, VerificationConfig, Verifier
+
+BYTES = 32  # of an ORB descriptor
+BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class VisualWordsConfig:
+    count: int = 1024  # 4 kB of counts a subgraph; 512 find 2 % less on kitchen and flat, 2048 no
+    # more
+    apart_bits: int = 64  # of 256: a feature farther from every word becomes one
+    learned_at_once: int = 64  # of one image, so that many images have a part in the words
+
+    def __post_init__(self) -> None:
+        if min(self.count, self.learned_at_once) < 1 or not 0 <= self.apart_bits < 8 * BYTES:
+            raise ConfigError(f"{self}: counts must be at least 1, apart_bits within 0..255.")
+
+
+class VisualWords:
+    """Descriptors that stand for those nearest to them: leaders, that never change or go.
+
+    The same images in the same order give the same words.
+    """
+
+    def __init__(self, config: VisualWordsConfig, words: np.ndarray | None = None) -> None:
+        self._config = config
+        self.words = np.zeros((0, BYTES), np.uint8) if words is None else words
+
+    def learn(self, descriptors: np.ndarray) -> None:
+        """Take what is far from every word among descriptors [N, 32], up to the limits."""
+        room = min(self._config.count - len(self.words), self._config.learned_at_once)
+        if room <= 0 or not len(descriptors):
+            return
+        nearest = self._distances(descriptors)
+        fresh: list[int] = []
+        while len(fresh) < room and len(far := np.flatnonzero(nearest > self._config.apart_bits)):
+            fresh.append(int(far[0]))
+            differing = BITS[descriptors ^ descriptors[fresh[-1]]].sum(axis=1)
+            nearest = np.minimum(nearest, differing)
+        if fresh:
+            self.words = np.concatenate([self.words, descriptors[fresh]])
+
+    def histogram(self, descriptors: np.ndarray) -> np.ndarray:
+        """[count] float32: how many descriptors [N, 32] are nearest to each word."""
+        if not len(descriptors) or not len(self.words):
+            return np.zeros(self._config.count, np.float32)
+        nearest = [m.trainIdx for m in _matches(descriptors, self.words)]
+        return np.bincount(nearest, minlength=self._config.count).astype(np.float32)
+
+    def _distances(self, descriptors: np.ndarray) -> np.ndarray:
+        """[N] bits to the nearest word; 256 while there is none."""
+        if not len(self.words):
+            return np.full(len(descriptors), 8 * BYTES)
+        return np.array([int(m.distance) for m in _matches(descriptors, self.words)])
+
+
+def _matches(descriptors: np.ndarray, words: np.ndarray) -> tuple[cv2.DMatch, ...]:
+    return tuple(cv2.BFMatcher(cv2.NORM_HAMMING).match(descriptors, words))
+
+
+@dataclass(frozen=True, slots=True)
+class LoopsConfig:
+    # two_stage: names and images, then features or landmarks and the surfaces. The others are for
+    # comparison: geometric knows no names, semantic no images (III.C's landmarks alone).
+    stages: Stages = "two_stage"
+    subgraphs: SubgraphConfig = field(default_factory=SubgraphConfig)
+    words: VisualWordsConfig = field(default_factory=VisualWordsConfig)
+    retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
+    places: PlacesConfig = field(default_factory=PlacesConfig)
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    features: FeatureConfig = field(default_factory=lambda: FeatureConfig(min_inliers=12))
+    align: AlignConfig = field(default_factory=AlignConfig)
+
+    def __post_init__(self) -> None:
+        if self.stages not in ("two_stage", "semantic", "geometric"):
+            raise ConfigError(
+                f"stages={self.stages!r} must be 'two_stage', 'semantic' or 'geometric'."
+            )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Finding:
+    """A candidate, with all its scores; a closure unless it was refused."""
+
+    new: Subgraph
+    likeness: Likeness
+    check: Check
+
+    @property
+    def closure(self) -> RelativePose | None:
+        return self.check.closure
+
+
+class Recogniser:
+    """Cuts keyframes into subgraphs and looks for each new one among the old."""
+
+    def __init__(self, config: LoopsConfig) -> None:
+        self._config = config
+        self._words = VisualWords(config.words)
+        self._memory = Memory(config.words.count, config.stages, config.retrieval)
+        self._open: list[View] = []  # of the subgraph that is not whole yet
+        self._path_m = 0.0
+        self._last: tuple[int, np.ndarray] | None = None  # segment and T_odom_keyframe
+        self._verifier = Verifier(
+            config.pyramid, config.align, config.features, config.verification
+        )
+
+    @property
+    def subgraphs(self) -> Sequence[Subgraph]:
+        return self._memory.subgraphs
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a subgraph was begun."""
+        return bool(self._open)
+
+    def add(
+        self,
+        place: Place,
+        frame: int,
+        stamp_ns: int,
+        sightings: Sightings | None,
+        poses: KeyframePoses,
+        joined: Mapping[int, int],
+    ) -> list[Finding]:
+        """Take a keyframe, and with it perhaps the last of a subgraph: then what it was like.
+
+        sightings   None where no detector looked
+        poses       T_map_keyframe of the keyframes kept; those that are not known are not judged by
+        joined      segments, each with the older one whose frame it is in
+        """
+        findings: list[Finding] = []
+        if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
+            findings = self.rest(poses, joined)
+            self._open = []
+        self._open.append(self._view(place, frame, stamp_ns, sightings))
+        if is_whole(self._open, self._config.subgraphs):
+            findings += self._completed(poses, joined)
+        return findings
+
+    def rest(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
+        """As `add`, when no keyframe follows: what was begun is whole, if it is long enough. A walk
+        often ends where it began, and what was seen last is where a lost camera is."""
+        if len(self._open) < self._config.subgraphs.least:
+            return []
+        return self._completed(poses, joined)
+
+    def _completed(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
+        new, self._open = self._subgraph(self._open), []
+        findings = self._findings(new, poses, joined)
+        kept = spread(new.views, self._config.subgraphs.kept_views)
+        self._memory.add(replace(new, views=kept))
+        return findings
+
+    # --- subgraphs --------------------------------------------------------------------------------
+    def _view(self, place: Place, frame: int, stamp_ns: int, sightings: Sightings | None) -> View:
+        self._path_m += self._step_m(place)
+        self._last = place.segment, place.T_odom_keyframe
+        self._words.learn(place.descriptors)
+        words = self._words.histogram(place.descriptors)
+        looked = sightings is not None
+        sightings = sightings if looked and self._config.stages != "geometric" else None
+        sightings = sightings or Sightings.none()
+        return View(place, frame, stamp_ns, self._path_m, looked, sightings, words)
+
+    def _step_m(self, place: Place) -> float:
+        """From the keyframe before; how far a lost camera went, nobody knows."""
+        if self._last is None or self._last[0] != place.segment:
+            return 0.0
+        return float(np.linalg.norm(place.T_odom_keyframe[:3, 3] - self._last[1][:3, 3]))
+
+    def _subgraph(self, views: list[View]) -> Subgraph:
+        seen = [view.sightings for view in views]
+        T_odom = [view.place.T_odom_keyframe for view in views]
+        landmarks = landmarks_of(seen, T_odom, self._config.verification.landmarks)
+        return Subgraph(
+            views=tuple(views),
+            keyframes=tuple(view.keyframe for view in views),
+            first_frame=min(view.frame for view in views),
+            last_frame=max(view.frame for view in views),
+            stamp_ns=views[-1].stamp_ns,
+            path_m=views[-1].path_m,
+            was_looked_at=any(view.was_looked_at for view in views),
+            landmarks=landmarks,
+            names=np.sum([sightings.histogram() for sightings in seen], axis=0),
+            layout=layout_of(landmarks),
+            words=np.sum([view.words for view in views], axis=0),
+        )
+
+    # --- loops ------------------------------------------------------------------------------------
+    def _findings(
+        self, new: Subgraph, poses: KeyframePoses, joined: Mapping[int, int]
+    ) -> list[Finding]:
+        """Coarse, then fine: the surest candidate that nothing speaks against closes the loop."""
+        known = Plausibility(poses, joined, self._config.plausibility)
+        is_possible = known.may_meet([old.views[0] for old in self.subgraphs], new.views[-1])
+        likely = self._memory.alike(new, is_possible)
+        proposals = [known.judged(self._proposal(like.subgraph, new, known)) for like in likely]
+        proposals = known.without_twins(proposals)
+        checks: dict[int, Check] = {}
+        is_closed = False
+        for index in sorted(range(len(likely)), key=lambda i: -proposals[i].inliers):
+            checks[index] = self._check(proposals[index], is_closed)
+            is_closed = is_closed or checks[index].closure is not None
+        return [Finding(new, like, checks[index]) for index, like in enumerate(likely)]
+
+    def _proposal(self, old: Subgraph, new: Subgraph, known: Plausibility) -> Proposal:
+        """Features first: they place a camera to centimetres, landmarks to decimetres. The map
+        last: what it says is judged by itself."""
+        verifier, stages = self._verifier, self._config.stages
+        if stages == "semantic":
+            return verifier.by_landmarks(old, new)
+        proposal = verifier.by_features(old, new)
+        if proposal.refused and stages == "two_stage":
+            proposal = _unless_refused(verifier.by_landmarks(old, new), proposal)
+        if proposal.refused:
+            proposal = _unless_refused(verifier.by_map(old, new, known.T_old_new), proposal)
+        return proposal
+
+    def _check(self, proposal: Proposal, is_closed: bool) -> Check:
+        if proposal.refused:
+            return Check(proposal, refused=proposal.refused)
+        if is_closed:
+            return Check(proposal, refused="another candidate closed the loop")
+        if self._config.stages == "semantic":
+            return self._verifier.believed(proposal)
+        return self._verifier.confirm(proposal)
+
+    # --- state ------------------------------------------------------------------------------------
+    def state(self) -> dict[str, Any]:
+        """`subgraphs` and `views` are lists of parts that never change; the rest is small."""
+        return {
+            "subgraphs": [subgraph.packed for subgraph in self._memory.subgraphs],
+            "views": [view.packed for view in self._open],
+            "words": self._words.words,
+            "path": (self._path_m, self._last),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.__init__(self._config)
+        for packed in state["subgraphs"]:
+            self._memory.add(Subgraph.unpacked(packed))
+        self._open = [View.unpacked(packed) for packed in state["views"]]
+        self._words = VisualWords(self._config.words, state["words"])
+        self._path_m, last = state["path"]
+        self._last = None if last is None else (last[0], last[1])
+
+
+def _unless_refused(proposal: Proposal, other: Proposal) -> Proposal:
+    return other if proposal.refused else proposal

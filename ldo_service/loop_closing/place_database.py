@@ -1,0 +1,185 @@
+"""Place database: all subgraphs so far, and those that a new one may show again (coarse stage).
+
+Histograms are compared by TF-IDF, with the weights of words learned from all that is known.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.semantics.gaussian_labels import MOST_LABELS
+from ldo_service.tracking.places import gaps
+
+from .object_points import LAYOUT_WORDS
+from .subgraph import Subgraph
+
+
+class Histograms:
+    """Rows [N, W] float32 of counts, in the order they came; the document frequencies go along.
+
+    similarity of rows a, b = cos(a * idf, b * idf),  idf_w = log(1 + N / n_w)
+
+    n_w of the N rows hold word w (Sivic and Zisserman 2003; the 1 keeps a word that all of them
+    hold from counting nothing while there are few rows). Sums run in a fixed order, on one thread.
+
+    >>> known = Histograms(2)
+    >>> known.add(np.array([1.0, 0.0]))
+    >>> known.add(np.array([1.0, 1.0]))
+    >>> known.idf().round(3).tolist()  # log(1 + 2 / 2), log(1 + 2 / 1)
+    [0.693, 1.099]
+    """
+
+    def __init__(self, words: int) -> None:
+        self._rows = np.zeros((16, words), np.float32)
+        self._count = 0
+        self._frequency = np.zeros(words, np.int64)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def rows(self) -> np.ndarray:
+        return self._rows[: self._count]
+
+    def add(self, row: np.ndarray) -> None:
+        """Append a row [W]; capacity doubles."""
+        if self._count == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.zeros_like(self._rows)])
+        self._rows[self._count] = row
+        self._count += 1
+        self._frequency += row > 0
+
+    def remove(self, index: int) -> None:
+        self._frequency -= self._rows[index] > 0
+        self._rows[index : self._count - 1] = self._rows[index + 1 : self._count]
+        self._count -= 1
+
+    def idf(self) -> np.ndarray:
+        """[W] float32; words that nobody holds weigh most."""
+        return np.log1p(self._count / np.maximum(self._frequency, 1)).astype(np.float32)
+
+    def cosines(self, row: np.ndarray) -> np.ndarray:
+        """[N] float32 in 0..1: how like each row a row [W] is; 0 where either is empty."""
+        weight = self.idf() ** 2
+        product = np.einsum("nw,w->n", self.rows, weight * row.astype(np.float32))
+        squares = np.einsum("nw,w->n", self.rows**2, weight)
+        own = float(np.einsum("w,w,w->", row.astype(np.float32), row.astype(np.float32), weight))
+        norms = np.sqrt(squares * own)
+        return np.clip(np.where(norms > 0, product / np.where(norms > 0, norms, 1), 0), 0, 1)
+
+
+Stages = Literal["two_stage", "semantic", "geometric"]
+
+
+@dataclass(frozen=True, slots=True)
+class RetrievalConfig:
+    exclude_frames: int = 100  # camera frames, not keyframes: what is nearer is no loop (III.C)
+    candidates: int = 5  # K (III.C)
+    min_similarity: float = 0.75  # theta_loop (III.C), of the names
+    # Cosine of the visual words from which two places are compared whatever they hold: a detector
+    # that misses two things of five is below theta. Above 1: never, as the paper has it.
+    min_appearance: float = 0.35
+    count: int = 1000  # subgraphs kept; then the path is thinned
+
+    def __post_init__(self) -> None:
+        if self.exclude_frames < 0 or self.candidates < 1 or self.count < 3:
+            raise ConfigError(
+                f"{self}: exclude_frames must not be negative, candidates at least 1 and count 3."
+            )
+        if not (0 <= self.min_similarity <= 1 and self.min_appearance >= 0):
+            raise ConfigError(f"{self}: min_similarity must be within 0..1.")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Likeness:
+    """An old subgraph that a new one is like."""
+
+    subgraph: Subgraph
+    similarity: float  # cosine of the names
+    layout: float  # cosine of which names are how far apart
+    appearance: float  # cosine of the visual words
+    score: float  # what candidates are ranked by
+
+
+class Memory:
+    """Subgraphs in the order they came, with tables of their histograms.
+
+    Beyond `count` the one goes whose neighbours along the path are nearest to each other: a month
+    in one building thins the path evenly, and no stretch of it is forgotten as a whole.
+    """
+
+    def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
+        self._stages, self._config = stages, config
+        self.subgraphs: list[Subgraph] = []
+        self._names = Histograms(MOST_LABELS)
+        self._layout = Histograms(LAYOUT_WORDS)
+        self._words = Histograms(words)
+
+    def __len__(self) -> int:
+        return len(self.subgraphs)
+
+    def add(self, subgraph: Subgraph) -> None:
+        self.subgraphs.append(subgraph)
+        self._names.add(subgraph.names)
+        self._layout.add(subgraph.layout)
+        self._words.add(subgraph.words)
+        if len(self) > self._config.count:
+            self._remove(int(np.argmin(gaps([s.views[0].place for s in self.subgraphs]))) + 1)
+
+    def _remove(self, index: int) -> None:
+        del self.subgraphs[index]
+        for table in (self._names, self._layout, self._words):
+            table.remove(index)
+
+    def alike(self, new: Subgraph, is_possible: np.ndarray) -> list[Likeness]:
+        """At most K old subgraphs that may show the same place, the likeliest first, of those that
+        are possible [S] bool."""
+        if not self.subgraphs:
+            return []
+        similarity = self._names.cosines(new.names)
+        layout = self._layout.cosines(new.layout)
+        appearance = self._words.cosines(new.words)
+        score = self._scores(new, similarity, layout, appearance)
+        score[~(self._are_far(new) & is_possible)] = 0
+        ranked = np.argsort(-score, kind="stable")[: self._config.candidates]
+        return [
+            Likeness(
+                self.subgraphs[i],
+                float(similarity[i]),
+                float(layout[i]),
+                float(appearance[i]),
+                float(score[i]),
+            )
+            for i in ranked.tolist()
+            if score[i] > 0
+        ]
+
+    def _scores(
+        self, new: Subgraph, similarity: np.ndarray, layout: np.ndarray, appearance: np.ndarray
+    ) -> np.ndarray:
+        """[S], 0 of those that are no candidates.
+
+        Names decide first, how they lie and what the images look like among those alike in names;
+        images alone decide where nothing was detected.
+        """
+        config = self._config
+        looks_alike = appearance >= config.min_appearance
+        if self._stages == "geometric":
+            return np.where(looks_alike, appearance, 0)
+        says_alike = similarity >= config.min_similarity
+        named = (similarity + layout) / 2
+        if self._stages == "semantic":
+            return np.where(says_alike, named, 0)
+        tells = new.names.any() & self._names.rows.any(axis=1)
+        both = np.where(says_alike | looks_alike, (named + appearance) / 2, 0)
+        return np.where(tells, both, np.where(looks_alike, appearance, 0))
+
+    def _are_far(self, new: Subgraph) -> np.ndarray:
+        """[S] bool: those more than `exclude_frames` before it, or after it where frames are
+        counted anew."""
+        first = np.array([subgraph.first_frame for subgraph in self.subgraphs])
+        last = np.array([subgraph.last_frame for subgraph in self.subgraphs])
+        exclude = self._config.exclude_frames
+        return (new.first_frame - last > exclude) | (first - new.last_frame > exclude)

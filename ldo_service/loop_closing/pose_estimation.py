@@ -1,0 +1,140 @@
+"""Pose estimation between two keyframes: RANSAC over correspondences, and agreement of surfaces.
+
+Conventions: `ldo_service.geometry`.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import Camera, se3
+from ldo_service.geometry.se3 import align
+
+SPREAD = 0.1  # m, of three points about their line: below, nothing fixes the turn about it
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Motion:
+    """T_a_b [4, 4], and which correspondences [M] agree with it."""
+
+    T_a_b: np.ndarray
+    inliers: np.ndarray
+
+
+def rigid_among(
+    p_a: np.ndarray,
+    p_b: np.ndarray,
+    pairs: np.ndarray,
+    limit_m: float,
+    iterations: int,
+    rng: np.random.Generator,
+) -> Motion | None:
+    """The motion that most correspondences agree on, by RANSAC over triples of them.
+
+    p_a [K, 3] and p_b [L, 3] m; pairs [M, 2] of indices (a, b) that may belong together: one point
+    may be in many, and counts in the nearest alone. None where no triple is a triangle of the same
+    shape in both. The winner is fitted again to its inliers.
+    """
+    best: Motion | None = None
+    if len(pairs) < 3:
+        return None
+    for _ in range(iterations):
+        a, b = pairs[rng.choice(len(pairs), 3, replace=False)].T
+        if len({*a}) < 3 or len({*b}) < 3 or not _are_alike(p_a[a], p_b[b], limit_m):
+            continue
+        motion = _supported(p_a, p_b, pairs, align(p_b[b], p_a[a]), limit_m)
+        if best is None or motion.inliers.sum() > best.inliers.sum():
+            best = motion
+    if best is None or best.inliers.sum() < 3:
+        return None
+    a, b = pairs[best.inliers].T
+    return _supported(p_a, p_b, pairs, align(p_b[b], p_a[a]), limit_m)
+
+
+def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
+    """Whether two triangles [3, 3] have the same sides, and are no lines."""
+    sides_a, sides_b = (np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1) for p in (p_a, p_b))
+    if np.abs(sides_a - sides_b).max() > 2 * limit_m:
+        return False
+    area = np.linalg.norm(np.cross(p_a[1] - p_a[0], p_a[2] - p_a[0]))
+    return bool(area > SPREAD * sides_a.max())
+
+
+def _supported(
+    p_a: np.ndarray, p_b: np.ndarray, pairs: np.ndarray, T_a_b: np.ndarray, limit_m: float
+) -> Motion:
+    gaps_m = np.linalg.norm(p_a[pairs[:, 0]] - se3.transform(T_a_b, p_b[pairs[:, 1]]), axis=1)
+    inliers = np.zeros(len(pairs), bool)
+    used: tuple[set[int], set[int]] = set(), set()
+    for m in np.argsort(gaps_m, kind="stable"):
+        a, b = map(int, pairs[m])
+        if gaps_m[m] <= limit_m and a not in used[0] and b not in used[1]:
+            inliers[m] = True
+            used[0].add(a)
+            used[1].add(b)
+    return Motion(T_a_b, inliers)
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceFitConfig:
+    gate_m: float = 0.1  # along the ray, beyond which two depths are of different surfaces
+    gate_share: float = 0.02  # of the depth, on top: the noise of structured light at 5 m
+    min_overlap: float = 0.2  # share of the new surface that the old keyframe sees too
+    max_rmse_m: float = 0.03  # along the normals
+    # Share of what falls into the old view and lies where that saw through: things come and go, a
+    # wrong pose puts walls into the air.
+    max_conflict: float = 0.15
+
+    def __post_init__(self) -> None:
+        if min(self.gate_m, self.max_rmse_m) <= 0 or self.gate_share < 0:
+            raise ConfigError(
+                f"{self}: gate_m and max_rmse_m must be positive, gate_share not < 0."
+            )
+        if not (0 <= self.min_overlap <= 1 and 0 <= self.max_conflict <= 1):
+            raise ConfigError(f"{self}: min_overlap and max_conflict must be within 0..1.")
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceFit:
+    overlap: float  # of the new surface's points, those that the old keyframe measured too
+    rmse_m: float  # of these along their normals
+    conflict: float  # of the points within the old view, those in its free space
+
+
+def surface_fit(
+    points: np.ndarray,
+    T_old_new: np.ndarray,
+    old_depth_m: np.ndarray,
+    camera: Camera,
+    config: SurfaceFitConfig,
+) -> SurfaceFit:
+    """Points [7, N] of the new keyframe (see `Reference`) against the old depth [H, W].
+
+    A point p with normal n falls on a pixel whose depth makes the point q on the same ray:
+
+        |z_p - z_q| <= gate    one surface, residual n . (p - q)
+        z_p < z_q - gate       the old camera saw through it: conflict
+        z_p > z_q + gate       hidden, says nothing
+    """
+    p = se3.transform(T_old_new, points[:3].T.astype(float))
+    normals = points[4:7].T.astype(float) @ T_old_new[:3, :3].T
+    seen = np.flatnonzero(p[:, 2] > 0)
+    pixels = np.rint(camera.project(p[seen])).astype(np.int64)
+    inside = np.all((pixels >= 0) & (pixels < [camera.width, camera.height]), axis=1)
+    seen, (u, v) = seen[inside], pixels[inside].T
+    old_m = old_depth_m[v, u].astype(float)
+    seen, old_m = seen[old_m > 0], old_m[old_m > 0]
+    if not len(seen):
+        return SurfaceFit(0.0, 0.0, 0.0)
+    z = p[seen, 2]
+    gate_m = config.gate_m + config.gate_share * old_m
+    is_one = np.abs(z - old_m) <= gate_m
+    along = np.einsum("ij,ij->i", normals[seen], p[seen] * (1 - old_m / z)[:, None])
+    has_normal = is_one & np.any(normals[seen] != 0, axis=1)
+    squares = along[has_normal] ** 2
+    return SurfaceFit(
+        overlap=float(is_one.sum() / points.shape[1]),
+        rmse_m=float(np.sqrt(squares.mean())) if len(squares) else 0.0,
+        conflict=float((z < old_m - gate_m).mean()),
+    )

@@ -1,0 +1,132 @@
+"""Keyframes that follow each other, taken together: what is recognised. Paper, III.C."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import se3
+from ldo_service.tracking.motion import extent
+from ldo_service.tracking.places import Place
+
+from .object_points import Landmarks, Sightings
+
+
+@dataclass(frozen=True, slots=True)
+class SubgraphConfig:
+    least: int = 3  # keyframes (III.C)
+    most: int = 5  # keyframes (III.C)
+    turned_rad: float = 0.5  # rotation plus parallax from first to last, after which `least` are
+    # enough: half of what a depth camera sees is new then
+    gap_rad: float = 1.5  # likewise, from one to the next, after which a new one begins: keyframes
+    # that follow each other are 0.35 apart, unless frames were dropped
+    kept_views: int = (
+        2  # of each: 0.13 MB a view at 640x480. More found no more on flat and kitchen
+    )
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.kept_views <= self.most or not 1 <= self.least <= self.most:
+            raise ConfigError(f"{self}: 1 <= least <= most and 1 <= kept_views <= most are needed.")
+        if not (self.turned_rad > 0 and self.gap_rad > 0):
+            raise ConfigError(f"{self}: turned_rad and gap_rad must be positive.")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A keyframe as places are recognised by.
+
+    words [W] float32 counts of visual words; path_m how far the camera had come by then
+    """
+
+    place: Place
+    frame: int  # of the camera
+    stamp_ns: int
+    path_m: float
+    was_looked_at: bool  # by a detector
+    sightings: Sightings
+    words: np.ndarray
+
+    @property
+    def keyframe(self) -> int:
+        return self.place.id
+
+    @cached_property
+    def packed(self) -> dict[str, Any]:
+        """Arrays and plain values, one and the same object each time."""
+        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**kept, "place": self.place.packed, "sightings": asdict(self.sightings)}
+
+    @staticmethod
+    def unpacked(kept: dict[str, Any]) -> "View":
+        """The inverse of `packed`."""
+        place, sightings = Place.unpacked(kept["place"]), Sightings(**kept["sightings"])
+        return View(**{**kept, "place": place, "sightings": sightings})
+
+
+@dataclass(frozen=True, eq=False)
+class Subgraph:
+    """`views` are those kept, the oldest first.
+
+    names [C], layout [512] and words [W] float32 are its histograms
+    """
+
+    views: tuple[View, ...]
+    keyframes: tuple[int, ...]
+    first_frame: int
+    last_frame: int
+    stamp_ns: int  # of its newest keyframe
+    path_m: float  # likewise
+    was_looked_at: bool
+    landmarks: Landmarks
+    names: np.ndarray
+    layout: np.ndarray
+    words: np.ndarray
+
+    @property
+    def segment(self) -> int:
+        return self.views[0].place.segment
+
+    @cached_property
+    def packed(self) -> dict[str, Any]:
+        """Arrays and plain values, one and the same object each time."""
+        kept = {field.name: getattr(self, field.name) for field in fields(self)}
+        views = [view.packed for view in self.views]
+        return {**kept, "views": views, "landmarks": self.landmarks.packed}
+
+    @staticmethod
+    def unpacked(kept: dict[str, Any]) -> "Subgraph":
+        """The inverse of `packed`."""
+        changed = {
+            "views": tuple(map(View.unpacked, kept["views"])),
+            "keyframes": tuple(kept["keyframes"]),
+            "landmarks": Landmarks(**kept["landmarks"]),
+        }
+        return Subgraph(**{**kept, **changed})
+
+
+def follows(before: Place, place: Place, config: SubgraphConfig) -> bool:
+    """Whether a keyframe goes on where the one before was made: others may lie between that were
+    made long ago."""
+    moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
+    is_near = extent(moved, before.median_depth_m) <= config.gap_rad
+    return is_near and before.segment == place.segment
+
+
+def is_whole(views: Sequence[View], config: SubgraphConfig) -> bool:
+    """Whether keyframes of one segment make a subgraph: enough of them, or far enough apart."""
+    if len(views) < config.least:
+        return False
+    first, last = views[0].place, views[-1].place
+    moved = se3.inverse(first.T_odom_keyframe) @ last.T_odom_keyframe
+    return len(views) >= config.most or extent(moved, first.median_depth_m) > config.turned_rad
+
+
+def spread(views: Sequence[View], count: int) -> tuple[View, ...]:
+    """So many of them, at equal steps, the first and the last included; the middle one of one."""
+    if count == 1:
+        return (views[len(views) // 2],)
+    at = np.rint(np.linspace(0, len(views) - 1, min(count, len(views)))).astype(int)
+    return tuple(views[index] for index in at)

@@ -1,0 +1,136 @@
+"""What landmarks are, from what was observed of them: min G(p) of `ldo_service.pose_graph`."""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import wrightomega
+
+FLOOR = 1e-6  # of a class that an observation does not name: rare, not impossible
+NEWTON_STEPS = 60  # it takes 5 to 15; monotone, so it cannot cycle
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """All observations of a landmark in two numbers per class: they enter G through these alone.
+
+    sum_k w_k KL(p || q_k) = W sum_c p_c log p_c - sum_c p_c L_c,  W = sum w_k, L = sum w_k log q_k
+    """
+
+    weight: float  # W
+    log_sum: np.ndarray  # L [C], nats
+
+    @staticmethod
+    def none(classes: int) -> "Evidence":
+        return Evidence(0.0, np.zeros(classes))
+
+    def with_observed(self, q: np.ndarray, weight: float) -> "Evidence":
+        """q [C] sums to one; classes below 1e-6 are raised to it."""
+        floored = np.maximum(q, FLOOR)
+        log_q = np.log(floored / floored.sum())
+        return Evidence(self.weight + weight, self.log_sum + weight * log_q)
+
+
+def fused(
+    evidence: Mapping[int, Evidence],
+    covisible: Iterable[tuple[int, int]] = (),
+    *,
+    lambda_sem: float = 0.5,
+    w_sem: float = 0.1,
+    start: Mapping[int, np.ndarray] | None = None,
+    only: Collection[int] | None = None,
+    sweeps: int = 20,
+    tolerance: float = 1e-9,
+) -> dict[int, np.ndarray]:
+    """p_l [C] of every landmark, in the order of their ids.
+
+        min_p  lambda sum_lk w_k KL(p_l || q_lk)
+             + w_sem / 2 sum_ij (KL(p_i || p_j) + KL(p_j || p_i)) [argmax p_i = argmax p_j]
+
+    `covisible` pairs count once each. `start` are estimates from before, else the geometric means;
+    where `only` some are asked for, the others stay at their start.
+    Which pairs are of one argmax is decided anew before each sweep; sweeps end when no p changes by
+    `tolerance`. Deterministic: Gauss-Seidel in the order of the ids. Paper, III.C.
+    """
+    p = {k: geometric_mean(evidence[k]) for k in sorted(evidence)}
+    p |= {k: v for k, v in (start or {}).items() if k in p}
+    neighbours = _neighbours(covisible, p)
+    if only is not None:
+        neighbours = {k: others for k, others in neighbours.items() if k in only}
+    for _ in range(sweeps):
+        largest = 0.0
+        for k, others in neighbours.items():
+            alike = [p[j] for j in others if p[j].argmax() == p[k].argmax()]
+            new = _minimum(evidence[k], alike, lambda_sem, w_sem)
+            largest = max(largest, float(np.abs(new - p[k]).max()))
+            p[k] = new
+        if largest < tolerance:
+            break
+    return p
+
+
+def geometric_mean(evidence: Evidence) -> np.ndarray:
+    """argmin_p sum_k w_k KL(p || q_k) = prod q_k^(w_k / W), normalised."""
+    mean = evidence.log_sum / max(evidence.weight, np.finfo(float).tiny)
+    p = np.exp(mean - mean.max())
+    return p / p.sum()
+
+
+def objective(
+    p: Mapping[int, np.ndarray],
+    evidence: Mapping[int, Evidence],
+    pairs: Iterable[tuple[int, int]],
+    lambda_sem: float = 0.5,
+    w_sem: float = 0.1,
+) -> float:
+    """G(p) up to a constant, with the similarity of `pairs` whatever their argmax."""
+    observed = sum(
+        evidence[k].weight * np.sum(p_k * np.log(p_k)) - p_k @ evidence[k].log_sum
+        for k, p_k in p.items()
+    )
+    alike = sum((p[i] - p[j]) @ (np.log(p[i]) - np.log(p[j])) for i, j in pairs)
+    return float(lambda_sem * observed + 0.5 * w_sem * alike)
+
+
+def _neighbours(
+    covisible: Iterable[tuple[int, int]], known: Mapping[int, object]
+) -> dict[int, list[int]]:
+    neighbours: dict[int, list[int]] = {}
+    for i, j in sorted({(min(pair), max(pair)) for pair in covisible}):
+        if i != j and i in known and j in known:
+            neighbours.setdefault(i, []).append(j)
+            neighbours.setdefault(j, []).append(i)
+    return dict(sorted(neighbours.items()))
+
+
+def _minimum(
+    evidence: Evidence, alike: list[np.ndarray], lambda_sem: float, w_sem: float
+) -> np.ndarray:
+    """Of one landmark's terms, its neighbours [C] held as they are.
+
+    With half of the similarity in each direction, n neighbours and the multiplier nu,
+
+        a (log p_c + 1) - g_c - b_c / p_c + nu = 0,    a = lambda W + n w / 2,
+        g = lambda L + w / 2 sum_j log p_j,            b = w / 2 sum_j p_j
+
+    is solved by p_c = (b_c / a) / omega(log(b_c / a) + 1 + (nu - g_c) / a), omega of Wright:
+    omega + log omega = x. The sum over c falls with nu, which makes it one.
+    """
+    half = 0.5 * w_sem
+    a = lambda_sem * evidence.weight + half * len(alike)
+    if not alike or half == 0:
+        return geometric_mean(evidence)
+    g = lambda_sem * evidence.log_sum + half * np.sum(np.log(alike), axis=0)
+    log_b = np.log(half * np.sum(alike, axis=0) / a)
+    x = 1 - g / a + log_b
+    # where sum_c p_c must exceed one, so that Newton comes from one side of a convex function
+    nu = float(np.max(g / a)) - 1
+    p = np.ones_like(g)
+    for _ in range(NEWTON_STEPS):
+        omega = wrightomega(x + nu)
+        p = np.exp(log_b) / omega
+        excess = p.sum() - 1
+        if abs(excess) < 1e-14:
+            break
+        nu += excess / np.sum(p / (1 + omega))
+    return p / p.sum()

@@ -1,0 +1,360 @@
+"""Keyframe poses from relative measurements and landmarks, by incremental smoothing (iSAM2)."""
+
+from collections.abc import Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ldo_service.errors import ConfigError
+from ldo_service.geometry.keyframe_poses import RelativePose
+
+from .component_merging import T_new_old, best_without, contradicted, judged
+from .condensation import group_to_condense
+from .factor_store import Measurements
+from .factors import (
+    NoiseConfig,
+    Sight,
+    information,
+    pack_relative,
+    pack_sights,
+    unpack_relative,
+    unpack_sights,
+)
+from .loop_closures import Closures, ClosuresConfig, Pair, Verdict, pair_of
+from .solver import Name, Solver, Variables, point_key
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeGraphConfig:
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    closures: ClosuresConfig = field(default_factory=ClosuresConfig)
+    condense_keyframes: int = 10  # of which one stays a variable (paper, III.C: every 10)
+    window_keyframes: int = 20  # the newest stay as they are: they are still measured anew
+    # An end of a closure that follows, and is bent by more sigmas of it, is a variable again, while
+    # there are so many keyframes for each: a solution takes time with the variables
+    most_bent: float = 0.1
+    keyframes_each: int = 5
+    most_changes: int = 64  # between two rebuilds: what a successor repeats to hold the same bits
+
+    def __post_init__(self) -> None:
+        counts = self.condense_keyframes, self.window_keyframes, self.most_changes
+        if min(*counts, self.keyframes_each) < 1:
+            raise ConfigError(f"{self}: keyframes and changes must be at least 1.")
+        if self.most_bent < 0:
+            raise ConfigError(f"most_bent={self.most_bent:g} must not be negative.")
+
+
+class KeyframeGraph:
+    """min F(T, mu) of `ldo_service.pose_graph`, over the keyframes that are variables.
+
+    Keyframes that measurements connect are a component, whose frame its first keyframe fixes; a
+    measurement between two components makes them one, in the frame of the older.
+
+    iSAM2 relinearises what moved. It cannot be saved, and another one built from the same
+    measurements differs in the last digits. So what is saved is the state at the last rebuild, and
+    the changes since, which a successor repeats: it goes on with the same bits. Rebuilt every few
+    keyframes anyway, when old ones are condensed, and where an update throws, which has already
+    changed the object. Deterministic: the same measurements in the same order give the same bits.
+    """
+
+    def __init__(self, config: KeyframeGraphConfig = KeyframeGraphConfig()) -> None:
+        self._config = config
+        self._known = Measurements(config.noise, config.closures)
+        self._initial: Variables = {}  # the value each variable was inserted with
+        self._solver = Solver()
+        self._base = self._packed()
+        self._changes: list[tuple[str, dict[str, Any]]] = []  # since the last rebuild
+        self.solved_times = 0
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._known.first_of
+
+    def __len__(self) -> int:
+        return len(self._known.first_of)
+
+    @property
+    def keyframes(self) -> Set[int]:
+        return self._known.first_of.keys()
+
+    @property
+    def newest(self) -> int | None:
+        return max(self.keyframes, default=None)
+
+    @property
+    def variables(self) -> int:
+        """Keyframes that are variables; the others follow them."""
+        return len(self) - len(self._known.rows)
+
+    @property
+    def closures(self) -> Closures:
+        return self._known.closures
+
+    # --- keyframes --------------------------------------------------------------------------------
+    def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
+        """The keyframe that fixes the frame of a new component."""
+        self._note("first", keyframe=keyframe, T_map=T_map_keyframe)
+        self._initial[keyframe] = np.array(T_map_keyframe, float)
+        self._known.first_of[keyframe] = keyframe
+        self._known.active.append(keyframe)
+        self._update([("first", keyframe)], [keyframe])
+
+    def first_of(self, keyframe: int) -> int:
+        """The first keyframe of its component. Raises KeyError when it is not known."""
+        return self._known.first_of[keyframe]
+
+    def add(self, measured: RelativePose, *more: RelativePose) -> None:
+        """A new keyframe `b`, measured from a known one, and from `more` of them.
+
+        Raises KeyError for an `a` that is not known, ValueError if they measure several keyframes.
+        """
+        every = (measured, *more)
+        if any(m.b != measured.b for m in every):
+            raise ValueError(f"keyframes {sorted({m.b for m in every})} cannot be added at once.")
+        self._require(m.a for m in every)
+        self._note("add", measured=pack_relative(every))
+        self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
+        self._known.first_of[measured.b] = self.first_of(measured.a)
+        self._known.active.append(measured.b)
+        self._update([self._known.measure(m) for m in every], [measured.b])
+        self._condense()
+
+    def replace(self, measured: Sequence[RelativePose]) -> None:
+        """Believe these in place of what was measured between the same keyframes before. One that
+        follows others is put where they say.
+
+        Raises KeyError for a keyframe that is not known.
+        """
+        self._require(k for m in measured for k in (m.a, m.b))
+        self._note("replace", measured=pack_relative(measured))
+        names = [self._known.measure_anew(m, self.pose) for m in measured]
+        self._update([name for name in names if name], [])
+
+    def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
+        """Odometry between keyframes of which those between were missed: believed less."""
+        noise = self._config.noise
+        own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)
+        return RelativePose(a, b, T_a_b, own)
+
+    def _require(self, keyframes: Iterable[int]) -> None:
+        for keyframe in keyframes:
+            if keyframe not in self:
+                raise KeyError(keyframe)
+
+    # --- components and loops ---------------------------------------------------------------------
+    def close(self, closure: RelativePose) -> Verdict:
+        """What somebody recognised, between known keyframes: is it believed, and what left for it.
+
+        See `loop_closures`; a refused one leaves no trace in any pose. Between two components there
+        is nothing to judge it by, and it joins them; where more of those that it refutes later
+        agree with each other than with it, one of them joins instead. Raises KeyError when a
+        keyframe is not known.
+        """
+        if self.first_of(closure.a) != self.first_of(closure.b):
+            self._join(closure)
+            return Verdict(True)
+        if pair_of(closure) in self._known.joins:
+            return Verdict(True)  # the same two images: told again they would count twice
+        start, known = self._solver.variables(), self._known
+        if known.in_head(closure.a)[0] == known.in_head(closure.b)[0]:
+            return self._refuse(closure)  # too late: both hang on one variable by now
+        verdict, variables = judged(known, closure, start, self._initial)
+        self.solved_times += 1
+        if not verdict.changes:
+            return self._refuse(closure)
+        known.closures = known.closures.after(closure, verdict)
+        self._rebase(self._with_ends(closure, variables))
+        return verdict
+
+    def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
+        """Make ends that a closure bends too much to follow variables again."""
+        known, config = self._known, self._config
+        for keyframe in (closure.a, closure.b):
+            is_room = len(known.condensed) * config.keyframes_each < len(self)
+            if is_room and known.bent(keyframe, variables) > config.most_bent:
+                follower = known.followers.only(known.rows[keyframe])
+                ends = int(follower.heads[0]), int(follower.tails[0])
+                T_head, T_tail = (variables[k][None] for k in ends)
+                known.part(keyframe)
+                variables = {**variables, keyframe: follower.placed(T_head, T_tail)[0]}
+        return variables
+
+    def _join(self, measured: RelativePose) -> None:
+        """Two components become one: the younger moves as a whole into the older one's frame,
+        before everything is solved again."""
+        first_a, first_b = self.first_of(measured.a), self.first_of(measured.b)
+        moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
+        younger, older = max(first_a, first_b), min(first_a, first_b)
+        moved = self._known.move_component(younger, older, moves, self._solver.variables())
+        self._known.joins[measured.a, measured.b] = measured
+        self._rebase(moved)
+
+    def _refuse(self, closure: RelativePose) -> Verdict:
+        """Unless more closures agree with it than with a join that it contradicts. Of several joins
+        the one falls that takes the fewest closures with it; where that is not one, all stay."""
+        known, variables = self._known, self._solver.variables()
+        known.closures = known.closures.after(closure, Verdict(False))
+        joins = contradicted(known, closure)
+        self._note("refuse", measured=pack_relative([closure]), is_doubt=bool(joins))
+        if not joins:
+            return Verdict(False)
+        known.doubt(closure)
+        better = best_without(known, joins, closure, self.pose, variables, self._initial)
+        if better is None:
+            return Verdict(False)
+        joined, self._known, variables = better
+        self._rebase(variables)
+        gone = (p for p in known.closures.accepted if p not in self.closures.accepted)
+        return Verdict(True, (joined.pair, *gone))
+
+    # --- landmarks --------------------------------------------------------------------------------
+    def see(self, sights: Sequence[Sight], placed: Mapping[int, np.ndarray]) -> None:
+        """Landmarks in the images of known keyframes; `placed` [3], in the map, are those that are
+        new. Raises KeyError for a keyframe that is not known."""
+        self._require(s.keyframe for s in sights)
+        self._note(
+            "see", sights=pack_sights(sights), ids=list(placed), points=list(placed.values())
+        )
+        self._initial |= {point_key(k): np.array(p, float) for k, p in placed.items()}
+        self._known.sights |= {(s.keyframe, s.landmark): s for s in sights}
+        names = [("sight", s.keyframe, s.landmark) for s in sights]
+        self._update(names, [point_key(k) for k in placed])
+
+    def unsee(self, pairs: Iterable[Pair]) -> None:
+        """Forget sights, by keyframe and landmark; with its last sight a landmark is forgotten."""
+        known = [pair for pair in pairs if pair in self._known.sights]
+        if not known:
+            return
+        self._note("unsee", pairs=[list(pair) for pair in known])
+        for pair in known:
+            del self._known.sights[pair]
+        left = {landmark for _, landmark in self._known.sights}
+        for landmark in {landmark for _, landmark in known} - left:
+            self._initial.pop(point_key(landmark), None)
+        self._update([], [], [("sight", *pair) for pair in known])
+
+    def has_landmark(self, landmark: int) -> bool:
+        return point_key(landmark) in self._initial
+
+    def landmarks(self) -> dict[int, np.ndarray]:
+        """mu [3] in the map of each, by id."""
+        variables = self._solver.variables()
+        return {k: variables[point_key(k)] for k in sorted({k for _, k in self._known.sights})}
+
+    # --- poses ------------------------------------------------------------------------------------
+    def pose(self, keyframe: int) -> np.ndarray:
+        """T_map_keyframe [4, 4], as estimated now."""
+        row = self._known.rows.get(keyframe)
+        if row is None:
+            return self._solver.pose(keyframe)
+        follower = self._known.followers.only(row)
+        ends = int(follower.heads[0]), int(follower.tails[0])
+        T_head, T_tail = (self._solver.pose(k)[None] for k in ends)
+        return follower.placed(T_head, T_tail)[0]
+
+    def poses(self) -> dict[int, np.ndarray]:
+        """T_map_keyframe of every keyframe, ascending by id."""
+        keyframes, T_map = self.placed()
+        return dict(zip(keyframes.tolist(), T_map, strict=True))
+
+    def placed(self) -> tuple[np.ndarray, np.ndarray]:
+        """All keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
+        variables, followers = self._solver.variables(), self._known.followers
+        keys = np.array([k for k in variables if k in self], np.int64)
+        T_map = np.array([variables[k] for k in keys.tolist()]).reshape(-1, 4, 4)
+        heads, tails = (np.searchsorted(keys, ids) for ids in (followers.heads, followers.tails))
+        keyframes = np.concatenate([keys, followers.keyframes])
+        order = np.argsort(keyframes)
+        every = np.concatenate([T_map, followers.placed(T_map[heads], T_map[tails])])
+        return keyframes[order], every[order]
+
+    # --- iSAM2 ------------------------------------------------------------------------------------
+    def _update(
+        self, names: Sequence[Name], variables: Sequence[int], gone: Sequence[Name] = ()
+    ) -> None:
+        if not names and not gone:
+            return
+        self.solved_times += 1
+        factors = {name: self._known.factor(name, self._initial) for name in names}
+        try:
+            self._solver.update(factors, {k: self._initial[k] for k in variables}, gone)
+        except RuntimeError:
+            self._rebuild_or_forget_landmarks()
+
+    def _rebuild_or_forget_landmarks(self) -> None:
+        """Keyframes hold each other; a landmark may have been placed where rays hardly cross."""
+        try:
+            self._rebuild()
+        except RuntimeError:
+            self._known.sights = {}
+            self._initial = {k: v for k, v in self._initial.items() if v.ndim == 2}
+            self._rebuild()
+
+    def _rebuild(self) -> None:
+        """All measurements into a new object. Raises RuntimeError when they cannot be solved."""
+        factors = {name: self._known.factor(name, self._initial) for name in self._known.names()}
+        self._solver = Solver()
+        if factors:
+            self._solver.update(factors, self._initial)
+
+    def _condense(self) -> None:
+        """What is due; and start anew from what is known now, often enough."""
+        config, known = self._config, self._known
+        heads = {k for pair in known.condensed for k in pair}
+        group = group_to_condense(
+            known.active, known.odometry, heads, config.condense_keyframes, config.window_keyframes
+        )
+        if group:
+            known.condense(group, {k: self.pose(k) for k in group})
+        if group or len(self._changes) > config.most_changes:
+            followers = known.rows.keys()
+            variables = self._solver.variables()
+            self._rebase({k: v for k, v in variables.items() if k not in followers})
+
+    def _rebase(self, variables: Variables) -> None:
+        """Start anew from here."""
+        self._initial, self._changes = variables, []
+        self._base = self._packed()
+        self._rebuild_or_forget_landmarks()
+
+    # --- state ------------------------------------------------------------------------------------
+    def _note(self, change: str, **what: Any) -> None:
+        self._changes.append((change, what))
+
+    def _packed(self) -> dict[str, Any]:
+        initial = list(self._initial), [v.ravel() for v in self._initial.values()]
+        return {"keys": initial[0], "values": initial[1], "known": self._known.packed()}
+
+    def snapshot(self) -> dict[str, Any]:
+        """`base` is the same object until the next rebuild."""
+        return {"base": self._base, "changes": list(self._changes)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Go on with the same bits."""
+        self._base, self._changes = state["base"], []
+        values = [v.reshape(4, 4) if v.size == 16 else v for v in self._base["values"]]
+        self._initial = dict(zip(self._base["keys"], values, strict=True))
+        self._known.unpack(self._base["known"])
+        self._rebuild_or_forget_landmarks()
+        for change, what in state["changes"]:
+            self._repeat(change, what)
+
+    def _repeat(self, change: str, what: Mapping[str, Any]) -> None:
+        match change:
+            case "first":
+                self.add_first(what["keyframe"], what["T_map"])
+            case "add":
+                self.add(*unpack_relative(what["measured"]))
+            case "replace":
+                self.replace(unpack_relative(what["measured"]))
+            case "see":
+                points = dict(zip(what["ids"], what["points"], strict=True))
+                self.see(unpack_sights(what["sights"]), points)
+            case "unsee":
+                self.unsee([(keyframe, landmark) for keyframe, landmark in what["pairs"]])
+            case "refuse":
+                (closure,) = unpack_relative(what["measured"])
+                self._note(change, **what)
+                self._known.closures = self._known.closures.after(closure, Verdict(False))
+                if what["is_doubt"]:
+                    self._known.doubt(closure)
