@@ -10,19 +10,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from ldo_service.actors.tracker import Tracker, TrackerConfig
-from ldo_service.errors import DataError
 from ldo_service.geometry import RgbdFrame
 from ldo_service.schemas import Keyframe, TrackedPose
-from ldo_service.storage.state_codec import decode_state
-from ldo_service.tracking.judgement import Status
-from ldo_service.tracking.localiser import Fix, Localiser
-from ldo_service.tracking.places import Place, Places
-
-PLACES = "places.msgpack"  # in the folder of a run
+from ldo_service.tracking.keyframe_database import places_of
+from ldo_service.tracking.localizer import Fix, Localiser
+from ldo_service.tracking.tracking_quality import Status
 
 
 class LocalisingTracker(Tracker):
@@ -44,23 +39,3 @@ class LocalisingTracker(Tracker):
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         super().restore(state)
         self._localiser.fix = Fix.unpacked(state["fix"])
-
-
-def places_of(folder: Path) -> Places:
-    """Of the map that a finished run left in its folder. Raises DataError when it left none."""
-    path = folder / PLACES
-    if not path.is_file():
-        raise DataError(
-            f"{folder} has no {PLACES}, so nothing can be localised in it. Name the folder that "
-            "`ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
-        )
-    try:
-        kept = decode_state(path.read_bytes())
-        places = Places(tuple(Place.unpacked(place) for place in kept["places"]))
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
-    except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} is not what `ldo run` writes: {error!r}. Run it again.") from error
-    if not len(places):
-        raise DataError(f"{path} holds no place: the run made no keyframe. Run it again.")
-    return places

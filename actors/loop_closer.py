@@ -42,7 +42,7 @@ from ldo_service.schemas.topics import (
     LOOP_CANDIDATE,
     LOOP_CLOSURE,
 )
-from ldo_service.tracking.places import Place, place_of
+from ldo_service.tracking.keyframe_database import Place, place_of
 
 log = logging.getLogger(__name__)
 

@@ -49,11 +49,11 @@ from ldo_service.schemas.topics import (
     ODOMETRY_PRIOR,
     POSE_TRACKED,
 )
-from ldo_service.tracking.judgement import Status
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
-from ldo_service.tracking.prior import Prior, Reading, Verdict
-from ldo_service.tracking.returning import SeenAgain
-from ldo_service.tracking.tracked import Tracked
+from ldo_service.tracking.odometry_prior import Prior, Reading, Verdict
+from ldo_service.tracking.relocalization import SeenAgain
+from ldo_service.tracking.tracking_quality import Status
+from ldo_service.tracking.tracking_result import Tracked
 
 log = logging.getLogger(__name__)
 

@@ -62,7 +62,7 @@ def offenders(room: str, forbidden: tuple[str, ...]) -> list[str]:
 
 
 def test_relative_imports_are_resolved() -> None:
-    path = ROOT / "ldo_service/tracking/align.py"
+    path = ROOT / "ldo_service/tracking/alignment.py"
     source = "from . import a\nfrom ..pose_graph import b\nfrom .c import d\nimport e.f\n"
     assert list(imports(path, source)) == [
         "ldo_service.tracking.a",

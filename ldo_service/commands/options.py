@@ -7,9 +7,9 @@ from typing import Annotated
 import tyro
 
 from ldo_service.actors.detector import require_detector
-from ldo_service.actors.localiser import places_of
 from ldo_service.actors.vlm_labeller import require_labeller
 from ldo_service.config import Config
+from ldo_service.tracking.keyframe_database import places_of
 
 ConfigFile = Annotated[
     Path | None,

@@ -16,7 +16,7 @@ from ldo_service.schemas import (
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
 from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
-from ldo_service.tracking.moving import resized
+from ldo_service.tracking.motion_segmentation import resized
 from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of
 
 from .poses import transform

@@ -13,9 +13,9 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
-from ldo_service.tracking.align import AlignConfig
+from ldo_service.tracking.alignment import AlignConfig
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.places import Place, PlacesConfig
+from ldo_service.tracking.keyframe_database import Place, PlacesConfig
 from ldo_service.tracking.pyramid import PyramidConfig
 
 from .consistency_check import Plausibility, PlausibilityConfig

@@ -10,7 +10,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.semantics.gaussian_labels import MOST_LABELS
-from ldo_service.tracking.places import gaps
+from ldo_service.tracking.keyframe_database import gaps
 
 from .object_points import LAYOUT_WORDS
 from .subgraph import Subgraph

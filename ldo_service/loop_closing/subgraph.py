@@ -9,8 +9,8 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
+from ldo_service.tracking.keyframe_database import Place
 from ldo_service.tracking.motion import extent
-from ldo_service.tracking.places import Place
 
 from .object_points import Landmarks, Sightings
 

@@ -16,7 +16,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
-from ldo_service.tracking.align import AlignConfig, Alignment, align
+from ldo_service.tracking.alignment import AlignConfig, Alignment, align
 from ldo_service.tracking.features import FeatureConfig, estimate_pose
 from ldo_service.tracking.keyframes import Keyframe
 from ldo_service.tracking.motion import extent

@@ -29,7 +29,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ldo_service.actors.localiser import PLACES
 from ldo_service.actors.tracker import TrackerConfig
 from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.errors import ConfigError
@@ -53,6 +52,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
+from ldo_service.tracking.keyframe_database import PLACES
 
 from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
 from .front_end import FRONT_END

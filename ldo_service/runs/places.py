@@ -10,7 +10,7 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.schemas import Keyframe
 from ldo_service.storage.state_codec import encode_state
 from ldo_service.tracking import OdometryConfig
-from ldo_service.tracking.places import Places, place_of
+from ldo_service.tracking.keyframe_database import Places, place_of
 
 
 class PlaceRecord:

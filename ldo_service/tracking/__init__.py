@@ -1,12 +1,11 @@
 """Camera poses from RGB-D frames: direct alignment to keyframes, relocalisation by features."""
 
-from .align import AlignConfig, Alignment, align
-from .judgement import Status
+from .alignment import AlignConfig, Alignment, align
 from .odometry import Odometry, OdometryConfig
-from .prior import Prior, PriorConfig, Reading
-from .pyramid import Pyramid, PyramidConfig, pyramid_of
-from .reference import Reference, build_reference
-from .tracked import Tracked
+from .odometry_prior import Prior, PriorConfig, Reading
+from .pyramid import Pyramid, PyramidConfig, Reference, build_reference, pyramid_of
+from .tracking_quality import Status
+from .tracking_result import Tracked
 
 __all__ = [
     "AlignConfig",

@@ -13,8 +13,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 
 from .features import FeatureConfig, Features, detect
-from .pyramid import Pyramid, PyramidConfig, build_pyramid
-from .reference import Reference, build_reference
+from .pyramid import Pyramid, PyramidConfig, Reference, build_pyramid, build_reference
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,24 +30,27 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .align import AlignConfig, Alignment
-from .candidates import Candidate, CandidateConfig
-from .equations import Appearance
-from .features import FeatureConfig
-from .guesses import Guesses
-from .judgement import History, JudgementConfig, Status, judge
+from .alignment import AlignConfig, Alignment, Appearance
+from .features import FeatureConfig, ShapeConfig
+from .keyframe_database import Place, Places, PlacesConfig, place_of, thumbnail_of
 from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping, movable_in
 from .motion import Motion
-from .moving import MovingConfig, spread, watch
-from .places import Place, Places, PlacesConfig, place_of, thumbnail_of
-from .prior import Anchor, PriorConfig, Reading
+from .motion_segmentation import MovingConfig, spread, watch
+from .odometry_prior import Anchor, PriorConfig, Reading
+from .pose_candidates import Candidate, CandidateConfig, Guesses
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
-from .relocalisation import RelocalisationConfig, Relocaliser
-from .returning import ReturnConfig, Returning, SeenAgain, nearby
-from .segments import Join, Look, SegmentConfig
-from .shape import ShapeConfig
+from .relocalization import (
+    RelocalisationConfig,
+    Relocaliser,
+    ReturnConfig,
+    Returning,
+    SeenAgain,
+    nearby,
+)
 from .state import Origin, State, packed, unpacked
-from .tracked import Tracked, report
+from .submaps import Join, Look, SegmentConfig
+from .tracking_quality import History, JudgementConfig, Status, judge
+from .tracking_result import Tracked, report
 from .window import EarlierKeyframes, WindowConfig, measured_from
 
 log = logging.getLogger(__name__)

@@ -1,8 +1,9 @@
-"""Image and depth pyramids with one definition of pixel centres: `Camera.halved`.
+"""Frames made ready for alignment: image pyramids, reference points, and the noise of their depth.
 
-Colour and depth are halved by averaging 2x2 blocks, so a pixel of the coarse image is centred on
-the corner that its four parents share. (`cv2.pyrDown` centres it on one of them; that half pixel
-doubles the trajectory's error.)
+Pixel centers have one definition, `Camera.halved`: color and depth are halved by averaging 2x2
+blocks, so a pixel of the coarse image is centered on the corner that its four parents share.
+(`cv2.pyrDown` centers it on one of them; that half pixel doubles the trajectory's error.) What a
+frame is aligned to are the surface points of a keyframe. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from ldo_service.kernels import _align
 
 CLIPPED = 250  # grey levels: above, one of the colours is at its end and the others are near it
 ANY_DIFFERENCE = 1e3  # relative
+
 
 Intrinsics = tuple[float, float, float, float]
 
@@ -118,3 +120,69 @@ def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
     return build_pyramid(
         cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m, frame.camera, config
     )
+
+
+@dataclass(frozen=True, slots=True)
+class DepthNoise:
+    """Axial noise sigma(z) = floor + growth (z - nearest)^2 of a depth camera.
+
+    The defaults are the Kinect's (Nguyen, Izadi and Lovell 2012, equation 5). Only the shape of
+    the curve matters much: alignment estimates a factor on it from every frame's residuals.
+    """
+
+    floor_m: float = 0.0012
+    growth_per_m: float = 0.0019
+    nearest_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not (self.floor_m > 0 and self.growth_per_m >= 0):
+            raise ConfigError(
+                f"depth noise floor_m={self.floor_m:g} must be positive and "
+                f"growth_per_m={self.growth_per_m:g} must not be negative."
+            )
+
+    @property
+    def coefficients(self) -> tuple[float, float, float]:
+        """(floor_m, growth_per_m, nearest_m)."""
+        return self.floor_m, self.growth_per_m, self.nearest_m
+
+    def sigma_m(self, depth_m: np.ndarray) -> np.ndarray:
+        """Standard deviation [...] of depth [...]."""
+        return self.floor_m + self.growth_per_m * (depth_m - self.nearest_m) ** 2
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Points [7, N] float32 of each level, the finest first.
+
+    Rows: x y z in m in the reference camera, grey level, and a normal (0 0 0 where none).
+    `median_depth_m` is the scale of the scene, 1 where nothing was measured.
+    """
+
+    points: tuple[np.ndarray, ...]
+    median_depth_m: float
+
+
+def build_reference(pyramid: Pyramid, left_out: np.ndarray | None = None) -> Reference:
+    """Of the pixels with depth, but for those `left_out` [H, W] bool at working resolution."""
+    levels = (_without(level, left_out) for level in pyramid.levels)
+    points = tuple(_level_points(level, i) for i, level in enumerate(levels))
+    depth_m = points[0][2]
+    return Reference(points, float(np.median(depth_m)) if depth_m.size else 1.0)
+
+
+def _without(level: Level, left_out: np.ndarray | None) -> Level:
+    if left_out is None or not left_out.any():
+        return level
+    size = level.camera.width, level.camera.height
+    share = cv2.resize(left_out.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    texels = level.texels.copy()
+    texels[..., 3][share > 0] = 0
+    return Level(texels, level.camera)
+
+
+def _level_points(level: Level, index: int) -> np.ndarray:
+    smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(level.depth_m), 3), np.float32)
+    radius_px = max(1, 3 - index)  # about the same angle on every level
+    normals = _align.normals(smooth, level.intrinsics, radius_px)
+    return _align.points(level.texels, normals, level.intrinsics)

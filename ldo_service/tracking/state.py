@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from .judgement import History, Status
+from .keyframe_database import Place, Places, PlacesConfig
 from .keyframes import Keyframe
 from .motion import Motion
-from .moving import Suspicion
-from .places import Place, Places, PlacesConfig
-from .prior import Anchor
+from .motion_segmentation import Suspicion
+from .odometry_prior import Anchor
 from .pyramid import PyramidConfig
-from .segments import Segments
+from .submaps import Segments
+from .tracking_quality import History, Status
 
 
 class Origin(StrEnum):

@@ -13,10 +13,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .align import AlignConfig, Alignment, align
-from .equations import Appearance
+from .alignment import AlignConfig, Alignment, Appearance, align
+from .keyframe_database import Place
 from .keyframes import Keyframe
-from .places import Place
 from .pyramid import PyramidConfig
 
 

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.localiser import PLACES, LocalisingTracker, places_of
+from ldo_service.actors.localiser import LocalisingTracker
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence
@@ -14,6 +14,7 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 from ldo_service.schemas import TrackedPose
 from ldo_service.storage.state_codec import decode_state, encode_state
+from ldo_service.tracking.keyframe_database import PLACES, places_of
 
 
 def localiser(finished_run: Path) -> LocalisingTracker:

@@ -34,7 +34,7 @@ from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.segments import SegmentConfig
+from ldo_service.tracking.submaps import SegmentConfig
 
 
 def poses_of(messages) -> list[TrackedPose]:

@@ -23,7 +23,7 @@ from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.tracking import Odometry, Status
-from ldo_service.tracking.tracked import Tracked
+from ldo_service.tracking.tracking_result import Tracked
 
 LEAST_OPACITY, NEAR = 0.9, 0.03  # NEAR: share of the depth
 ITERATIONS = 10  # of the mapper, per keyframe

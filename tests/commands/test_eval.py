@@ -10,8 +10,8 @@ import pytest
 from evo.core import metrics, sync
 from evo.tools import file_interface
 
-from ldo_service.actors.localiser import PLACES
 from ldo_service.runs.folder import MAP_FILES, prepare
+from ldo_service.tracking.keyframe_database import PLACES
 from tests.commands.test_cli import ldo
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ldo_service.actors.localiser import PLACES, places_of
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.errors import DataError, LdoError
 from ldo_service.gaussians import chunk, training_views
@@ -28,7 +27,7 @@ from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.storage.state_store import FolderStore
-from ldo_service.tracking.places import Place
+from ldo_service.tracking.keyframe_database import PLACES, Place, places_of
 from tests.schemas.examples import EXAMPLES
 
 from .of_data_sets import DEPTH, TRAJECTORY, png

@@ -3,7 +3,7 @@
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.tracking.equations import (
+from ldo_service.tracking.alignment import (
     DEGREES_OF_FREEDOM,
     INLIER_SIGMA,
     Appearance,

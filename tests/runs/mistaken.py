@@ -17,8 +17,8 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandidate, LoopClosure
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
-from ldo_service.tracking.prior import Reading
-from ldo_service.tracking.tracked import Tracked
+from ldo_service.tracking.odometry_prior import Reading
+from ldo_service.tracking.tracking_result import Tracked
 
 UP_ODOM = np.array([0.0, -1.0, 0.0])  # of a camera held level at the start
 ASIDE_ODOM = np.array([1.0, 0.0, 0.0])  # level

@@ -4,7 +4,7 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import PyramidConfig, build_reference, pyramid_of
-from ldo_service.tracking.equations import Appearance, ResidualConfig, Term, normal_equations
+from ldo_service.tracking.alignment import Appearance, ResidualConfig, Term, normal_equations
 
 
 def test_first_step_is_the_missing_right_perturbation(room) -> None:

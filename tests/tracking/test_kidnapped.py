@@ -9,7 +9,7 @@ import pytest
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
-from ldo_service.tracking.segments import SegmentConfig
+from ldo_service.tracking.submaps import SegmentConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.tracking.noise import DepthNoise
+from ldo_service.tracking.pyramid import DepthNoise
 
 
 def test_noise_grows_with_the_square_of_depth() -> None:

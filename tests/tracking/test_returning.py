@@ -19,9 +19,9 @@ from ldo_service.tracking import (
     pyramid_of,
 )
 from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframe_database import Place, PlacesConfig, place_of
 from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig
-from ldo_service.tracking.places import Place, PlacesConfig, place_of
-from ldo_service.tracking.returning import ReturnConfig, nearby
+from ldo_service.tracking.relocalization import ReturnConfig, nearby
 
 SOON = OdometryConfig(returning=ReturnConfig(after=1))
 

@@ -17,7 +17,7 @@ from ldo_service.tracking import (
     build_reference,
     pyramid_of,
 )
-from ldo_service.tracking.shape import ShapeConfig, pose_from_shape
+from ldo_service.tracking.features import ShapeConfig, pose_from_shape
 
 T_WORLD_CORNER = se3.exp(np.array([-0.35, 0.6, 0.0, 0.0, 0.0, 0.0]))  # floor and two walls in view
 STEP = np.array([0.02, 0.06, 0.01, 0.06, 0.02, 0.04])  # 4 degrees and 7 cm

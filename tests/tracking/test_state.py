@@ -4,9 +4,9 @@ import numpy as np
 
 from ldo_service.tracking import PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframe_database import Places, PlacesConfig, place_of
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.moving import Suspicion
-from ldo_service.tracking.places import Places, PlacesConfig, place_of
+from ldo_service.tracking.motion_segmentation import Suspicion
 from ldo_service.tracking.state import State, packed, unpacked
 
 

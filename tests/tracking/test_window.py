@@ -8,10 +8,10 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
-from ldo_service.tracking.equations import Appearance
+from ldo_service.tracking.alignment import Appearance
 from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframe_database import PlacesConfig, place_of
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.places import PlacesConfig, place_of
 from ldo_service.tracking.pyramid import build_pyramid
 from ldo_service.tracking.window import EarlierKeyframes, WindowConfig, measured_from
 

@@ -3,7 +3,7 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.tracking.segments import Look, SegmentConfig, Segments
+from ldo_service.tracking.submaps import Look, SegmentConfig, Segments
 
 PERIOD_NS = 33_333_333
 CONFIG = SegmentConfig(begin_after_s=0.1, look_every=4, confirm_after=2)

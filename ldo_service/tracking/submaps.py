@@ -15,7 +15,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .align import Alignment
+from .alignment import Alignment
 from .keyframes import Keyframe
 from .motion import extent
 

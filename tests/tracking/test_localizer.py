@@ -4,10 +4,10 @@ import pytest
 from ldo_service.geometry import se3
 from ldo_service.tracking import Odometry, OdometryConfig, PyramidConfig, Status, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframe_database import Places, PlacesConfig, place_of
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.localiser import Fix, Localiser
-from ldo_service.tracking.places import Places, PlacesConfig, place_of
-from ldo_service.tracking.segments import SegmentConfig
+from ldo_service.tracking.localizer import Fix, Localiser
+from ldo_service.tracking.submaps import SegmentConfig
 
 T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
 T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))

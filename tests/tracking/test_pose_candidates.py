@@ -2,8 +2,8 @@ import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
-from ldo_service.tracking.candidates import CandidateConfig, attempt, best
 from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.pose_candidates import CandidateConfig, attempt, best
 
 T_KEYFRAME_CAMERA = se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]))
 T_ASTRAY = se3.exp(np.array([0.0, -0.4, 0.1, -0.6, 0.1, 0.0]))

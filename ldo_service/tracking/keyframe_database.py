@@ -7,26 +7,31 @@ and depth at the working resolution, compressed: from these it can be tracked ag
 from collections.abc import Sequence, Set
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from pathlib import Path
 from statistics import median
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, codecs, se3
+from ldo_service.storage.state_codec import decode_state
 
 from .features import FeatureConfig, Features, detect, detect_across_scales
-from .judgement import History
 from .keyframes import Keyframe
 from .motion import extents
-from .moving import resized
+from .motion_segmentation import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
+from .tracking_quality import History
 
 THUMBNAIL = 20, 15  # columns, rows: so blurred that a hand's width of motion matters little
 CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactly in float32
 DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
 NO_PAST = History()
+
+PLACES = "places.msgpack"  # in the folder of a run
 
 
 @dataclass(frozen=True, slots=True)
@@ -264,3 +269,23 @@ def _apart(places: tuple[Place, ...], other: Place) -> np.ndarray:
 
 def _poses(places: Sequence[Place]) -> np.ndarray:
     return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
+
+
+def places_of(folder: Path) -> Places:
+    """Of the map that a finished run left in its folder. Raises DataError when it left none."""
+    path = folder / PLACES
+    if not path.is_file():
+        raise DataError(
+            f"{folder} has no {PLACES}, so nothing can be localised in it. Name the folder that "
+            "`ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
+        )
+    try:
+        kept = decode_state(path.read_bytes())
+        places = Places(tuple(Place.unpacked(place) for place in kept["places"]))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}.") from error
+    except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is not what `ldo run` writes: {error!r}. Run it again.") from error
+    if not len(places):
+        raise DataError(f"{path} holds no place: the run made no keyframe. Run it again.")
+    return places

@@ -12,9 +12,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import Odometry, OdometryConfig, Prior, PriorConfig, Status, Tracked
-from ldo_service.tracking.prior import KEPT, Anchor, Reading, Verdict
-from ldo_service.tracking.relocalisation import RelocalisationConfig
-from ldo_service.tracking.segments import SegmentConfig
+from ldo_service.tracking.odometry_prior import KEPT, Anchor, Reading, Verdict
+from ldo_service.tracking.relocalization import RelocalisationConfig
+from ldo_service.tracking.submaps import SegmentConfig
 
 CONFIG = PriorConfig()
 PERIOD_NS = 33_333_333

@@ -14,9 +14,8 @@ from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
 from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
-from ldo_service.tracking.moving import MovingConfig, Watched, gap_m, spread, watch
-from ldo_service.tracking.noise import DepthNoise
-from ldo_service.tracking.pyramid import Level, Pyramid, PyramidConfig, pyramid_of
+from ldo_service.tracking.motion_segmentation import MovingConfig, Watched, gap_m, spread, watch
+from ldo_service.tracking.pyramid import DepthNoise, Level, Pyramid, PyramidConfig, pyramid_of
 
 CONFIG = MovingConfig(level=0)  # images of 160 pixels, as the level that is looked at otherwise
 EMPTY, LATE = 0, 70  # frames: before anybody came, and in the middle of the way

@@ -3,7 +3,7 @@ import pytest
 
 from ldo_service.geometry import Camera, se3
 from ldo_service.tracking import PyramidConfig, build_reference, pyramid_of
-from ldo_service.tracking.equations import Appearance, ResidualConfig, normal_equations
+from ldo_service.tracking.alignment import Appearance, ResidualConfig, normal_equations
 from ldo_service.tracking.pyramid import Level
 from tests.reference import alignment
 

@@ -6,8 +6,8 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.tracking import Alignment, Status
-from ldo_service.tracking.candidates import Candidate
-from ldo_service.tracking.judgement import History, JudgementConfig, judge
+from ldo_service.tracking.pose_candidates import Candidate
+from ldo_service.tracking.tracking_quality import History, JudgementConfig, judge
 
 CONFIG, MEDIAN_DEPTH_M = JudgementConfig(), 2.0
 SOUND = Alignment(

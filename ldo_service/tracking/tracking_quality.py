@@ -14,9 +14,9 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 
-from .align import Alignment
-from .candidates import Candidate
+from .alignment import Alignment
 from .motion import extent
+from .pose_candidates import Candidate
 
 LEAST_GAIN = 0.05  # a frame this dark shows nothing
 

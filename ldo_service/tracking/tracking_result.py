@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .align import Alignment
-from .judgement import Status
+from .alignment import Alignment
 from .keyframes import Keyframe
-from .segments import Join
+from .submaps import Join
+from .tracking_quality import Status
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,16 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.judgement import History, JudgementConfig
+from ldo_service.tracking.keyframe_database import (
+    Place,
+    Places,
+    PlacesConfig,
+    place_of,
+    thumbnail_of,
+)
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of, thumbnail_of
-from ldo_service.tracking.relocalisation import RelocalisationConfig, Relocaliser
+from ldo_service.tracking.relocalization import RelocalisationConfig, Relocaliser
+from ldo_service.tracking.tracking_quality import History, JudgementConfig
 
 T_AWAY = se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
 T_NEAR = se3.exp(np.array([0.03, -0.15, 0.05, 0.15, 0.05, 0.1]))

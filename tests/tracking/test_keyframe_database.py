@@ -6,11 +6,17 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
-from ldo_service.tracking.candidates import attempt
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.judgement import History
+from ldo_service.tracking.keyframe_database import (
+    Place,
+    Places,
+    PlacesConfig,
+    place_of,
+    thumbnail_of,
+)
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.places import Place, Places, PlacesConfig, place_of, thumbnail_of
+from ldo_service.tracking.pose_candidates import attempt
+from ldo_service.tracking.tracking_quality import History
 
 
 def turned(angle_rad: float) -> np.ndarray:

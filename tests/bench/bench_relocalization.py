@@ -1,6 +1,6 @@
 """Single frames looked for in maps of their own and of other places.
 
-    OMP_NUM_THREADS=1 python tests/bench/bench_relocalisation.py [SOURCE ...] [--every N]
+    OMP_NUM_THREADS=1 python tests/bench/bench_relocalization.py [SOURCE ...] [--every N]
 
 SOURCE: data sets or synthetic sequences; default: tum/kitchen in LDO_DATA, and synthetic:flat.
 Each is tracked once, and its keyframes are the places of its map. Every N-th frame of each source
@@ -22,10 +22,10 @@ import numpy as np
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import Odometry, OdometryConfig, pyramid_of
-from ldo_service.tracking.judgement import History
+from ldo_service.tracking.keyframe_database import Places, place_of
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.places import Places, place_of
-from ldo_service.tracking.relocalisation import Relocaliser
+from ldo_service.tracking.relocalization import Relocaliser
+from ldo_service.tracking.tracking_quality import History
 
 APART_FRAMES = 30
 RIGHT_M, RIGHT_RAD = 0.10, float(np.radians(5.0))

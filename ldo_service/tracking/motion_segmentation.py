@@ -15,8 +15,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 
-from .noise import DepthNoise
-from .pyramid import Level, Pyramid
+from .pyramid import DepthNoise, Level, Pyramid
 
 NOTHING_M = 1e4  # the depth of a pixel without one, for minima
 

@@ -12,12 +12,12 @@ import numpy as np
 
 from ldo_service.geometry import RgbdFrame, se3
 
-from .judgement import Status
+from .keyframe_database import Places
 from .odometry import Odometry
-from .places import Places
-from .prior import Reading
-from .segments import Look, SegmentConfig
-from .tracked import Tracked
+from .odometry_prior import Reading
+from .submaps import Look, SegmentConfig
+from .tracking_quality import Status
+from .tracking_result import Tracked
 
 MAP = -1  # stands for the map where a segment's number stands otherwise
 
