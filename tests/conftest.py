@@ -12,7 +12,7 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence, open_sequence
 from ldo_service.runs.folder import CAMERA, prepare
 from ldo_service.runs.job import Job
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.source import Selection
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service import cli
+from ldo_service.commands import cli
 from ldo_service.config import load_config
 
 ROOT = Path(__file__).parent.parent

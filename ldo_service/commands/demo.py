@@ -15,15 +15,14 @@ from ldo_service.evaluation.results import Results, evaluate_run, work
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import Job
-from ldo_service.runs.objects_file import read_objects
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.records import read_objects
 from ldo_service.runs.source import Selection
 from ldo_service.schemas import MapObjects
 from ldo_service.synthetic import FlatSequence
 from ldo_service.synthetic.flat.sequence import prerender
 
-from .options import Overwrite
-from .progress import progress
+from .options import Overwrite, progress
 from .run import with_options
 
 FRAMES = 70  # of the flat: what stands in its first room

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
@@ -12,22 +13,72 @@ from rich.table import Table
 
 from ldo_service.config import Config, load_config
 from ldo_service.evaluation import loops, semantics, trajectory, views
+from ldo_service.evaluation.label_measures import Found
 from ldo_service.evaluation.loops import LoopErrors
 from ldo_service.evaluation.lpips import Lpips
 from ldo_service.evaluation.results import Results, evaluate_run, plain, work
+from ldo_service.evaluation.semantics import GATES, LabelErrors
 from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import RenderingErrors
 from ldo_service.runs.finished import read_run, written
 from ldo_service.runs.source import open_source
 
-from .label_tables import label_table, open_table
-from .options import Json, Source
-from .progress import progress
+from .options import Json, Source, progress
+
+FIGURES = {
+    "mIoU": "mean_iou",
+    "objects": "object_iou",
+    "by frequency": "weighted_iou",
+    "accuracy": "mean_accuracy",
+    "pixels": "pixel_accuracy",
+}
 
 WIDTH = 120  # of the tables in a file
 NO_TRUTH = "The source has no ground truth, so trajectories are not judged."
 NO_MAP = "The run localised in {folder} and made no map, so renderings are not judged."
 NO_LPIPS = "LPIPS is left out; --lpips FILE.onnx adds it."
+
+
+def label_table(rows: list[LabelErrors]) -> Table:
+    """A line for each list of names, and for each share of the pixels that a class must have."""
+    table = Table("map", "names", "classes", *FIGURES, "per image", "frames")
+    for row in rows:
+        for errors in row.lists:
+            for gate, share in GATES.items():
+                figures = errors.figures(share)
+                cells = [_percent(getattr(figures, figure)) for figure in FIGURES.values()]
+                is_all = share == 0
+                cells.append(_percent(errors.per_image_iou()) if is_all else "")
+                names = f"{errors.labels.name}, {gate}"
+                table.add_row(row.map, names, str(figures.classes), *cells, str(len(errors.frames)))
+    return table
+
+
+def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
+    """Agreement of views, names beyond COCO, and how often somebody was asked for one."""
+    columns = ("map", "consistency", "beyond COCO: recall", "precision", "VLM calls per frame")
+    table = Table(*columns)
+    for row in rows:
+        calls = "not counted" if calls_per_frame is None else f"{calls_per_frame:.3f}"
+        agreed = f"{_number(row.consistency.share)}, {row.pairs} pairs"
+        table.add_row(row.map, agreed, *_shares(row.objects, "objects"), calls)
+        table.add_row("", "", *_shares(row.pixels, "pixels"), "")
+    return table
+
+
+def _shares(found: Found, what: str) -> tuple[str, str]:
+    return (
+        f"{_percent(found.recall)} of {found.wanted:,} {what}",
+        f"{_percent(found.precision)} of {found.named:,}",
+    )
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1%}" if isfinite(value) else "-"
+
+
+def _number(value: float) -> str:
+    return f"{value:.3f}" if isfinite(value) else "-"
 
 
 def evaluate(

@@ -25,7 +25,7 @@ from ldo_service.volumes import (
     write_mesh,
 )
 
-from .progress import progress
+from .options import progress
 
 Format = Literal["ply", "splat", "spz", "tum", "csv", "mesh", "occupancy"]
 Up = Literal["x", "y", "z", "-x", "-y", "-z"]

@@ -1,15 +1,23 @@
-"""Arguments that several verbs share."""
+"""Options that several commands share, and the progress of long work."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ldo_service.actors.detector import require_detector
 from ldo_service.actors.vlm_labeller import require_labeller
 from ldo_service.config import Config
+from ldo_service.runs.job import Advance
 from ldo_service.tracking.keyframe_database import places_of
+
+LINES = 10  # in a log file
+
 
 ConfigFile = Annotated[
     Path | None,
@@ -97,3 +105,29 @@ def with_usable_networks(config: Config) -> Config:
     require_detector(config.detector)
     require_labeller(config.vlm_labeller)
     return config
+
+
+@contextmanager
+def progress(title: str, total: int, console: Console) -> Iterator[Advance]:
+    """A function to call with the number of items done, and with that of all where it grew."""
+    if not console.is_terminal:
+        yield _plain(title, total, console)
+        return
+    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(title, total=total)
+        yield lambda done, total=None: bar.update(task, completed=done, total=total)
+
+
+def _plain(title: str, total: int, console: Console) -> Advance:
+    said = 0
+
+    def advance(done: int, grown: int | None = None, /) -> None:
+        nonlocal said, total
+        if grown not in (None, total):
+            said, total = 0, grown
+        if done * LINES // total > said:
+            said = done * LINES // total
+            console.print(f"{title}: {done} of {total}", highlight=False)
+
+    return advance

@@ -28,8 +28,7 @@ from .live_camera import (
     relay,
     require_no_sequence,
 )
-from .options import ConfigFile, Endpoint, KeysFolder, MaxFrames, Robot, Settings, Stride
-from .progress import progress
+from .options import ConfigFile, Endpoint, KeysFolder, MaxFrames, Robot, Settings, Stride, progress
 
 FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
 MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad

@@ -20,7 +20,7 @@ from ldo_service.detection.model_registry import open_labeller
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.maps.object_search import Answer, answer
-from ldo_service.runs.objects_file import read_objects
+from ldo_service.runs.records import read_objects
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.semantics.text_search import Encode, NotCompared

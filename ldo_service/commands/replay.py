@@ -12,8 +12,7 @@ from rich.table import Table
 from ldo_service.recordings.replay import Replayed
 from ldo_service.runs.replayed import RecordedActor, open_recording
 
-from .options import Recording
-from .progress import progress
+from .options import Recording, progress
 
 
 def replay(

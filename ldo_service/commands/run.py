@@ -17,7 +17,7 @@ from ldo_service.geometry.sequence import Sequence
 from ldo_service.runs.folder import RunFolder, prepare
 from ldo_service.runs.front_end import FrontEnd
 from ldo_service.runs.job import Advance, Job
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
 from ldo_service.runs.source import Selection, open_source
 
@@ -30,9 +30,9 @@ from .options import (
     Source,
     Stride,
     localising,
+    progress,
     with_usable_networks,
 )
-from .progress import progress
 
 
 def run(

@@ -19,9 +19,9 @@ from .options import (
     Settings,
     Source,
     Stride,
+    progress,
     with_usable_networks,
 )
-from .progress import progress
 from .run import with_options
 
 

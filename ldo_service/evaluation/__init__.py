@@ -1,8 +1,8 @@
 """How good a run is: trajectories, rendered views, pictures of both."""
 
 from .pictures import contact_sheet, depth_picture, trajectory_picture
-from .rendering import depth_error, psnr, ssim
 from .trajectory import ErrorStatistics, TrajectoryErrors, align, evaluate_trajectory
+from .views import depth_error, psnr, ssim
 
 __all__ = [
     "ErrorStatistics",

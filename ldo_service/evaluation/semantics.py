@@ -13,11 +13,19 @@ from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.semantics.semantic_fusion import label_image
 from ldo_service.semantics.semantics_file import SavedSemantics
 
-from .cross_view import Agreement, Correspondences, agreement, correspondences
 from .finished_run import FinishedRun, PosedMap, RunFrame
 from .label_lists import LabelList, coco_list, full_list, object_labels
-from .open_names import Found, OpenNames
-from .segmentation import Segmentation, confusion, segmentation
+from .label_measures import (
+    Agreement,
+    Correspondences,
+    Found,
+    OpenNames,
+    Segmentation,
+    agreement,
+    confusion,
+    correspondences,
+    segmentation,
+)
 from .views import Judged
 
 APART = 3  # frames, between views that ought to agree

@@ -21,7 +21,7 @@ from ldo_service.semantics.semantics_file import SavedSemantics, read_semantics
 from ldo_service.volumes import Viewpoint
 
 from .folder import CAMERA, REFINED, SEMANTICS
-from .loops_file import read_loops
+from .records import read_loops
 
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:

@@ -7,10 +7,10 @@ frames.csv              every frame: status, residuals, milliseconds, segment
 keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians that hang on keyframes in the map's frame
                         (those of segments that are not joined to the first are nowhere: left out)
-semantics.npz           what those Gaussians are, if a detector looked: see `semantics.saved`
-objects.json            the objects among them, if a detector looked: see `objects_file`
+semantics.npz           what those Gaussians are, if a detector looked: `semantics.semantics_file`
+objects.json            the objects among them, if a detector looked: see `runs.records`
 places.msgpack          what `--localise` finds the camera by, at the newest poses
-loops.json              places that were compared, and why each pair was refused: `runs.loops_file`
+loops.json              places that were compared, and why each pair was refused: `runs.records`
 front_end.mcap          what tracker and detector said, if it was to be kept: see `runs.front_end`
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
@@ -23,6 +23,7 @@ that config.yaml names in tracker.localise.
 import csv
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.tracker import TrackerConfig
+from ldo_service.conversions.frames import keyframe_of
 from ldo_service.conversions.poses import keyframe_poses_of, transform
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.file_formats import write_ply
@@ -52,13 +54,13 @@ from ldo_service.schemas import (
 )
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
-from ldo_service.tracking.keyframe_database import PLACES
+from ldo_service.storage.state_codec import encode_state
+from ldo_service.tracking import OdometryConfig
+from ldo_service.tracking.keyframe_database import PLACES, Places, place_of
 
 from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
 from .front_end import FRONT_END
-from .loops_file import LOOPS, LoopRecord
-from .objects_file import OBJECTS, write_objects
-from .places import PlaceRecord
+from .records import LOOPS, OBJECTS, LoopRecord, write_objects
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
 SEMANTICS = "semantics.npz"
@@ -96,6 +98,28 @@ COLUMNS = (
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
     *("segment", "method", "disagreement"),
 )
+
+
+class PlaceRecord:
+    """Places of the keyframes that it is shown: no more than `places.count`, 0.13 MB each."""
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self._config = config
+        self._places = Places()
+
+    def add(self, message: Keyframe) -> None:
+        config = self._config
+        place = place_of(keyframe_of(message, config.pyramid), config.features, config.places)
+        self._places = self._places.added(place, config.places)
+
+    def save(self, path: Path, poses: KeyframePoses, joined: dict[int, int]) -> None:
+        """Those that are in the map's frame, with T_map_keyframe for T_odom_keyframe."""
+        places = [
+            replace(place, segment=0, T_odom_keyframe=np.array(poses[place.id]))
+            for place in self._places.all
+            if joined.get(place.segment, place.segment) == 0
+        ]
+        path.write_bytes(encode_state({"places": [place.packed for place in places]}))
 
 
 def prepare(folder: Path, overwrite: bool) -> None:

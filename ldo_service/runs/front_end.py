@@ -18,6 +18,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from ldo_service import versions
 from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
@@ -27,7 +28,6 @@ from ldo_service.geometry.sequence import Sequence
 from ldo_service.recordings.mcap_file import ABOUT, McapIndex, Place, RecordingFile
 from ldo_service.schemas import Message, decode
 from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW, POSE_TRACKED
-from ldo_service.versions import versions
 
 from .source import Selection
 

@@ -19,7 +19,7 @@ from ldo_service.transport.interface import MemoryTransport
 
 from .folder import RunFolder
 from .job import Advance, Job
-from .over_file import require_usable
+from .offline import require_usable
 from .source import Reader, with_prior
 from .summary import Usage, summarise
 

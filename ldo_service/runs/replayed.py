@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 import msgspec
 import yaml
 
-from ldo_service import kernels
+from ldo_service import kernels, versions
 from ldo_service.actors.topology import box_named
 from ldo_service.config import Config, config_of
 from ldo_service.errors import ConfigError, DataError
@@ -17,7 +17,6 @@ from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.recordings.replay import Replayed, replay
 from ldo_service.runtime import Actor
 from ldo_service.storage.yaml_io import plain_values
-from ldo_service.versions import versions
 
 
 @dataclass(frozen=True, slots=True)

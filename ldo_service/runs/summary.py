@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service import kernels
-from ldo_service.versions import versions
+from ldo_service import kernels, versions
 
 from .folder import RunFolder
 

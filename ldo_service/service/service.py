@@ -17,7 +17,7 @@ from pathlib import Path
 
 import zenoh
 
-from ldo_service import kernels
+from ldo_service import kernels, versions
 from ldo_service.actors.topology import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.errors import ConfigError, StageError
@@ -39,7 +39,6 @@ from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.worker import Worker
 from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
-from ldo_service.versions import versions
 
 from .state_folder import claim_state
 

@@ -4,10 +4,9 @@ The files beside this one are the tables of the paper that LDO-SLAM implements, 
 its ablation; `published` in them are the figures that the paper prints, of its own and of others.
 """
 
-from .figures import FIGURES, Judged
-from .suite import Entry, Suite, known_suites, load_suite
+from .runner import Outcome, Work
+from .suite import FIGURES, Entry, Judged, Suite, known_suites, load_suite
 from .tables import markdown
-from .work import Outcome, Work
 
 __all__ = [
     "FIGURES",

@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from statistics import mean, stdev
 
-from .figures import FIGURES, Figure
-from .suite import Suite
-from .work import Outcome
+from .runner import Outcome
+from .suite import FIGURES, Figure, Suite
 
 AVERAGE = "average"
 Cells = dict[str, str]  # by column

@@ -2,7 +2,7 @@
 
     run_folder, live     sources: what a run left, what a service says
     scene                what they know, as plain arrays
-    splats, lines        how it is drawn
+    lines                how it is drawn
     flight               where to look from
     panel                what is told in words
     window               the browser's side, with viser

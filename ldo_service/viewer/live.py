@@ -1,11 +1,26 @@
-"""A running service as a source of a scene."""
+"""A running service as a scene: bounded, whatever it publishes."""
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from itertools import islice
+from typing import get_args
 
 from ldo_service.client import Client
-from ldo_service.schemas import Health, Keyframe
+from ldo_service.conversions.frames import camera_of
+from ldo_service.maps.bounded_replica import KnownGaussians
+from ldo_service.schemas import (
+    Correction,
+    DetectionBoxes,
+    Health,
+    Keyframe,
+    LoopClosure,
+    MapDelta,
+    MapObjects,
+    MapSnapshot,
+    Message,
+    TrackedPose,
+)
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
@@ -19,9 +34,15 @@ from ldo_service.schemas.topics import (
     Topic,
 )
 
+from . import panel
 from .config import ViewerConfig
-from .live_scene import LiveScene
-from .scene import Layer, Scene
+from .lines import MOST_SIGHTS
+from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
+from .scene import Layer, Scene, Sight, sights_of
+
+MOST_ACTORS = 64  # whose health is told; a name is what a message says
+MOST_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with
+FACTS_EVERY_S = 1.0  # words that change faster cannot be read
 
 KEPT: dict[
     Topic, int
@@ -37,9 +58,158 @@ KEPT: dict[
 }
 STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)  # what a late joiner asks for
 
-
 ANEW = ("tracker", "mapper")  # both began anew: so did the map, or it is told again
 TOGETHER_S = 30.0  # from one to the other of a service that starts; apart, each went on by itself
+
+
+class LiveScene:
+    """`take` every message, then `update`: `scene` is what they say together."""
+
+    def __init__(self, config: ViewerConfig, clock: Callable[[], float]) -> None:
+        self._config, self._clock = config, clock
+        self._heard: dict[str, panel.Heard] = {}
+        self._pose_rate, self._poses = panel.Rate(), 0
+        self._told_s = -FACTS_EVERY_S
+        self.scene = Scene()
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """The map is empty, and what comes is of another one."""
+        self._gaussians = KnownGaussians(self._config.most_gaussians)
+        self.scene = Scene(camera=self.scene.camera)
+        self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
+        self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
+        self._correction: Correction | None = None
+        self._pose: panel.HeardPose | None = None
+        self._changed: set[Layer] = set(get_args(Layer)) - {"facts"}
+
+    @property
+    def has_camera(self) -> bool:
+        return self.scene.camera is not None
+
+    def take(self, message: Message) -> None:
+        match message:
+            case TrackedPose():
+                self._take_pose(message)
+            case Correction():
+                self._take_correction(message)
+            case Keyframe():
+                self.scene.camera = camera_of(message.camera)
+                self._changed.add("keyframes")
+            case DetectionBoxes():
+                self._take_boxes(message)
+            case MapDelta() | MapSnapshot():
+                self._take_map(message)
+            case MapObjects():
+                self._take_objects(message)
+            case LoopClosure():
+                self._take_loop(message)
+            case Health():
+                self._take_health(message)
+
+    def _take_pose(self, pose: TrackedPose) -> None:
+        self._poses += 1
+        self._pose = panel.HeardPose(pose, self._clock())
+        if pose.status == "LOST":
+            return
+        self.scene.T_map_camera = T_map_camera_of(pose)
+        self._path.add(pose, self.scene.T_map_camera)
+        self._changed |= {"camera", "online", "final"}
+        if pose.keyframe is not None:
+            self._keyframes.add(pose, self.scene.T_map_camera)
+            self._changed.add("keyframes")
+
+    def _take_correction(self, correction: Correction) -> None:
+        if self._correction and correction.graph_version <= self._correction.graph_version:
+            return
+        self._correction = correction
+        for loop in correction.not_believed:  # the newest of them: older ones are gone already
+            self._loops.pop(loop, None)
+        self._keyframes.correct(correction)
+        self._changed |= {"keyframes", "final", "loops"}
+
+    def _take_objects(self, objects: MapObjects) -> None:
+        if self.scene.objects is None:  # what was seen before anybody listened
+            sights = sights_of(objects)
+            newest = sorted(sights)[-self._config.most_keyframes :]
+            self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
+            self._changed.add("keyframes")
+        self.scene.objects = objects
+        self._changed.add("objects")
+
+    def _take_boxes(self, boxes: DetectionBoxes) -> None:
+        found = (Sight(one.label, one.box_px) for one in islice(boxes.detections, MOST_SIGHTS))
+        sights = self.scene.sights
+        sights[boxes.keyframe] = tuple(found)
+        while len(sights) > self._config.most_keyframes:
+            del sights[next(iter(sights))]
+        self._changed.add("keyframes")
+
+    def _take_loop(self, loop: LoopClosure) -> None:
+        self._loops[loop.pose.reference, loop.pose.keyframe] = None
+        while len(self._loops) > MOST_LOOPS:
+            del self._loops[next(iter(self._loops))]
+        self._changed.add("loops")
+
+    def _take_map(self, message: MapDelta | MapSnapshot) -> None:
+        if isinstance(message, MapDelta) and message.since == 0 and self._gaussians.version:
+            self.begin_anew()  # on request, see `ldo control reset`
+        if self._gaussians.take(message):
+            self._changed.add("gaussians")
+
+    def _take_health(self, health: Health) -> None:
+        if health.actor not in self._heard and len(self._heard) >= MOST_ACTORS:
+            return
+        heard = self._heard.get(health.actor)
+        rate = heard.rate if heard else panel.Rate()
+        rate.add(self._clock(), health.steps)
+        self._heard[health.actor] = panel.Heard(health, self._clock(), rate)
+
+    # --- together ---------------------------------------------------------------------------------
+    def update(self) -> set[Layer]:
+        """Bring the scene up to date; what changed since the last call."""
+        changed, self._changed = self._changed, set()
+        scene = self.scene
+        if "keyframes" in changed:
+            scene.keyframes = self._keyframes.T_map
+        if "online" in changed:
+            scene.online = self._path.online()
+        if "final" in changed:
+            scene.final = self._path.final(self._keyframes.T_map)
+        if "loops" in changed:
+            scene.loops = self._agreed_loops()
+        if "gaussians" in changed:
+            scene.rows = self._gaussians.rows
+        if self._clock() - self._told_s >= FACTS_EVERY_S:
+            self._told_s = self._clock()
+            self._pose_rate.add(self._told_s, self._poses)
+            scene.facts = self._facts()
+            changed.add("facts")
+        return changed
+
+    def _agreed_loops(self) -> tuple[tuple[int, int], ...]:
+        """Heard of or in the newest correction, but for those that it does not believe."""
+        if self._correction is None:
+            return tuple(self._loops)
+        named = dict.fromkeys((*self._loops, *self._correction.closures))
+        refused = set(self._correction.not_believed)
+        return tuple(loop for loop in named if loop not in refused)
+
+    def _facts(self) -> str:
+        scene, behind = self.scene, ", behind until the next snapshot"
+        counts = (
+            f"{len(self._keyframes.T_map):,} keyframes, {len(scene.rows):,} Gaussians drawn, "
+            f"{len(scene.objects.objects) if scene.objects else 0} objects, "
+            f"{len(scene.loops)} loops; map version {self._gaussians.version}"
+            f"{behind if self._gaussians.is_behind else ''}"
+        )
+        return "\n\n".join(
+            (
+                panel.of_pose(self._pose, self._pose_rate, self._clock()),
+                counts,
+                panel.of_health(self._heard.values(), self._clock()),
+            )
+        )
 
 
 class Live:

@@ -13,8 +13,7 @@ from ldo_service.gaussians.pruning import weightiest
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import has_refined, read_viewpoints
 from ldo_service.runs.folder import REFINED
-from ldo_service.runs.loops_file import LOOPS, read_loops
-from ldo_service.runs.objects_file import OBJECTS, read_objects, refuse_state
+from ldo_service.runs.records import LOOPS, OBJECTS, read_loops, read_objects, refuse_state
 
 from . import panel
 from .config import ViewerConfig

@@ -1,4 +1,7 @@
-"""What is known of a map, and of the camera in it. Conventions: `ldo_service.geometry`."""
+"""The map and the camera as a scene, and its Gaussians as a browser draws them.
+
+Conventions: `ldo_service.geometry`.
+"""
 
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
@@ -6,12 +9,15 @@ from typing import Literal, Protocol
 import numpy as np
 
 from ldo_service.gaussians.model import ROW
-from ldo_service.geometry import Camera
+from ldo_service.gaussians.pruning import _opacities
+from ldo_service.geometry import Camera, se3
 from ldo_service.schemas import MapObjects
 from ldo_service.schemas.objects import Box
 
-Layer = Literal["gaussians", "camera", "online", "final", "keyframes", "objects", "loops", "facts"]
 NOTHING = np.zeros((0, 3))
+
+
+Layer = Literal["gaussians", "camera", "online", "final", "keyframes", "objects", "loops", "facts"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,3 +70,30 @@ def sights_of(objects: MapObjects) -> dict[int, tuple[Sight, ...]]:
 def thinned(values: np.ndarray, most: int) -> np.ndarray:
     """At most so many of `values` [K, ...], evenly chosen, the first among them."""
     return values[:: max(1, -(-len(values) // most))]
+
+
+@dataclass(frozen=True, slots=True)
+class Splats:
+    """centers      [N, 3] float32, metres, map frame
+    covariances  [N, 3, 3] float32, m^2
+    colors       [N, 3] float32 RGB, 0..1
+    opacities    [N, 1] float32, 0..1
+    """
+
+    centers: np.ndarray
+    covariances: np.ndarray
+    colors: np.ndarray
+    opacities: np.ndarray
+
+
+def splats_of(rows: np.ndarray) -> Splats:
+    """Of Gaussian rows [N, 16] (see `gaussians.model`): the covariance is R S S R^T, with the
+    rotation R of the quaternion and the scales S."""
+    R, scales = se3.rotation(rows[:, 6:10]), np.exp(rows[:, 3:6])
+    half = R * scales[:, None, :]  # R S
+    return Splats(
+        rows[:, 0:3],
+        half @ half.transpose(0, 2, 1),
+        np.clip(rows[:, 11:14], 0, 1),
+        _opacities(rows)[:, None],
+    )

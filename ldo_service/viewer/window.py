@@ -31,8 +31,7 @@ from .lines import (
     sight_lines,
 )
 from .panel import escaped
-from .scene import Layer, Scene, Source
-from .splats import splats_of
+from .scene import Layer, Scene, Source, splats_of
 
 FLIGHT_STEPS, FLIGHT_STEP_S = 30, 1 / 30
 THICK_PX, VERY_THICK_PX = 1.5, 4.0

@@ -2,15 +2,19 @@
 
 viewpoints      what the map looks like from where it was seen
 tsdf            depth images, fused into distances to the surface
-marching_cubes  the surface, out of distances on a lattice
-mesh            triangles, and the PLY file for them
-occupancy       voxels that are free, occupied or unknown
-floor_plan      a slice of them, as ROS' map_server reads it
+marching_cubes  the surface, out of distances on a lattice, and the PLY file for it
+occupancy       voxels that are free, occupied or unknown; a slice of them for ROS' map_server
 """
 
-from .floor_plan import FloorPlan, floor_plan, write_floor_plan
-from .mesh import Mesh, write_mesh
-from .occupancy import OccupancyConfig, OccupancyGrid, occupancy
+from .marching_cubes import Mesh, write_mesh
+from .occupancy import (
+    FloorPlan,
+    OccupancyConfig,
+    OccupancyGrid,
+    floor_plan,
+    occupancy,
+    write_floor_plan,
+)
 from .tsdf import Tsdf, TsdfConfig, fuse
 from .viewpoints import Viewpoint
 

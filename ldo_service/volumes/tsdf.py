@@ -12,8 +12,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
-from .marching_cubes import CORNERS, marching_cubes, packed
-from .mesh import Mesh
+from .marching_cubes import CORNERS, Mesh, marching_cubes, packed
 from .viewpoints import Viewpoint, surface_color, surface_depth_m
 
 SIDE = 8  # voxels of a block

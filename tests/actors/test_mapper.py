@@ -18,7 +18,7 @@ from ldo_service.conversions.poses import (
     pose_message,
     transform,
 )
-from ldo_service.evaluation.rendering import psnr
+from ldo_service.evaluation.views import psnr
 from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.map_builder import MapBuilderConfig
 from ldo_service.gaussians.visibility import SleepConfig

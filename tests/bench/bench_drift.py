@@ -30,7 +30,7 @@ from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import Job
-from ldo_service.runs.over_file import run_over_file, with_all_cores
+from ldo_service.runs.offline import run_over_file, with_all_cores
 from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, Message, TrackedPose

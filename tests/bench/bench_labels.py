@@ -31,9 +31,9 @@ import numpy as np
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.model_registry import open_detector
 from ldo_service.detection.vocabulary import Vocabulary
-from ldo_service.evaluation.cross_view import Correspondences, correspondences
 from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
-from ldo_service.evaluation.label_sheet import LabelPicture, label_sheet
+from ldo_service.evaluation.label_measures import Correspondences, correspondences
+from ldo_service.evaluation.label_results import LabelPicture, label_sheet
 from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelJudge, LabelView
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Rendering

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service import cli
+from ldo_service.commands import cli
 
 LDO = (sys.executable, "-m", "ldo_service")
 

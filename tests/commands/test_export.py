@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
-from ldo_service import cli
+from ldo_service.commands import cli
 from ldo_service.errors import LdoError
 from ldo_service.gaussians.file_formats import read_ply, write_ply
 from ldo_service.geometry import Trajectory, se3

@@ -16,7 +16,7 @@ from ldo_service.commands import query
 from ldo_service.demo_networks import IMAGE_ENCODER
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
-from ldo_service.runs.objects_file import OBJECTS, read_objects, write_objects
+from ldo_service.runs.records import OBJECTS, read_objects, write_objects
 from ldo_service.schemas import MapObjects, Pose, encode
 from ldo_service.schemas.topics import MAP_OBJECTS
 from tests.commands.test_cli import assert_one_paragraph, ldo

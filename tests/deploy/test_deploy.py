@@ -15,8 +15,8 @@ import pytest
 import yaml
 import zenoh
 
-from ldo_service import cli
 from ldo_service.client import connect
+from ldo_service.commands import cli
 from ldo_service.commands.keys import router_yaml
 from ldo_service.metrics import HealthCollector
 from ldo_service.metrics import exported as exporting

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ldo_service.evaluation.cross_view import Agreement, agreement, correspondences
+from ldo_service.evaluation.label_measures import Agreement, agreement, correspondences
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 CAMERA = Camera(20, 10, 100.0, 100.0, 9.5, 4.5)

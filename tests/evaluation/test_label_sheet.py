@@ -1,7 +1,7 @@
 import numpy as np
 
 from ldo_service.evaluation.label_lists import UNKNOWN, VOID, full_list
-from ldo_service.evaluation.label_sheet import (
+from ldo_service.evaluation.label_results import (
     BEYOND,
     CONFUSED,
     INVENTED,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.evaluation.label_lists import full_list
-from ldo_service.evaluation.open_names import Found, OpenNames, is_beyond_coco
+from ldo_service.evaluation.label_measures import Found, OpenNames, is_beyond_coco
 from ldo_service.geometry.sequence import FrameLabels
 
 SOURCE = ("undefined", "wall", "chair", "ladder", "globe", "fan")

@@ -13,8 +13,8 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.detection.vocabulary import Vocabulary, coco_class
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import FinishedRun, RunFrame
+from ldo_service.evaluation.label_measures import Found
 from ldo_service.evaluation.label_results import frames_to_show, plain_labels
-from ldo_service.evaluation.open_names import Found
 from ldo_service.evaluation.results import NO_LABELS, NO_TRUTH
 from ldo_service.evaluation.semantics import GATES, LabelErrors, ListErrors, evaluate_labels
 from ldo_service.evaluation.views import Judged
@@ -23,7 +23,7 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import SEMANTICS
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.semantics_file import write_semantics
 from tests.commands.test_cli import ldo

@@ -16,7 +16,7 @@ from random import Random
 from threading import Timer
 from typing import Any
 
-from ldo_service import cli
+from ldo_service.commands import cli
 from ldo_service.runtime import Actor
 from ldo_service.runtime.stage import Stage
 from ldo_service.service.service import service

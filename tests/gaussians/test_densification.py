@@ -5,7 +5,7 @@ import pytest
 
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
-from ldo_service.evaluation import rendering
+from ldo_service.evaluation import views
 from ldo_service.gaussians import GaussianMap, InsertionConfig, insert, render
 from ldo_service.gaussians.densification import with_small_holes_filled
 from ldo_service.geometry import Camera, RgbdFrame, se3
@@ -35,7 +35,7 @@ def view(gaussians: GaussianMap, T_map_camera: np.ndarray):
 
 def psnr(color: np.ndarray, truth: np.ndarray) -> float:
     """Of a rendering in 0..1 against a camera's 0..255."""
-    return rendering.psnr(color, truth / np.float32(255))
+    return views.psnr(color, truth / np.float32(255))
 
 
 def without_depth(frame: RgbdFrame, missing: np.ndarray) -> RgbdFrame:

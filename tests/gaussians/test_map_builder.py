@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.evaluation.rendering import psnr
+from ldo_service.evaluation.views import psnr
 from ldo_service.gaussians import OptimiserConfig, PruningConfig, render
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, WindowConfig

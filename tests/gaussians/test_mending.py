@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ldo_service.evaluation.rendering import psnr
+from ldo_service.evaluation.views import psnr
 from ldo_service.gaussians import render
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import se3

@@ -125,5 +125,5 @@ def standing_in(*actors: Actor) -> Iterator[None]:
     def made(config: Config) -> Sequence[Actor]:
         return [names.get(actor.name, actor) for actor in make_actors(config)]
 
-    with patch("ldo_service.runs.over_file.make_actors", made):
+    with patch("ldo_service.runs.offline.make_actors", made):
         yield

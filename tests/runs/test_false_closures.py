@@ -11,7 +11,7 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 
 from .jobs import ROUGH, job
 from .mistaken import MistakenLoopCloser, standing_in

@@ -12,7 +12,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError, StageError
 from ldo_service.geometry import RawFrame
 from ldo_service.runs.front_end import FRONT_END, FrontEnd, front_end_settings
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.source import Selection
 
 from .jobs import AND_BACK, LONG_AGO, ROUGH, Rearranged, job
@@ -163,7 +163,7 @@ def test_it_is_whole_when_the_stream_ends(
     def fails(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ldo_service.runs.over_file.FileRun.repair", fails)
+    monkeypatch.setattr("ldo_service.runs.offline.FileRun.repair", fails)
     asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
     with pytest.raises(KeyboardInterrupt):
         run_over_file(replace(asked, keep_front_end=True), lambda *_: None)

@@ -8,8 +8,8 @@ import pytest
 from ldo_service.datasets import Sequence
 from ldo_service.runs.finished import MapFolder
 from ldo_service.runs.folder import RunFolder
-from ldo_service.runs.objects_file import read_objects
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.records import read_objects
 from ldo_service.semantics.gaussian_labels import fields
 from tests.detection.labellers.server import Server, hangs, says, sends, serving
 

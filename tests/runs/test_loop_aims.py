@@ -15,7 +15,7 @@ from ldo_service.evaluation.results import Results, evaluate_run
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import Job
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.source import Selection
 
 from .mistaken import Drift, DriftingTracker, standing_in

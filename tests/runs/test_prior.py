@@ -10,7 +10,7 @@ import pytest
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.realtime import run_in_real_time
 from ldo_service.runs.source import Reader, with_prior
 from ldo_service.schemas import CameraRgbd, OdometryPrior

@@ -8,7 +8,7 @@ import pytest
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 
 from .jobs import Rearranged, job
 

@@ -13,7 +13,7 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.evaluation.views import Judged, evaluate_rendering
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import MapFolder, read_run
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.simulation import simulate_graph
 from ldo_service.runs.source import Selection
 

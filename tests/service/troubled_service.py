@@ -11,9 +11,9 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from ldo_service import cli
 from ldo_service.actors import topology
 from ldo_service.actors.tracker import Tracker
+from ldo_service.commands import cli
 from ldo_service.schemas import Correction, FrameRgbd
 from ldo_service.service.service import service
 

@@ -20,7 +20,7 @@ from ldo_service.suites import (
     load_suite,
     markdown,
 )
-from ldo_service.suites.figures import FIGURES
+from ldo_service.suites.suite import FIGURES
 
 SETTING = "mapper.iterations=2"
 TWO = Suite(

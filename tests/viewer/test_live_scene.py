@@ -20,7 +20,7 @@ from ldo_service.schemas import (
     TrackedPose,
 )
 from ldo_service.viewer.config import ViewerConfig
-from ldo_service.viewer.live_scene import FACTS_EVERY_S, MOST_ACTORS, LiveScene
+from ldo_service.viewer.live import FACTS_EVERY_S, MOST_ACTORS, LiveScene
 from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES
 

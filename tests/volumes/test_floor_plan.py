@@ -9,8 +9,7 @@ import yaml
 
 from ldo_service.errors import ConfigError
 from ldo_service.volumes import OccupancyGrid, floor_plan, write_floor_plan
-from ldo_service.volumes.floor_plan import UP
-from ldo_service.volumes.occupancy import FREE, OCCUPIED, UNKNOWN
+from ldo_service.volumes.occupancy import FREE, OCCUPIED, UNKNOWN, UP
 
 
 @pytest.fixture

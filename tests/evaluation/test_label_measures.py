@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.evaluation.label_lists import UNKNOWN, VOID
-from ldo_service.evaluation.segmentation import Segmentation, class_ious, confusion, segmentation
+from ldo_service.evaluation.label_measures import Segmentation, class_ious, confusion, segmentation
 
 # background takes 90 of its 94 pixels, chairs 20 of 30, the one cup is taken for a chair;
 # rows are the truth, the last column is unknown

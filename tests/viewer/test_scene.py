@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.gaussians.pruning import weightiest, weights
 from ldo_service.runs.finished import read_viewpoints
-from ldo_service.viewer.splats import splats_of
+from ldo_service.viewer.scene import splats_of
 from tests.maps.streams import random_rows
 
 

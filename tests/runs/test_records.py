@@ -14,8 +14,8 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation.results import judge_loops
 from ldo_service.runs.finished import read_run
-from ldo_service.runs.loops_file import LoopRecord, read_loops
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.records import LoopRecord, read_loops
 from ldo_service.runs.simulation import Made, simulate_graph
 from ldo_service.runs.source import Selection
 from tests.schemas.examples import EXAMPLES

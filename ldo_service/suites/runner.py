@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from ldo_service import versions
 from ldo_service.errors import ConfigError
 from ldo_service.runs.front_end import FRONT_END
-from ldo_service.versions import versions
 
-from .figures import Judged
-from .suite import SYNTHETIC, Entry, Suite
+from .suite import SYNTHETIC, Entry, Judged, Suite
 
 log = logging.getLogger(__name__)
+
 LDO = (sys.executable, "-m", "ldo_service")
 TOLD, RESULTS = "entry.json", "eval.json"
 

@@ -17,7 +17,7 @@ from ldo_service.gaussians.model import new_labels
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.runs.finished import MapFolder, read_run
 from ldo_service.runs.folder import RunFolder
-from ldo_service.runs.over_file import run_over_file
+from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.source import Warn
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
