@@ -5,19 +5,38 @@ The drawing and the table of topics in README are printed from here (`ldo topics
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Protocol
 
-from ldo_service.actors.detector import Detector
-from ldo_service.actors.frame_source import FrameSource
+from ldo_service.actors.detector import Detector, DetectorConfig
+from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
 from ldo_service.actors.localiser import LocalisingTracker
-from ldo_service.actors.loop_closer import LoopCloser
-from ldo_service.actors.mapper import Mapper
-from ldo_service.actors.optimizer import Optimizer
-from ldo_service.actors.tracker import Tracker
-from ldo_service.actors.vlm_labeller import VlmLabeller
-from ldo_service.config import Config
+from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
+from ldo_service.actors.mapper import Mapper, MapperConfig
+from ldo_service.actors.optimizer import Optimizer, OptimizerConfig
+from ldo_service.actors.tracker import Tracker, TrackerConfig
+from ldo_service.actors.vlm_labeller import VlmLabeller, VlmLabellerConfig
 from ldo_service.errors import ConfigError
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import topics as t
+
+
+class Sections(Protocol):
+    """The sections of the configuration that actors are made from."""
+
+    @property
+    def frame_source(self) -> FrameSourceConfig: ...
+    @property
+    def tracker(self) -> TrackerConfig: ...
+    @property
+    def detector(self) -> DetectorConfig: ...
+    @property
+    def vlm_labeller(self) -> VlmLabellerConfig: ...
+    @property
+    def mapper(self) -> MapperConfig: ...
+    @property
+    def loop_closer(self) -> LoopCloserConfig: ...
+    @property
+    def optimizer(self) -> OptimizerConfig: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,10 +47,10 @@ class Box:
     does: str
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
-    make: Callable[[Config], Actor]
+    make: Callable[[Sections], Actor]
 
 
-def _box(actor: type[Actor], does: str, make: Callable[[Config], Actor]) -> Box:
+def _box(actor: type[Actor], does: str, make: Callable[[Sections], Actor]) -> Box:
     return Box(actor.name, does, actor.inputs, actor.outputs, make)
 
 
@@ -83,7 +102,7 @@ def box_named(name: str) -> Box:
     raise ConfigError(f"there is no actor {name!r}. The actors are {names}.")
 
 
-def make_actors(config: Config) -> list[Actor]:
+def make_actors(config: Sections) -> list[Actor]:
     """All of them, producers first."""
     return [box.make(config) for box in GRAPH]
 

@@ -16,10 +16,10 @@ from ldo_service import __version__, kernels
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import connect
 from ldo_service.detection.model_registry import Models
-from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.errors import ConfigError, LdoError, ModelError
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
+from ldo_service.service.diagnostics import Seen, remarks, troubles
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
 from .options import Endpoint, KeysFolder, Robot

@@ -12,9 +12,9 @@ from rich.console import Console
 
 from ldo_service.client import connect
 from ldo_service.config import load_config
+from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import ConfigError
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
-from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live import live
 from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source

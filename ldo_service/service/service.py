@@ -21,7 +21,6 @@ from ldo_service import kernels, versions
 from ldo_service.actors.topology import GRAPH, Box, box_named
 from ldo_service.config import Config, config_yaml
 from ldo_service.errors import ConfigError, StageError
-from ldo_service.metrics import HealthCollector, exported
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
 from ldo_service.runtime import check_graph
@@ -40,6 +39,7 @@ from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.worker import Worker
 from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
 
+from .metrics import HealthCollector, exported
 from .state_folder import claim_state
 
 log = logging.getLogger(__name__)

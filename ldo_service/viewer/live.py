@@ -7,6 +7,7 @@ from itertools import islice
 from typing import get_args
 
 from ldo_service.client import Client
+from ldo_service.config.sections import ViewerConfig
 from ldo_service.conversions.frames import camera_of
 from ldo_service.maps.bounded_replica import KnownGaussians
 from ldo_service.schemas import (
@@ -35,7 +36,6 @@ from ldo_service.schemas.topics import (
 )
 
 from . import panel
-from .config import ViewerConfig
 from .lines import MOST_SIGHTS
 from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
 from .scene import Layer, Scene, Sight, sights_of

@@ -7,6 +7,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import DataError
 from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.gaussians.pruning import weightiest
@@ -16,7 +17,6 @@ from ldo_service.runs.folder import REFINED
 from ldo_service.runs.records import LOOPS, OBJECTS, read_loops, read_objects, refuse_state
 
 from . import panel
-from .config import ViewerConfig
 from .scene import Layer, Scene, sights_of, thinned
 
 Signature = tuple[int, int]  # time of the last change, ns, and size, bytes

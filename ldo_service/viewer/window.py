@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import viser
 
+from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import ConfigError, LdoError
 from ldo_service.maps.object_search import Answer, answer
 from ldo_service.schemas import MapObject
 from ldo_service.transport.endpoint import LOOPBACK
 
-from .config import ViewerConfig
 from .flight import View, flight, overview, up_of, view_of
 from .lines import (
     FINAL,

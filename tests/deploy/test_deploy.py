@@ -18,11 +18,11 @@ import zenoh
 from ldo_service.client import connect
 from ldo_service.commands import cli
 from ldo_service.commands.keys import router_yaml
-from ldo_service.metrics import HealthCollector
-from ldo_service.metrics import exported as exporting
 from ldo_service.schemas import encode
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CONTROL, ODOMETRY_PRIOR, TOPICS
+from ldo_service.service.metrics import HealthCollector
+from ldo_service.service.metrics import exported as exporting
 from ldo_service.transport.access_control import read_access, rules_of
 from ldo_service.transport.certificate_authority import Authority
 from tests.schemas.examples import EXAMPLES

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from ldo_service.conversions.frames import camera_rgbd_message
-from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.schemas import CameraRgbd, TrackedPose
+from ldo_service.service.diagnostics import Seen, remarks, troubles
 from ldo_service.synthetic.flat import FlatSequence
 from tests.detection.labellers.server import serving
 from tests.service.conftest import PATIENCE, live_service, wait_until

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.viewer.config import ViewerConfig
+from ldo_service.config.sections import ViewerConfig
 from ldo_service.viewer.flight import view_of
 from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source

@@ -11,6 +11,7 @@ import pytest
 import zenoh
 
 from ldo_service.client import connect
+from ldo_service.config.sections import ViewerConfig
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
@@ -27,7 +28,6 @@ from ldo_service.schemas.topics import (
 from ldo_service.transport.certificate_authority import Authority
 from ldo_service.transport.keys import Keys
 from ldo_service.transport.zenoh_transport import Network, open_session
-from ldo_service.viewer.config import ViewerConfig
 from ldo_service.viewer.live import Live, live
 from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES

@@ -3,8 +3,8 @@
 import msgspec
 import pytest
 
-from ldo_service.diagnosis import Seen, remarks, troubles
 from ldo_service.schemas import Health, InputCount
+from ldo_service.service.diagnostics import Seen, remarks, troubles
 
 
 def health(**fields) -> Health:

@@ -13,8 +13,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from ldo_service.errors import ConfigError
-from ldo_service.metrics import COMES_BACK_S, HealthCollector, exported
 from ldo_service.schemas import encode
+from ldo_service.service.metrics import COMES_BACK_S, HealthCollector, exported
 from tests.schemas.examples import EXAMPLES
 from tests.transport.conftest import free_port
 
@@ -64,7 +64,7 @@ def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) ->
         collector.heard(b"", memoryview(encode(tracker)))
         assert asked(port) == (200, "every actor reports")
         later_s = time.monotonic() + 2 * (10 + COMES_BACK_S)
-        monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
+        monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
         assert asked(port) == (503, "no heartbeat: mapper, tracker")
 
 
@@ -73,7 +73,7 @@ def test_who_may_be_silent_for_long_is_not_missed_before(monkeypatch: pytest.Mon
     for collector in (patient, hasty):
         collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
     later_s = time.monotonic() + 30
-    monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
+    monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
     assert (patient.silent(), hasty.silent()) == ([], ["mapper"])
 
 
@@ -133,7 +133,7 @@ def test_an_actor_that_was_killed_is_counted_and_its_gauges_go(
     assert samples["ldo_process_restarts_total"] == 2
     assert "ldo_resident_bytes" in samples
     later_s = time.monotonic() + 60
-    monkeypatch.setattr("ldo_service.metrics.time.monotonic", lambda: later_s)
+    monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
     samples = {s.name: s.value for family in collector.collect() for s in family.samples}
     assert samples["ldo_heartbeat_age_seconds"] > 30
     assert all(name.endswith("_total") for name in samples if name != "ldo_heartbeat_age_seconds")
