@@ -1,6 +1,6 @@
 """The built-in networks for the synthetic scenes; CARD.md beside this says what they score.
 
-They are trained by `networks/train_demo.py` of the repository. `detector.model` and
+They are trained by `training/train_demo.py` of the repository. `detector.model` and
 `vlm_labeller.model` take them by NAME; `ldo_service.detection.model_registry` opens them.
 """
 

@@ -24,7 +24,7 @@ LIMIT_BYTES = 6e6
 @pytest.fixture(scope="module")
 def rooms() -> Any:
     """Modules of the trainer that need no framework."""
-    sys.path.insert(0, str(Path(__file__).parents[2] / "networks"))
+    sys.path.insert(0, str(Path(__file__).parents[2] / "training"))
     import crops
     import views
 

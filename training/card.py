@@ -152,7 +152,7 @@ on COCO (`ldo models add`) and an image-text model for that.
 |---|---|
 {files}
 
-Apache-2.0, like the rest. Written by `python networks/train_demo.py`, which also wrote this card.
+Apache-2.0, like the rest. Written by `python training/train_demo.py`, which also wrote this card.
 
 ## What they are
 - `detector.onnx`: the layout of YOLOv8. `images` [1, 3, 256, 320], RGB 0..1, the image centred on

@@ -13,7 +13,7 @@ SEEDS = range(400, 404)
 
 @pytest.fixture(scope="module")
 def rooms() -> Iterator[SimpleNamespace]:
-    sys.path.insert(0, str(Path(__file__).parents[2] / "networks"))
+    sys.path.insert(0, str(Path(__file__).parents[2] / "training"))
     import furnishing
     import layout
     import views

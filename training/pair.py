@@ -11,13 +11,13 @@ from itertools import islice
 import encoder
 import jax.numpy as jnp
 import numpy as np
-import training
 from crops import INPUT_PX, crop, enlarged
 from encoder import BATCH, DIMENSIONS, NAMES, RATE, Framing, Pair
 from layers import Live
 from regions import NO_THING
 from views import Seen, Views
 
+import training
 from ldo_service.regions.region_views import ViewConfig
 from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 

@@ -19,7 +19,7 @@ OVEN, CHAIR, WALL = (CLASS_NAMES.index(name) for name in ("oven", "chair", "wall
 
 @pytest.fixture
 def trainer(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     import encoder
     import pair
     import regions

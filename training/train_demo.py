@@ -1,6 +1,6 @@
 """Train the built-in networks of the semantic path and write them with their scores.
 
-    python networks/train_demo.py [--out DIR] [--work DIR] [--share SHARE]
+    python training/train_demo.py [--out DIR] [--work DIR] [--share SHARE]
 
 Renders rooms other than the flat (two processes), trains the detector's first look and the dual
 encoder beside each other (one thread each), fits the confidences on rooms kept apart, writes ONNX,

@@ -14,7 +14,7 @@ pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --
 
 @pytest.fixture
 def training(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     import training
 
     yield training
@@ -47,7 +47,7 @@ def test_descent_finds_the_least_and_leaves_what_it_began_with(training: ModuleT
 
 
 def test_crops_grow_after_their_shares_of_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     before = set(sys.modules)
     import pair
 

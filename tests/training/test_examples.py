@@ -15,7 +15,7 @@ MADE = ("examples", "cells", "views", "layout", "regions", "wear")
 @pytest.fixture
 def examples(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """With the paints as they are."""
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     import examples
 
     monkeypatch.setattr(examples, "repainted", lambda color, _plane, _rng: color)

@@ -14,7 +14,7 @@ NAMES = {COUCH: 3, CUP: 5}
 
 @pytest.fixture
 def cells(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     import cells
 
     yield cells

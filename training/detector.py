@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-import training
 from cells import BOXES_CELLS, INPUT_PX, STRIDES_PX, THINGS, grid
 from layers import Graph, Live, Statistics, Weights, merged, residual
 from views import Views
 
+import training
 from examples import SMALL, batches
 
 WIDE, TOLD_BY = 48, 64  # channels of the neck and of the heads

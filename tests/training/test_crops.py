@@ -15,7 +15,7 @@ RED, GREEN, GREY = (200, 0, 0), (0, 200, 0), 90
 
 @pytest.fixture
 def encoder(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "networks")
+    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     import encoder
 
     yield encoder
