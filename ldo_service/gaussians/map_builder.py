@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice, zip_longest
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -16,13 +15,14 @@ from ldo_service.geometry.point_records import PoseTable
 from .change_log import ChangeLog, Changes
 from .densification import InsertionConfig, insert
 from .exposure import Exposure, estimated_exposure
+from .fitting import Fitting, WindowConfig, random_for
 from .keyframe_store import KeyframeStore, KeyframeStoreConfig, KeyframeViews
 from .model import GaussianMap, Piece
 from .offloading import SleepingGaussians, whole_map
-from .optimizer import Optimiser, OptimiserConfig
+from .optimizer import OptimiserConfig
 from .pruning import MergingConfig, PruningConfig, doubled, superfluous
 from .renderer import Contributions, Rendering, RenderMemory, render
-from .training_views import View, sampled_surface, schedule, shared_surface, shown_within
+from .training_views import View, shown_within
 from .visibility import (
     AnchorSpheres,
     Horizon,
@@ -33,26 +33,6 @@ from .visibility import (
 )
 
 MOST_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
-TRIES_PER_DRAW = 4  # of keyframes at random, where many see what sleeps
-
-
-@dataclass(frozen=True, slots=True)
-class WindowConfig:
-    """Which keyframes the map is fitted to when a new one comes. Random ones keep what was learnt:
-    +4.2 dB, covisible ones +1.1 dB in the ablations of others (ALGORITHMS, The map)."""
-
-    newest_share: float = 0.3
-    covisible_share: float = 0.3
-    min_shared: float = 0.3  # of the newest one's surface, to be covisible
-    recent: int = 32  # keyframes that are looked at for that, and
-    earlier: int = 32  # so many of those before, at random: bounded, however long the journey
-
-    def __post_init__(self) -> None:
-        shares = (self.newest_share, self.covisible_share)
-        if not (min(shares) >= 0 and sum(shares) <= 1):
-            raise ConfigError(f"newest_share and covisible_share {shares} must not exceed 1.")
-        if min(self.recent, self.earlier) < 0 or not 0 <= self.min_shared <= 1:
-            raise ConfigError(f"{self}: counts must not be negative, min_shared within 0..1.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +75,19 @@ class MapBuilder:
         self.sleeping = SleepingGaussians(folder and folder / "gaussians")
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self._threads, self._memory = threads, RenderMemory()
-        self._optimiser = Optimiser(self.config.optimiser, threads=threads)
+        self._fitting = Fitting(
+            self.config.optimiser,
+            self.config.window,
+            self.views,
+            self.is_awake,
+            seed=self.config.seed,
+            threads=threads,
+        )
         self._log = ChangeLog()
         self._told = PoseTable()  # T_map_keyframe that others know, of those with images
         self._newest: int | None = None
         self._shown: tuple[int, Rendering] | None = None  # of a keyframe, while the map stays
-        self._iterations = self._unusable = self._pruned = self._excess = 0
+        self._pruned = self._excess = 0
 
     # --- keyframes --------------------------------------------------------------------------------
     def add(
@@ -128,8 +115,9 @@ class MapBuilder:
         self._told[keyframe], self._newest = T_map_camera, keyframe
         for forgotten in self.views.add(view):
             del self._told[forgotten]
-            self._optimiser.forget_view(forgotten)
-        touched = self._fit(self._plan(view, MOST_PER_EFFORT * iterations), effort=iterations)
+            self._fitting.forget_view(forgotten)
+        plan = self._fitting.plan(view, MOST_PER_EFFORT * iterations)
+        touched = self._fit(plan, effort=iterations)
         if len(self.views) % self.config.prune_keyframes == 0:
             self._prune_misshapen(touched)
         self._prune_unconfirmed(keyframe)
@@ -208,62 +196,6 @@ class MapBuilder:
         return int(np.count_nonzero(mask))
 
     # --- fitting ----------------------------------------------------------------------------------
-    def _plan(self, newest: View, iterations: int) -> list[int]:
-        """Which keyframe each iteration takes."""
-        window, rng = self.config.window, self._rng(newest.keyframe)
-        older = [k for k in self.views.store.keyframes() if k != newest.keyframe]
-        return schedule(
-            newest.keyframe,
-            self._covisible(newest, older, rng),
-            older,
-            iterations,
-            rng,
-            newest_share=window.newest_share,
-            covisible_share=window.covisible_share,
-        )
-
-    def _covisible(self, newest: View, older: list[int], rng: np.random.Generator) -> list[int]:
-        """Those of the recent keyframes, and of a few earlier ones, that see the same surface."""
-        window = self.config.window
-        split = max(0, len(older) - window.recent)
-        earlier, recent = older[:split], older[split:]
-        if len(earlier) > window.earlier:
-            chosen = rng.choice(len(earlier), window.earlier, replace=False)
-            earlier = [earlier[i] for i in np.sort(chosen)]
-        surface = sampled_surface(newest)
-        return [k for k in (*earlier, *recent) if self._shared(surface, k) >= window.min_shared]
-
-    def _shared(self, p_map: np.ndarray, keyframe: int) -> float:
-        return shared_surface(p_map, self.views.cameras[keyframe], self.views.poses[keyframe])
-
-    def _rng(self, *what: int) -> np.random.Generator:
-        """Of one piece of work: nothing to keep between two."""
-        return np.random.default_rng([self.config.seed, *what])
-
-    def _fit(
-        self,
-        plan: Iterable[int],
-        rates: tuple[float, float] = (1.0, 1.0),
-        effort: float = inf,
-    ) -> np.ndarray:
-        """Mask [N] of the Gaussians that changed."""
-        steps_before = self._optimiser.steps(self.gaussians).copy()
-        plan = list(plan)
-        usable = {k for k in set(plan) if self._is_usable(k)}
-        self._unusable += len(set(plan)) - len(usable)
-        plan = [k for k in plan if k in usable]
-        first = next(iter(self.views.poses), None)
-        losses = self._optimiser.optimise(
-            self.gaussians, self.views, plan, rates=rates, fixed=first, effort=effort
-        )
-        self._iterations += len(losses)
-        touched = self._optimiser.steps(self.gaussians) != steps_before
-        self._log.changed(touched)
-        return touched
-
-    def _is_usable(self, keyframe: int) -> bool:
-        return self.is_awake(keyframe) and self.views.is_readable(keyframe)
-
     def refine(
         self,
         iterations: int,
@@ -276,20 +208,19 @@ class MapBuilder:
         all of `first` are through, to one of them and one at random in turn. How many iterations it
         were: fewer where `effort` was spent, or where most keyframes see what sleeps.
         """
-        self._shown, before = None, self._iterations
-        drawn = self._drawn(iterations - len(first))
-        turns = (k for pair in zip_longest(first, drawn) for k in pair if k is not None)
-        self._fit(turns, rates, effort)
-        return self._iterations - before
+        self._shown, before = None, self._fitting.iterations
+        self._fit(self._fitting.plan_refinement(iterations, first), rates, effort)
+        return self._fitting.iterations - before
 
-    def _drawn(self, count: int) -> list[int]:
-        """So many keyframes at random, one perhaps more than once, that see nothing that sleeps."""
-        known = self.views.store.keyframes()
-        if not known:
-            return []
-        rng = self._rng(len(self.views), self._iterations)
-        tried = rng.integers(len(known), size=TRIES_PER_DRAW * count)
-        return list(islice((known[i] for i in tried if self.is_awake(known[i])), count))
+    def _fit(
+        self,
+        plan: Iterable[int],
+        rates: tuple[float, float] = (1.0, 1.0),
+        effort: float = inf,
+    ) -> np.ndarray:
+        touched = self._fitting.fit(self.gaussians, plan, rates, effort)
+        self._log.changed(touched)
+        return touched
 
     def is_awake(self, keyframe: int) -> bool:
         """Whether all is awake that it may see: else what is would be bent to stand in for it."""
@@ -327,7 +258,10 @@ class MapBuilder:
         older = [k for k in self.views.store.keyframes() if k < newest][: 1 - age or None]
         if not older or pruning.min_weight_px == 0:
             return
-        chosen = {older[-1], older[int(self._rng(newest, 1).integers(len(older)))]}
+        chosen = {
+            older[-1],
+            older[int(random_for(self.config.seed, newest, 1).integers(len(older)))],
+        }
         shown = np.zeros(len(self.gaussians), np.float32)
         for keyframe in (newest, *sorted(chosen)):
             made_by = self._contributions(keyframe)
@@ -429,11 +363,11 @@ class MapBuilder:
         return {
             "map": self.gaussians.snapshot(),
             "sleeping": self.sleeping.snapshot(),
-            "optimiser": self._optimiser.snapshot(),
+            "optimiser": self._fitting.snapshot(),
             "views": self.views.snapshot(),
             "told": self._told.of(self._told),
             "newest": self._newest,
-            "iterations": self._iterations,
+            "iterations": self._fitting.iterations,
         }
 
     def saved(self) -> None:
@@ -443,19 +377,19 @@ class MapBuilder:
     def restore(self, state: Mapping[str, Any]) -> None:
         """Go on from a snapshot: followers are taken to know the whole map."""
         self.gaussians = GaussianMap.restore(state["map"])
-        self._optimiser.restore(state["optimiser"])
+        self._fitting.restore(state["optimiser"], state["iterations"])
         self.views.restore(state["views"])
         self.sleeping.restore(state["sleeping"])
         self._told.become(self.views.cameras, state["told"])
-        self._newest, self._iterations, self._shown = state["newest"], state["iterations"], None
+        self._newest, self._shown = state["newest"], None
         self._log.all_told(self.gaussians)
 
     def statistics(self) -> dict[str, float]:
         return {
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
-            "iterations": self._iterations,
-            "keyframes_unusable": self._unusable,  # drawn, but gone, or they see what sleeps
+            "iterations": self._fitting.iterations,
+            "keyframes_unusable": self._fitting.unusable,  # chosen; gone, or see what sleeps
             "gaussians_over_cap": self._excess,  # they may be looked at, so they do not sleep
             **self.sleeping.statistics(),
             **self.views.store.statistics(),
