@@ -1,4 +1,4 @@
-"""The mapper's map as messages of a bounded size; `map_follower` puts them together again."""
+"""The mapper's map as messages of a bounded size; `replica` puts them together again."""
 
 from collections.abc import Iterable, Iterator
 

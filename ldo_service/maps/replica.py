@@ -1,72 +1,115 @@
-"""A copy of the mapper's map, kept from its messages."""
+"""A replica of the mapper's map, kept from its messages."""
 
 import numpy as np
 
 from ldo_service.conversions.poses import transform
-from ldo_service.gaussians.model import GaussianMap
+from ldo_service.gaussians.model import GaussianMap, Piece
+from ldo_service.gaussians.pruning import weightiest
 from ldo_service.schemas import MapDelta, MapSnapshot
 
 from .messages import piece_of
 
-NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)
+NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # gains and biases of a camera, [2, 3]
+SLACK = 1.25  # a bounded replica grows so far beyond its limit before it is cut back
 
 
-class MapFollower:
-    """Feed it every map/delta and map/snapshot; `map` is equal to the mapper's at `version`, and
-    `label_names` says what its labels are, by index.
+class MapReplica:
+    """The map of a mapper whose every map/delta and map/snapshot is given to `apply`.
 
-    A missed delta is noticed (`is_behind`), and the next complete snapshot puts it right.
+    Without a limit the replica is exact: `map` equals the mapper's at `version`. After a missed
+    delta it waits, with `is_behind` set, for the next complete snapshot.
+
+    With a limit the replica is bounded and goes on after a missed delta: what is wrong then stays
+    so until the next snapshot, each part of which is applied as it comes. Gaussians that no part
+    names between its first and its last id are gone. Of more than `max_gaussians` it keeps those
+    with the largest weight; it may exceed the limit by a quarter.
+
+    Args:
+        max_gaussians: Limit of a bounded replica; None for an exact one.
     """
 
-    def __init__(self) -> None:
-        self._parts: dict[int, MapSnapshot] = {}
-        self._begin()
+    def __init__(self, max_gaussians: int | None = None) -> None:
+        self._max_gaussians = max_gaussians
+        self.reset()
 
-    def _begin(self) -> None:
+    def reset(self) -> None:
+        """Start with an empty map, as at the mapper's start."""
         self.map = GaussianMap()
         self.version = 0
         self.is_behind = False
-        self.label_names: tuple[str, ...] = ()
+        self.label_names: tuple[str, ...] = ()  # names of the labels, by index
         self._exposures: dict[int, np.ndarray] = {}
-        self._parts.clear()
+        self._next_id = 0  # above all ids that ever came
+        self._was_cut = False  # Gaussians were left out, and may weigh more by now
+        self._parts: dict[int, MapSnapshot] = {}  # of a snapshot that an exact replica awaits
+        self._last_ids: dict[int, int] = {}  # of the parts that a bounded replica applied
+        self._applied_version = 0  # of these parts
 
     def exposure(self, keyframe: int) -> np.ndarray:
-        """Gains and biases [2, 3] of a keyframe's camera, as of the last snapshot; 1 and 0 for one
-        that it did not name."""
+        """Return gains and biases [2, 3] of a keyframe's camera, as of the last snapshot.
+
+        They are 1 and 0 for a keyframe that it did not name.
+        """
         return self._exposures.get(keyframe, NEUTRAL)
 
-    def take(self, message: MapDelta | MapSnapshot) -> bool:
-        """Whether `map` changed."""
-        if isinstance(message, MapSnapshot):
-            return self._take_part(message)
-        if message.since == 0 and self.version:
-            self._begin()  # the mapper began anew
-        if message.version <= self.version:
-            return False
-        if message.since != self.version:
-            self.is_behind = True
-            return False
-        self._apply(message)
-        return True
+    def apply(self, message: MapDelta | MapSnapshot) -> bool:
+        """Apply a message, and return whether the map changed."""
+        if isinstance(message, MapDelta):
+            has_changed = self._apply_delta(message)
+        elif self._max_gaussians is None:
+            has_changed = self._collect_part(message)
+        else:
+            has_changed = self._apply_part(message)
+        self._cut_to_limit()
+        return has_changed
 
-    def _apply(self, delta: MapDelta) -> None:
+    # --- changes ----------------------------------------------------------------------------------
+    def _apply_delta(self, delta: MapDelta) -> bool:
+        if delta.since == 0 and self.version:
+            self.reset()  # the mapper started again
+        if delta.version <= self.version:
+            return False
+        if delta.since != self.version:
+            self.is_behind = True
+            if self._max_gaussians is None:
+                return False
         if delta.motions:
             self.map.move_anchors({m.keyframe: transform(m.T_new_old) for m in delta.motions})
         if delta.removed.shape[0]:
             self.map.remove(np.isin(self.map.ids, delta.removed.numpy()))
-        if delta.changed.ids.shape[0]:
-            changed = piece_of(delta.changed)
-            where = np.searchsorted(self.map.ids, changed.ids)
-            self.map.rows[where], self.map.labels[where] = changed.rows, changed.labels
-            self.map.touch(where.astype(np.uint32))
-        self.map.append(*piece_of(delta.added))
+        self._change(piece_of(delta.changed))
+        self._add(piece_of(delta.added))
         self.label_names = delta.label_names or self.label_names
         self.version = delta.version
+        return True
 
-    def _take_part(self, part: MapSnapshot) -> bool:
-        if part.part == 0 and part.version >= self.version:
-            exposures = part.exposures.numpy().copy()
-            self._exposures = dict(zip(part.keyframes.numpy().tolist(), exposures, strict=True))
+    def _change(self, changed: Piece) -> None:
+        """Overwrite the Gaussians that are here: a bounded replica may lack some."""
+        if not (len(self.map) and len(changed.ids)):
+            return
+        where = np.searchsorted(self.map.ids, changed.ids)
+        where = np.minimum(where, len(self.map) - 1)
+        is_here = self.map.ids[where] == changed.ids
+        where = where[is_here]
+        self.map.rows[where] = changed.rows[is_here]
+        self.map.labels[where] = changed.labels[is_here]
+        self.map.touch(where.astype(np.uint32))
+
+    def _add(self, added: Piece) -> None:
+        """Append the Gaussians that no snapshot brought already."""
+        new = added.at(added.ids >= self._next_id)
+        self.map.append(*new)
+        self._next_id = max(self._next_id, int(new.ids[-1]) + 1 if len(new.ids) else 0)
+
+    def _cut_to_limit(self) -> None:
+        if self._max_gaussians is not None and len(self.map) > SLACK * self._max_gaussians:
+            self.map.remove(~weightiest(self.map.rows, self._max_gaussians))
+            self._was_cut = True
+
+    # --- snapshots --------------------------------------------------------------------------------
+    def _collect_part(self, part: MapSnapshot) -> bool:
+        """Keep a part until the snapshot is complete, then replace the map by it."""
+        self._note_exposures(part)
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
         if any(other.version != part.version for other in self._parts.values()):
@@ -74,10 +117,44 @@ class MapFollower:
         self._parts[part.part] = part
         if len(self._parts) < part.parts:
             return False
-        self.map = GaussianMap()
+        self.map, self._next_id = GaussianMap(), 0
         for number in range(part.parts):
-            self.map.append(*piece_of(self._parts[number].gaussians))
+            self._add(piece_of(self._parts[number].gaussians))
         self.label_names = self._parts[0].label_names
         self.version, self.is_behind = part.version, False
         self._parts.clear()
         return True
+
+    def _apply_part(self, part: MapSnapshot) -> bool:
+        """Replace the Gaussians that a part speaks of."""
+        self._note_exposures(part)
+        is_news = self.is_behind or self._was_cut or part.version > self.version
+        if part.version < self.version or not is_news:
+            return False
+        if part.version != self._applied_version:
+            self._last_ids.clear()
+            self._applied_version = part.version
+        piece = piece_of(part.gaussians)
+        first, last = self._span(part, piece.ids)
+        self.map.remove((self.map.ids >= first) & (self.map.ids <= last))
+        self.map.bring_back(*piece.at(piece.ids < self._next_id))
+        self._add(piece)
+        self.label_names = part.label_names or self.label_names
+        self._last_ids[part.part] = int(piece.ids[-1]) if len(piece.ids) else -1
+        if len(self._last_ids) == part.parts:
+            self.version, self.is_behind = part.version, False
+            self._last_ids.clear()
+        return True
+
+    def _span(self, part: MapSnapshot, ids: np.ndarray) -> tuple[float, float]:
+        """Return the first and the last id that a part speaks of."""
+        if not len(ids):
+            return (0, np.inf) if part.parts == 1 else (0, -1)
+        follows = part.part == 0 or part.part - 1 in self._last_ids
+        first = self._last_ids.get(part.part - 1, -1) + 1 if follows else int(ids[0])
+        return first, np.inf if part.part == part.parts - 1 else int(ids[-1])
+
+    def _note_exposures(self, part: MapSnapshot) -> None:
+        if part.part == 0 and part.version >= self.version:
+            exposures = part.exposures.numpy().copy()
+            self._exposures = dict(zip(part.keyframes.numpy().tolist(), exposures, strict=True))

@@ -37,7 +37,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.file_formats import write_ply
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
     Correction,
     DetectionBoxes,
@@ -160,7 +160,7 @@ class RunFolder:
         self._poses, self._final_poses = KeyframePoses(), FinalPoses()
         self._joined: dict[int, int] = {}  # segments placed in an older one
         self._keyframes: dict[int, dict[str, Any]] = {}
-        self.follower = MapFollower()
+        self.follower = MapReplica()
         self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.loops = LoopRecord()
@@ -193,7 +193,7 @@ class RunFolder:
             case LoopCandidate() | LoopClosure():
                 self.loops.observe(message, step_ms)
             case MapDelta() | MapSnapshot():
-                self.follower.take(message)
+                self.follower.apply(message)
 
     def _observe_pose(self, pose: TrackedPose, step_ms: float) -> None:
         self.statuses[pose.status] += 1

@@ -9,7 +9,7 @@ from typing import get_args
 from ldo_service.client import Client
 from ldo_service.config.sections import ViewerConfig
 from ldo_service.conversions.frames import camera_of
-from ldo_service.maps.bounded_replica import KnownGaussians
+from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
     Correction,
     DetectionBoxes,
@@ -75,7 +75,7 @@ class LiveScene:
 
     def begin_anew(self) -> None:
         """The map is empty, and what comes is of another one."""
-        self._gaussians = KnownGaussians(self._config.most_gaussians)
+        self._gaussians = MapReplica(self._config.most_gaussians)
         self.scene = Scene(camera=self.scene.camera)
         self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
         self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
@@ -154,7 +154,7 @@ class LiveScene:
     def _take_map(self, message: MapDelta | MapSnapshot) -> None:
         if isinstance(message, MapDelta) and message.since == 0 and self._gaussians.version:
             self.begin_anew()  # on request, see `ldo control reset`
-        if self._gaussians.take(message):
+        if self._gaussians.apply(message):
             self._changed.add("gaussians")
 
     def _take_health(self, health: Health) -> None:
@@ -179,7 +179,7 @@ class LiveScene:
         if "loops" in changed:
             scene.loops = self._agreed_loops()
         if "gaussians" in changed:
-            scene.rows = self._gaussians.rows
+            scene.rows = self._gaussians.map.rows
         if self._clock() - self._told_s >= FACTS_EVERY_S:
             self._told_s = self._clock()
             self._pose_rate.add(self._told_s, self._poses)

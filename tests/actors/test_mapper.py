@@ -23,7 +23,7 @@ from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfi
 from ldo_service.gaussians.map_builder import MapBuilderConfig
 from ldo_service.gaussians.visibility import SleepConfig
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import MapReplica
 from ldo_service.runtime.actor import Situation
 from ldo_service.runtime.delivery_state import Past, Taken, successor
 from ldo_service.schemas import (
@@ -67,10 +67,10 @@ def deltas_of(messages) -> list[MapDelta]:
     return [message for message in messages if isinstance(message, MapDelta)]
 
 
-def followed(messages, follower: MapFollower | None = None) -> MapFollower:
-    follower = follower or MapFollower()
+def followed(messages, follower: MapReplica | None = None) -> MapReplica:
+    follower = follower or MapReplica()
     for message in changes(messages):
-        follower.take(message)
+        follower.apply(message)
     return follower
 
 
@@ -128,7 +128,7 @@ def test_followers_hold_to_the_bit_what_sleeps_and_wakes(keyframes) -> None:
     sleep = SleepConfig(max_active=500, reach_m=3.0, clump_m=0.5)
     builder = MapBuilderConfig(sleep=sleep, recent_cameras=1)
     config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, least_iterations=1)
-    mapper, follower = Mapper(replace(config, mended_at_end=0)), MapFollower()
+    mapper, follower = Mapper(replace(config, mended_at_end=0)), MapReplica()
     for version, keyframe in enumerate(keyframes, 1):
         poses = {0: se3.exp(0.01 * version * np.ones(6)) @ transform(keyframes[0].T_odom_keyframe)}
         correction = correction_message(0, version, poses)
@@ -428,7 +428,7 @@ def test_a_keyframe_sent_twice_counts_once(keyframes) -> None:
 def test_a_follower_of_a_killed_mapper_ends_with_the_successors_map(keyframes) -> None:
     """The successor lacks what came after the checkpoint, and inserts other Gaussians."""
     first, second = Mapper(SLOW_CHECKPOINTS), Mapper(SLOW_CHECKPOINTS)
-    follower = MapFollower()
+    follower = MapReplica()
     for keyframe in keyframes[:4]:  # the checkpoint holds the first keyframe only
         followed(changes(list(first.handle(keyframe))), follower)
         state = first.snapshot()
@@ -535,7 +535,7 @@ def test_a_follower_notices_that_the_mapper_began_anew(keyframes) -> None:
     assert_equal_maps(follower, anew)
 
 
-def assert_equal_maps(follower: MapFollower, mapper: Mapper) -> None:
+def assert_equal_maps(follower: MapReplica, mapper: Mapper) -> None:
     """Of one that heard everything so far: nothing is left to tell it."""
     last_words = list(mapper.finish())
     assert deltas_of(last_words) == []
@@ -586,7 +586,7 @@ LABELLING = replace(CONFIG, semantics=SemanticMapConfig(LabellingConfig(region="
 
 
 def test_followers_hold_labels_to_the_bit_and_know_their_names(keyframes) -> None:
-    mapper, follower = Mapper(LABELLING), MapFollower()
+    mapper, follower = Mapper(LABELLING), MapReplica()
     for keyframe in keyframes[:6]:
         boxes = boxes_of(keyframe, "lava lamp" if keyframe.keyframe > 2 else "chair")
         followed(deltas_of(handled(mapper, [keyframe, boxes])), follower)

@@ -14,7 +14,7 @@ from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.conversions.frames import camera_message
 from ldo_service.conversions.poses import correction_message, matrix6_message, pose_message
 from ldo_service.geometry import se3
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import MapReplica
 from ldo_service.regions.open_vocabulary import Naming, NamingConfig
 from ldo_service.regions.region_proposals import TriggerConfig
 from ldo_service.regions.region_tracker import RegionConfig
@@ -110,11 +110,11 @@ def of(kind: type, messages: Iterable[Message]) -> list:
     return [message for message in messages if isinstance(message, kind)]
 
 
-def followed(messages: Iterable[Message]) -> MapFollower:
-    follower = MapFollower()
+def followed(messages: Iterable[Message]) -> MapReplica:
+    follower = MapReplica()
     for message in messages:
         if isinstance(message, MapDelta | MapSnapshot):
-            follower.take(message)
+            follower.apply(message)
     return follower
 
 

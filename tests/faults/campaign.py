@@ -27,7 +27,7 @@ import numpy as np
 
 from ldo_service.conversions.poses import transform
 from ldo_service.geometry import se3
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import CameraRgbd, Correction, Health, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
@@ -394,7 +394,7 @@ class Batch:
         inputs = self.witness.health["mapper"][1].inputs
         return sum(i.delivered for i in inputs if i.topic == "map/refine")
 
-    def _same_map(self, whose: str, saved: dict[str, Any], follower: MapFollower) -> None:
+    def _same_map(self, whose: str, saved: dict[str, Any], follower: MapReplica) -> None:
         """One that missed something knows that, and waits for the next snapshot."""
         if follower.is_behind or not follower.version:
             return

@@ -25,7 +25,7 @@ from ldo_service.config import load_config
 from ldo_service.conversions.objects import map_objects
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import MapReplica
 from ldo_service.runtime.delivery_state import Past, successor
 from ldo_service.schemas import Correction, MapObject, MapObjects, MapSnapshot
 from ldo_service.schemas.topics import GRAPH_CORRECTION, MAP_OBJECTS, MAP_SNAPSHOT
@@ -55,14 +55,14 @@ class NotRecovered(Exception):
 class Shown:
     """What a service shows of its map and its graph."""
 
-    map: MapFollower
+    map: MapReplica
     objects: tuple[MapObject, ...] | None  # None before any were told, or where nobody looked
     graph: Correction | None
 
     @classmethod
     def of(cls, messages: Iterable[Any]) -> "Shown | None":
         """None where there is no map."""
-        follower, objects, graph = MapFollower(), None, None
+        follower, objects, graph = MapReplica(), None, None
         for message in messages:
             match message:
                 case MapObjects():
@@ -70,7 +70,7 @@ class Shown:
                 case Correction():
                     graph = message
                 case _:
-                    follower.take(message)
+                    follower.apply(message)
         return cls(follower, objects, graph) if follower.version else None
 
 
@@ -202,7 +202,7 @@ def saved_objects(state: Mapping[str, Any]) -> tuple[MapObject, ...]:
     return map_objects(semantics.objects.landmarks, semantics.names)
 
 
-def arrays_of(follower: MapFollower) -> dict[str, np.ndarray]:
+def arrays_of(follower: MapReplica) -> dict[str, np.ndarray]:
     return follower.map.snapshot()
 
 

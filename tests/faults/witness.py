@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import zenoh
 
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
     Correction,
     Health,
@@ -50,8 +50,8 @@ class Witness:
     pose: TrackedPose | None = None
     first_stamp_ns: int | None = None  # of keyframe 0, whose frame the map's is
     health: dict[str, tuple[float, Health]] = field(default_factory=dict)
-    follower: MapFollower = field(default_factory=MapFollower)  # from the first message on
-    late: MapFollower = field(default_factory=MapFollower)  # from the last fault on
+    follower: MapReplica = field(default_factory=MapReplica)  # from the first message on
+    late: MapReplica = field(default_factory=MapReplica)  # from the last fault on
     _behind_since: float | None = None
     _subscribers: list[object] = field(default_factory=list)
     _heard: deque[tuple[str, bytes, bytes]] = field(default_factory=lambda: deque(maxlen=20_000))
@@ -59,7 +59,7 @@ class Witness:
     # --- hearing ----------------------------------------------------------------------------------
     def listen(self, session: zenoh.Session, network: Network) -> None:
         """For as long as the session lives. Who listens now may have missed something."""
-        self.follower, self.late = MapFollower(), MapFollower()
+        self.follower, self.late = MapReplica(), MapReplica()
         self._subscribers.clear()
         for topic in (*KINDS, GRANTS, "health/*"):
             prefix = network.expression("")
@@ -77,14 +77,14 @@ class Witness:
     def join_late(self, snapshot: Iterable[Message]) -> None:
         """Follow the map anew, from the last snapshot that there is."""
         self.update()
-        self.late = MapFollower()
+        self.late = MapReplica()
         for part in snapshot:
             assert isinstance(part, MapSnapshot)
-            self.late.take(part)
+            self.late.apply(part)
 
     def _follow(self, message: MapDelta | MapSnapshot) -> None:
-        self.follower.take(message)
-        self.late.take(message)
+        self.follower.apply(message)
+        self.late.apply(message)
 
     def update(self) -> None:
         """Judge what came since the last call."""

@@ -1,11 +1,10 @@
-"""A picture of the map in bounded memory, against the follower that keeps all of it."""
+"""A bounded replica of the map against the exact one."""
 
 import numpy as np
 import pytest
 
 from ldo_service.gaussians.pruning import weightiest
-from ldo_service.maps.bounded_replica import ROOM, KnownGaussians
-from ldo_service.maps.replica import MapFollower
+from ldo_service.maps.replica import SLACK, MapReplica
 
 from .streams import ChangingMap
 
@@ -14,12 +13,12 @@ PLENTY = 1_000_000
 
 @pytest.mark.parametrize("seed", range(3))
 def test_with_room_for_all_it_is_the_followers_map(seed: int) -> None:
-    changing, known, follower = ChangingMap(seed), KnownGaussians(PLENTY), MapFollower()
+    changing, known, follower = ChangingMap(seed), MapReplica(PLENTY), MapReplica()
     for step in range(20):
         messages = [changing.delta(), *(changing.snapshot() if step % 6 == 5 else ())]
         for message in messages:
-            assert known.take(message) == follower.take(message)
-        np.testing.assert_array_equal(known.rows, follower.map.rows)
+            assert known.apply(message) == follower.apply(message)
+        np.testing.assert_array_equal(known.map.rows, follower.map.rows)
         assert not known.is_behind
 
 
@@ -27,65 +26,65 @@ def test_who_comes_late_has_it_from_the_snapshot() -> None:
     changing = ChangingMap()
     for _ in range(10):
         changing.delta()
-    known, snapshot = KnownGaussians(PLENTY), changing.snapshot()
+    known, snapshot = MapReplica(PLENTY), changing.snapshot()
     for message in (*snapshot, changing.delta(), changing.delta()):
-        assert known.take(message)
-    np.testing.assert_array_equal(known.rows, changing.map.rows)
+        assert known.apply(message)
+    np.testing.assert_array_equal(known.map.rows, changing.map.rows)
 
 
 @pytest.mark.parametrize("parts", [1, 4])
 def test_what_was_missed_is_wrong_until_the_next_snapshot(parts: int) -> None:
-    changing, known = ChangingMap(), KnownGaussians(PLENTY)
+    changing, known = ChangingMap(), MapReplica(PLENTY)
     for _ in range(4):
-        known.take(changing.delta())
+        known.apply(changing.delta())
     for _ in range(3):
         changing.delta()  # lost
-    assert known.take(changing.delta())
+    assert known.apply(changing.delta())
     assert known.is_behind
-    assert len(known.rows)  # goes on
+    assert len(known.map.rows)  # goes on
     for message in changing.snapshot(parts):
-        known.take(message)
+        known.apply(message)
     assert not known.is_behind
-    np.testing.assert_array_equal(known.rows, changing.map.rows)
+    np.testing.assert_array_equal(known.map.rows, changing.map.rows)
 
 
 def test_an_old_message_changes_nothing() -> None:
-    changing, known = ChangingMap(), KnownGaussians(PLENTY)
+    changing, known = ChangingMap(), MapReplica(PLENTY)
     first, early = changing.delta(), changing.snapshot()
     second = changing.delta()
     late = changing.snapshot()
     for message in (first, second):
-        known.take(message)
-    before = known.rows.copy()
-    assert not any(known.take(message) for message in (second, *early, *late))
-    np.testing.assert_array_equal(known.rows, before)
+        known.apply(message)
+    before = known.map.rows.copy()
+    assert not any(known.apply(message) for message in (second, *early, *late))
+    np.testing.assert_array_equal(known.map.rows, before)
 
 
 def test_a_mapper_that_begins_anew_is_followed() -> None:
-    known = KnownGaussians(PLENTY)
+    known = MapReplica(PLENTY)
     before, anew = ChangingMap(1), ChangingMap(2)
     for changing in (before, before, before, anew, anew):
-        assert known.take(changing.delta())
-    np.testing.assert_array_equal(known.rows, anew.map.rows)
+        assert known.apply(changing.delta())
+    np.testing.assert_array_equal(known.map.rows, anew.map.rows)
 
 
 def test_it_holds_the_weightiest_and_no_more_than_there_is_room_for() -> None:
-    changing, known, most = ChangingMap(), KnownGaussians(100), 100
+    changing, known, most = ChangingMap(), MapReplica(100), 100
     for step in range(40):
         for message in [changing.delta(), *(changing.snapshot() if step % 10 == 9 else ())]:
-            known.take(message)
-            assert len(known.rows) <= ROOM * most
+            known.apply(message)
+            assert len(known.map.rows) <= SLACK * most
     truth = changing.map.rows  # of which there was a snapshot just now
     best = truth[weightiest(truth, most)]
-    assert {row.tobytes() for row in best} <= {row.tobytes() for row in known.rows}
+    assert {row.tobytes() for row in best} <= {row.tobytes() for row in known.map.rows}
 
 
 def test_an_empty_map_is_told_of_too() -> None:
-    known = KnownGaussians(PLENTY)
-    known.take(ChangingMap().delta())
+    known = MapReplica(PLENTY)
+    known.apply(ChangingMap().delta())
     known.is_behind = True
     empty = ChangingMap()
     empty.version = 5
     for message in empty.snapshot(parts=1):
-        known.take(message)
-    assert len(known.rows) == 0
+        known.apply(message)
+    assert len(known.map.rows) == 0
