@@ -40,7 +40,6 @@ LIBRARIES = {  # name on the package index: name to import
 EXTRAS = {
     "viewer": ("viser", "gsply"),
     "keys": ("cryptography",),
-    "cuda": ("torch", "gsplat"),
     "realsense": ("pyrealsense2",),
     "ros2": ("rosbags",),
 }

@@ -271,7 +271,7 @@ def test_the_image_is_built_from_stages_and_files_that_there_are() -> None:
     lines = (DEPLOY / "Dockerfile").read_text().splitlines()
     stages = [line.split()[-1] for line in lines if line.startswith("FROM")]
     sources = [line.split()[1] for line in lines if line.startswith("FROM")]
-    assert stages == ["build", "base", "cuda", "cpu"], "the last is what is built by default"
+    assert stages == ["build", "base", "cpu"], "the last is what is built by default"
     assert set(sources[2:]) <= set(stages)
     kept = (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines()
     for name in (line[1:] for line in kept if line.startswith("!")):
