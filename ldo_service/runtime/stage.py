@@ -2,14 +2,13 @@
 
 import asyncio
 import logging
-import secrets
 from collections.abc import Callable, Iterator, Mapping
 
 from ldo_service.errors import StageStalled
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import HEALTH
 from ldo_service.storage.state_store import MemoryStore, State, StateStore
-from ldo_service.transport.flow_control import Header, encode_link
+from ldo_service.transport.flow_control import Header, encode_link, new_epoch
 from ldo_service.transport.interface import Transport
 from ldo_service.transport.worker import Worker
 
@@ -394,8 +393,3 @@ class Stage:
             inputs=self._mailbox.statistics() if self._mailbox else (),
             outputs=self._outlets.statistics(),
         )
-
-
-def new_epoch() -> int:
-    """A number no earlier run of this stage had."""
-    return 1 + secrets.randbits(62)

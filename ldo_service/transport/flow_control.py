@@ -15,6 +15,7 @@ write with it: so each message takes effect once, whichever process is killed, a
 follows the sequence numbers that a producer gave to the messages of a topic.
 """
 
+import secrets
 from typing import NamedTuple
 
 import msgspec
@@ -93,6 +94,11 @@ class InletPast(NamedTuple):
 
     epoch: int  # of its producer; 0: none was known
     handled: int
+
+
+def new_epoch() -> int:
+    """Return a number that no earlier run of a producer had."""
+    return 1 + secrets.randbits(62)
 
 
 encode_link = msgspec.msgpack.Encoder().encode
