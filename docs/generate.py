@@ -15,14 +15,14 @@ PAGES = (ROOT / "README.md", ROOT / "docs/architecture.md")
 BLOCK = re.compile(r"(<!-- (?P<name>[^>]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def rooms_table() -> str:
+def packages_table() -> str:
     """Markdown: every package with the first sentence of its docstring."""
-    lines = ["| room | what is in it |", "|---|---|"]
-    lines += [f"| `{name}/` | {_first_sentence(path)} |" for name, path in _rooms()]
+    lines = ["| package | what is in it |", "|---|---|"]
+    lines += [f"| `{name}/` | {_first_sentence(path)} |" for name, path in _packages()]
     return "\n".join(lines)
 
 
-def _rooms() -> Iterator[tuple[str, Path]]:
+def _packages() -> Iterator[tuple[str, Path]]:
     links = ("actors", "schemas")
     yield from ((name, ROOT / name / "__init__.py") for name in links)
     for path in sorted((ROOT / "ldo_service").glob("*/__init__.py")):
@@ -38,7 +38,7 @@ def _first_sentence(path: Path) -> str:
 BLOCKS: dict[str, Callable[[], str]] = {
     "ldo topics --markdown": topics_table,
     "ldo topics --mermaid": lambda: f"```mermaid\n{drawing()}\n```",
-    "rooms": rooms_table,
+    "packages": packages_table,
 }
 
 
