@@ -51,7 +51,7 @@ from ldo_service.schemas.topics import (
 )
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.odometry_prior import Prior, Reading, Verdict
-from ldo_service.tracking.relocalization import SeenAgain
+from ldo_service.tracking.relocalization import ReusedKeyframe
 from ldo_service.tracking.tracking_quality import Status
 from ldo_service.tracking.tracking_result import Tracked
 
@@ -201,7 +201,7 @@ class Tracker(Actor):
         return has_room
 
     def _make_keyframe(
-        self, frame: RgbdFrame, tracked: Tracked, seen: SeenAgain | None
+        self, frame: RgbdFrame, tracked: Tracked, seen: ReusedKeyframe | None
     ) -> Keyframe:
         """A new reference for tracking, or one that supports the map between two of these.
 
@@ -246,7 +246,7 @@ class Tracker(Actor):
             else (measured_message(tracked.join.measures(keyframe)),),
         )
 
-    def _seen_again(self, frame: RgbdFrame, tracked: Tracked) -> SeenAgain | None:
+    def _seen_again(self, frame: RgbdFrame, tracked: Tracked) -> ReusedKeyframe | None:
         """A keyframe that the map has already, where the frame would be mapped otherwise."""
         is_wanted = tracked.wants_mapping and tracked.join is None and self._odometry.may_return
         if not is_wanted or tracked.keyframe is None or tracked.keyframe not in self._poses:
@@ -254,7 +254,7 @@ class Tracker(Actor):
         T_map_camera = self._poses[tracked.keyframe] @ tracked.T_keyframe_camera
         return self._odometry.seen_again(frame, tracked, self._T_map_keyframe(), T_map_camera)
 
-    def _return_to(self, seen: SeenAgain, tracked: Tracked) -> Tracked:
+    def _return_to(self, seen: ReusedKeyframe, tracked: Tracked) -> Tracked:
         self._returns += 1
         returned = self._odometry.return_to(seen, tracked)
         self._place(seen.place.id, returned, self._T_map_keyframe()[seen.place.id])

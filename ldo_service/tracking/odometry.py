@@ -40,15 +40,15 @@ from .odometry_prior import Anchor, PriorConfig, Reading
 from .pose_candidates import Candidate, CandidateConfig, Guesses
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
 from .relocalization import (
+    KeyframeReuse,
     RelocalisationConfig,
     Relocaliser,
     ReturnConfig,
-    Returning,
-    SeenAgain,
+    ReusedKeyframe,
     nearby,
 )
 from .state import Origin, State, packed, unpacked
-from .submaps import Join, Look, SegmentConfig
+from .submaps import Look, SegmentConfig, SubmapMeasurement
 from .tracking_quality import History, JudgementConfig, Status, judge
 from .tracking_result import Tracked, report
 from .window import EarlierKeyframes, WindowConfig, measured_from
@@ -93,7 +93,7 @@ class Odometry:
             self.config.judgement,
             self.config.relocalisation,
         )
-        self._returning = Returning(
+        self._returning = KeyframeReuse(
             self.config.pyramid,
             self.config.align,
             self.config.keyframes,
@@ -179,12 +179,12 @@ class Odometry:
         tracked: Tracked,
         T_map_keyframe: Mapping[int, np.ndarray],
         T_map_camera: np.ndarray,
-    ) -> SeenAgain | None:
+    ) -> ReusedKeyframe | None:
         """A known keyframe that shows what the frame just tracked does; None where none will do.
 
         T_map_keyframe  [4, 4] by id, where the map has them; T_map_camera [4, 4] likewise
         """
-        joined = self._state.segments.are_joined
+        joined = self._state.segments.are_merged
         known = [
             place
             for place in self._state.places.all
@@ -193,7 +193,7 @@ class Odometry:
         near = nearby(known, T_map_keyframe, T_map_camera, self.config.keyframes)
         return self._returning.find(self._view(frame), near, self._state.history)
 
-    def return_to(self, seen: SeenAgain, tracked: Tracked) -> Tracked:
+    def return_to(self, seen: ReusedKeyframe, tracked: Tracked) -> Tracked:
         """Track against a known keyframe from now on; the frame just tracked, against that.
 
         Odometry goes on where it is: the keyframe is elsewhere in it now, and of its segment.
@@ -357,7 +357,7 @@ class Odometry:
     def _apart_from(self, segment: int) -> Places:
         """The places of segments that are not joined to one."""
         state = self._state
-        joined = state.segments.are_joined
+        joined = state.segments.are_merged
         return Places(tuple(p for p in state.places.all if not joined(p.segment, segment)))
 
     def _found(
@@ -372,14 +372,14 @@ class Odometry:
     def _joining(self, tracked: Tracked, keyframe: Keyframe, view: Pyramid) -> Tracked:
         """Now and then, whether the view is seen from another segment too."""
         before, config = self._state.segments, self.config.segments
-        if tracked.status is not Status.OK or not before.is_time_to_look(config):
+        if tracked.status is not Status.OK or not before.is_search_due(config):
             return tracked
         found = self._found(view, self._apart_from(keyframe.segment), is_lost=False)
         look = join = None
         if found is not None:
             there, alignment = found[0], found[1].alignment
             look = Look.at(there, alignment, tracked.segment, tracked.T_odom_camera)
-            join = Join.of(there, alignment)
+            join = SubmapMeasurement.of(there, alignment)
         self._state = replace(self._state, segments=before.looked(look, config))
         if look is None or not before.is_confirmed_by(look, config):
             return tracked
@@ -397,7 +397,7 @@ class Odometry:
             Status.LOST,
             "none",
         )
-        may_begin = self._state.segments.may_begin(frame.stamp_ns, self.config.segments)
+        may_begin = self._state.segments.should_start(frame.stamp_ns, self.config.segments)
         return replace(lost, may_begin=may_begin and self._is_usable(self._view(frame)))
 
     def _accepted(

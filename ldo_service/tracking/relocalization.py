@@ -218,7 +218,7 @@ class ReturnConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SeenAgain:
+class ReusedKeyframe:
     """A place, the keyframe that it was, and the alignment of a view to that."""
 
     place: Place
@@ -232,7 +232,7 @@ class SeenAgain:
 
 
 @dataclass(frozen=True, slots=True)
-class Returning:
+class KeyframeReuse:
     """How a known keyframe is found to go on against; knows nothing from frame to frame."""
 
     pyramid: PyramidConfig
@@ -241,7 +241,9 @@ class Returning:
     judgement: JudgementConfig
     config: ReturnConfig
 
-    def find(self, view: Pyramid, near: Sequence[Nearby], history: History) -> SeenAgain | None:
+    def find(
+        self, view: Pyramid, near: Sequence[Nearby], history: History
+    ) -> ReusedKeyframe | None:
         """The first that a view surely shows, from where the map has the camera, and has not left.
 
         history  noise of the frames before: the next ones are judged by it too
@@ -251,7 +253,7 @@ class Returning:
             candidate = attempt(keyframe, view, T_place_camera, "returned", self.align)
             histories = history, place.history(history)
             if self._is_sure(candidate, T_place_camera, histories):
-                return SeenAgain(place, keyframe, candidate)
+                return ReusedKeyframe(place, keyframe, candidate)
         return None
 
     def _is_sure(

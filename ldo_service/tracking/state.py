@@ -12,7 +12,7 @@ from .motion import Motion
 from .motion_segmentation import Suspicion
 from .odometry_prior import Anchor
 from .pyramid import PyramidConfig
-from .submaps import Segments
+from .submaps import Submaps
 from .tracking_quality import History, Status
 
 
@@ -37,7 +37,7 @@ class State:
     origin: Origin = Origin.NEW
     trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     searches: int = 0  # frames that were looked for among the places
-    segments: Segments = field(default_factory=Segments)
+    segments: Submaps = field(default_factory=Submaps)
     T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
     suspicion: Suspicion | None = None
@@ -112,7 +112,7 @@ def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
         origin=Origin(values["origin"]),
         trusted=values["trusted"],
         searches=values["searches"],
-        segments=Segments.unpacked(values["segments"]),
+        segments=Submaps.unpacked(values["segments"]),
         T_odom_mapped=values["T_odom_mapped"],
         is_moving=None if is_moving is None else _mask(is_moving),
         suspicion=None if suspicion is None else Suspicion(_mask(suspicion[0]), suspicion[1]),

@@ -45,8 +45,8 @@ class SegmentConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Join:
-    """The camera as a keyframe of another segment sees it; `information` as in `Tracked`."""
+class SubmapMeasurement:
+    """The camera as a keyframe of another segment sees it; `information` as in `TrackingResult`."""
 
     keyframe: int
     segment: int  # of the keyframe
@@ -54,10 +54,12 @@ class Join:
     information: np.ndarray  # [6, 6]
 
     @staticmethod
-    def of(keyframe: Keyframe, alignment: Alignment) -> "Join":
+    def of(keyframe: Keyframe, alignment: Alignment) -> "SubmapMeasurement":
         """By the alignment of the camera's frame to that keyframe."""
         T_keyframe_camera = alignment.T_reference_camera
-        return Join(keyframe.id, keyframe.segment, T_keyframe_camera, alignment.information)
+        return SubmapMeasurement(
+            keyframe.id, keyframe.segment, T_keyframe_camera, alignment.information
+        )
 
     def measures(self, keyframe: int) -> RelativePose:
         """The pose of the keyframe that the camera's frame was made."""
@@ -97,7 +99,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Segments:
+class Submaps:
     """`roots[s]` is the oldest segment that s is joined to, itself where there is none."""
 
     roots: tuple[int, ...] = ()
@@ -106,10 +108,10 @@ class Segments:
     last: Look | None = None  # the find that is to be confirmed
     missed: int = 0  # looks in a row since it that found nothing
 
-    def begun(self) -> "Segments":
-        return Segments((*self.roots, len(self.roots)))
+    def begun(self) -> "Submaps":
+        return Submaps((*self.roots, len(self.roots)))
 
-    def after(self, is_lost: bool, stamp_ns: int) -> "Segments":
+    def after(self, is_lost: bool, stamp_ns: int) -> "Submaps":
         """One frame later; a camera that starts again may count time from an earlier point."""
         known = self.lost_since_ns
         since_ns = stamp_ns if known is None else min(known, stamp_ns)
@@ -117,18 +119,18 @@ class Segments:
             self, lost_since_ns=since_ns if is_lost else None, since_look=self.since_look + 1
         )
 
-    def may_begin(self, stamp_ns: int, config: SegmentConfig) -> bool:
+    def should_start(self, stamp_ns: int, config: SegmentConfig) -> bool:
         """Whether a frame of this stamp is LOST, and those before it were for long enough."""
         if self.lost_since_ns is None or config.begin_after_s == 0:
             return False
         return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
-    def is_time_to_look(self, config: SegmentConfig) -> bool:
+    def is_search_due(self, config: SegmentConfig) -> bool:
         """Whether any segments are apart, and the last look was long enough ago."""
         wait = config.look_every if self.last is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.since_look >= wait
 
-    def are_joined(self, segment: int, other: int) -> bool:
+    def are_merged(self, segment: int, other: int) -> bool:
         return self.roots[segment] == self.roots[other]
 
     def is_confirmed_by(self, look: Look, config: SegmentConfig) -> bool:
@@ -136,7 +138,7 @@ class Segments:
         last = self.last
         return last is not None and last.agrees(look, config) and last.is_apart_from(look, config)
 
-    def looked(self, found: Look | None, config: SegmentConfig) -> "Segments":
+    def looked(self, found: Look | None, config: SegmentConfig) -> "Submaps":
         """The oldest find that nothing speaks against is kept."""
         if found is None:
             is_kept = self.missed < config.misses
@@ -146,7 +148,7 @@ class Segments:
         is_same = self.last is not None and self.last.agrees(found, config)
         return replace(self, since_look=0, last=self.last if is_same else found, missed=0)
 
-    def joined(self, segment: int, other: int) -> "Segments":
+    def joined(self, segment: int, other: int) -> "Submaps":
         older, younger = sorted((self.roots[segment], self.roots[other]))
         roots = tuple(older if root == younger else root for root in self.roots)
         return replace(self, roots=roots, last=None)
@@ -157,6 +159,6 @@ class Segments:
         return asdict(self)
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Segments":
+    def unpacked(kept: dict[str, Any]) -> "Submaps":
         last = None if kept["last"] is None else Look(**kept["last"])
-        return Segments(**{**kept, "roots": tuple(kept["roots"]), "last": last})
+        return Submaps(**{**kept, "roots": tuple(kept["roots"]), "last": last})

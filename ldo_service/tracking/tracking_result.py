@@ -6,7 +6,7 @@ import numpy as np
 
 from .alignment import Alignment
 from .keyframes import Keyframe
-from .submaps import Join
+from .submaps import SubmapMeasurement
 from .tracking_quality import Status
 
 
@@ -35,7 +35,9 @@ class Tracked:
     is_moving: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped
     segment: int = 0  # whose odometry frame T_odom_camera leads to
     may_begin: bool = False  # LOST for so long that a new segment is better than none
-    join: Join | None = None  # where it is in another segment; counts once it is a keyframe
+    join: SubmapMeasurement | None = (
+        None  # where it is in another segment; counts once it is a keyframe
+    )
 
 
 def report(

@@ -3,7 +3,7 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.tracking.submaps import Look, SegmentConfig, Segments
+from ldo_service.tracking.submaps import Look, SegmentConfig, Submaps
 
 PERIOD_NS = 33_333_333
 CONFIG = SegmentConfig(begin_after_s=0.1, look_every=4, confirm_after=2)
@@ -20,14 +20,14 @@ def look(
     return Look(here, there, T_there_here, turned(angle_rad), median_depth_m=2.0)
 
 
-def begun(count: int) -> Segments:
-    segments = Segments()
+def begun(count: int) -> Submaps:
+    segments = Submaps()
     for _ in range(count):
         segments = segments.begun()
     return segments
 
 
-def after(segments: Segments, frames: int) -> Segments:
+def after(segments: Submaps, frames: int) -> Submaps:
     for k in range(frames):
         segments = segments.after(is_lost=False, stamp_ns=k * PERIOD_NS)
     return segments
@@ -38,7 +38,7 @@ def begins(is_lost: list[bool], stamps_ns: list[int], config: SegmentConfig) -> 
     segments, may_begin = begun(1), []
     for lost, stamp_ns in zip(is_lost, stamps_ns, strict=True):
         segments = segments.after(lost, stamp_ns)
-        may_begin.append(segments.may_begin(stamp_ns, config))
+        may_begin.append(segments.should_start(stamp_ns, config))
     return may_begin
 
 
@@ -66,15 +66,15 @@ def test_a_camera_that_starts_again_while_lost_is_waited_for_by_its_new_clock() 
 
 
 def test_nobody_looks_for_other_segments_where_there_is_none_apart() -> None:
-    assert not after(begun(1), 99).is_time_to_look(CONFIG)
-    assert after(begun(2), 4).is_time_to_look(CONFIG)
-    assert not after(begun(2).joined(1, 0), 99).is_time_to_look(CONFIG)
+    assert not after(begun(1), 99).is_search_due(CONFIG)
+    assert after(begun(2), 4).is_search_due(CONFIG)
+    assert not after(begun(2).joined(1, 0), 99).is_search_due(CONFIG)
 
 
 def test_a_find_is_looked_at_again_sooner() -> None:
     found = begun(2).looked(look(), CONFIG)
-    assert after(found, 2).is_time_to_look(CONFIG)
-    assert not after(begun(2).looked(None, CONFIG), 2).is_time_to_look(CONFIG)
+    assert after(found, 2).is_search_due(CONFIG)
+    assert not after(begun(2).looked(None, CONFIG), 2).is_search_due(CONFIG)
 
 
 def test_two_finds_confirm_each_other_when_they_say_the_same_of_different_views() -> None:
@@ -105,15 +105,15 @@ def test_a_find_is_forgotten_after_looks_that_find_nothing() -> None:
 def test_joined_segments_share_the_oldest_as_their_root() -> None:
     segments = begun(4).joined(3, 2).joined(2, 1)
     assert segments.roots == (0, 1, 1, 1)
-    assert segments.are_joined(3, 1)
-    assert not segments.are_joined(3, 0)
+    assert segments.are_merged(3, 1)
+    assert not segments.are_merged(3, 0)
 
 
 @pytest.mark.parametrize(
-    "segments", [Segments(), begun(3).looked(look(), CONFIG), begun(2).joined(0, 1)]
+    "segments", [Submaps(), begun(3).looked(look(), CONFIG), begun(2).joined(0, 1)]
 )
-def test_segments_survive_packing(segments: Segments) -> None:
-    again = Segments.unpacked(segments.packed)
+def test_segments_survive_packing(segments: Submaps) -> None:
+    again = Submaps.unpacked(segments.packed)
     assert again.roots == segments.roots
     assert (again.last is None) == (segments.last is None)
     if again.last is not None:
