@@ -9,7 +9,6 @@ from typing import Protocol
 
 from ldo_service.actors.detector import Detector, DetectorConfig
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
-from ldo_service.actors.localiser import LocalisingTracker
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.actors.optimizer import Optimizer, OptimizerConfig
@@ -63,7 +62,7 @@ GRAPH: tuple[Box, ...] = (
     _box(
         Tracker,
         "finds the camera's pose",
-        lambda config: (LocalisingTracker if config.tracker.localise else Tracker)(config.tracker),
+        lambda config: Tracker(config.tracker),
     ),
     _box(
         Detector,

@@ -4,34 +4,32 @@ in   frame/rgbd         FrameRgbd     Latest(1)   a late frame is worth less tha
 in   graph/correction   Correction    Latest(1)   a versioned absolute state: the newest says it all
 in   odometry/prior     OdometryPrior Latest(64)  0.3 s at 200 Hz, while a frame is tracked; older
                                                   poses are worth less, and no robot waits for us
-in   detection/boxes    DetectionBoxes Latest(1)  who may walk away is not tracked against
+in   detection/boxes    DetectionBoxes Latest(1)  dynamic objects are not tracked against
 out  pose/tracked       TrackedPose
 out  keyframe/new       Keyframe      made only when every consumer has room: never waited for
+
+The actor converts messages, and keeps the ports, the prior and the counters. What becomes of a
+frame is decided in one call: `Odometry.process`. When `tracker.localise` names a finished run, a
+`Localizer` stands in place of the odometry. It makes no keyframe, so the mapper and the optimizer
+are idle and the map stays as it is; subscribers of poses see no difference.
 """
 
 import logging
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ldo_service.conversions.frames import camera_message, mask_message, rgbd_of
-from ldo_service.conversions.poses import (
-    keyframe_poses_of,
-    matrix6_message,
-    measured_message,
-    pose_message,
-    transform,
-)
+from ldo_service.conversions.frames import keyframe_message, rgbd_of, tracked_pose_message
+from ldo_service.conversions.poses import map_correction_of, transform
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import (
-    Array,
     Correction,
     Detection,
     DetectionBoxes,
@@ -49,23 +47,22 @@ from ldo_service.schemas.topics import (
     ODOMETRY_PRIOR,
     POSE_TRACKED,
 )
+from ldo_service.tracking.keyframe_database import places_of
+from ldo_service.tracking.localizer import Localizer
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
-from ldo_service.tracking.odometry_prior import Prior, Reading, Verdict
-from ldo_service.tracking.relocalization import ReusedKeyframe
-from ldo_service.tracking.tracking_quality import Status
-from ldo_service.tracking.tracking_result import Tracked
+from ldo_service.tracking.odometry_prior import Prior, Verdict
+from ldo_service.tracking.tracking_result import TrackingResult
 
 log = logging.getLogger(__name__)
 
-UNIT_WITHIN = 1e-3  # of a quaternion's norm: four digits, as people copy them, and then normalised
-MANY_MISSED = 30  # frames in a row that no prior reaches: a second, no hiccup any more
-VIEWS = "keyframe", "supporting"  # of the odometry's state, each a part of its own
-RECENT_KEYFRAMES = 32  # four windows of keyframe/new: the optimizer cannot be further behind
+UNIT_WITHIN = 1e-3  # Of a quaternion's norm: four digits, as people copy them; then normalized.
+MISSED_PRIOR_WARNING_COUNT = 30  # Frames in a row without a prior: a second is no hiccup.
+OWN_PARTS = "keyframe", "supporting"  # Of the odometry's state, each a part of its own.
 
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Where the camera sits on the robot: T_base_camera.
+    """Pose of the camera on the robot: T_base_camera.
 
     `camera` has the optical axes of this project: x right, y down, z forward. For a base whose x
     is forward and z up (REP-103) a camera that looks ahead has quaternion 0.5 -0.5 0.5 -0.5.
@@ -85,7 +82,7 @@ class Mounting:
             )
 
     def matrix(self) -> np.ndarray:
-        """T_base_camera [4, 4]."""
+        """Return T_base_camera [4, 4]."""
         return se3.from_quaternion(np.array(self.translation_m), np.array(self.quaternion_wxyz))
 
 
@@ -102,7 +99,7 @@ class TrackerConfig:
 
 
 class Tracker(Actor):
-    """Odometry against the last keyframe; the map's frame hangs on the optimizer's poses."""
+    """Odometry against the reference keyframe, placed in the map by the optimizer's poses."""
 
     name = "tracker"
     inputs = (
@@ -118,17 +115,16 @@ class Tracker(Actor):
         super().__init__()
         self.config = config or TrackerConfig()
         self._T_base_camera = self.config.T_base_camera.matrix()
-        self._odometry = Odometry(self.config.odometry)
-        self._poses = KeyframePoses()  # of the last keyframes and the one tracked against
-        self._correction = b""  # the last, as a body: places all keyframes, old ones too
-        self._joined: dict[int, int] = {}  # segments placed in an older one, as it says
-        self._T_map: dict[int, np.ndarray] | None = None  # what it says, once that is asked for
-        self._made = self._without_room = self._returns = 0
+        self._odometry = _make_odometry(self.config, self._T_base_camera)
+        self._correction = b""  # The last one, encoded.
         self._prior = Prior()
-        self._verdicts: Counter[Verdict] = Counter()  # on poses of the prior
-        self._with_prior = self._without_prior = 0  # frames, since there is one
-        self._missed = 0  # frames in a row that it does not reach
-        self._parts: dict[str, Any] | None = None  # of the state; what a prior does not change
+        self._made = self._without_room = self._reused = 0  # Keyframes.
+        self._verdicts: Counter[Verdict] = Counter()  # On poses of the prior.
+        self._with_prior = self._without_prior = 0  # Frames, since the prior began.
+        self._missed = 0  # Frames in a row that the prior does not reach.
+        self._parts: dict[str, Any] | None = (
+            None  # Of the state, before the last poses of the prior.
+        )
 
     def handle(
         self, message: FrameRgbd | Correction | OdometryPrior | DetectionBoxes
@@ -140,29 +136,40 @@ class Tracker(Actor):
         if isinstance(message, Correction):
             self._correct(message)
         elif isinstance(message, DetectionBoxes):
-            self._odometry.leave_out(message.keyframe, [_box(d) for d in message.detections])
+            boxes = [_box(detection) for detection in message.detections]
+            self._odometry.mask_dynamic_objects(message.keyframe, boxes)
         else:
             yield from self._track(rgbd_of(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
-        tracked = self._odometry.track(frame, self._prior_of(frame))
-        if tracked.method == "relocalised":
-            self._recall(tracked)
-        if tracked.may_begin and self._may_map(frame):
-            tracked = self._odometry.begin_segment(frame)
-        seen = self._seen_again(frame, tracked)
-        if seen is not None and self._odometry.is_tied:
-            tracked, seen = self._return_to(seen, tracked), None
-        is_wanted = tracked.wants_mapping and tracked.status is Status.OK
-        is_mapped = is_wanted and self._may_map(frame)
-        keyframe = self._make_keyframe(frame, tracked, seen) if is_mapped else None
-        if keyframe is not None:
-            yield keyframe
-        elif tracked.method == "first":
-            return  # nobody is there to map it yet: begin with a later frame
-        yield self._tracked_pose(frame, tracked, None if keyframe is None else keyframe.keyframe)
+        """Track a frame, and publish its pose and the keyframe that was made of it."""
+        hold_out = self.config.hold_out
+        is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
+        may_map = not is_held_out and self.has_room(KEYFRAME_NEW)
+        result = self._odometry.process(frame, self._prior, may_map=may_map)
+        self._count(frame, result, is_held_out)
+        if result.awaits_mapping:
+            return  # Odometry begins with a later frame, which consumers have room for.
+        if result.keyframe is not None:
+            yield keyframe_message(frame, result, result.keyframe)
+        yield tracked_pose_message(frame, result, self._T_base_camera)
 
-    # --- the other odometry -----------------------------------------------------------------------
+    def _count(self, frame: RgbdFrame, result: TrackingResult, is_held_out: bool) -> None:
+        self._made += result.keyframe is not None
+        self._reused += result.reused_keyframe is not None
+        self._without_room += result.denied_keyframe is not None and not is_held_out
+        if not self._prior.poses:
+            return
+        self._with_prior += result.has_prior
+        self._without_prior += not result.has_prior
+        self._missed = 0 if result.has_prior else self._missed + 1
+        if self._missed == MISSED_PRIOR_WARNING_COUNT:
+            log.warning(
+                "odometry/prior: %d frames were tracked without it, and its newest pose is %.3f s "
+                "older than the last of them: does it still come, and do both stamp by one clock?",
+                self._missed, 1e-9 * (frame.stamp_ns - self._prior.poses[-1].stamp_ns),
+            )  # fmt: skip
+
     def _take_prior(self, message: OdometryPrior) -> None:
         T_odom_base = transform(message.T_odom_base)
         config = self.config.odometry.prior
@@ -174,192 +181,41 @@ class Tracker(Actor):
                 message.stamp_ns, verdict,
             )  # fmt: skip
 
-    def _prior_of(self, frame: RgbdFrame) -> Reading | None:
-        """Where the other odometry has a frame, if there is one."""
-        if not self._prior.poses:
-            return None
-        reading = self._prior.at(frame.stamp_ns, self._T_base_camera, self.config.odometry.prior)
-        self._with_prior += reading is not None
-        self._without_prior += reading is None
-        self._missed = self._missed + 1 if reading is None else 0
-        if self._missed == MANY_MISSED:
-            log.warning(
-                "odometry/prior: %d frames were tracked without it, and its newest pose is %.3f s "
-                "older than the last of them: does it still come, and do both stamp by one clock?",
-                MANY_MISSED, 1e-9 * (frame.stamp_ns - self._prior.poses[-1].stamp_ns),
-            )  # fmt: skip
-        return reading
-
-    # --- keyframes --------------------------------------------------------------------------------
-    def _may_map(self, frame: RgbdFrame) -> bool:
-        """Whether the frame may become a keyframe: it is not held out, and everyone has room."""
-        hold_out = self.config.hold_out
-        if hold_out and frame.index % hold_out == hold_out - 1:
-            return False
-        has_room = self.has_room(KEYFRAME_NEW)
-        self._without_room += not has_room
-        return has_room
-
-    def _make_keyframe(
-        self, frame: RgbdFrame, tracked: Tracked, seen: ReusedKeyframe | None
-    ) -> Keyframe:
-        """A new reference for tracking, or one that supports the map between two of these.
-
-        seen  a known keyframe that the camera may go back to, once the graph knows of it
-        """
-        window: list[RelativePose] = []
-        if seen is not None:
-            keyframe = self._odometry.make_keyframe(frame, tracked, is_tied=True)
-            others = self._odometry.window(tracked)
-            window = [seen.measures(keyframe), *(m for m in others if m.a != seen.place.id)]
-        elif tracked.wants_keyframe:
-            keyframe = self._odometry.make_keyframe(frame, tracked)
-            window = self._odometry.window(tracked)
-        else:
-            keyframe = self._odometry.make_supporting(frame, tracked)
-        self._poses.chain(
-            keyframe,
-            tracked.keyframe,
-            tracked.T_keyframe_camera,
-            tracked.T_odom_camera,
-            tracked.segment,
-        )
-        self._poses.keep_only(self._needed(keyframe, tracked.keyframe))
-        self._made += 1
-        return Keyframe(
-            stamp_ns=frame.stamp_ns,
-            keyframe=keyframe,
-            frame=frame.index,
-            camera=camera_message(frame.camera),
-            color=Array.of(frame.color),
-            depth_m=Array.of(frame.depth_m),
-            reference=tracked.keyframe,
-            T_reference_keyframe=pose_message(tracked.T_keyframe_camera),
-            information=matrix6_message(tracked.information),
-            T_odom_keyframe=pose_message(tracked.T_odom_camera),
-            overlap=tracked.overlap,
-            window=tuple(map(measured_message, window)),
-            is_moving=mask_message(tracked.is_moving, frame.camera),
-            segment=tracked.segment,
-            joins=()
-            if tracked.join is None
-            else (measured_message(tracked.join.measures(keyframe)),),
-        )
-
-    def _seen_again(self, frame: RgbdFrame, tracked: Tracked) -> ReusedKeyframe | None:
-        """A keyframe that the map has already, where the frame would be mapped otherwise."""
-        is_wanted = tracked.wants_mapping and tracked.join is None and self._odometry.may_return
-        if not is_wanted or tracked.keyframe is None or tracked.keyframe not in self._poses:
-            return None
-        T_map_camera = self._poses[tracked.keyframe] @ tracked.T_keyframe_camera
-        return self._odometry.seen_again(frame, tracked, self._T_map_keyframe(), T_map_camera)
-
-    def _return_to(self, seen: ReusedKeyframe, tracked: Tracked) -> Tracked:
-        self._returns += 1
-        returned = self._odometry.return_to(seen, tracked)
-        self._place(seen.place.id, returned, self._T_map_keyframe()[seen.place.id])
-        return returned
-
-    def _needed(self, newest: int, reference: int | None) -> Iterator[int]:
-        """Those tracked against, before and from now on, and those that the optimizer may not have
-        placed yet."""
-        tracked_against = (reference, self._odometry.keyframe)
-        return (k for k in self._poses if k > newest - RECENT_KEYFRAMES or k in tracked_against)
-
-    # --- poses ------------------------------------------------------------------------------------
     def _correct(self, message: Correction) -> None:
-        if message.graph_version > self._poses.version:
-            self._correction, self._joined = encode(message), dict(message.joined)
-            self._T_map = None
-        T_map = keyframe_poses_of(message, only=self._poses)
-        self._poses.correct(message.graph_version, T_map)
-
-    def _recall(self, tracked: Tracked) -> None:
-        """Know where in the map the keyframe is that a lost frame was found by."""
-        keyframe = tracked.keyframe
-        if keyframe is None or keyframe in self._poses:
-            return
-        self._place(keyframe, tracked, self._T_map_keyframe().get(keyframe))
-
-    def _place(self, keyframe: int, tracked: Tracked, T_map_keyframe: np.ndarray | None) -> None:
-        """Know where a keyframe is that a frame was tracked against; None: by odometry."""
-        T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_keyframe_camera)
-        newest = max(self._poses, default=keyframe)
-        self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe, tracked.segment)
-        if T_map_keyframe is not None:
-            self._poses.place(keyframe, T_map_keyframe)
-        self._poses.keep_only(self._needed(newest, keyframe))
-
-    def _T_map_keyframe(self) -> dict[int, np.ndarray]:
-        """[4, 4] by id, of all keyframes that the last correction places."""
-        if self._T_map is None:
-            correction = decode(self._correction, Correction) if self._correction else None
-            self._T_map = {} if correction is None else keyframe_poses_of(correction)
-        return self._T_map
-
-    def _tracked_pose(
-        self, frame: RgbdFrame, tracked: Tracked, keyframe: int | None
-    ) -> TrackedPose:
-        """The first keyframe refers to itself; before it nothing is known."""
-        reference = keyframe if tracked.keyframe is None else tracked.keyframe
-        T_map_odom = np.eye(4) if reference is None else self._poses.T_map_odom(reference)
-        segment = self._placed_in(tracked.segment)
-        return self._pose_message(frame, tracked, T_map_odom, reference, keyframe, segment)
-
-    def _pose_message(
-        self,
-        frame: RgbdFrame,
-        tracked: Tracked,
-        T_map_odom: np.ndarray,
-        reference: int | None,
-        keyframe: int | None = None,
-        segment: int = 0,
-    ) -> TrackedPose:
-        return TrackedPose(
-            stamp_ns=frame.stamp_ns,
-            frame=frame.index,
-            status=tracked.status.value,
-            T_odom_camera=pose_message(tracked.T_odom_camera),
-            T_map_odom=pose_message(se3.orthonormalised(T_map_odom)),
-            graph_version=self._poses.version,
-            reference=reference,
-            T_reference_camera=pose_message(tracked.T_keyframe_camera),
-            keyframe=keyframe,
-            covariance=matrix6_message(np.linalg.pinv(tracked.information, hermitian=True)),
-            inlier_fraction=tracked.inlier_fraction,
-            residual_color=tracked.intensity_sigma,
-            residual_depth=tracked.depth_noise_scale,
-            overlap=tracked.overlap,
-            iterations=tracked.iterations,
-            method=tracked.method,
-            disagreement=tracked.disagreement_rad,
-            T_base_camera=pose_message(self._T_base_camera),
-            segment=segment,
-        )
-
-    def _placed_in(self, segment: int) -> int:
-        """The oldest segment that it is joined to, as the optimizer knows."""
-        return self._joined.get(segment, segment)
+        body = encode(message)
+        if self._odometry.correct(map_correction_of(decode(body, Correction))):
+            self._correction = body
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """A part for each place, written once, and few for what changes."""
+        """Return a part for each place, which is written once, and few parts for what changes."""
         if self._parts is None:
             self._parts = self._tracked_parts()
         return {**self._parts, "prior": self._prior.packed}
 
     def _tracked_parts(self) -> dict[str, Any]:
-        """All that does not change with each pose of a prior."""
-        state = self._odometry.state()
+        """Return all parts; poses of the prior change that of the prior alone."""
+        state = self._odometry.snapshot()
         places = {place["id"]: place for place in state.pop("places")}
-        state["order"] = [*places]  # as they were come by last
-        views = {name: state.pop(name) for name in VIEWS}
-        localise = self.config.localise
-        now = {"odometry": state, "poses": self._poses.snapshot(), "localise": localise}
-        parts = {f"place_{number}": place for number, place in places.items()}
-        return {**parts, **views, "correction": self._correction, "now": now}
+        state["order"] = [*places]  # Of the places: the last one used is the last.
+        own = {name: state.pop(name) for name in OWN_PARTS}
+        fix = {"fix": state.pop("fix")} if "fix" in state else {}
+        poses, localise = state.pop("poses"), self.config.localise
+        return {
+            **{f"place_{number}": place for number, place in places.items()},
+            **own,
+            "correction": self._correction,
+            "now": {"odometry": state, "poses": poses, "localise": localise},
+            "prior": self._prior.packed,
+            **fix,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        """Continue from a snapshot.
+
+        Raises:
+            ConfigError: The snapshot is of another `tracker.localise`.
+        """
         now = state["now"]
         if now["localise"] != self.config.localise:
             raise ConfigError(
@@ -367,13 +223,14 @@ class Tracker(Actor):
                 f"{self.config.localise or '(none)'}. Choose another folder with --state."
             )
         places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
-        views = {name: state[name] for name in VIEWS}
-        self._odometry.restore({**now["odometry"], **views, "places": places})
+        own = {name: state[name] for name in (*OWN_PARTS, "fix") if name in state}
+        self._correction = state["correction"]
+        correction = decode(self._correction, Correction) if self._correction else None
+        self._odometry.restore(
+            {**now["odometry"], **own, "places": places, "poses": now["poses"]},
+            None if correction is None else map_correction_of(correction),
+        )
         self._prior, self._parts = Prior.unpacked(state["prior"]), None
-        self._poses.restore(now["poses"])
-        self._correction, self._T_map = state["correction"], None
-        if self._correction:
-            self._joined = dict(decode(self._correction, Correction).joined)
 
     def facts(self) -> dict[str, float]:
         refused = self._verdicts[Verdict.LATE] + self._verdicts[Verdict.BROKEN]
@@ -381,15 +238,26 @@ class Tracker(Actor):
         return {
             "keyframes": self._made,
             "keyframes_without_room": self._without_room,
-            "keyframes_returned_to": self._returns,
+            "keyframes_returned_to": self._reused,
             "frames_with_prior": self._with_prior,
-            "frames_without_prior": self._without_prior,  # since the first pose of it
+            "frames_without_prior": self._without_prior,  # Since the first pose of the prior.
             "prior_refused": refused,
             "prior_restarts": restarts,
         }
 
 
+def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry:
+    """Return odometry that maps, or one in the map of a finished run.
+
+    Raises:
+        DataError: The run left no keyframe database.
+    """
+    if not config.localise:
+        return Odometry(config.odometry, T_base_camera)
+    return Localizer(places_of(Path(config.localise)), config.odometry, T_base_camera)
+
+
 def _box(detection: Detection) -> Box:
-    """From pixel centres at integers to edges of pixels."""
+    """Convert from pixel centers at integers to the edges of pixels."""
     x0, y0, x1, y1 = (edge + 0.5 for edge in detection.box_px)
     return Box(detection.label, x0, y0, x1, y1)

@@ -1,4 +1,4 @@
-"""Conversions between messages and numerics: cameras, frames, keyframes and masks."""
+"""Conversions between messages and numerics: cameras, frames, tracked frames and masks."""
 
 import cv2
 import numpy as np
@@ -12,14 +12,16 @@ from ldo_service.schemas import (
     Image,
     Keyframe,
     LabelRequest,
+    TrackedPose,
 )
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
 from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
 from ldo_service.tracking.motion_segmentation import resized
 from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of
+from ldo_service.tracking.tracking_result import NewKeyframe, TrackingResult
 
-from .poses import transform
+from .poses import matrix6_message, measured_message, pose_message, transform
 
 
 def camera_message(camera: Camera) -> CameraModel:
@@ -58,6 +60,56 @@ def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
         camera=camera_of(message.camera),
         stamp_ns=message.stamp_ns,
         index=message.frame,
+    )
+
+
+def tracked_pose_message(
+    frame: RgbdFrame, result: TrackingResult, T_base_camera: np.ndarray
+) -> TrackedPose:
+    """Return the message of a tracked frame, with the camera on the robot [4, 4]."""
+    keyframe = result.keyframe
+    return TrackedPose(
+        stamp_ns=frame.stamp_ns,
+        frame=frame.index,
+        status=result.status.value,
+        T_odom_camera=pose_message(result.T_odom_camera),
+        T_map_odom=pose_message(result.T_map_odom),
+        graph_version=result.graph_version,
+        reference=result.reference,
+        T_reference_camera=pose_message(result.T_reference_camera),
+        keyframe=None if keyframe is None else keyframe.id,
+        covariance=matrix6_message(np.linalg.pinv(result.information, hermitian=True)),
+        inlier_fraction=result.inlier_fraction,
+        residual_color=result.intensity_sigma,
+        residual_depth=result.depth_noise_scale,
+        overlap=result.overlap,
+        iterations=result.iterations,
+        method=result.method,
+        disagreement=result.hypothesis_spread_rad,
+        T_base_camera=pose_message(T_base_camera),
+        segment=result.submap,
+    )
+
+
+def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyframe) -> Keyframe:
+    """Return the message of the keyframe that was made of a tracked frame."""
+    merge = keyframe.submap_measurement
+    return Keyframe(
+        stamp_ns=frame.stamp_ns,
+        keyframe=keyframe.id,
+        frame=frame.index,
+        camera=camera_message(frame.camera),
+        color=Array.of(frame.color),
+        depth_m=Array.of(frame.depth_m),
+        reference=None if result.reference == keyframe.id else result.reference,
+        T_reference_keyframe=pose_message(result.T_reference_camera),
+        information=matrix6_message(result.information),
+        T_odom_keyframe=pose_message(result.T_odom_camera),
+        overlap=result.overlap,
+        window=tuple(map(measured_message, keyframe.window)),
+        is_moving=mask_message(result.dynamic_mask, frame.camera),
+        segment=keyframe.submap,
+        joins=() if merge is None else (measured_message(merge),),
     )
 
 

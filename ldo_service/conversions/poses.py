@@ -1,6 +1,7 @@
 """Conversions between messages and numerics: poses, measurements and corrections."""
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from ldo_service.schemas import (
     MeasuredPose,
     Pose,
 )
+from ldo_service.tracking.map_frame import MapCorrection
 
 
 def pose_message(T: np.ndarray) -> Pose:
@@ -101,3 +103,12 @@ def keyframe_poses_of(
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, :3], T[:, :3, 3] = se3.rotation(rows[:, 3:]), rows[:, :3]
     return dict(zip(keyframes.tolist(), T, strict=True))
+
+
+def map_correction_of(correction: Correction) -> MapCorrection:
+    """Return a correction as tracking follows it; its poses are converted when asked for."""
+    return MapCorrection(
+        version=correction.graph_version,
+        roots=dict(correction.joined),
+        read_poses=partial(keyframe_poses_of, correction),
+    )

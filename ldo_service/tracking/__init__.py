@@ -5,7 +5,7 @@ from .odometry import Odometry, OdometryConfig
 from .odometry_prior import Prior, PriorConfig, Reading
 from .pyramid import Pyramid, PyramidConfig, Reference, build_reference, pyramid_of
 from .tracking_quality import Status
-from .tracking_result import Tracked
+from .tracking_result import TrackingResult
 
 __all__ = [
     "AlignConfig",
@@ -19,7 +19,7 @@ __all__ = [
     "Reading",
     "Reference",
     "Status",
-    "Tracked",
+    "TrackingResult",
     "align",
     "build_reference",
     "pyramid_of",

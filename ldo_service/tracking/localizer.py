@@ -1,10 +1,11 @@
-"""The camera in a finished map that stays as it is. Conventions: `ldo_service.geometry`.
+"""Localization in a finished map, which stays as it is. Conventions: `ldo_service.geometry`.
 
-Odometry follows the camera as always, with keyframes of its own; now and then the view is looked
-for among the places of the map, which says where the odometry frame is in it: T_map_odom. As in
-any localiser (REP-105), odometry is continuous and T_map_odom takes the jumps.
+Odometry follows the camera with keyframes of its own. At intervals the view is searched for in the
+keyframe database of the map, which places the odometry frame in it: T_map_odom. Odometry is
+continuous and T_map_odom takes the jumps (REP-105).
 """
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,89 +13,136 @@ import numpy as np
 
 from ldo_service.geometry import RgbdFrame, se3
 
+from .frame_tracking import OdometryConfig
 from .keyframe_database import Places
+from .map_frame import MapCorrection
 from .odometry import Odometry
-from .odometry_prior import Reading
+from .odometry_prior import Prior
 from .submaps import Look, SegmentConfig
 from .tracking_quality import Status
-from .tracking_result import Tracked
+from .tracking_result import KeyframeKind, TrackedFrame, TrackingResult, make_tracking_result
 
-MAP = -1  # stands for the map where a segment's number stands otherwise
+MAP = -1  # Stands for the map in place of the number of a submap.
 
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """Where odometry is in the map, and the last look at it."""
+    """Odometry frame in the map, and the last match that speaks for it."""
 
-    segment: int = 0  # of the odometry
-    T_map_odom: np.ndarray | None = None  # [4, 4]; None: not known yet
+    segment: int = 0  # Submap of odometry.
+    T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found.
     last: Look | None = None
-    since_look: int = 0  # frames
+    since_look: int = 0  # Frames since the last search.
 
-    def is_time_to_look(self, config: SegmentConfig) -> bool:
-        """At every frame until the camera is found."""
+    def is_search_due(self, config: SegmentConfig) -> bool:
+        """Return whether to search in this frame: in every one until the camera is found."""
         return self.T_map_odom is None or self.since_look >= config.look_every
 
-    def after(self, tracked: Tracked) -> "Fix":
-        """One frame later; a new segment of odometry may be anywhere."""
-        if tracked.segment != self.segment:
-            return Fix(tracked.segment)
+    def after(self, tracked: TrackedFrame) -> "Fix":
+        """Return the fix one frame later; a new submap of odometry may be anywhere."""
+        if tracked.submap != self.segment:
+            return Fix(tracked.submap)
         return replace(self, since_look=self.since_look + 1)
 
     def looked(self, look: Look, config: SegmentConfig) -> "Fix":
-        """After a look that found something: believed when the last one said the same."""
+        """Return the fix after a match, which is accepted when the last one agrees with it."""
         is_confirmed = self.last is not None and self.last.agrees(look, config)
         T_map_odom = look.T_there_here if is_confirmed else self.T_map_odom
-        # a find that contradicts the last one is looked at again soon
+        # A match that contradicts the last one is followed by another search soon.
         since = 0 if is_confirmed else config.look_every - config.confirm_after
         return replace(self, T_map_odom=T_map_odom, last=look, since_look=since)
 
     @property
     def packed(self) -> dict[str, Any]:
-        """Arrays and plain values."""
+        """The fix in arrays and plain values."""
         return asdict(self)
 
     @staticmethod
     def unpacked(kept: dict[str, Any]) -> "Fix":
+        """Return the fix that `packed` was taken of."""
         last = None if kept["last"] is None else Look(**kept["last"])
         return Fix(**{**kept, "last": last})
 
 
-class Localiser:
-    """`places` are those of the map: their `T_odom_keyframe` is T_map_keyframe."""
+class Localizer(Odometry):
+    """Odometry whose map is a finished one: its keyframes are tracked against and never mapped."""
 
-    def __init__(self, odometry: Odometry, places: Places) -> None:
-        self._odometry, self._places = odometry, places
-        self.fix = Fix()
+    def __init__(
+        self,
+        places: Places,
+        config: OdometryConfig | None = None,
+        T_base_camera: np.ndarray | None = None,
+    ) -> None:
+        """Begin before the first frame.
 
-    def track(
-        self, frame: RgbdFrame, prior: Reading | None = None
-    ) -> tuple[Tracked, np.ndarray | None]:
-        """The frame in odometry, and T_map_odom [4, 4]; None until the camera is found."""
-        tracked = self._followed(frame, prior)
-        self.fix = self.fix.after(tracked)
-        config = self._odometry.config.segments
-        if tracked.status is Status.OK and self.fix.is_time_to_look(config):
-            self._look(frame, tracked)
-        return tracked, self.fix.T_map_odom
+        Args:
+            places: Keyframe database of the map; their T_odom_keyframe is T_map_keyframe.
+            config: See `Odometry`, as is T_base_camera.
+            T_base_camera: Camera on the robot, [4, 4].
+        """
+        super().__init__(config, T_base_camera)
+        self._places = places
+        self._fix = Fix()
 
-    def _followed(self, frame: RgbdFrame, prior: Reading | None) -> Tracked:
-        tracked = self._odometry.track(frame, prior)
-        if tracked.may_begin:
-            tracked = self._odometry.begin_segment(frame)
-        if tracked.wants_keyframe:
-            self._odometry.make_keyframe(frame, tracked)
-        return tracked
+    def process(
+        self,
+        frame: RgbdFrame,
+        prior: Prior | None = None,
+        *,
+        may_map: bool = True,  # noqa: ARG002
+    ) -> TrackingResult:
+        """Track a frame, and find it in the map.
 
-    def _look(self, frame: RgbdFrame, tracked: Tracked) -> None:
-        config = self._odometry.config.segments
-        found = self._odometry.recognised(frame, self._places)
+        Args:
+            frame: The frame.
+            prior: The last poses of another odometry.
+            may_map: Not used: nothing is mapped.
+
+        Returns:
+            The pose of the frame in odometry and in the map; LOST until the camera is found in
+            the map. It has no reference, for the keyframes of the odometry are not in the map.
+        """
+        # Odometry with its own keyframes.
+        reading = self._read(prior, frame)
+        tracked = self._frames.track(frame, reading)
+        if tracked.should_start_submap:
+            tracked = self._frames.start_submap(frame)
+        if tracked.needed_keyframe in (KeyframeKind.FIRST, KeyframeKind.REFERENCE):
+            self._add_reference(frame, tracked)
+        # Odometry in the map.
+        self._fix = self._fix.after(tracked)
+        if tracked.status is Status.OK and self._fix.is_search_due(self.config.segments):
+            self._search(frame, tracked)
+        T_map_odom = self._fix.T_map_odom
+        if T_map_odom is None:
+            tracked, T_map_odom = replace(tracked, status=Status.LOST), np.eye(4)
+        return make_tracking_result(
+            tracked,
+            T_map_odom,
+            self._map.version,
+            submap=0,
+            reference=None,
+            has_prior=reading is not None,
+        )
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that the next frames depend on; see `Odometry.snapshot`."""
+        return {**super().snapshot(), "fix": self._fix.packed}
+
+    def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:
+        """Continue from a snapshot; see `Odometry.restore`."""
+        super().restore(state, correction)
+        self._fix = Fix.unpacked(state["fix"])
+
+    def _search(self, frame: RgbdFrame, tracked: TrackedFrame) -> None:
+        """Search the frame just tracked in the map, and update the fix."""
+        found = self._frames.relocalize_in(frame, self._places)
         if found is None:
-            self.fix = replace(self.fix, since_look=0)
+            self._fix = replace(self._fix, since_look=0)
             return
         keyframe, alignment = found
         T_map_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_map_odom = se3.orthonormalised(T_map_camera @ se3.inverse(tracked.T_odom_camera))
         median_depth_m = keyframe.reference.median_depth_m
-        look = Look(tracked.segment, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
-        self.fix = self.fix.looked(look, config)
+        look = Look(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
+        self._fix = self._fix.looked(look, self.config.segments)

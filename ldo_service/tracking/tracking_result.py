@@ -1,8 +1,12 @@
-"""What the odometry says of a frame. Conventions: `ldo_service.geometry`."""
+"""Results of tracking one frame. Conventions: `ldo_service.geometry`."""
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
+
+from ldo_service.geometry import se3
+from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import Alignment
 from .keyframes import Keyframe
@@ -10,64 +14,178 @@ from .submaps import SubmapMeasurement
 from .tracking_quality import Status
 
 
-@dataclass(frozen=True, slots=True)
-class Tracked:
-    """Where a frame was taken. While LOST the pose is the last trusted one.
+class KeyframeKind(StrEnum):
+    """Role of a keyframe in tracking and mapping."""
 
-    information [6, 6] is that of T_keyframe_camera * exp(xi), rotation rad then translation m;
-    zero while LOST.
-    """
-
-    T_odom_camera: np.ndarray  # [4, 4]
-    T_keyframe_camera: np.ndarray  # [4, 4]
-    keyframe: int | None  # id of the keyframe it was aligned to; None before the first
-    status: Status
-    method: str  # the guess that won: "first", "direct", "prior", "features", "shape", ...
-    wants_keyframe: bool
-    wants_mapping: bool = False  # as a supporting keyframe: mapped, and not tracked against
-    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
-    inlier_fraction: float = 0.0  # smaller of the photometric and the geometric
-    intensity_sigma: float = 0.0  # photometric residual, grey levels
-    depth_noise_scale: float = 0.0  # geometric residual, times the sensor model
-    overlap: float = 0.0  # visible fraction of the keyframe's surface
-    iterations: int = 0
-    disagreement_rad: float = 0.0  # between the guesses' outcomes, where several were tried
-    is_moving: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped
-    segment: int = 0  # whose odometry frame T_odom_camera leads to
-    may_begin: bool = False  # LOST for so long that a new segment is better than none
-    join: SubmapMeasurement | None = (
-        None  # where it is in another segment; counts once it is a keyframe
+    FIRST = "first"  # Starts a submap and is measured from no other keyframe.
+    REFERENCE = "reference"  # The next frames are aligned to it.
+    MAPPING = (
+        "mapping"  # It is mapped; the next frames are aligned to the same reference as before.
     )
 
 
-def report(
-    alignment: Alignment,
-    T_odom_camera: np.ndarray,
-    keyframe: Keyframe,
-    status: Status,
-    method: str,
+@dataclass(frozen=True, slots=True)
+class TrackedFrame:
+    """Pose of a frame against its reference keyframe, and what the pose calls for.
+
+    The pose is the last trusted one while the status is LOST. `information` is that of
+    T_reference_camera * exp(xi) with xi = (rotation rad, translation m), and zero while LOST.
+    """
+
+    status: Status
+    method: str  # The initial guess that won: "first", "direct", "prior", "features", "shape", ...
+    T_odom_camera: np.ndarray  # [4, 4]
+    T_reference_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
+    reference: int | None = None  # Keyframe that the frame was aligned to; None before the first.
+    submap: int = 0  # Submap whose odometry frame T_odom_camera leads to.
+    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))  # [6, 6]
+    overlap: float = 0.0  # Visible fraction of the reference's surface.
+    inlier_fraction: float = 0.0  # The smaller of the photometric and the geometric fraction.
+    intensity_sigma: float = 0.0  # Photometric residual, gray levels.
+    depth_noise_scale: float = 0.0  # Geometric residual, times the noise of the sensor model.
+    iterations: int = 0
+    hypothesis_spread_rad: float = 0.0  # Between the outcomes of all guesses; 0 for a single one.
+    dynamic_mask: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped.
+    needed_keyframe: KeyframeKind | None = None  # Set for OK frames only.
+    should_start_submap: bool = False  # LOST for so long that a new submap is better than none.
+    submap_measurement: SubmapMeasurement | None = None  # Counts once the frame is a keyframe.
+
+    @staticmethod
+    def of(
+        alignment: Alignment,
+        T_odom_camera: np.ndarray,
+        keyframe: Keyframe,
+        status: Status,
+        method: str,
+        *,
+        needed_keyframe: KeyframeKind | None = None,
+        hypothesis_spread_rad: float = 0.0,
+        dynamic_mask: np.ndarray | None = None,
+    ) -> "TrackedFrame":
+        """Return the result of an alignment to a keyframe.
+
+        Args:
+            alignment: The alignment of the frame to the keyframe.
+            T_odom_camera: Pose of the camera, [4, 4].
+            keyframe: The reference keyframe.
+            status: Tracking status of the frame.
+            method: The initial guess that the alignment started from.
+            needed_keyframe: The keyframe that the frame should become.
+            hypothesis_spread_rad: Spread of the outcomes of all initial guesses.
+            dynamic_mask: Moving pixels, [H, W] bool at working resolution.
+        """
+        return TrackedFrame(
+            status,
+            method,
+            T_odom_camera,
+            alignment.T_reference_camera,
+            keyframe.id,
+            keyframe.segment,
+            information=alignment.information,
+            overlap=alignment.overlap,
+            inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
+            intensity_sigma=alignment.intensity_sigma,
+            depth_noise_scale=alignment.depth_noise_scale,
+            iterations=alignment.iterations,
+            hypothesis_spread_rad=hypothesis_spread_rad,
+            dynamic_mask=dynamic_mask,
+            needed_keyframe=needed_keyframe,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NewKeyframe:
+    """Keyframe that was made of a frame."""
+
+    id: int
+    kind: KeyframeKind
+    submap: int  # Its own submap, whatever that was merged with.
+    window: tuple[RelativePose, ...] = ()  # From earlier keyframes other than the reference.
+    submap_measurement: RelativePose | None = None  # From a keyframe of another submap: a merge.
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingResult:
+    """Pose of a frame in odometry and in the map, and what became of the frame.
+
+    The pose is the last trusted one while the status is LOST. `information` is that of
+    T_reference_camera * exp(xi) with xi = (rotation rad, translation m), and zero while LOST.
+    """
+
+    # Pose.
+    status: Status
+    method: str  # The initial guess that won: "first", "direct", "prior", "features", "shape", ...
+    T_odom_camera: np.ndarray  # [4, 4]
+    T_map_odom: np.ndarray  # [4, 4]
+    graph_version: int  # Version of the pose graph that T_map_odom follows.
+    submap: int  # The oldest submap that the pose graph has merged with the frame's own.
+    # Alignment.
+    reference: int | None  # The first keyframe refers to itself; None before it.
+    T_reference_camera: np.ndarray  # [4, 4]
+    information: np.ndarray  # [6, 6]
+    overlap: float  # Visible fraction of the reference's surface.
+    # Quality.
+    inlier_fraction: float  # The smaller of the photometric and the geometric fraction.
+    intensity_sigma: float  # Photometric residual, gray levels.
+    depth_noise_scale: float  # Geometric residual, times the noise of the sensor model.
+    iterations: int
+    hypothesis_spread_rad: float  # Between the outcomes of all guesses; 0 for a single one.
+    dynamic_mask: np.ndarray | None  # [H, W] bool at working resolution: not to be mapped.
+    has_prior: bool  # An odometry prior reached the time of the frame.
+    # What became of the frame.
+    keyframe: NewKeyframe | None = None
+    reused_keyframe: int | None = None  # Known keyframe that is the reference from now on.
+    denied_keyframe: KeyframeKind | None = None  # Needed, and not allowed by `may_map`.
+    awaits_mapping: bool = False  # Odometry has not begun: its first frame may not be mapped yet.
+
+
+def make_tracking_result(
+    tracked: TrackedFrame,
+    T_map_odom: np.ndarray,
+    graph_version: int,
+    submap: int,
+    reference: int | None,
     *,
-    wants_keyframe: bool = False,
-    wants_mapping: bool = False,
-    disagreement_rad: float = 0.0,
-    is_moving: np.ndarray | None = None,
-) -> Tracked:
-    """What an alignment to a keyframe says of a frame, with what is asked of the caller."""
-    return Tracked(
-        T_odom_camera,
-        alignment.T_reference_camera,
-        keyframe.id,
-        status,
-        method,
-        wants_keyframe,
-        wants_mapping,
-        information=alignment.information,
-        inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
-        intensity_sigma=alignment.intensity_sigma,
-        depth_noise_scale=alignment.depth_noise_scale,
-        overlap=alignment.overlap,
-        iterations=alignment.iterations,
-        disagreement_rad=disagreement_rad,
-        is_moving=is_moving,
-        segment=keyframe.segment,
+    has_prior: bool,
+    keyframe: NewKeyframe | None = None,
+    reused_keyframe: int | None = None,
+    denied_keyframe: KeyframeKind | None = None,
+    awaits_mapping: bool = False,
+) -> TrackingResult:
+    """Return the result of a tracked frame, with its place in the map.
+
+    Args:
+        tracked: The frame in odometry.
+        T_map_odom: Odometry frame in the map, [4, 4]; its rotation is orthonormalized here.
+        graph_version: See `TrackingResult`, as are the arguments below.
+        submap: The root of the frame's submap.
+        reference: The keyframe that subscribers find the pose by.
+        has_prior: An odometry prior reached the time of the frame.
+        keyframe: The keyframe made of the frame.
+        reused_keyframe: The known keyframe that is the reference from now on.
+        denied_keyframe: The keyframe that was needed and not allowed.
+        awaits_mapping: Odometry has not begun.
+    """
+    return TrackingResult(
+        status=tracked.status,
+        method=tracked.method,
+        T_odom_camera=tracked.T_odom_camera,
+        T_map_odom=se3.orthonormalised(T_map_odom),
+        graph_version=graph_version,
+        submap=submap,
+        reference=reference,
+        T_reference_camera=tracked.T_reference_camera,
+        information=tracked.information,
+        overlap=tracked.overlap,
+        inlier_fraction=tracked.inlier_fraction,
+        intensity_sigma=tracked.intensity_sigma,
+        depth_noise_scale=tracked.depth_noise_scale,
+        iterations=tracked.iterations,
+        hypothesis_spread_rad=tracked.hypothesis_spread_rad,
+        dynamic_mask=tracked.dynamic_mask,
+        has_prior=has_prior,
+        keyframe=keyframe,
+        reused_keyframe=reused_keyframe,
+        denied_keyframe=denied_keyframe,
+        awaits_mapping=awaits_mapping,
     )

@@ -202,7 +202,8 @@ def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, key
     shift = se3.exp(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
     tracker, successor = Tracker(), Tracker()
     handled(tracker, frames)
-    tracker._poses.keep_only([max(tracker._poses)])
+    known = tracker._odometry._map._poses
+    known.keep_only([max(known)])
     new = {k.keyframe: shift @ transform(k.T_odom_keyframe) for k in keyframes}
     handled(tracker, [correction_message(0, 7, new)])
     successor.restore(tracker.snapshot())
@@ -220,7 +221,7 @@ def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, key
 def test_a_lost_camera_may_make_a_keyframe_from_one_it_had_forgotten(
     frames, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ldo_service.actors.tracker.RECENT_KEYFRAMES", 1)
+    monkeypatch.setattr("ldo_service.tracking.map_frame.RECENT_KEYFRAMES", 1)
     often = KeyframeConfig(min_overlap=1.0, min_frames=1)  # every frame that is OK
     tracker = Tracker(TrackerConfig(odometry=OdometryConfig(keyframes=often)))
     handled(tracker, frames)

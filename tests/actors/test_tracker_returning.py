@@ -166,7 +166,7 @@ def test_without_a_map_nobody_returns(frames, back) -> None:
 def test_what_is_remembered_does_not_grow_while_no_keyframe_is_made(
     frames, back, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ldo_service.actors.tracker.RECENT_KEYFRAMES", 2)
+    monkeypatch.setattr("ldo_service.tracking.map_frame.RECENT_KEYFRAMES", 2)
     tracker, _, made = round_trip(1, frames, back)
     assert len(made) == 1
-    assert len(tracker._poses) <= 4
+    assert len(tracker._odometry._map._poses) <= 4

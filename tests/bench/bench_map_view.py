@@ -22,8 +22,9 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import RgbdFrame, Trajectory
-from ldo_service.tracking import Odometry, Status
-from ldo_service.tracking.tracking_result import Tracked
+from ldo_service.tracking import Odometry, OdometryConfig, Status
+from ldo_service.tracking.tracking_result import TrackedFrame
+from ldo_service.tracking.window import WindowConfig
 
 LEAST_OPACITY, NEAR = 0.9, 0.03  # NEAR: share of the depth
 ITERATIONS = 10  # of the mapper, per keyframe
@@ -34,29 +35,31 @@ MODELS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray] | None] = {
 }
 
 
-class Tracker:
+class MapViewOdometry(Odometry):
     """Odometry that tracks against keyframes with other depth than the sensor's."""
 
     def __init__(self, model: str) -> None:
+        super().__init__(OdometryConfig(window=WindowConfig(measurements=0)))
         self._mix = MODELS[model]
-        self._odometry, self._builder, self._mapped = Odometry(), MapBuilder(threads=2), 0
+        self._builder, self._mapped = MapBuilder(threads=2), 0
 
-    def pose_of(self, frame: RgbdFrame) -> tuple[np.ndarray, bool]:
-        """T_odom_camera [4, 4], and whether it is trusted."""
-        tracked = self._odometry.track(frame)
-        if tracked.wants_mapping and self._mix is not None:
-            self._map(frame, tracked)
-        if tracked.wants_keyframe:
-            self._odometry.make_keyframe(self._as_mapped(frame, tracked), tracked)
-        elif tracked.wants_mapping:
-            self._odometry.make_supporting(frame, tracked)
-        return tracked.T_odom_camera, tracked.status is Status.OK
+    def _add_mapping_keyframe(self, frame: RgbdFrame, tracked: TrackedFrame) -> int:
+        self._insert(frame, tracked)
+        return super()._add_mapping_keyframe(frame, tracked)
 
-    def _map(self, frame: RgbdFrame, tracked: Tracked) -> None:
-        self._builder.add(frame, tracked.T_odom_camera, self._mapped, ITERATIONS)
-        self._mapped += 1
+    def _add_reference(
+        self, frame: RgbdFrame, tracked: TrackedFrame, *, is_connected: bool = False
+    ) -> int:
+        self._insert(frame, tracked)
+        seen = self._as_mapped(frame, tracked)
+        return super()._add_reference(seen, tracked, is_connected=is_connected)
 
-    def _as_mapped(self, frame: RgbdFrame, tracked: Tracked) -> RgbdFrame:
+    def _insert(self, frame: RgbdFrame, tracked: TrackedFrame) -> None:
+        if self._mix is not None:
+            self._builder.add(frame, tracked.T_odom_camera, self._mapped, ITERATIONS)
+            self._mapped += 1
+
+    def _as_mapped(self, frame: RgbdFrame, tracked: TrackedFrame) -> RgbdFrame:
         if self._mix is None:
             return frame
         seen = self._builder.seen_from(frame.camera, tracked.T_odom_camera)
@@ -75,11 +78,11 @@ def row(sequence: Sequence, frames: int, model: str) -> str:
     truth = sequence.truth()
     if truth is None:
         raise SystemExit(f"{sequence.name} has no true trajectory to compare with.")
-    tracker, poses, trusted = Tracker(model), [], 0
+    odometry, poses, trusted = MapViewOdometry(model), [], 0
     for index in range(frames):
-        T_odom_camera, is_trusted = tracker.pose_of(sequence[index])
-        poses.append(T_odom_camera)
-        trusted += is_trusted
+        result = odometry.process(sequence[index])
+        poses.append(result.T_odom_camera)
+        trusted += result.status is Status.OK
     stamps_s = sequence.stamps_ns[:frames] * 1e-9
     ate_m = evaluate_trajectory(Trajectory(stamps_s, np.array(poses)), truth).ate_m.rmse
     return f"| {sequence.name} | {frames} | {model} | {100 * ate_m:.2f} | {trusted / frames:.1%} |"

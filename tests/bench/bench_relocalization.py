@@ -13,7 +13,7 @@ false. CPU time is that of the search, with the pyramid of the frame.
 import argparse
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -23,7 +23,7 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import Odometry, OdometryConfig, pyramid_of
 from ldo_service.tracking.keyframe_database import Places, place_of
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig
 from ldo_service.tracking.relocalization import Relocaliser
 from ldo_service.tracking.tracking_quality import History
 
@@ -70,15 +70,15 @@ class Tally:
 
 
 def mapped(source: str) -> Mapped:
-    sequence, odometry, places = open_sequence(source), Odometry(), Places()
+    references_only = replace(CONFIG, keyframes=KeyframeConfig(supporting=2.0))
+    sequence, odometry, places = open_sequence(source), Odometry(references_only), Places()
     for frame in sequence:
-        tracked = odometry.track(frame)
-        if tracked.wants_keyframe:
-            odometry.make_keyframe(frame, tracked)
+        result = odometry.process(frame)
+        if result.keyframe is not None:
             view = pyramid_of(frame, CONFIG.pyramid)
-            keyframe = Keyframe(view, tracked.T_odom_camera, frame.index)
+            keyframe = Keyframe(view, result.T_odom_camera, frame.index)
             places = places.added(place_of(keyframe, CONFIG.features, CONFIG.places), CONFIG.places)
-    return Mapped(sequence, places, History(**odometry.state()["history"]))
+    return Mapped(sequence, places, History(**odometry.snapshot()["history"]))
 
 
 def search(frame: RgbdFrame, places: Places, turn: int, history: History, tally: Tally):

@@ -31,7 +31,8 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.kernels import isa
 from ldo_service.schemas import TrackedPose
-from ldo_service.tracking import Odometry, Status
+from ldo_service.tracking import Odometry, OdometryConfig, Status
+from ldo_service.tracking.window import WindowConfig
 from tests.bench.tracking_peers import Step, peers
 
 WARM_UP = 5  # frames left out of the times
@@ -97,16 +98,12 @@ class Runner:
 
 
 def ours() -> Step:
-    """As the service's tracker: references and supporting keyframes, all of them with room."""
-    odometry = Odometry()
+    """Track as the service does: every keyframe is allowed. The pose graph's window is left out."""
+    odometry = Odometry(OdometryConfig(window=WindowConfig(measurements=0)))
 
     def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
-        tracked = odometry.track(frame)
-        if tracked.wants_keyframe:
-            odometry.make_keyframe(frame, tracked)
-        elif tracked.wants_mapping:
-            odometry.make_supporting(frame, tracked)
-        return tracked.T_odom_camera, tracked.status is Status.OK
+        result = odometry.process(frame)
+        return result.T_odom_camera, result.status is Status.OK
 
     return step
 

@@ -160,11 +160,7 @@ def test_errors_agree_with_evo_on_the_trajectory_that_was_tracked(data: Path) ->
     kitchen, odometry = open_sequence(str(data / "tum/kitchen")), Odometry()
     poses, indices = [], range(0, 160, 4)
     for index in indices:
-        frame = kitchen[index]
-        tracked = odometry.track(frame)
-        poses.append(tracked.T_odom_camera)
-        if tracked.wants_keyframe:
-            odometry.make_keyframe(frame, tracked)
+        poses.append(odometry.process(kitchen[index]).T_odom_camera)
     truth = kitchen.truth()
     assert truth is not None
     assert_evo_agrees(Trajectory(kitchen.stamps_ns[indices] * 1e-9, np.array(poses)), truth)

@@ -16,9 +16,10 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandidate, LoopClosure
+from ldo_service.tracking.map_frame import MapCorrection, MapFrame
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
-from ldo_service.tracking.odometry_prior import Reading
-from ldo_service.tracking.tracking_result import Tracked
+from ldo_service.tracking.odometry_prior import Prior
+from ldo_service.tracking.tracking_result import TrackedFrame, TrackingResult
 
 UP_ODOM = np.array([0.0, -1.0, 0.0])  # of a camera held level at the start
 ASIDE_ODOM = np.array([1.0, 0.0, 0.0])  # level
@@ -48,44 +49,53 @@ class DriftingOdometry(Odometry):
     def __init__(self, config: OdometryConfig, drift: Drift) -> None:
         super().__init__(config)
         self._drift = drift
-        self._right: Tracked | None = None  # the last frame, as it was tracked
-        self._T_drifted = np.eye(4)  # T_odom_camera, as it is told
-        self._told: dict[int, np.ndarray] = {}  # T_odom_keyframe, likewise
+        self._right: TrackingResult | None = None  # The last frame, as it was tracked.
+        self._T_drifted = np.eye(4)  # T_odom_camera, as it is told.
+        self._told: dict[int, np.ndarray] = {}  # T_odom_keyframe, likewise.
+        self._told_map = MapFrame()
 
-    def track(self, frame: RgbdFrame, prior: Reading | None = None) -> Tracked:
-        before, self._right = self._right, super().track(frame, prior)
+    def process(
+        self, frame: RgbdFrame, prior: Prior | None = None, *, may_map: bool = True
+    ) -> TrackingResult:
+        before, right = self._right, super().process(frame, prior, may_map=may_map)
+        self._right = right
         if before is not None:
-            T_before_now = se3.inverse(before.T_odom_camera) @ self._right.T_odom_camera
+            T_before_now = se3.inverse(before.T_odom_camera) @ right.T_odom_camera
             T_step = self._drift.of(before.T_odom_camera, T_before_now)
             self._T_drifted = se3.orthonormalised(self._T_drifted @ T_step)
-        T_keyframe_camera = np.eye(4)
-        if self._right.keyframe is not None:
-            T_keyframe_camera = se3.inverse(self._told[self._right.keyframe]) @ self._T_drifted
+        return self._as_told(right)
+
+    def correct(self, correction: MapCorrection) -> bool:
+        self._told_map.correct(correction)
+        return super().correct(correction)
+
+    def _as_told(self, right: TrackingResult) -> TrackingResult:
+        keyframe, reference = right.keyframe, right.reference
+        T_reference_camera = np.eye(4)
+        if reference in self._told:
+            T_reference_camera = se3.inverse(self._told[reference]) @ self._T_drifted
+        if keyframe is not None:
+            self._told[keyframe.id] = self._T_drifted
+            told = TrackedFrame(
+                right.status,
+                right.method,
+                self._T_drifted,
+                T_reference_camera,
+                None if reference == keyframe.id else reference,
+                keyframe.submap,
+            )
+            self._told_map.add_keyframe(keyframe.id, told, self.reference)
+            keyframe = replace(keyframe, window=tuple(map(self._as_told_of, keyframe.window)))
         return replace(
-            self._right, T_odom_camera=self._T_drifted, T_keyframe_camera=T_keyframe_camera
+            right,
+            T_odom_camera=self._T_drifted,
+            T_reference_camera=T_reference_camera,
+            T_map_odom=se3.orthonormalised(self._told_map.T_map_odom(reference)),
+            keyframe=keyframe,
         )
 
-    def make_keyframe(self, frame: RgbdFrame, tracked: Tracked) -> int:
-        return self._noted(super().make_keyframe(frame, self._as_tracked(tracked)))
-
-    def make_supporting(self, frame: RgbdFrame, tracked: Tracked) -> int:
-        return self._noted(super().make_supporting(frame, self._as_tracked(tracked)))
-
-    def window(self, tracked: Tracked) -> list[RelativePose]:
-        return [
-            replace(m, T_a_b=se3.inverse(self._told[m.a]) @ self._told[m.b])
-            for m in super().window(self._as_tracked(tracked))
-        ]
-
-    def _as_tracked(self, told: Tracked) -> Tracked:
-        assert self._right is not None
-        right = self._right
-        T_odom_camera, T_keyframe_camera = right.T_odom_camera, right.T_keyframe_camera
-        return replace(told, T_odom_camera=T_odom_camera, T_keyframe_camera=T_keyframe_camera)
-
-    def _noted(self, keyframe: int) -> int:
-        self._told[keyframe] = self._T_drifted
-        return keyframe
+    def _as_told_of(self, right: RelativePose) -> RelativePose:
+        return replace(right, T_a_b=se3.inverse(self._told[right.a]) @ self._told[right.b])
 
 
 class DriftingTracker(Tracker):

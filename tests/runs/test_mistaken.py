@@ -5,6 +5,7 @@ import numpy as np
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
+from ldo_service.tracking.tracking_result import KeyframeKind
 
 from .mistaken import Drift, DriftingOdometry
 
@@ -15,19 +16,19 @@ def followed(odometry: Odometry, frames: list[RgbdFrame]) -> tuple[np.ndarray, l
     """T_odom_camera [N, 4, 4], and the frames that became keyframes."""
     T_odom, keyframes, T_odom_keyframe = [], [], {}
     for index, frame in enumerate(frames):
-        tracked = odometry.track(frame)
-        T_odom.append(tracked.T_odom_camera)
-        if tracked.keyframe is not None:
-            T_chained = T_odom_keyframe[tracked.keyframe] @ tracked.T_keyframe_camera
-            np.testing.assert_allclose(T_chained, tracked.T_odom_camera, atol=1e-9)
-        if tracked.wants_keyframe:
-            T_odom_keyframe[odometry.make_keyframe(frame, tracked)] = tracked.T_odom_camera
+        result = odometry.process(frame)
+        keyframe = result.keyframe
+        T_odom.append(result.T_odom_camera)
+        if keyframe is not None:
+            T_odom_keyframe[keyframe.id] = result.T_odom_camera
+        T_chained = T_odom_keyframe[result.reference] @ result.T_reference_camera
+        np.testing.assert_allclose(T_chained, result.T_odom_camera, atol=1e-9)
+        np.testing.assert_allclose(result.T_map_odom, np.eye(4), atol=1e-9)
+        if keyframe is not None and keyframe.kind is not KeyframeKind.MAPPING:
             keyframes.append(index)
-            for m in odometry.window(tracked):
+            for m in keyframe.window:
                 T_chained = T_odom_keyframe[m.a] @ m.T_a_b
                 np.testing.assert_allclose(T_chained, T_odom_keyframe[m.b], atol=2e-3)
-        elif tracked.wants_mapping:
-            T_odom_keyframe[odometry.make_supporting(frame, tracked)] = tracked.T_odom_camera
     return np.array(T_odom), keyframes
 
 

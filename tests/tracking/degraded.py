@@ -146,13 +146,9 @@ def follow(frames: Iterator[RgbdFrame], stamps_ns: np.ndarray) -> list[Step]:
     """Track as the service does."""
     odometry, steps = Odometry(), []
     for frame in frames:
-        tracked = odometry.track(frame)
-        if tracked.wants_keyframe:
-            odometry.make_keyframe(frame, tracked)
-        elif tracked.wants_mapping:
-            odometry.make_supporting(frame, tracked)
+        result = odometry.process(frame)
         k = int(np.searchsorted(stamps_ns, frame.stamp_ns))
-        steps.append(Step(k, frame.index, tracked.status, tracked.T_odom_camera))
+        steps.append(Step(k, frame.index, result.status, result.T_odom_camera))
     return steps
 
 

@@ -8,31 +8,29 @@ import pytest
 
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
+from ldo_service.tracking import Odometry, OdometryConfig, Status, TrackingResult
+from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.submaps import SegmentConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
-def followed(frames: Iterable[RgbdFrame], patience_s: float = 0) -> list[Tracked]:
+def followed(frames: Iterable[RgbdFrame], patience_s: float = 0) -> list[TrackingResult]:
     """`patience_s`: how long it is LOST until a new segment begins; 0: none does."""
-    odometry = Odometry(OdometryConfig(segments=SegmentConfig(begin_after_s=patience_s)))
-    results = []
-    for frame in frames:
-        results.append(odometry.track(frame))
-        if results[-1].may_begin:
-            results[-1] = odometry.begin_segment(frame)
-        if results[-1].wants_keyframe:
-            odometry.make_keyframe(frame, results[-1])
-    return results
+    segments = SegmentConfig(begin_after_s=patience_s)
+    config = OdometryConfig(segments=segments, keyframes=KeyframeConfig(supporting=2.0))
+    odometry = Odometry(config)
+    return [odometry.process(frame) for frame in frames]
 
 
-def distances_m(results: Sequence[Tracked], T_odom_camera: Iterable[np.ndarray]) -> np.ndarray:
+def distances_m(
+    results: Sequence[TrackingResult], T_odom_camera: Iterable[np.ndarray]
+) -> np.ndarray:
     pairs = zip(results, T_odom_camera, strict=True)
     return np.array([np.linalg.norm(r.T_odom_camera[:3, 3] - T[:3, 3]) for r, T in pairs])
 
 
-def assert_found(back: Sequence[Tracked], distances: np.ndarray) -> None:
+def assert_found(back: Sequence[TrackingResult], distances: np.ndarray) -> None:
     """Within 3 cm of the truth from the tenth frame on, and never wrong where it is not LOST."""
     known = np.array([r.status is not Status.LOST for r in back])
     assert known[10:].all(), [str(r.status) for r in back]
@@ -61,23 +59,25 @@ def test_the_apartment_becomes_a_segment_of_its_own_and_the_kitchen_stays(data: 
     results = followed([*frames[:60], *visit, *frames[60:]], patience_s=0.63)
     gone, back = results[60:160], results[160:]
     assert {r.status for r in gone[:19]} == {Status.LOST}
-    apart = [r for r in gone if r.segment > 0]
+    apart = [r for r in gone if r.submap > 0]
     assert sum(r.status is Status.OK for r in apart) > 40
-    assert all(r.status is Status.LOST for r in gone if r.segment == 0)
-    assert not any(r.join for r in results), "two places that do not meet"
+    assert all(r.status is Status.LOST for r in gone if r.submap == 0)
+    assert not any(r.keyframe and r.keyframe.submap_measurement for r in results), (
+        "two places that do not meet"
+    )
     known = [r for r in back if r.status is not Status.LOST]
-    assert {r.segment for r in known[3:]} == {0}
+    assert {r.submap for r in known[3:]} == {0}
     assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
 
 
-def walked(flat, *stretches: range) -> list[list[Tracked]]:
+def walked(flat, *stretches: range) -> list[list[TrackingResult]]:
     """Results of each stretch of one track."""
     results = followed(flat[k] for stretch in stretches for k in stretch)
     ends = np.cumsum([len(stretch) for stretch in stretches])
     return [results[end - len(s) : end] for s, end in zip(stretches, ends, strict=True)]
 
 
-def errors_m(flat, results: Sequence[Tracked], frames: range, start: int) -> np.ndarray:
+def errors_m(flat, results: Sequence[TrackingResult], frames: range, start: int) -> np.ndarray:
     """Against exact truth, in the frame of the first pose of the track, frame `start`."""
     T_world = flat.truth().T_world_camera
     return distances_m(results, se3.inverse(T_world[start]) @ T_world[frames.start : frames.stop])

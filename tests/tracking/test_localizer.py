@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import se3
-from ldo_service.tracking import Odometry, OdometryConfig, PyramidConfig, Status, pyramid_of
+from ldo_service.tracking import OdometryConfig, PyramidConfig, Status, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframe_database import Places, PlacesConfig, place_of
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.localizer import Fix, Localiser
+from ldo_service.tracking.localizer import Fix, Localizer
 from ldo_service.tracking.submaps import SegmentConfig
 
 T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
@@ -25,22 +25,25 @@ def places(large_room, make_walk) -> Places:
     return Places(tuple(made))
 
 
-def located(localiser: Localiser, room, truth: list[np.ndarray]) -> list[float | None]:
+def located(localizer: Localizer, room, truth: list[np.ndarray]) -> list[float | None]:
     """Errors in the map, m; None where the camera is not found."""
     errors: list[float | None] = []
     for index, T_world_camera in enumerate(truth):
         frame = room.view(T_world_camera, stamp_ns=index * 33_333_333, index=index)
-        tracked, T_map_odom = localiser.track(frame)
-        if T_map_odom is None or tracked.status is Status.LOST:
+        result = localizer.process(frame)
+        assert (result.reference, result.keyframe) == (None, None)
+        if result.status is Status.LOST:
             errors.append(None)
             continue
-        T_error = se3.inverse(T_MAP_WORLD @ T_world_camera) @ T_map_odom @ tracked.T_odom_camera
+        T_error = (
+            se3.inverse(T_MAP_WORLD @ T_world_camera) @ result.T_map_odom @ result.T_odom_camera
+        )
         errors.append(float(np.linalg.norm(T_error[:3, 3])))
     return errors
 
 
 def test_a_camera_is_found_at_the_second_look_and_followed(large_room, make_walk, places) -> None:
-    first, *rest = located(Localiser(Odometry(CONFIG), places), large_room, make_walk(14))
+    first, *rest = located(Localizer(places, CONFIG), large_room, make_walk(14))
     assert first is None, "one look is not believed"
     assert max(error for error in rest if error is not None) < 5e-3
     assert None not in rest
@@ -48,13 +51,13 @@ def test_a_camera_is_found_at_the_second_look_and_followed(large_room, make_walk
 
 def test_a_camera_in_a_strange_place_is_not_found(large_room, make_walk, places) -> None:
     strange = [T_BEHIND @ T for T in make_walk(8)]
-    assert located(Localiser(Odometry(CONFIG), places), large_room, strange) == [None] * 8
+    assert located(Localizer(places, CONFIG), large_room, strange) == [None] * 8
 
 
 def test_after_a_kidnap_the_old_fix_is_forgotten(large_room, make_walk, places) -> None:
     here, there = make_walk(6), [T_BEHIND @ T for T in make_walk(8)]
-    localiser = Localiser(Odometry(CONFIG), places)
-    errors = located(localiser, large_room, [*here, *there, *here])
+    localizer = Localizer(places, CONFIG)
+    errors = located(localizer, large_room, [*here, *there, *here])
     assert errors[6:14] == [None] * 8, "the new segment of odometry was not found in the map"
     back = [error for error in errors[14:] if error is not None]
     assert len(back) >= 4
@@ -62,9 +65,9 @@ def test_after_a_kidnap_the_old_fix_is_forgotten(large_room, make_walk, places) 
 
 
 def test_a_fix_survives_packing(large_room, make_walk, places) -> None:
-    localiser = Localiser(Odometry(CONFIG), places)
-    located(localiser, large_room, make_walk(4))
-    again = Fix.unpacked(localiser.fix.packed)
-    np.testing.assert_array_equal(again.T_map_odom, localiser.fix.T_map_odom)
+    localizer = Localizer(places, CONFIG)
+    located(localizer, large_room, make_walk(4))
+    fix, again = localizer._fix, Fix.unpacked(localizer.snapshot()["fix"])
+    np.testing.assert_array_equal(again.T_map_odom, fix.T_map_odom)
     assert again.last is not None
-    assert again.since_look == localiser.fix.since_look
+    assert again.since_look == fix.since_look

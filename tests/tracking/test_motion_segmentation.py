@@ -13,7 +13,8 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
-from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
+from ldo_service.tracking import Odometry, OdometryConfig, Status, TrackingResult
+from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.motion_segmentation import MovingConfig, Watched, gap_m, spread, watch
 from ldo_service.tracking.pyramid import DepthNoise, Level, Pyramid, PyramidConfig, pyramid_of
 
@@ -165,45 +166,49 @@ def test_impossible_settings_are_refused(bad: dict) -> None:
 
 
 # --- in the odometry ------------------------------------------------------------------------------
-def tracked_masks(frames: Iterable[RgbdFrame], config: OdometryConfig) -> list[Tracked]:
-    odometry, results = Odometry(config), []
-    for frame in frames:
-        results.append(odometry.track(frame))
-        if results[-1].wants_keyframe:
-            odometry.make_keyframe(frame, results[-1])
-    return results
+EACH_FRAME = KeyframeConfig(min_frames=1, max_frames=1, still_motion=0.0)  # Needs a keyframe.
+
+
+def tracked_masks(frames: Iterable[RgbdFrame]) -> list[TrackingResult]:
+    odometry = Odometry(OdometryConfig(keyframes=KeyframeConfig(supporting=2.0)))
+    return [odometry.process(frame) for frame in frames]
 
 
 def test_keyframes_of_the_odometry_do_not_track_against_who_walks(walked: Walked) -> None:
-    odometry, kept = Odometry(OdometryConfig(moving=CONFIG)), []
+    config = OdometryConfig(moving=CONFIG, keyframes=EACH_FRAME)
+    odometry, kept = Odometry(config), []
     for k in range(56, 84, 2):
         frame = walked.frame(k)
-        tracked = odometry.track(frame)
-        if k in (80, 82):  # the last frames against their keyframes
-            left_out = odometry.state()["keyframe"]["left_out"]
+        if k in (80, 82):  # The last frames against their keyframes.
+            before = Odometry(config)
+            before.restore(odometry.snapshot())
+            before.process(frame, may_map=False)
+            left_out = before.snapshot()["keyframe"]["left_out"]
             assert recall_and_precision(left_out, walked.person(kept[-1]))[0] > 0.5
-        if k in (56, 80):
-            odometry.make_keyframe(frame, tracked)
+        result = odometry.process(frame, may_map=k in (56, 80))
+        if result.keyframe is not None:
             kept.append(k)
-    assert tracked.is_moving is not None
-    assert recall_and_precision(tracked.is_moving, walked.person(k))[0] > 0.5
+    assert kept == [56, 80]
+    assert result.dynamic_mask is not None
+    assert recall_and_precision(result.dynamic_mask, walked.person(k))[0] > 0.5
 
 
 def test_whom_a_detector_found_in_a_keyframe_is_not_tracked_against(walked: Walked) -> None:
     """Before anything was seen to move, and after a restart."""
     frame, person = walked.frame(LATE), walked.person(LATE)
     odometry = Odometry()
-    keyframe = odometry.make_keyframe(frame, odometry.track(frame))
-    odometry.leave_out(keyframe, [Box("couch", 0, 0, 160, 120)])
-    odometry.leave_out(keyframe + 1, [box_around(person)])
-    assert odometry.state()["keyframe"]["movable"] is None
-    odometry.leave_out(keyframe, [box_around(person)])
-    kept = odometry.state()
+    keyframe = odometry.process(frame).reference
+    assert keyframe is not None
+    odometry.mask_dynamic_objects(keyframe, [Box("couch", 0, 0, 160, 120)])
+    odometry.mask_dynamic_objects(keyframe + 1, [box_around(person)])
+    assert odometry.snapshot()["keyframe"]["movable"] is None
+    odometry.mask_dynamic_objects(keyframe, [box_around(person)])
+    kept = odometry.snapshot()
     assert recall_and_precision(kept["keyframe"]["movable"], person)[0] > 0.95
     restored = Odometry()
     restored.restore(decode_state(encode_state(kept)))
     for one in (odometry, restored):
-        tracked = one.track(walked.frame(LATE + 6))
+        tracked = one.process(walked.frame(LATE + 6), may_map=False)
         error = se3.inverse(walked.T(LATE, LATE + 6)) @ tracked.T_odom_camera
         assert np.linalg.norm(error[:3, 3]) < 0.01
 
@@ -218,7 +223,7 @@ def box_around(mask: np.ndarray) -> Box:
 def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
     """ATE 0.15 cm and 16 frames WEAK without."""
     sequence = SyntheticSequence.named("person-noisy")
-    results = tracked_masks(sequence, OdometryConfig())
+    results = tracked_masks(sequence)
     T = np.array([r.T_odom_camera for r in results])
     truth = sequence.truth()
     errors = evaluate_trajectory(Trajectory(truth.stamps_s, T), truth)
@@ -226,9 +231,9 @@ def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
     assert errors.ate_m.rmse < 0.0012
     recalls, precisions = zip(
         *(
-            recall_and_precision(results[k].is_moving, sequence.person(k))
+            recall_and_precision(results[k].dynamic_mask, sequence.person(k))
             for k in range(40, 135)
-            if results[k].is_moving is not None
+            if results[k].dynamic_mask is not None
         ),
         strict=True,
     )
@@ -240,17 +245,17 @@ def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
 @pytest.mark.timeout(600)
 def test_hardly_anything_moves_in_a_kitchen_where_nobody_is(data: Path) -> None:
     kitchen = open_sequence(str(data / "tum" / "kitchen"))
-    assert mean_masked(tracked_masks(map(kitchen.__getitem__, range(300)), OdometryConfig())) < 0.01
+    assert mean_masked(tracked_masks(map(kitchen.__getitem__, range(300)))) < 0.01
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_hardly_anything_moves_in_the_flat() -> None:
     flat = open_sequence("synthetic:flat")
-    assert mean_masked(tracked_masks(map(flat.__getitem__, range(200)), OdometryConfig())) < 0.01
+    assert mean_masked(tracked_masks(map(flat.__getitem__, range(200)))) < 0.01
 
 
-def mean_masked(results: list[Tracked]) -> float:
-    masks = [r.is_moving for r in results if r.is_moving is not None]
+def mean_masked(results: list[TrackingResult]) -> float:
+    masks = [r.dynamic_mask for r in results if r.dynamic_mask is not None]
     assert len(masks) > 0.9 * len(results)
     return float(np.mean([mask.mean() for mask in masks]))

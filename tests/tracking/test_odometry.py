@@ -10,35 +10,35 @@ from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.tracking import Odometry, OdometryConfig, Status, Tracked
+from ldo_service.tracking import Odometry, OdometryConfig, Status, TrackingResult
 from ldo_service.tracking.keyframes import KeyframeConfig
+from ldo_service.tracking.tracking_result import KeyframeKind
 
 T_ELSEWHERE = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
 
 
-def track(odometry: Odometry, frames: Sequence[RgbdFrame]) -> list[Tracked]:
-    results = []
-    for frame in frames:
-        results.append(odometry.track(frame))
-        if results[-1].wants_keyframe:
-            odometry.make_keyframe(frame, results[-1])
-        elif results[-1].wants_mapping:
-            odometry.make_supporting(frame, results[-1])
-    return results
+def track(odometry: Odometry, frames: Sequence[RgbdFrame]) -> list[TrackingResult]:
+    return [odometry.process(frame) for frame in frames]
 
 
-def largest_error_m(results: Sequence[Tracked], truth: Sequence[np.ndarray]) -> float:
+def became_reference(result: TrackingResult) -> bool:
+    """Return whether the next frames are aligned to this one."""
+    return result.keyframe is not None and result.keyframe.kind is not KeyframeKind.MAPPING
+
+
+def largest_error_m(results: Sequence[TrackingResult], truth: Sequence[np.ndarray]) -> float:
     return max(
         float(np.linalg.norm(r.T_odom_camera[:3, 3] - T[:3, 3]))
         for r, T in zip(results, truth, strict=True)
     )
 
 
-def assert_bitwise_equal(a: Sequence[Tracked], b: Sequence[Tracked]) -> None:
+def assert_bitwise_equal(a: Sequence[TrackingResult], b: Sequence[TrackingResult]) -> None:
     for x, y in zip(a, b, strict=True):
         assert x.T_odom_camera.tobytes() == y.T_odom_camera.tobytes()
         assert x.information.tobytes() == y.information.tobytes()
-        assert (x.status, x.method, x.wants_keyframe) == (y.status, y.method, y.wants_keyframe)
+        assert (x.status, x.method) == (y.status, y.method)
+        assert became_reference(x) == became_reference(y)
 
 
 def test_walk_is_followed_and_keyframes_are_made(room, make_walk) -> None:
@@ -46,32 +46,37 @@ def test_walk_is_followed_and_keyframes_are_made(room, make_walk) -> None:
     results = track(Odometry(), [room.view(T, index=k) for k, T in enumerate(truth)])
     assert {r.status for r in results} == {Status.OK}
     assert largest_error_m(results, truth) < 5e-3
-    assert 2 < sum(r.wants_keyframe for r in results) < 14
-    made = [index for index, r in enumerate(results) if r.wants_mapping]  # `track` numbers each
+    assert 2 < sum(map(became_reference, results)) < 14
+    made = [index for index, r in enumerate(results) if r.keyframe is not None]
     last = results[-1]
-    assert last.keyframe is not None
-    between = se3.inverse(truth[made[last.keyframe]]) @ truth[-1]
-    np.testing.assert_allclose(last.T_keyframe_camera, between, atol=2e-3)
+    assert last.reference is not None
+    between = se3.inverse(truth[made[last.reference]]) @ truth[-1]
+    np.testing.assert_allclose(last.T_reference_camera, between, atol=2e-3)
 
 
 def test_tracking_survives_when_there_is_never_room_for_a_keyframe(room, make_walk) -> None:
     truth = make_walk(16)
     odometry = Odometry()
-    first = room.view(truth[0])
-    odometry.make_keyframe(first, odometry.track(first))
-    results = [odometry.track(room.view(T)) for T in truth[1:]]
+    odometry.process(room.view(truth[0]))
+    results = [odometry.process(room.view(T), may_map=False) for T in truth[1:]]
     assert {r.status for r in results} == {Status.OK}
     assert largest_error_m(results, truth[1:]) < 5e-3
-    assert all(r.wants_keyframe for r in results[-5:])
+    assert all(r.keyframe is None for r in results)
+    assert all(r.denied_keyframe is KeyframeKind.REFERENCE for r in results[-5:])
 
 
 def test_before_the_first_keyframe_every_usable_frame_is_the_first(room) -> None:
     odometry = Odometry()
-    assert odometry.track(room.blank()).status is Status.LOST
+    assert odometry.process(room.blank()).status is Status.LOST
     for _ in range(2):
-        tracked = odometry.track(room.view(np.eye(4)))
-        assert (tracked.status, tracked.method) == (Status.OK, "first")
-        assert tracked.wants_keyframe
+        result = odometry.process(room.view(np.eye(4)), may_map=False)
+        assert (result.status, result.method) == (Status.OK, "first")
+        assert result.denied_keyframe is KeyframeKind.FIRST
+        assert result.awaits_mapping
+    result = odometry.process(room.view(np.eye(4)))
+    assert result.keyframe is not None
+    assert (result.keyframe.kind, result.reference) == (KeyframeKind.FIRST, result.keyframe.id)
+    assert not result.awaits_mapping
 
 
 def test_missed_frames_are_bridged(room, make_walk) -> None:
@@ -105,7 +110,7 @@ def test_frame_without_depth_is_weak_and_does_not_break_the_track(room, make_wal
     frames[6] = replace(frames[6], depth_m=np.zeros_like(frames[6].depth_m))
     results = track(Odometry(), frames)
     assert results[6].status is Status.WEAK
-    assert not results[6].wants_keyframe
+    assert results[6].keyframe is None
     assert results[-1].status is Status.OK
     assert largest_error_m(results, truth) < 5e-3
 
@@ -123,23 +128,26 @@ def test_blank_frame_is_not_ok_and_the_next_one_is_found_again(large_room, make_
 def test_kidnapped_camera_knows_it_and_relocalises_on_return(large_room, make_walk) -> None:
     odometry = Odometry()
     track(odometry, [large_room.view(T, index=k) for k, T in enumerate(make_walk(8))])
-    before = odometry.track(large_room.view(make_walk(8)[-1]))
-    gone = [odometry.track(large_room.view(T_ELSEWHERE @ T)) for T in make_walk(5)]
+    before = odometry.process(large_room.view(make_walk(8)[-1]), may_map=False)
+    gone = [odometry.process(large_room.view(T_ELSEWHERE @ T)) for T in make_walk(5)]
     assert {r.status for r in gone} == {Status.LOST}
     for r in gone:  # the pose does not jump
         np.testing.assert_array_equal(r.T_odom_camera, before.T_odom_camera)
         assert not r.information.any()
     T_back = make_walk(3)[-1] @ se3.exp(np.array([0.0, -0.1, 0.05, -0.1, 0.0, 0.05]))
-    back = odometry.track(large_room.view(T_back))
+    back = odometry.process(large_room.view(T_back), may_map=False)
     assert back.status is Status.OK
     np.testing.assert_allclose(back.T_odom_camera, T_back, atol=5e-3)
 
 
 def test_lost_frame_cannot_become_a_keyframe(room) -> None:
     odometry = Odometry()
-    blank = room.blank()
-    with pytest.raises(ValueError, match="LOST"):
-        odometry.make_keyframe(blank, odometry.track(blank))
+    for frame in (room.blank(), room.view(np.eye(4)), room.blank()):
+        result = odometry.process(frame)
+        is_lost = result.status is Status.LOST
+        assert (result.keyframe is None) is is_lost
+        assert result.denied_keyframe is None
+    assert is_lost
 
 
 def test_two_runs_are_bitwise_equal(large_room, make_walk) -> None:
@@ -151,7 +159,7 @@ def test_restored_odometry_continues_bitwise_equal(large_room, make_walk) -> Non
     frames = [large_room.view(T, index=k) for k, T in enumerate(make_walk(14, 0.05, 0.03))]
     odometry = Odometry()
     track(odometry, frames[:7])
-    state = odometry.state()
+    state = odometry.snapshot()
     expected = track(odometry, [*frames[7:10], large_room.blank(), *frames[10:]])
     restored = Odometry()
     restored.restore(state)
@@ -164,7 +172,7 @@ def test_state_survives_its_form_on_disk(large_room, make_walk) -> None:
     frames = [large_room.view(T) for T in make_walk(8, 0.05, 0.03)]
     odometry, restored = Odometry(), Odometry()
     track(odometry, frames[:6])
-    restored.restore(decode_state(encode_state(odometry.state())))
+    restored.restore(decode_state(encode_state(odometry.snapshot())))
     rest = [large_room.blank(), *frames[6:]]
     assert_bitwise_equal(track(restored, rest), track(odometry, rest))
 
@@ -175,15 +183,15 @@ def test_a_place_left_long_ago_is_found_again(large_room) -> None:
     odometry = Odometry()
     out = track(odometry, [large_room.view(T) for T in turns])
     assert {r.status for r in out} == {Status.OK}
-    assert sum(r.wants_keyframe for r in out) >= 9
+    assert sum(map(became_reference, out)) >= 9
     walk = [se3.exp(np.array([0.0, 0.05, 0.0, 0.01 * k, 0.0, 0.02])) for k in range(8)]
     frames = [large_room.view(T) for T in walk]
-    back = odometry.track(frames[0])
+    back = odometry.process(frames[0], may_map=False)
     assert (back.status, back.method) == (Status.OK, "relocalised")
-    assert back.keyframe in (0, 1)
+    assert back.reference in (0, 1)
     np.testing.assert_allclose(back.T_odom_camera, walk[0], atol=0.01)
     restored = Odometry()
-    restored.restore(decode_state(encode_state(odometry.state())))
+    restored.restore(decode_state(encode_state(odometry.snapshot())))
     after = track(odometry, frames[1:])
     assert {r.status for r in after} == {Status.OK}
     assert largest_error_m(after, walk[1:]) < 0.01
@@ -199,8 +207,8 @@ def test_a_lost_camera_is_found_by_the_last_frame_mapped(large_room) -> None:
     turned = [se3.exp(np.array([0.0, 0.06 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
     odometry, restored = (Odometry(OdometryConfig(keyframes=rarely)) for _ in range(2))
     known = track(odometry, [large_room.view(T) for T in turned[:13]])
-    assert [r.wants_keyframe for r in known] == [True] + 12 * [False]
-    restored.restore(decode_state(encode_state(odometry.state())))
+    assert [*map(became_reference, known)] == [True] + 12 * [False]
+    restored.restore(decode_state(encode_state(odometry.snapshot())))
     frames = [large_room.blank(), large_room.view(turned[-1])]
     *_, found = track(odometry, frames)
     assert (found.status, found.method) == (Status.OK, "relocalised")

@@ -1,7 +1,7 @@
 """A prior helps where it is right, and changes nothing where it is wrong."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +11,15 @@ from scipy.spatial.transform import Rotation, Slerp
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.tracking import Odometry, OdometryConfig, Prior, PriorConfig, Status, Tracked
+from ldo_service.tracking import (
+    Odometry,
+    OdometryConfig,
+    Prior,
+    PriorConfig,
+    Status,
+    TrackingResult,
+)
+from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.odometry_prior import KEPT, Anchor, Reading, Verdict
 from ldo_service.tracking.relocalization import RelocalisationConfig
 from ldo_service.tracking.submaps import SegmentConfig
@@ -155,17 +163,13 @@ class Covered:
 
     def followed(
         self, poses: list[np.ndarray] | None, config: OdometryConfig | None = None
-    ) -> list[Tracked]:
+    ) -> list[TrackingResult]:
+        config = replace(config or OdometryConfig(), keyframes=KeyframeConfig(supporting=2.0))
         odometry, prior, results = Odometry(config), Prior(), []
         for k, frame in enumerate(self.frames):
             if poses is not None:
                 prior, _ = prior.added(frame.stamp_ns, poses[k], CONFIG)
-            tracked = odometry.track(frame, prior.at(frame.stamp_ns, IDENTITY, CONFIG))
-            if tracked.may_begin:
-                tracked = odometry.begin_segment(frame)
-            if tracked.wants_keyframe:
-                odometry.make_keyframe(frame, tracked)
-            results.append(tracked)
+            results.append(odometry.process(frame, prior))
         return results
 
 
@@ -205,11 +209,11 @@ WRONG: dict[str, Callable[[list[np.ndarray]], list[np.ndarray]]] = {
 }
 
 
-def statuses(results: list[Tracked]) -> list[Status]:
+def statuses(results: list[TrackingResult]) -> list[Status]:
     return [tracked.status for tracked in results]
 
 
-def largest_error_m(covered: Covered, results: list[Tracked]) -> float:
+def largest_error_m(covered: Covered, results: list[TrackingResult]) -> float:
     return max(
         float(np.linalg.norm(tracked.T_odom_camera[:3, 3] - T[:3, 3]))
         for tracked, T in zip(results, covered.T_world_camera, strict=True)
@@ -260,7 +264,7 @@ def test_a_new_segment_begins_where_a_prior_has_the_camera(room, make_walk) -> N
     config = OdometryConfig(segments=SegmentConfig(begin_after_s=0.3))
     alone, helped = turned.followed(None, config), turned.followed(drifting(truth), config)
     for results in (alone, helped):
-        assert {tracked.segment for tracked in results[BEFORE + COVERED :]} == {1}
+        assert {tracked.submap for tracked in results[BEFORE + COVERED :]} == {1}
     assert largest_error_m(turned, helped) < 0.02
     assert largest_error_m(turned, alone) > 0.1, "odometry goes on where it was lost"
 
@@ -291,14 +295,10 @@ def test_a_successor_that_begins_while_covered_resumes_bit_for_bit(covered: Cove
     first, second = Odometry(), Odometry()
     for k, frame in enumerate(covered.frames):
         if k == BEFORE + 5:
-            second.restore(decode_state(encode_state(first.state())))
-        reading = prior.at(frame.stamp_ns, IDENTITY, CONFIG)
-        expected = first.track(frame, reading)
+            second.restore(decode_state(encode_state(first.snapshot())))
+        expected = first.process(frame, prior)
         if k >= BEFORE + 5:
-            tracked = second.track(frame, reading)
+            tracked = second.process(frame, prior)
             assert tracked.T_odom_camera.tobytes() == expected.T_odom_camera.tobytes()
             assert (tracked.status, tracked.method) == (expected.status, expected.method)
-        if expected.wants_keyframe:
-            for odometry in (first, second):
-                odometry.make_keyframe(frame, expected)
     assert expected.status is Status.OK

@@ -11,6 +11,7 @@ from ldo_service.tracking import (
     AlignConfig,
     Alignment,
     Odometry,
+    OdometryConfig,
     PyramidConfig,
     Status,
     align,
@@ -18,6 +19,7 @@ from ldo_service.tracking import (
     pyramid_of,
 )
 from ldo_service.tracking.features import ShapeConfig, pose_from_shape
+from ldo_service.tracking.keyframes import KeyframeConfig
 
 T_WORLD_CORNER = se3.exp(np.array([-0.35, 0.6, 0.0, 0.0, 0.0, 0.0]))  # floor and two walls in view
 STEP = np.array([0.02, 0.06, 0.01, 0.06, 0.02, 0.04])  # 4 degrees and 7 cm
@@ -68,13 +70,8 @@ def test_equal_input_gives_equal_bits(large_room) -> None:
 
 
 def walked(room, poses: Sequence[np.ndarray]) -> list:
-    odometry, results = Odometry(), []
-    for index, T in enumerate(poses):
-        frame = white(room, T, index)
-        results.append(odometry.track(frame))
-        if results[-1].wants_keyframe:
-            odometry.make_keyframe(frame, results[-1])
-    return results
+    odometry = Odometry(OdometryConfig(keyframes=KeyframeConfig(supporting=2.0)))
+    return [odometry.process(white(room, T, index)) for index, T in enumerate(poses)]
 
 
 def test_the_odometry_follows_large_steps_past_white_walls(large_room) -> None:
@@ -83,7 +80,7 @@ def test_the_odometry_follows_large_steps_past_white_walls(large_room) -> None:
     assert [r.status for r in results] == [Status.OK] * 4
     assert max(error_m(r.T_odom_camera, T) for r, T in zip(results, truth, strict=True)) < 2e-3
     assert "shape" in {r.method for r in results}
-    assert max(r.disagreement_rad for r in results) > 0.1, "where the others led is told"
+    assert max(r.hypothesis_spread_rad for r in results) > 0.1, "where the others led is told"
 
 
 @pytest.mark.parametrize("wrong", [{"level": -1}, {"spacing": 0.3}, {"min_partners": 0.0}])

@@ -6,7 +6,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.localiser import LocalisingTracker
 from ldo_service.actors.tracker import Tracker, TrackerConfig
 from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence
@@ -17,13 +16,13 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking.keyframe_database import PLACES, places_of
 
 
-def localiser(finished_run: Path) -> LocalisingTracker:
-    return LocalisingTracker(TrackerConfig(localise=str(finished_run)))
+def localizing(finished_run: Path) -> Tracker:
+    return Tracker(TrackerConfig(localise=str(finished_run)))
 
 
 def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, frames) -> None:
     """The run saw frames 0 to 15; the camera starts at the 12th and leaves."""
-    tracker = localiser(finished_run)
+    tracker = localizing(finished_run)
     made = [out for frame in frames[12:30] for out in tracker.handle(frame)]
     assert all(isinstance(message, TrackedPose) for message in made), "no keyframe is made"
     assert [pose.status for pose in made[:2]] == ["LOST", "OK"]
@@ -39,7 +38,7 @@ def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, f
 
 @pytest.mark.parametrize("split", [1, 8])
 def test_a_successor_goes_on_bit_for_bit(finished_run: Path, frames, split: int) -> None:
-    first, second = localiser(finished_run), localiser(finished_run)
+    first, second = localizing(finished_run), localizing(finished_run)
     for frame in frames[: split + 1]:
         list(first.handle(frame))
     state = {name: decode_state(encode_state(part)) for name, part in first.snapshot().items()}
@@ -54,12 +53,12 @@ def test_the_state_of_a_mapping_service_is_refused_and_the_other_way_round(
 ) -> None:
     mapping = Tracker()
     list(mapping.handle(frames[0]))
-    localising = LocalisingTracker(TrackerConfig(localise=str(finished_run)))
-    list(localising.handle(frames[0]))
+    tracker = localizing(finished_run)
+    list(tracker.handle(frames[0]))
     with pytest.raises(ConfigError, match="--state"):
-        LocalisingTracker(localising.config).restore(mapping.snapshot())
+        localizing(finished_run).restore(mapping.snapshot())
     with pytest.raises(ConfigError, match=str(finished_run)):
-        Tracker().restore(localising.snapshot())
+        Tracker().restore(tracker.snapshot())
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:

@@ -1,0 +1,363 @@
+"""Where a frame was taken: its pose against the reference keyframe.
+
+A frame is aligned from the pose that constant motion predicts. Where the outcome is unsure, it is
+aligned from all other initial guesses too, and the tracking status says how far the best one is
+trusted. A LOST camera is searched for in the keyframe database. What becomes of the frame is
+decided in `odometry`. Conventions: `ldo_service.geometry`.
+"""
+
+import logging
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ldo_service.detection.dynamic_classes import MovableConfig
+from ldo_service.errors import ConfigError
+from ldo_service.geometry import RgbdFrame, se3
+
+from .alignment import AlignConfig, Alignment
+from .features import FeatureConfig, ShapeConfig
+from .keyframe_database import Places, PlacesConfig, thumbnail_of
+from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
+from .motion import Motion
+from .motion_segmentation import MovingConfig, spread, watch
+from .odometry_prior import Anchor, PriorConfig, Reading
+from .pose_candidates import Candidate, CandidateConfig, Guesses
+from .pyramid import Pyramid, PyramidConfig, pyramid_of
+from .relocalization import RelocalisationConfig, Relocaliser, ReturnConfig
+from .state import Origin, State
+from .submaps import Look, SegmentConfig, SubmapMeasurement
+from .tracking_quality import History, JudgementConfig, Status, judge
+from .tracking_result import KeyframeKind, TrackedFrame
+from .window import WindowConfig
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig:
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    shape: ShapeConfig = field(default_factory=ShapeConfig)
+    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    places: PlacesConfig = field(default_factory=PlacesConfig)
+    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
+    returning: ReturnConfig = field(default_factory=ReturnConfig)
+    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    judgement: JudgementConfig = field(default_factory=JudgementConfig)
+    moving: MovingConfig = field(default_factory=MovingConfig)
+    movable: MovableConfig = field(default_factory=MovableConfig)
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
+
+    def __post_init__(self) -> None:
+        if not self.large_motion > 0:
+            raise ConfigError(f"large_motion={self.large_motion:g} must be positive.")
+
+
+class FrameTracker:
+    """Pose tracking of one camera, frame by frame.
+
+    `state` holds all that the next frame depends on. Equal frames give bitwise equal results.
+    """
+
+    def __init__(self, config: OdometryConfig) -> None:
+        self.config = config
+        self.state = State()
+        self._relocalizer = Relocaliser(
+            config.pyramid,
+            config.align,
+            config.features,
+            config.judgement,
+            config.relocalisation,
+        )
+        self._guesses = Guesses(
+            config.align,
+            config.features,
+            config.shape,
+            config.candidates,
+            config.large_motion,
+        )
+        self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
+        self._prior: Reading | None = None  # Of the last frame.
+
+    @property
+    def can_reuse_keyframes(self) -> bool:
+        """Whether so many keyframes were made that known ones are reused."""
+        return 0 < self.config.returning.after <= self.state.next_id
+
+    def track(self, frame: RgbdFrame, prior: Reading | None = None) -> TrackedFrame:
+        """Return the pose of a frame, whatever the frame shows: it may be blank.
+
+        Args:
+            frame: The frame.
+            prior: Camera pose by another odometry. It is one more initial guess, and dead
+                reckoning while tracking is LOST. It makes no tracking status better.
+        """
+        view, keyframe = self.view(frame), self.state.keyframe
+        self._prior = prior
+        if keyframe is None:
+            return self._first_result(view)
+        # Alignment, and how far it is trusted.
+        candidate = self._track_against(keyframe, view, frame.stamp_ns)
+        status = self._classify(candidate)
+        if status is Status.WEAK and not self._relocalizer.is_familiar(view, self.state.trusted):
+            status = Status.LOST
+        # Relocalization.
+        if status is Status.LOST:
+            found = self._relocalize(view, self._places_when_lost(), is_lost=True)
+            if found is None:
+                return self._lost_result(frame, keyframe, candidate.alignment)
+            (keyframe, candidate), status = found, Status.OK
+            # Noise differs between scenes, and pixels that moved belong to one keyframe.
+            origin = Origin.KNOWN if self.can_reuse_keyframes else Origin.NEW
+            self.state = replace(self.state, history=History(), suspicion=None, origin=origin)
+        # Motion, dynamic pixels, the need of a keyframe, and views of other submaps.
+        tracked = self._accepted_result(frame, keyframe, candidate, status)
+        return self._search_other_submaps(tracked, keyframe, view)
+
+    def start_submap(self, frame: RgbdFrame) -> TrackedFrame:
+        """Return the frame just tracked, LOST, as the first of a new submap.
+
+        Odometry goes on where tracking was lost, so its frame never jumps, and the motion missed
+        meanwhile is its error. A prior supplies that motion.
+        """
+        submap = len(self.state.segments.roots)
+        log.info("tracker: starts submap %d with frame %d.", submap, frame.index)
+        T_odom_camera = self._dead_reckoned_pose()
+        if T_odom_camera is None:
+            T_odom_camera = self.state.motion.T_odom_camera
+        return TrackedFrame(
+            Status.OK, "first", T_odom_camera, submap=submap, needed_keyframe=KeyframeKind.FIRST
+        )
+
+    def restart_at(self, frame: RgbdFrame, T_odom_camera: np.ndarray) -> None:
+        """Begin a submap with the frame just tracked, at a pose [4, 4] in odometry."""
+        self.state = replace(
+            self.state,
+            motion=Motion(T_odom_camera, stamp_ns=frame.stamp_ns),
+            status=Status.OK,
+            trusted=thumbnail_of(self.view(frame)),
+            history=History(),
+            segments=self.state.segments.begun(),
+            is_moving=None,
+            suspicion=None,
+            anchor=self._prior and Anchor(T_odom_camera, self._prior),
+        )
+
+    def relocalize_in(self, frame: RgbdFrame, places: Places) -> tuple[Keyframe, Alignment] | None:
+        """Return the keyframe of `places` that the frame just tracked shows, and the alignment."""
+        found = self._relocalize(self.view(frame), places, is_lost=False)
+        return None if found is None else (found[0], found[1].alignment)
+
+    def view(self, frame: RgbdFrame) -> Pyramid:
+        """Return the pyramid of a frame; it is built once for the frame just tracked."""
+        if self._view is None or self._view[0] is not frame:
+            self._view = (frame, pyramid_of(frame, self.config.pyramid))
+        return self._view[1]
+
+    def restore(self, state: State) -> None:
+        """Continue from a state."""
+        self.state, self._view = state, None
+
+    # --- initial guesses and the tracking status --------------------------------------------------
+    def _first_result(self, view: Pyramid) -> TrackedFrame:
+        if not self._is_usable(view):
+            return TrackedFrame(Status.LOST, "none", np.eye(4))
+        return TrackedFrame(Status.OK, "first", np.eye(4), needed_keyframe=KeyframeKind.FIRST)
+
+    def _is_usable(self, view: Pyramid) -> bool:
+        """Return whether frames could be aligned to a view: enough of its depth is measured."""
+        measured = float(np.mean(view.levels[0].depth_m > 0))
+        return measured >= self.config.judgement.min_paired
+
+    def _track_against(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
+        """Align from the predicted pose, and from all other guesses when that is not sure."""
+        motion = self.state.motion
+        T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
+        resting = T_keyframe_odom @ motion.T_odom_camera
+        predicted = self._guesses.from_motion(
+            keyframe, view, T_keyframe_odom @ motion.predicted(stamp_ns)
+        )
+        is_sure = self._classify(predicted) is Status.OK
+        if is_sure and not self._guesses.is_large_step(predicted, resting, view):
+            return predicted
+        T_odom_camera = self._dead_reckoned_pose()
+        carried = None if T_odom_camera is None else T_keyframe_odom @ T_odom_camera
+        return self._guesses.best_of_all(predicted, keyframe, view, resting, carried)
+
+    def _dead_reckoned_pose(self) -> np.ndarray | None:
+        """Return T_odom_camera [4, 4] by the prior's motion since the last OK frame, if known."""
+        start, now = self.state.anchor, self._prior
+        if start is None or now is None:
+            return None
+        return start.carried_to(now, self.config.prior)
+
+    def _classify(self, candidate: Candidate) -> Status:
+        state = self.state
+        return judge(candidate, state.history, state.status, self.config.judgement)
+
+    # --- relocalization ---------------------------------------------------------------------------
+    def _places_when_lost(self) -> Places:
+        """Add the last mapping keyframe to the database, and return the database.
+
+        It shows more of the camera's last position than the reference keyframe does.
+        """
+        before = self.state
+        if before.supporting is not None:
+            places = before.places.added(before.supporting, self.config.places)
+            self.state = replace(before, places=places, supporting=None)
+        return self.state.places
+
+    def _relocalize(
+        self, view: Pyramid, places: Places, *, is_lost: bool
+    ) -> tuple[Keyframe, Candidate] | None:
+        if not self._is_usable(view):
+            return None
+        state = self.state
+        self.state = replace(state, searches=state.searches + 1)
+        return self._relocalizer.find(view, places, state.searches, state.history, is_lost=is_lost)
+
+    def _places_of_other_submaps(self, submap: int) -> Places:
+        """Return the places of all submaps that are not merged with one."""
+        state = self.state
+        are_merged = state.segments.are_merged
+        return Places(tuple(p for p in state.places.all if not are_merged(p.segment, submap)))
+
+    def _search_other_submaps(
+        self, tracked: TrackedFrame, keyframe: Keyframe, view: Pyramid
+    ) -> TrackedFrame:
+        """Search other submaps at intervals; a confirmed match makes the frame a keyframe."""
+        before, config = self.state.segments, self.config.segments
+        if tracked.status is not Status.OK or not before.is_search_due(config):
+            return tracked
+        places = self._places_of_other_submaps(keyframe.segment)
+        found = self._relocalize(view, places, is_lost=False)
+        look = measurement = None
+        if found is not None:
+            there, alignment = found[0], found[1].alignment
+            look = Look.at(there, alignment, tracked.submap, tracked.T_odom_camera)
+            measurement = SubmapMeasurement.of(there, alignment)
+        self.state = replace(self.state, segments=before.looked(look, config))
+        if look is None or not before.is_confirmed_by(look, config):
+            return tracked
+        needed = KeyframeKind.REFERENCE
+        return replace(tracked, needed_keyframe=needed, submap_measurement=measurement)
+
+    # --- results ----------------------------------------------------------------------------------
+    def _lost_result(
+        self, frame: RgbdFrame, keyframe: Keyframe, alignment: Alignment
+    ) -> TrackedFrame:
+        motion = self.state.motion.stopped()
+        self._remember(frame, keyframe, motion, self.state.history, Status.LOST)
+        self.state = replace(self.state, is_moving=None, suspicion=None)
+        T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
+        lost = TrackedFrame.of(
+            replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
+            motion.T_odom_camera,
+            keyframe,
+            Status.LOST,
+            "none",
+        )
+        is_long_lost = self.state.segments.should_start(frame.stamp_ns, self.config.segments)
+        should_start = is_long_lost and self._is_usable(self.view(frame))
+        return replace(lost, should_start_submap=should_start)
+
+    def _accepted_result(
+        self, frame: RgbdFrame, keyframe: Keyframe, candidate: Candidate, status: Status
+    ) -> TrackedFrame:
+        alignment, history, config = candidate.alignment, self.state.history, self.config
+        T_odom_camera = se3.orthonormalised(keyframe.T_odom_keyframe @ alignment.T_reference_camera)
+        motion = self.state.motion.moved_to(T_odom_camera, frame.stamp_ns)
+        is_steady = status is Status.OK and self.state.status is Status.OK
+        if status is Status.OK:
+            history = history.extended(alignment, config.judgement)
+            anchor = self._prior and Anchor(T_odom_camera, self._prior)
+            trusted = thumbnail_of(self.view(frame))
+            self.state = replace(self.state, trusted=trusted, anchor=anchor)
+        self._remember(frame, keyframe, motion if is_steady else motion.stopped(), history, status)
+        dynamic_mask = None  # Surfaces contradict each other where a pose is unsure.
+        if status is Status.OK:
+            dynamic_mask = self._segment_motion(keyframe, self.view(frame), alignment)
+        if self.state.origin is Origin.KNOWN:
+            # What was put there since the keyframe was made does not move.
+            dynamic_mask = None
+            self.state = replace(self.state, is_moving=None)
+        needed = self._needed_keyframe(T_odom_camera, candidate) if status is Status.OK else None
+        return TrackedFrame.of(
+            alignment,
+            T_odom_camera,
+            keyframe,
+            status,
+            candidate.method,
+            needed_keyframe=needed,
+            hypothesis_spread_rad=candidate.disagreement_rad,
+            dynamic_mask=dynamic_mask,
+        )
+
+    def _needed_keyframe(
+        self, T_odom_camera: np.ndarray, candidate: Candidate
+    ) -> KeyframeKind | None:
+        """Return the keyframe that an OK frame should become, by its distance to the last one."""
+        config, frames = self.config.keyframes, self.state.frames_since_keyframe
+        is_known = self.state.origin is Origin.KNOWN
+        if is_known:  # A known keyframe serves for any time.
+            frames = min(frames, config.max_frames - 1)
+        alignment, depth_m = candidate.alignment, candidate.median_depth_m
+        if is_due(alignment.T_reference_camera, alignment.overlap, depth_m, frames, config):
+            return KeyframeKind.REFERENCE
+        T_mapped_camera = se3.inverse(self.state.T_odom_mapped) @ T_odom_camera
+        if not is_known and is_worth_mapping(T_mapped_camera, depth_m, config):
+            return KeyframeKind.MAPPING
+        return None
+
+    def _segment_motion(
+        self, keyframe: Keyframe, view: Pyramid, alignment: Alignment
+    ) -> np.ndarray | None:
+        """Return the moving pixels of a frame [H, W] bool.
+
+        Pixels of the keyframe that have moved since are masked in it.
+        """
+        config = self.config.moving
+        if not config.is_on:
+            return None
+        seen = watch(
+            view,
+            keyframe.view,
+            keyframe.has_moved,
+            alignment.T_reference_camera,
+            alignment.depth_noise_scale,
+            self.state.suspicion,
+            config,
+            self.config.align.residuals.noise,
+        )
+        self.state = replace(self.state, is_moving=seen.is_moving, suspicion=seen.suspicion)
+        if seen.is_much_news(keyframe.has_moved, config):
+            left_out = spread(seen.has_moved, keyframe.view, config)
+            renewed = replace(keyframe, has_moved=seen.has_moved, left_out=left_out)
+            self.state = replace(self.state, keyframe=renewed)
+        return spread(seen.is_moving, view, config)
+
+    def _remember(
+        self,
+        frame: RgbdFrame,
+        keyframe: Keyframe,
+        motion: Motion,
+        history: History,
+        status: Status,
+    ) -> None:
+        before = self.state
+        if status is not before.status:
+            log.info("tracking %s, was %s; keyframe %d", status, before.status, keyframe.id)
+        self.state = replace(
+            before,
+            keyframe=keyframe,
+            motion=motion,
+            history=history,
+            status=status,
+            frames_since_keyframe=before.frames_since_keyframe + 1,
+            segments=before.segments.after(status is Status.LOST, frame.stamp_ns),
+        )
