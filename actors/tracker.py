@@ -61,7 +61,7 @@ OWN_PARTS = "keyframe", "supporting"  # Of the odometry's state, each a part of 
 
 
 @dataclass(frozen=True, slots=True)
-class Mounting:
+class CameraExtrinsics:
     """Pose of the camera on the robot: T_base_camera.
 
     `camera` has the optical axes of this project: x right, y down, z forward. For a base whose x
@@ -73,7 +73,10 @@ class Mounting:
 
     def __post_init__(self) -> None:
         if not np.isfinite((*self.translation_m, *self.quaternion_wxyz)).all():
-            raise ConfigError(f"tracker.T_base_camera holds NaN or infinity: {self}.")
+            raise ConfigError(
+                f"tracker.T_base_camera.translation_m={list(self.translation_m)} and "
+                f"quaternion_wxyz={list(self.quaternion_wxyz)} must be finite."
+            )
         norm = float(np.linalg.norm(self.quaternion_wxyz))
         if abs(norm - 1.0) > UNIT_WITHIN:
             raise ConfigError(
@@ -88,7 +91,7 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class TrackerConfig:
-    T_base_camera: Mounting = field(default_factory=Mounting)
+    T_base_camera: CameraExtrinsics = field(default_factory=CameraExtrinsics)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
     localise: str = ""  # folder of a finished run: track in its map, which stays as it is
     hold_out: int = 0  # every n-th frame is tracked and never mapped, to judge the map by; 0: none

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.optimizer import Optimizer
-from ldo_service.actors.tracker import Mounting, Tracker, TrackerConfig
+from ldo_service.actors.tracker import CameraExtrinsics, Tracker, TrackerConfig
 from ldo_service.conversions.frames import rgbd_message, rgbd_of
 from ldo_service.conversions.poses import (
     correction_message,
@@ -318,7 +318,7 @@ AHEAD = (0.5, -0.5, 0.5, -0.5)  # optical axes in a base with x forward and z up
 
 
 def test_a_pose_says_where_the_camera_sits_on_the_robot(frames) -> None:
-    mounting = Mounting(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
+    mounting = CameraExtrinsics(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
     (pose,) = poses_of(handled(Tracker(TrackerConfig(T_base_camera=mounting)), frames[:1]))
     T_base_camera = transform(pose.T_base_camera)
     forward, down = [0, 0, 1], [0, 1, 0]
@@ -331,13 +331,13 @@ def test_a_pose_says_where_the_camera_sits_on_the_robot(frames) -> None:
 
 def test_without_a_mounting_the_base_is_the_camera_and_poses_are_as_ever(frames, tracked) -> None:
     assert all(pose.T_base_camera == IDENTITY for pose in poses_of(tracked))
-    mounted = Tracker(TrackerConfig(T_base_camera=Mounting(quaternion_wxyz=AHEAD)))
+    mounted = Tracker(TrackerConfig(T_base_camera=CameraExtrinsics(quaternion_wxyz=AHEAD)))
     for pose, other in zip(poses_of(tracked), poses_of(handled(mounted, frames[:5])), strict=False):
         assert pose == msgspec.structs.replace(other, T_base_camera=IDENTITY)
 
 
 def test_a_quaternion_of_four_digits_is_normalised() -> None:
-    mounting = Mounting(quaternion_wxyz=(0.7071, 0.0, 0.7071, 0.0))
+    mounting = CameraExtrinsics(quaternion_wxyz=(0.7071, 0.0, 0.7071, 0.0))
     np.testing.assert_allclose(np.linalg.det(mounting.matrix()), 1.0, atol=1e-12)
 
 
@@ -352,11 +352,11 @@ def test_a_quaternion_of_four_digits_is_normalised() -> None:
 )
 def test_an_impossible_mounting_is_refused(fields) -> None:
     with pytest.raises(ConfigError, match="T_base_camera"):
-        Mounting(**fields)
+        CameraExtrinsics(**fields)
 
 
 # --- another odometry -----------------------------------------------------------------------------
-T_BASE_CAMERA = Mounting(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
+T_BASE_CAMERA = CameraExtrinsics(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
 T_PRIOR_WORLD = se3.exp(np.array([0.2, 1.0, -0.3, 4.0, -1.0, 2.0]))
 
 
