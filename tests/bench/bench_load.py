@@ -37,7 +37,7 @@ from ldo_service.schemas import CameraRgbd, Health, TrackedPose, decode
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.zenoh_transport import open_session
 from tests.faults.camera import frames
-from tests.service.conftest import free_endpoint
+from tests.ports import free_endpoint
 
 LIGHT = ("mapper.iterations=2", "mapper.threads=1", "service.spawned=[]")  # a process per robot
 SAMPLE_S = 2.0

@@ -12,8 +12,8 @@ from ldo_service.schemas import encode
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.flow_control import Header, encode_link
 from ldo_service.transport.zenoh_transport import open_session
+from tests.ports import free_endpoint
 from tests.schemas.examples import EXAMPLES
-from tests.service.conftest import free_endpoint
 
 from .ros import STORE
 

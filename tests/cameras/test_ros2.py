@@ -17,7 +17,8 @@ from ldo_service.errors import ConfigError
 from ldo_service.schemas import CameraRgbd, TrackedPose, decode
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.zenoh_transport import open_session
-from tests.service.conftest import LDO, free_endpoint, live_service
+from tests.ports import free_endpoint
+from tests.service.conftest import LDO, live_service
 
 from .ros import COLOR, DEPTH_MM, camera_info, cdr, header, image
 

@@ -20,8 +20,8 @@ from ldo_service.runs.records import OBJECTS, read_objects, write_objects
 from ldo_service.schemas import MapObjects, Pose, encode
 from ldo_service.schemas.topics import MAP_OBJECTS
 from tests.commands.test_cli import assert_one_paragraph, ldo
+from tests.ports import free_endpoint
 from tests.schemas.examples import EXAMPLES
-from tests.service.conftest import free_endpoint
 
 EXAMPLE = EXAMPLES["map_objects"]
 assert isinstance(EXAMPLE, MapObjects)

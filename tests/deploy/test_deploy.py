@@ -25,8 +25,8 @@ from ldo_service.service.metrics import HealthCollector
 from ldo_service.service.metrics import exported as exporting
 from ldo_service.transport.access_control import read_access, rules_of
 from ldo_service.transport.certificate_authority import Authority
+from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
-from tests.transport.conftest import free_port
 
 DEPLOY = Path(__file__).parent.parent.parent / "deploy"
 UNIT = DEPLOY / "ldo@.service"

@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -33,6 +32,7 @@ from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.zenoh_transport import open_session
+from tests.ports import free_endpoint
 
 from .witness import Witness
 
@@ -237,9 +237,3 @@ def children_of(pid: int) -> set[int]:
         return set(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
     except OSError:
         return set()
-
-
-def free_endpoint() -> str:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"

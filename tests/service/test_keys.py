@@ -9,7 +9,8 @@ from ldo_service.client import connect
 from ldo_service.schemas import TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.transport.certificate_authority import Authority
-from tests.service.conftest import LDO, free_endpoint, wait_until
+from tests.ports import free_endpoint
+from tests.service.conftest import LDO, wait_until
 
 
 @pytest.mark.slow

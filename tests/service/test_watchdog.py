@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.service.conftest import LDO, free_endpoint
+from tests.ports import free_endpoint
+from tests.service.conftest import LDO
 
 
 @pytest.mark.slow

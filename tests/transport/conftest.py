@@ -1,12 +1,12 @@
 """A router on a free port of this machine, and clients of it."""
 
-import socket
 from collections.abc import Callable, Iterator
 
 import pytest
 import zenoh
 
 from ldo_service.transport.zenoh_transport import Network, open_session
+from tests.ports import free_port
 
 
 @pytest.fixture
@@ -29,9 +29,3 @@ def client(network: Network) -> Iterator[Callable[[], zenoh.Session]]:
     yield open_client
     for session in sessions:
         session.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]

@@ -10,7 +10,7 @@ from ldo_service.transport.certificate_authority import Authority
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.keys import Keys
 from ldo_service.transport.zenoh_transport import open_session
-from tests.transport.conftest import free_port
+from tests.ports import free_port
 
 
 def sockets() -> list[tuple[str, int, str]]:

@@ -30,8 +30,9 @@ from ldo_service.transport.keys import Keys
 from ldo_service.transport.zenoh_transport import Network, open_session
 from ldo_service.viewer.live import Live, live
 from tests.maps.streams import ChangingMap
+from tests.ports import free_endpoint
 from tests.schemas.examples import EXAMPLES
-from tests.service.conftest import free_endpoint, wait_until
+from tests.service.conftest import wait_until
 
 
 class Robot:
