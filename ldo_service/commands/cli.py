@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
-    signal.signal(signal.SIGTERM, _interrupt)
+    _handle_interrupts()
     try:
         if not words or words[0] in ("-h", "--help"):
             print(HELP.format(verbs="\n".join(first_lines())))
@@ -65,9 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _interrupt(_number: int, _frame: object) -> None:
-    """SIGTERM ends a verb as Ctrl-C does."""
-    raise KeyboardInterrupt
+def _handle_interrupts() -> None:
+    """Make SIGINT and SIGTERM raise KeyboardInterrupt.
+
+    A shell without job control starts `ldo view &` with SIGINT ignored. Python keeps that setting,
+    so the handler must be installed again.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
 
 
 def first_lines() -> Iterator[str]:

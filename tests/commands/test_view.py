@@ -1,32 +1,12 @@
-"""ldo view"""
+"""ldo view; tests/commands/test_interrupt.py starts and ends it."""
 
-import signal
-import subprocess
 import sys
-import urllib.request
 from pathlib import Path
 
 import pytest
 
 from tests.commands.test_cli import assert_one_paragraph, ldo
-from tests.service.conftest import LDO, free_endpoint
-
-
-def test_a_run_is_served_on_loopback_until_it_is_interrupted(run: Path) -> None:
-    command = [*LDO, "view", str(run), "--set", "viewer.port=0"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as viewer:
-        try:
-            assert viewer.stderr
-            words = viewer.stderr.readline().split()
-            assert words[:3] == ["ldo", "view", "run"]
-            assert words[-1].startswith("http://127.0.0.1:")
-            with urllib.request.urlopen(words[-1]) as page:
-                assert page.headers["Content-Type"] == "text/html"
-            viewer.send_signal(signal.SIGINT)
-            _, err = viewer.communicate(timeout=30)
-        finally:
-            viewer.kill()  # a viewer serves until somebody stops it
-    assert (viewer.returncode, err) == (0, "")
+from tests.ports import free_endpoint
 
 
 def test_without_the_extra_one_line_says_how_to_get_it(

@@ -1,0 +1,102 @@
+"""Programs that end by SIGINT or SIGTERM, also when a script started them in the background."""
+
+import signal
+import subprocess
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from ldo_service.transport.endpoint import Network
+from ldo_service.transport.zenoh_transport import open_session
+from tests.ports import free_endpoint
+from tests.service.conftest import LDO, PATIENCE, wait_until
+
+# A shell without job control starts a background job with SIGINT ignored.
+IGNORING = ("bash", "-c", 'trap "" INT; exec "$@"', "bash")
+
+both_signals = pytest.mark.parametrize(
+    "number", [signal.SIGINT, signal.SIGTERM], ids=lambda number: number.name
+)
+
+
+class Program:
+    """`ldo` in a process that was started with SIGINT ignored."""
+
+    def __init__(self, log: Path, *arguments: str | Path) -> None:
+        self._log = log
+        with log.open("w") as output:
+            self.process = subprocess.Popen([*IGNORING, *LDO, *arguments], stderr=output)
+
+    @property
+    def log(self) -> str:
+        return self._log.read_text()
+
+    def wait_until(self, is_ready: Callable[[], bool]) -> None:
+        def is_ready_while_running() -> bool:
+            assert self.process.poll() is None, self.log
+            return is_ready()
+
+        wait_until(is_ready_while_running, 20, "the program is ready")
+
+    def end_by(self, number: signal.Signals) -> int:
+        """Send a signal and return the exit code."""
+        self.process.send_signal(number)
+        return self.process.wait(PATIENCE * 20)
+
+
+@contextmanager
+def started(log: Path, *arguments: str | Path) -> Iterator[Program]:
+    program = Program(log, *arguments)
+    try:
+        yield program
+    finally:
+        program.process.kill()
+        program.process.wait()
+
+
+@both_signals
+def test_a_viewer_serves_a_run_on_loopback_and_ends_with_0(
+    run: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    with started(tmp_path / "log", "view", run, "--set", "viewer.port=0") as viewer:
+        viewer.wait_until(lambda: "http://" in viewer.log)
+        words = viewer.log.split()
+        assert words[:3] == ["ldo", "view", "run"]
+        assert words[-1].startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(words[-1]) as page:
+            assert page.headers["Content-Type"] == "text/html"
+        assert viewer.end_by(number) == 0
+        assert len(viewer.log.splitlines()) == 1
+
+
+def test_a_service_ends_with_0(tmp_path: Path) -> None:
+    with started(tmp_path / "log", "serve", "--endpoint", free_endpoint()) as service:
+        service.wait_until(lambda: "serving" in service.log)
+        assert service.end_by(signal.SIGINT) == 0
+        assert "Traceback" not in service.log
+
+
+@both_signals
+def test_a_run_ends_with_130_and_keeps_what_is_done(tmp_path: Path, number: signal.Signals) -> None:
+    out = tmp_path / "out"
+    with started(tmp_path / "log", "run", "synthetic:room", "--out", out) as run:
+        run.wait_until(out.exists)
+        assert run.end_by(number) == 130
+        assert "ldo: interrupted; what is done is kept." in run.log
+        assert "Traceback" not in run.log
+
+
+def test_a_publisher_ends_with_130(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    slowly = "--rate", "1", "--endpoint", endpoint
+    with open_session(Network("robot", endpoint), router=True) as session:
+        frames = session.declare_subscriber("ldo/robot/camera/rgbd", zenoh.handlers.RingChannel(1))
+        with started(tmp_path / "log", "publish", "synthetic:room", *slowly) as publisher:
+            publisher.wait_until(lambda: frames.try_recv() is not None)
+            assert publisher.end_by(signal.SIGINT) == 130
+            assert "ldo: interrupted." in publisher.log
+            assert "Traceback" not in publisher.log
