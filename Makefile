@@ -10,11 +10,11 @@ help:  ## what can be made
 demo: .venv/installed  ## the main job on a built-in synthetic room: a table and three pictures
 	$(BIN)/ldo demo --out build/demo --overwrite
 
-test: .venv/tests  ## the default test suite
-	$(BIN)/python -m pytest -q
+test: .venv/tests  ## the default test suite, one process a core; ARGS="-n 0 ..." for one process
+	$(BIN)/python -m pytest -q -n auto --dist worksteal $(ARGS)
 
-slow: .venv/tests  ## the tests that take longer
-	$(BIN)/python -m pytest -q -m slow
+slow: .venv/tests  ## the tests that take longer, one by one: each needs the cores
+	$(BIN)/python -m pytest -q -m slow $(ARGS)
 
 check: .venv/dev  ## format, lint, types
 	deploy/check
