@@ -5,7 +5,6 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
 import zenoh
 
 from ldo_service.schemas import encode
@@ -20,7 +19,6 @@ from .ros import STORE
 EXAMPLE = Path(__file__).parent.parent.parent / "examples" / "5_pose_for_ros.py"
 
 
-@pytest.mark.timeout(120)
 def test_poses_become_transforms() -> None:
     endpoint, pose = free_endpoint(), EXAMPLES["tracked_pose"]
     program = EXAMPLE.read_text().replace("tcp/127.0.0.1:7447", endpoint)

@@ -133,7 +133,6 @@ def publisher(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[str]]
         process.kill()
 
 
-@pytest.mark.timeout(120)
 def test_a_publisher_passes_on_what_a_bridge_forwards() -> None:
     endpoint = free_endpoint()
     with open_session(Network("robot", endpoint), router=True) as session:

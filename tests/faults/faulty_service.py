@@ -19,7 +19,7 @@ from typing import Any
 from ldo_service.commands import cli
 from ldo_service.runtime import Actor
 from ldo_service.runtime.stage import Stage
-from ldo_service.service.service import service
+from ldo_service.service import service
 from ldo_service.transport.interface import OnMessage
 from ldo_service.transport.zenoh_transport import ZenohTransport
 

@@ -151,7 +151,6 @@ def test_a_refined_map_lies_beside_the_runs_own_and_looks_better(
     assert refined.mean("psnr_db") > online.mean("psnr_db") + 1
 
 
-@pytest.mark.timeout(60)
 def test_forty_real_frames_stay_within_three_centimetres(data: Path, tmp_path: Path) -> None:
     from ldo_service.datasets import open_sequence
 

@@ -3,8 +3,6 @@
 import json
 from pathlib import Path
 
-import pytest
-
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.runs.realtime import run_in_real_time
@@ -12,7 +10,6 @@ from ldo_service.runs.realtime import run_in_real_time
 from .jobs import job
 
 
-@pytest.mark.timeout(60)
 def test_a_paced_run_takes_as_long_as_the_sequence_and_accounts_for_every_frame(
     room: Sequence, tmp_path: Path
 ) -> None:

@@ -122,7 +122,6 @@ def test_the_last_line_is_json_for_scripts(capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(120)
 def test_real_frames_give_the_same_digests_for_one_thread_and_two(data: Path) -> None:
     from ldo_service.datasets import open_sequence
 

@@ -15,7 +15,7 @@ from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, new_epoch
 from ldo_service.schemas import Message, encode
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
-from ldo_service.transport.flow_control import InletPast, OutletPast, Sent
+from ldo_service.transport.flow_control import InletPast, OutletPast, Sent, grant_key
 from ldo_service.transport.interface import MemoryTransport
 
 from .cast import (
@@ -257,9 +257,14 @@ async def test_a_stage_that_waits_for_its_disk_says_so_to_its_producers() -> Non
         for value in range(4):
             await send(numbers, number(value))
         await eventually(lambda: adder.health().failures == 1)
-        for _ in range(30):
-            numbers.check_windows()
-            await asyncio.sleep(0.01)
+        loop = asyncio.get_running_loop()
+
+        def on_grant(_header: bytes, _body: memoryview) -> None:
+            """Check after each grant: a pause of the whole process is no silence of the adder."""
+            loop.call_soon_threadsafe(numbers.check_windows)
+
+        transport.subscribe(grant_key(NUMBERS.name), on_grant)
+        await asyncio.sleep(0.3)  # three times the patience
         assert numbers.room() == 0
         store.fails = ""
         await eventually(lambda: adder.health().steps == 4)

@@ -83,7 +83,7 @@ def test_actors_compute_side_by_side() -> None:
     """Each waits for the other, which one thread alone could never do."""
 
     class Partner(Doubler):
-        both: ClassVar[threading.Barrier] = threading.Barrier(2, timeout=10)
+        both: ClassVar[threading.Barrier] = threading.Barrier(2, timeout=60)
 
         def handle(self, _message: Message) -> Iterator[Message]:
             self.both.wait()

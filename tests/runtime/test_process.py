@@ -61,7 +61,7 @@ async def test_a_killed_consumer_nobody_expects_releases_the_window(
         await asyncio.sleep(0.05)
         assert not waiting.done()
         process.kill()
-        await asyncio.wait_for(waiting, 10)
+        await asyncio.wait_for(waiting, 60)
     finally:
         process.kill()
         process.wait()
@@ -73,7 +73,11 @@ async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
     numbers, transport = tmp_path / "numbers", ZenohTransport(client(), network)
     source = Outlet(Out(NUMBERS), "producer", 1, transport, ["collector"])
     process = ChildProcess(
-        "collector", command(network, numbers, 0.01), transport, silent_after_s=1.0
+        "collector",
+        command(network, numbers, 0.01),
+        transport,
+        silent_after_s=1.0,
+        max_restarts=100,
     )
     stop = Stop()
     service = asyncio.create_task(supervise([process], stop))
@@ -127,7 +131,7 @@ async def test_a_child_that_is_drained_while_it_starts_ends() -> None:
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     sleeping.drain()
-    await asyncio.wait_for(task, 10)
+    await asyncio.wait_for(task, 60)
     assert sleeping.restarts == 0
 
 
@@ -159,7 +163,7 @@ def test_a_child_of_a_killed_parent_does_not_outlive_it(network: Network, tmp_pa
     pid = int(parent.stdout.readline())
     parent.kill()
     parent.communicate()
-    deadline_s = time.monotonic() + 15
+    deadline_s = time.monotonic() + 60
     while is_running(pid):
         assert time.monotonic() < deadline_s
         time.sleep(0.02)

@@ -197,7 +197,7 @@ async def test_a_state_that_cannot_be_restored_exhausts_the_restarts() -> None:
 async def test_a_handler_that_does_not_return_is_a_stall() -> None:
     transport, stuck = MemoryTransport(), Event()
     config = StageConfig(heartbeat_s=0.01, stall_after_s=0.05)
-    stage = collector(transport, [], lambda _value: stuck.wait(10) and None, config=config)
+    stage = collector(transport, [], lambda _value: stuck.wait(60) and None, config=config)
     numbers = source(transport, "collector")
     running_stage = asyncio.create_task(stage.run())
     await send(numbers, number(0))
@@ -210,7 +210,7 @@ async def test_a_soft_stop_handles_what_has_arrived_and_says_the_last_words() ->
     transport, sums, go = MemoryTransport(), [], Event()
 
     def wait(_value: int) -> None:
-        go.wait(10)
+        go.wait(60)
 
     adder = Stage(lambda: Adder(wait), transport, config=QUICK)
     numbers = source(transport, "adder")
@@ -228,7 +228,7 @@ async def test_a_soft_stop_handles_what_has_arrived_and_says_the_last_words() ->
 async def test_a_soft_stop_before_the_start_ends_at_once() -> None:
     stage = Stage(Doubler, MemoryTransport(), config=QUICK)
     stage.drain()
-    await asyncio.wait_for(stage.run(), 5)
+    await asyncio.wait_for(stage.run(), 60)
 
 
 async def test_last_words_that_fail_do_not_hinder_the_stop() -> None:
@@ -238,7 +238,7 @@ async def test_last_words_that_fail_do_not_hinder_the_stop() -> None:
 
     stage = Stage(Speechless, MemoryTransport(), config=QUICK)
     stage.drain()
-    await asyncio.wait_for(stage.run(), 5)
+    await asyncio.wait_for(stage.run(), 60)
     assert stage.health().failures == 1
 
 
@@ -267,7 +267,7 @@ async def test_a_busy_stage_says_so_in_its_heartbeat() -> None:
     transport.subscribe(
         "health/collector", lambda _header, body: beats.append(decode(body, Health))
     )
-    stage = collector(transport, [], lambda _value: stuck.wait(10) and None)
+    stage = collector(transport, [], lambda _value: stuck.wait(60) and None)
     numbers = source(transport, "collector")
     async with running(stage):
         await send(numbers, number(0))
@@ -297,7 +297,7 @@ async def test_an_output_that_never_waits_is_made_only_where_there_is_room() -> 
     async with running(stage):
         await send(feed, number(0))  # nobody there yet: no room
         await eventually(lambda: stage.health().steps == 1)
-        async with running(collector(transport, seen, lambda _value: stuck.wait(10) and None)):
+        async with running(collector(transport, seen, lambda _value: stuck.wait(60) and None)):
             await eventually(lambda: stage._outlets[Number].room() == 4)
             for value in range(1, 21):
                 await send(feed, number(value))
@@ -378,7 +378,7 @@ class Queued(Actor):
 
     def handle(self, message: Message) -> Iterator[Message]:
         self.seen.append(self.situation.waiting[NUMBERS])
-        self._stuck.wait(10)
+        self._stuck.wait(60)
         yield Double(stamp_ns=message.stamp_ns, value=0)
 
 

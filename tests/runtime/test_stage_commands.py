@@ -78,10 +78,10 @@ async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
     async with running(stage):
         arrive(1)
         await eventually(lambda: seen == [1])
-        assert await commander.order("hold", "collector", 5) == ""
+        assert await commander.order("hold", "collector", 60) == ""
         assert stage.health().held
         arrive(2, 3, 4)
-        assert await commander.order("release", "collector", 5) == ""
+        assert await commander.order("release", "collector", 60) == ""
         arrive(5)
         await eventually(lambda: seen == [1, 5] and stage.health().inputs[0].delivered == 2)
         (counted,) = stage.health().inputs
@@ -94,25 +94,25 @@ async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
     stage, commander = collector(transport, seen), Commander(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
     async with running(stage):
-        await commander.order("hold", "collector", 5)
+        await commander.order("hold", "collector", 60)
         for value in range(4):
             await send(numbers, number(value))
         waiting = asyncio.create_task(send(numbers, number(4)))
         await asyncio.sleep(0.05)
         assert (seen, waiting.done()) == ([], False)
-        await commander.order("release", "collector", 5)
+        await commander.order("release", "collector", 60)
         await eventually(lambda: seen == [0, 1, 2, 3, 4])
         await waiting
 
 
 async def test_a_hold_waits_for_the_step_under_way() -> None:
     transport, seen, go = MemoryTransport(), [], Event()
-    stage = collector(transport, seen, lambda _value: go.wait(10) and None, policy=Latest(1))
+    stage = collector(transport, seen, lambda _value: go.wait(60) and None, policy=Latest(1))
     commander = Commander(transport)
     async with running(stage):
         transport.deliver(NUMBERS.name, encode_link(OUTSIDE), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
-        holding = asyncio.create_task(commander.order("hold", "collector", 5))
+        holding = asyncio.create_task(commander.order("hold", "collector", 60))
         await asyncio.sleep(0.05)
         assert not holding.done()
         go.set()
@@ -124,9 +124,9 @@ async def test_a_soft_stop_ends_a_held_stage() -> None:
     transport, seen = MemoryTransport(), []
     stage, commander = collector(transport, seen), Commander(transport)
     async with running(stage) as (task,):
-        await commander.order("hold", "collector", 5)
+        await commander.order("hold", "collector", 60)
         stage.drain()
-        await asyncio.wait_for(task, 5)
+        await asyncio.wait_for(task, 60)
 
 
 async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
@@ -139,7 +139,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
         await eventually(lambda: seen == [1])
         feed(transport, 11)
         await eventually(lambda: seen == [1, 2])
-        await commander.order("save", "counter", 5)
+        await commander.order("save", "counter", 60)
         epoch = counter.health().epoch
         for what in ("hold", "renew", "release"):
             assert await commander.order(what, "counter", 5) == ""
@@ -158,7 +158,7 @@ async def test_a_renewed_consumer_joins_its_producer_again() -> None:
     async with running(stage):
         await send(numbers, number(0))
         await eventually(lambda: seen == [0])
-        assert await commander.order("renew", "collector", 5) == ""
+        assert await commander.order("renew", "collector", 60) == ""
         for value in range(1, 9):
             await send(numbers, number(value))
         await eventually(lambda: seen == list(range(9)))
@@ -171,11 +171,11 @@ async def test_nothing_of_the_time_before_is_handled_after_a_renewal() -> None:
     old = Outlet(Out(DOUBLES), "source", 7, transport)
     async with running(stage):
         await eventually(lambda: "double_collector" in old._consumers)
-        await commander.order("hold", "double_collector", 5)
+        await commander.order("hold", "double_collector", 60)
         await send(old, Double(stamp_ns=1, value=1))
         old.renew(8)
-        await commander.order("renew", "double_collector", 5)
-        await commander.order("release", "double_collector", 5)
+        await commander.order("renew", "double_collector", 60)
+        await commander.order("release", "double_collector", 60)
         await eventually(lambda: old.room() == 2)
         await send(old, Double(stamp_ns=2, value=2))
         await eventually(lambda: seen == [2])
@@ -198,12 +198,12 @@ async def test_a_save_writes_what_the_actor_had_left_for_later(tmp_path: Path) -
         feed(transport, 1)
         await eventually(lambda: counter.health().steps == 1)
         assert FolderStore(tmp_path).load("counter") is None
-        assert await commander.order("save", "counter", 5) == ""
+        assert await commander.order("save", "counter", 60) == ""
         assert FolderStore(tmp_path).load("counter") == {"count": 1}
         store.forget("counter")
         assert FolderStore(tmp_path).load("counter") is None
         assert list((tmp_path / "counter").iterdir()) == []
-        assert await commander.order("save", "counter", 5) == ""
+        assert await commander.order("save", "counter", 60) == ""
         assert FolderStore(tmp_path).load("counter") == {"count": 1}
 
 
@@ -212,7 +212,7 @@ async def test_a_save_that_fails_is_reported_and_the_stage_goes_on(tmp_path: Pat
     counter = Stage(Counter, transport, config=QUICK, store=FolderStore(tmp_path))
     (tmp_path / "counter").write_text("a file where the folder should be")
     async with running(counter):
-        assert "FileExistsError" in await Commander(transport).order("save", "counter", 5)
+        assert "FileExistsError" in await Commander(transport).order("save", "counter", 60)
         feed(transport, 1)
         await eventually(lambda: counter.health().steps == 1)
 
@@ -226,7 +226,7 @@ async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
     counter, commander = Stage(Counter, transport, config=QUICK), Commander(transport)
     epochs = [counter.health().epoch]
     async with running(counter):
-        assert await commander.order("renew", "counter", 5) == ""
+        assert await commander.order("renew", "counter", 60) == ""
         epochs.append(counter.health().epoch)
         await asyncio.sleep(0.05)
         assert counter.health().epoch == epochs[1] != epochs[0]

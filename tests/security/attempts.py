@@ -214,7 +214,7 @@ def camera_is_alive(lab: Lab) -> str:
         declared = session.liveliness().declare_token(token)
         session.put(f"ldo/{ROBOT}/{CAMERA_RGBD.name}", b"after it")
         eventually(lambda: bool(lab.got))
-        found = list(viewer.liveliness().get(token, timeout=2.0))
+        found = list(viewer.liveliness().get(token, timeout=60.0))
         declared.undeclare()
         return "seen" if found else "not seen"
 

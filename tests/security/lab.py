@@ -18,11 +18,11 @@ from ldo_service.transport.certificate_authority import Authority
 from ldo_service.transport.endpoint import Network
 from ldo_service.transport.keys import Keys
 from ldo_service.transport.zenoh_transport import open_session
-from tests.transport.conftest import free_port
+from tests.ports import free_port
 
 ROBOT, OTHER_ROBOT = "mule", "goat"
 LARGEST_MB = 1
-STEP_S, PATIENCE_S = 0.01, 20.0
+STEP_S, PATIENCE_S = 0.01, 60.0
 SETTLED = "settled"
 LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"  # a camera's keys that were made again; others
 ROLES: tuple[Role, ...] = ("service", "camera", "odometry", "viewer", "operator")
@@ -131,5 +131,5 @@ def eventually(true: Callable[[], bool]) -> None:
 def asked(network: Network, expression: str) -> list[bytes]:
     """What a query is answered."""
     with open_session(network) as session:
-        replies = session.get(f"ldo/{ROBOT}/{expression}", timeout=2.0)
+        replies = session.get(f"ldo/{ROBOT}/{expression}", timeout=PATIENCE_S)
         return [reply.ok.payload.to_bytes() for reply in replies if reply.ok is not None]

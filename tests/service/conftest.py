@@ -2,29 +2,31 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from itertools import count, cycle
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import Client, connect
+from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.errors import ConfigError
-from ldo_service.schemas import Health, TrackedPose
+from ldo_service.geometry.sequence import Sequence as FrameSequence
+from ldo_service.schemas import CameraRgbd, Health, TrackedPose
+from tests.ports import free_endpoint
 
-PATIENCE = 4  # machines that run tests do other things too: a test waits, it measures no time
+PATIENCE = 6  # machines that run tests do other things too: a test waits, it measures no time
+RESEND_AFTER_S = 1.0  # without an answer to a frame
+MAX_COPIES = 1000  # of a frame that is sent again, 1 ns apart
 LDO = (sys.executable, "-m", "ldo_service")
-
-
-def free_endpoint() -> str:
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{listener.getsockname()[1]}"
 
 
 def wait_until(true: Callable[[], bool], timeout_s: float, what: str) -> None:
@@ -57,25 +59,31 @@ class LiveService:
             stderr=self._log,
         )
         self._stack = ExitStack()
-        self.client = self._connect()
-        self._health = self._stack.enter_context(self.client.listen("health/*", Health))
-        self._poses = self._stack.enter_context(
-            self.client.listen("pose/tracked", TrackedPose, keep=4096)
-        )
         self.health: dict[str, Health] = {}
+        try:
+            self.client = self._connect()
+            self._health = self._stack.enter_context(self.client.listen("health/*", Health))
+            self._poses = self._stack.enter_context(
+                self.client.listen("pose/tracked", TrackedPose, keep=4096)
+            )
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def log(self) -> str:
         return self.log_path.read_text()
 
     def _connect(self) -> Client:
-        for _ in range(20):
+        """Try until the router listens. Where nothing listens a try ends at once."""
+        until_s = time.monotonic() + PATIENCE * 20
+        while True:
             try:
                 return self._stack.enter_context(connect("robot", self.endpoint))
             except ConfigError:
                 assert self.process.poll() is None, self.log
+                assert time.monotonic() < until_s, f"the service does not answer:\n{self.log}"
                 time.sleep(0.2)
-        pytest.fail(f"the service does not answer:\n{self.log}")
 
     def update_health(self) -> dict[str, Health]:
         self.health.update({health.actor: health for health in self._health()})
@@ -99,9 +107,85 @@ class LiveService:
         wait_until(enough, timeout_s, f"{count} poses (log: {self.log})")
         return poses
 
+    def send_until(
+        self,
+        frame: CameraRgbd,
+        is_done: Callable[[], bool],
+        timeout_s: float,
+        what: str,
+        send: Callable[[CameraRgbd], None] | None = None,
+    ) -> None:
+        """Send a frame each second until a condition holds: a busy machine may drop any frame.
+
+        Args:
+            frame: The frame. Each copy is stamped 1 ns after the one before, because a stamp that
+                comes twice is rejected.
+            is_done: The condition.
+            timeout_s: The time limit on a machine with nothing else to do.
+            what: The condition in words, for the failure.
+            send: What sends a copy; by default `self.client.send`.
+        """
+        copies = count()
+        due_s = time.monotonic()
+
+        def is_done_after_sending() -> bool:
+            nonlocal due_s
+            assert self.process.poll() is None, self.log
+            if is_done():
+                return True
+            if time.monotonic() >= due_s:
+                stamp_ns = frame.stamp_ns + next(copies)
+                (send or self.client.send)(msgspec.structs.replace(frame, stamp_ns=stamp_ns))
+                due_s = time.monotonic() + RESEND_AFTER_S
+            return False
+
+        wait_until(is_done_after_sending, timeout_s, what)
+
+    def pose_of(
+        self, frame: CameraRgbd, send: Callable[[CameraRgbd], None] | None = None
+    ) -> TrackedPose:
+        """Send a frame, as often as it takes, and return its pose."""
+        found: list[TrackedPose] = []
+
+        def has_come() -> bool:
+            found.extend(
+                pose
+                for pose in self.poses()
+                if frame.stamp_ns <= pose.stamp_ns < frame.stamp_ns + MAX_COPIES
+            )
+            return bool(found)
+
+        self.send_until(frame, has_come, 20, f"a pose of frame {frame.frame}", send)
+        return found[0]
+
     def publisher(self, *arguments: str) -> subprocess.Popen[bytes]:
         command = [*LDO, "publish", *arguments, "--endpoint", self.endpoint]
         return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+
+    @contextmanager
+    def camera(self, frames: FrameSequence, rate_hz: float = 5) -> Iterator[None]:
+        """Send a sequence that ends where it begins, again and again, until the block ends.
+
+        Args:
+            frames: The sequence; each frame is stamped with the time at which it is sent.
+            rate_hz: So few that frames in a row have poses on a busy machine, too.
+        """
+        is_over = threading.Event()
+
+        def send_all() -> None:
+            for index in cycle(range(len(frames))):
+                if is_over.wait(1 / rate_hz):
+                    return
+                frame = camera_rgbd_message(frames.read(index))
+                self.client.send(msgspec.structs.replace(frame, stamp_ns=time.time_ns()))
+
+        with ThreadPoolExecutor(1) as thread:
+            sending = thread.submit(send_all)
+            try:
+                yield
+            finally:
+                is_over.set()
+            sending.result()
 
     def stop(self, number: signal.Signals = signal.SIGINT, timeout_s: float = 15) -> int:
         self.process.send_signal(number)

@@ -12,7 +12,6 @@ APART = ("--set", "service.spawned=[detector]", "--set", "mapper.iterations=2")
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("is_garbage", [False, True], ids=["network", "garbage"])
 def test_every_keyframe_is_answered_whatever_the_network_is(
     tmp_path: Path, is_garbage: bool

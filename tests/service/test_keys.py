@@ -14,7 +14,6 @@ from tests.service.conftest import LDO, wait_until
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_frames_go_in_and_poses_come_out_over_tls(tmp_path: Path) -> None:
     keys = tmp_path / "keys"
     authority = Authority.new(keys, days=2)

@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.topology import GRAPH
+from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import MapSnapshot, TrackedPose
 from ldo_service.schemas.topics import MAP_SNAPSHOT, POSE_TRACKED
-from tests.service.conftest import LDO, free_endpoint, is_running, live_service, wait_until
+from tests.ports import free_endpoint
+from tests.service.conftest import LDO, PATIENCE, is_running, live_service, wait_until
 
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 EVERY_ACTOR = tuple(box.name for box in GRAPH)
@@ -20,30 +23,31 @@ EVERY_ACTOR = tuple(box.name for box in GRAPH)
 APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]", "--set", "mapper.iterations=2")
 
 
-@pytest.mark.timeout(300)
 def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "45")
-        poses = service.wait_for_poses(40)
+        # So slow that a busy machine, which drops some, keeps enough of them.
+        publisher = service.publisher("synthetic:room", "--rate", "5", "--max-frames", "25")
+        poses = service.wait_for_poses(8)
+        assert publisher.wait(PATIENCE * 20) == 0
+        poses += service.poses()
         assert {pose.status for pose in poses} == {"OK"}
-        assert publisher.wait(20) == 0
-        assert isinstance(service.client.last(POSE_TRACKED)[0], TrackedPose)
-        assert service.client.last("pose/tracked") == service.client.last(POSE_TRACKED)
+        last = service.client.last(POSE_TRACKED, timeout_s=60)
+        assert isinstance(last[0], TrackedPose)
+        assert service.client.last("pose/tracked", timeout_s=60) == last
         heard = service.client.messages("health", keep=16)
         assert {next(heard)[1].actor for _ in range(16)} == set(EVERY_ACTOR)
         with pytest.raises(ConfigError, match="Did you mean pose/tracked"):
             service.client.last("pose/traked")
         with pytest.raises(ConfigError, match="map/delta keeps no last value"):
             service.client.last("map/delta")
-        parts = service.client.last(MAP_SNAPSHOT)
+        parts = service.client.last(MAP_SNAPSHOT, timeout_s=60)
         assert all(isinstance(part, MapSnapshot) for part in parts)
         assert sum(part.gaussians.ids.shape[0] for part in parts) > 1000
         assert service.stop() == 0
         assert "Traceback" not in service.log
 
 
-@pytest.mark.timeout(300)
 def test_the_examples_run_as_printed(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -54,13 +58,13 @@ def test_the_examples_run_as_printed(tmp_path: Path) -> None:
                 text=True,
             )
             for name, count in (
-                ("1_publish_a_camera.py", "150"),
+                ("1_publish_a_camera.py", "10000"),
                 ("2_follow_the_pose.py", "5"),
                 ("3_without_our_package.py", "5"),
             )
         )
         for subscriber in (ours, plain):
-            printed, _ = subscriber.communicate(timeout=30)
+            printed, _ = subscriber.communicate(timeout=30 * PATIENCE)
             lines = printed.splitlines()
             assert len(lines) == 5
             assert all(line.split()[1] == "OK" for line in lines)
@@ -68,7 +72,6 @@ def test_the_examples_run_as_printed(tmp_path: Path) -> None:
         camera.communicate()
 
 
-@pytest.mark.timeout(300)
 def test_the_example_of_an_odometry_is_taken(tmp_path: Path) -> None:
     poses = tmp_path / "odometry.txt"
     poses.write_text(
@@ -77,7 +80,7 @@ def test_the_example_of_an_odometry_is_taken(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         example = _at(service.endpoint, EXAMPLES / "4_publish_odometry.py")
-        done = subprocess.run([sys.executable, "-c", example, str(poses)], timeout=60)
+        done = subprocess.run([sys.executable, "-c", example, str(poses)])
         assert done.returncode == 0
 
         def taken() -> int:
@@ -94,7 +97,6 @@ def _at(endpoint: str, example: Path) -> str:
     return text.replace('connect("robot")', f'connect("robot", "{endpoint}")')
 
 
-@pytest.mark.timeout(300)
 def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -106,30 +108,28 @@ def test_a_taken_port_is_said_in_one_paragraph(tmp_path: Path) -> None:
         assert "Traceback" not in second.stderr
 
 
-@pytest.mark.timeout(300)
-def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(tmp_path: Path) -> None:
+def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
+    tmp_path: Path, room: Sequence
+) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        camera = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "40")
-        service.wait_for_poses(30)
+        for index in range(30):
+            service.pose_of(camera_rgbd_message(room.read(index)))
         state = tmp_path / "s"
         assert "another service keeps its state" in refused(state)
-        assert camera.wait(20) == 0
         wait_until(lambda: service.update_health()["mapper"].facts["keyframes"] > 2, 10, "a map")
         assert service.stop() == 0
         keyframes = service.health["mapper"].facts["keyframes"]
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        camera = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "60")
-        service.wait_for_poses(40)
+        for index in range(30, 60):
+            service.pose_of(camera_rgbd_message(room.read(index)))
         wait_until(
             lambda: service.update_health()["mapper"].facts.get("keyframes", 0) > keyframes,
             10,
             "the map goes on",
         )
         assert service.stop() == 0
-        camera.kill()
-        camera.wait()
     for part in (state / "state" / "tracker").iterdir():
         part.write_bytes(b"torn")
     assert "no readable state of tracker" in refused(state)
@@ -147,7 +147,6 @@ def refused(state: Path) -> str:
     return done.stderr
 
 
-@pytest.mark.timeout(300)
 def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
@@ -159,7 +158,6 @@ def test_children_leave_when_the_service_is_killed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> None:
     with live_service(tmp_path, *APART) as service:
         service.wait_for_actors()
@@ -187,7 +185,6 @@ def test_every_actor_may_be_killed_and_the_service_goes_on(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
@@ -204,7 +201,6 @@ def test_the_publisher_may_be_killed_and_started_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_sleeping_subscriber_is_its_own_problem(tmp_path: Path) -> None:
     sleeper = (
         "import time, zenoh, json, sys\n"

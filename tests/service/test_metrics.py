@@ -15,8 +15,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import encode
 from ldo_service.service.metrics import COMES_BACK_S, HealthCollector, exported
+from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
-from tests.transport.conftest import free_port
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def port() -> Iterator[int]:
 
 def scraped(port: int) -> dict[tuple[str, tuple[tuple[str, str], ...]], float]:
     """Value by name and labels, read by Prometheus's own parser."""
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5) as reply:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60) as reply:
         text = reply.read().decode()
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
@@ -47,7 +47,7 @@ def labels(*own: tuple[str, str]) -> tuple[tuple[str, str], ...]:
 def asked(port: int) -> tuple[int, str]:
     """Status and text of /healthz."""
     try:
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=5) as reply:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/healthz", timeout=60) as reply:
             return reply.status, reply.read().decode().strip()
     except urllib.error.HTTPError as error:
         return error.code, error.read().decode().strip()
@@ -82,7 +82,7 @@ def test_any_address_of_this_machine_will_do(address: str) -> None:
     port = free_port()
     with suppress(ConfigError), exported(HealthCollector("mule"), port, address):  # no IPv6 here
         url = f"http://{f'[{address}]' if ':' in address else address}:{port}/healthz"
-        with urllib.request.urlopen(url, timeout=5) as reply:
+        with urllib.request.urlopen(url, timeout=60) as reply:
             assert reply.status == 200
             return
     assert address == "::1", "only IPv6 may be missing"

@@ -11,7 +11,7 @@ from tests.service.conftest import LDO, LiveService, live_service, wait_until
 
 from .test_live import APART, EVERY_ACTOR
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(120)]
+pytestmark = pytest.mark.slow
 
 
 def publish(service: LiveService, frames: int) -> None:
@@ -36,7 +36,6 @@ def test_a_recorded_service_replays(tmp_path: Path) -> None:
     assert_replays(recording)
 
 
-@pytest.mark.timeout(400)
 def test_actors_that_are_killed_replay_with_both_their_lives(tmp_path: Path) -> None:
     recording = tmp_path / "recording"
     with live_service(tmp_path, "--record", str(recording), *APART) as service:

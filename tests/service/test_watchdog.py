@@ -12,7 +12,6 @@ from tests.service.conftest import LDO
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(300)
 def test_a_service_says_when_it_is_up_pings_and_says_that_it_stops(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(str(tmp_path / "notify"))

@@ -15,7 +15,7 @@ from ldo_service.actors import topology
 from ldo_service.actors.tracker import Tracker
 from ldo_service.commands import cli
 from ldo_service.schemas import Correction, FrameRgbd
-from ldo_service.service.service import service
+from ldo_service.service import service
 
 TROUBLE, FRAME = os.environ["TROUBLE"], 20
 HUNG = Path(os.environ["TROUBLE_FOLDER"]) / "has_hung"

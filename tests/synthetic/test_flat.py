@@ -332,7 +332,6 @@ def test_the_flat_holds_objects_inside_and_outside_coco(exact: FlatSequence) -> 
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(120)
 def test_the_walk_sees_them_before_bare_walls(exact: FlatSequence) -> None:
     shown = contents(exact, stride=6)
     objects = shown.objects_per_class

@@ -29,7 +29,7 @@ def outlet(transport: MemoryTransport, *expected: str, epoch: int = 1, **options
 
 async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> None:
     transport, seen, let_go = MemoryTransport(), [], Event()
-    stage = collector(transport, seen, lambda _value: let_go.wait(10) and None)
+    stage = collector(transport, seen, lambda _value: let_go.wait(60) and None)
     source = outlet(transport, "collector")
 
     async def produce() -> None:
@@ -131,7 +131,7 @@ async def test_everyone_else_sees_a_repeated_message_once(monkeypatch: pytest.Mo
 async def test_a_consumer_nobody_expects_releases_the_window_when_it_dies() -> None:
     transport, stuck = MemoryTransport(), Event()
     source = outlet(transport)
-    async with running(collector(transport, [], lambda _value: stuck.wait(10) and None)):
+    async with running(collector(transport, [], lambda _value: stuck.wait(60) and None)):
         await eventually(lambda: source.room() == 4)
         for value in range(4):
             await send(source, number(value))
@@ -149,7 +149,7 @@ async def test_an_expected_consumer_that_died_gets_what_it_had_not_handled() -> 
 
     def hang_at_two(value: int) -> None:
         if value == 2:
-            stuck.wait(10)
+            stuck.wait(60)
             raise RuntimeError("this process is dead")
 
     async with running(collector(transport, first, hang_at_two)):
@@ -222,7 +222,7 @@ async def test_a_living_consumer_that_takes_nothing_is_evicted_and_returns_when_
     source = Outlet(
         Out(NUMBERS), "producer", 1, transport, (), evict_after_s=0.05, on_evicted=evicted.append
     )
-    async with running(collector(transport, seen, lambda _value: stuck.wait(10) and None)):
+    async with running(collector(transport, seen, lambda _value: stuck.wait(60) and None)):
         await eventually(lambda: source.room() == 4)
         for value in range(4):
             await send(source, number(value))

@@ -33,7 +33,7 @@ async def test_what_a_job_raises_comes_back(raised: type, expected: type) -> Non
 
     worker = Worker("test")
     with pytest.raises(expected):
-        await asyncio.wait_for(worker.run(job), 5)
+        await asyncio.wait_for(worker.run(job), 60)
     assert await worker.run(int) == 0  # the thread goes on
     worker.close()
 
