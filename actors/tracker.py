@@ -125,9 +125,8 @@ class Tracker(Actor):
         self._verdicts: Counter[Verdict] = Counter()  # On poses of the prior.
         self._with_prior = self._without_prior = 0  # Frames, since the prior began.
         self._missed = 0  # Frames in a row that the prior does not reach.
-        self._parts: dict[str, Any] | None = (
-            None  # Of the state, before the last poses of the prior.
-        )
+        # Parts of the state, up to the prior, which alone changes between two frames.
+        self._parts: dict[str, Any] | None = None
 
     def handle(
         self, message: FrameRgbd | Correction | OdometryPrior | DetectionBoxes
@@ -191,16 +190,16 @@ class Tracker(Actor):
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """Return a part for each place, which is written once, and few parts for what changes."""
+        """Return a part for each known keyframe, written once, and few parts that change."""
         if self._parts is None:
             self._parts = self._tracked_parts()
         return {**self._parts, "prior": self._prior.packed}
 
     def _tracked_parts(self) -> dict[str, Any]:
-        """Return all parts; poses of the prior change that of the prior alone."""
+        """Return all parts as of the last frame, correction or detection."""
         state = self._odometry.snapshot()
         places = {place["id"]: place for place in state.pop("places")}
-        state["order"] = [*places]  # Of the places: the last one used is the last.
+        state["order"] = [*places]  # The keyframe used last is the last one.
         own = {name: state.pop(name) for name in OWN_PARTS}
         fix = {"fix": state.pop("fix")} if "fix" in state else {}
         poses, localise = state.pop("poses"), self.config.localise
@@ -217,7 +216,7 @@ class Tracker(Actor):
         """Continue from a snapshot.
 
         Raises:
-            ConfigError: The snapshot is of another `tracker.localise`.
+            ConfigError: The snapshot was taken with another `tracker.localise`.
         """
         now = state["now"]
         if now["localise"] != self.config.localise:

@@ -86,11 +86,11 @@ class FrameTracker:
 
     @property
     def can_reuse_keyframes(self) -> bool:
-        """Whether so many keyframes were made that known ones are reused."""
+        """True once so many keyframes were made that known ones are reused."""
         return 0 < self.config.returning.after <= self.state.next_id
 
     def track(self, frame: RgbdFrame, prior: Reading | None = None) -> TrackedFrame:
-        """Return the pose of a frame, whatever the frame shows: it may be blank.
+        """Return the pose of a frame. The frame may be blank.
 
         Args:
             frame: The frame.

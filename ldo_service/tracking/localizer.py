@@ -59,7 +59,7 @@ class Fix:
 
     @staticmethod
     def unpacked(kept: dict[str, Any]) -> "Fix":
-        """Return the fix that `packed` was taken of."""
+        """Return the fix from its packed form."""
         last = None if kept["last"] is None else Look(**kept["last"])
         return Fix(**{**kept, "last": last})
 
@@ -73,7 +73,7 @@ class Localizer(Odometry):
         config: OdometryConfig | None = None,
         T_base_camera: np.ndarray | None = None,
     ) -> None:
-        """Begin before the first frame.
+        """Start without a fix.
 
         Args:
             places: Keyframe database of the map; their T_odom_keyframe is T_map_keyframe.

@@ -51,7 +51,7 @@ class MapFrame:
 
     @property
     def T_map_keyframe(self) -> Mapping[int, np.ndarray]:
-        """T_map_keyframe [4, 4] by id, of all keyframes in the last correction."""
+        """Poses [4, 4] by id, of all keyframes in the last correction."""
         if self._T_map is None:
             self._T_map = {} if self._correction is None else self._correction.read_poses(None)
         return self._T_map
@@ -114,7 +114,7 @@ class MapFrame:
         self._keep(newest, keyframe)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the poses that are kept. The correction is not part of it."""
+        """Return the poses that are kept, without the correction."""
         return self._poses.snapshot()
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None) -> None:

@@ -57,7 +57,7 @@ class Odometry:
     def __init__(
         self, config: OdometryConfig | None = None, T_base_camera: np.ndarray | None = None
     ) -> None:
-        """Begin before the first frame.
+        """Start without a keyframe.
 
         Args:
             config: Settings; the defaults when None.
@@ -162,7 +162,7 @@ class Odometry:
         return None if keyframe is None else keyframe.id
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the next frames depend on but the last correction.
+        """Return all that the next frames depend on, except for the last correction.
 
         Returns:
             Arrays and plain values. `places`, `keyframe` and `supporting` hold the same objects
@@ -190,13 +190,13 @@ class Odometry:
     # --- keyframe reuse ---------------------------------------------------------------------------
     @property
     def _is_connected_to_map(self) -> bool:
-        """Whether the reference is a known keyframe, or was measured from one."""
+        """True when the reference is a known keyframe, or was measured from one."""
         return self._frames.state.origin is not Origin.NEW
 
     def _find_reusable_keyframe(
         self, frame: RgbdFrame, tracked: TrackedFrame
     ) -> ReusedKeyframe | None:
-        """Return a known keyframe that shows what a frame shows which needs a new keyframe."""
+        """Return a known keyframe that can replace the new one that a frame needs, if any."""
         is_needed = tracked.needed_keyframe is not None and tracked.submap_measurement is None
         if not is_needed or not self._frames.can_reuse_keyframes:
             return None
