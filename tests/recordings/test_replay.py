@@ -17,7 +17,7 @@ from ldo_service.storage.state_store import State
 from tests.runtime.cast import DOUBLES, NUMBERS, PIECES, Double
 
 from .journals import UNLUCKY, Tally, files, recorded, replayed
-from .test_journal import BusyDisk
+from .test_recorder import BusyDisk
 
 VALUES = [5, 1, 4, 1, 5, 9, 2, 6]
 
