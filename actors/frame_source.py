@@ -44,7 +44,9 @@ class FrameSourceConfig:
         if not 0 <= self.max_skew_s < 10:
             raise ConfigError(f"frame_source.max_skew_s={self.max_skew_s:g}: must be within 0..10.")
         if not self.restart_after_s > 0:
-            raise ConfigError("frame_source.restart_after_s must be positive.")
+            raise ConfigError(
+                f"FrameSourceConfig.restart_after_s={self.restart_after_s:g} must be positive."
+            )
         if min(self.pair_buffer, self.min_side_px) < 1:
             raise ConfigError(f"{self}: pair_buffer and min_side_px must be at least 1.")
 
@@ -142,7 +144,7 @@ class FrameSource(Actor):
         if min(width, height) < self.config.min_side_px:
             raise DataError(
                 f"{width}x{height} pixels are too few to track: a side needs "
-                f"{self.config.min_side_px}, by frame_source.min_side_px."
+                f"{self.config.min_side_px}."
             )
 
     def _reject(self, message: Input, error: DataError) -> None:

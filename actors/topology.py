@@ -4,8 +4,7 @@ The drawing and the table of topics in README are printed from here (`ldo topics
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
 
 from ldo_service.actors.detector import Detector, DetectorConfig
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
@@ -19,23 +18,17 @@ from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import topics as t
 
 
-class Sections(Protocol):
-    """The sections of the configuration that actors are made from."""
+@dataclass(frozen=True, slots=True)
+class ActorParameters:
+    """Parameter object of each actor; the defaults are those of the configuration."""
 
-    @property
-    def frame_source(self) -> FrameSourceConfig: ...
-    @property
-    def tracker(self) -> TrackerConfig: ...
-    @property
-    def detector(self) -> DetectorConfig: ...
-    @property
-    def vlm_labeller(self) -> VlmLabellerConfig: ...
-    @property
-    def mapper(self) -> MapperConfig: ...
-    @property
-    def loop_closer(self) -> LoopCloserConfig: ...
-    @property
-    def optimizer(self) -> OptimizerConfig: ...
+    frame_source: FrameSourceConfig = field(default_factory=FrameSourceConfig)
+    tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    detector: DetectorConfig = field(default_factory=DetectorConfig)
+    vlm_labeller: VlmLabellerConfig = field(default_factory=VlmLabellerConfig)
+    mapper: MapperConfig = field(default_factory=MapperConfig)
+    loop_closer: LoopCloserConfig = field(default_factory=LoopCloserConfig)
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,10 +39,10 @@ class Box:
     does: str
     inputs: tuple[In, ...]
     outputs: tuple[Out, ...]
-    make: Callable[[Sections], Actor]
+    make: Callable[[ActorParameters], Actor]
 
 
-def _box(actor: type[Actor], does: str, make: Callable[[Sections], Actor]) -> Box:
+def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]) -> Box:
     return Box(actor.name, does, actor.inputs, actor.outputs, make)
 
 
@@ -57,37 +50,39 @@ GRAPH: tuple[Box, ...] = (
     _box(
         FrameSource,
         "checks and rectifies camera frames",
-        lambda config: FrameSource(config.frame_source),
+        lambda parameters: FrameSource(parameters.frame_source),
     ),
     _box(
         Tracker,
         "finds the camera's pose",
-        lambda config: Tracker(config.tracker),
+        lambda parameters: Tracker(parameters.tracker),
     ),
     _box(
         Detector,
         "finds objects of known classes",
-        lambda config: Detector(config.detector),
+        lambda parameters: Detector(parameters.detector),
     ),
     _box(
         VlmLabeller,
         "names what the detector does not know",
-        lambda config: VlmLabeller(config.vlm_labeller),
+        lambda parameters: VlmLabeller(parameters.vlm_labeller),
     ),
     _box(
         Mapper,
         "keeps the map of Gaussians, and what stands in it",
-        lambda config: Mapper(config.mapper, has_labeller=config.vlm_labeller.is_chosen),
+        lambda parameters: Mapper(
+            parameters.mapper, has_labeller=parameters.vlm_labeller.is_chosen
+        ),
     ),
     _box(
         LoopCloser,
         "recognises places",
-        lambda config: LoopCloser(config.loop_closer),
+        lambda parameters: LoopCloser(parameters.loop_closer),
     ),
     _box(
         Optimizer,
         "makes keyframe poses agree",
-        lambda config: Optimizer(config.optimizer),
+        lambda parameters: Optimizer(parameters.optimizer),
     ),
 )
 
@@ -101,9 +96,9 @@ def box_named(name: str) -> Box:
     raise ConfigError(f"there is no actor {name!r}. The actors are {names}.")
 
 
-def make_actors(config: Sections) -> list[Actor]:
+def make_actors(parameters: ActorParameters) -> list[Actor]:
     """All of them, producers first."""
-    return [box.make(config) for box in GRAPH]
+    return [box.make(parameters) for box in GRAPH]
 
 
 def producer_of(topic: t.Topic) -> str:

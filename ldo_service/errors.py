@@ -58,7 +58,7 @@ class RestartsExhausted(StageError):
     def __init__(self, actor: str, restarts: int, window_s: float) -> None:
         super().__init__(
             f"{actor} failed {restarts} times within {window_s:g} s and was given up. "
-            "The log above has each failure; fix its cause, or raise stage.max_restarts."
+            "The log above has each failure; fix its cause, or raise supervision.max_restarts."
         )
         self.actor, self.restarts, self.window_s = actor, restarts, window_s
 
@@ -67,7 +67,7 @@ class StageStalled(StageError):
     def __init__(self, actor: str, age_s: float) -> None:
         super().__init__(
             f"{actor} has been busy with one message for {age_s:.0f} s and cannot be interrupted. "
-            "Give it less work per message, or raise stage.stall_after_s."
+            "Give it less work per message, or raise supervision.step_timeout_s."
         )
         self.actor, self.age_s = actor, age_s
 

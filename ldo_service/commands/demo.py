@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.config import Config, load_config
+from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.evaluation.results import Results, evaluate_run, work
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
@@ -54,7 +54,7 @@ def demo(
     job = Job(sequence, out, demo_config(), Selection(max_frames=FRAMES), console.print)
     with progress("tracking and mapping", job.work, console) as advance:
         record = run_over_file(job, advance)
-    run, threads = read_run(out), job.config.mapper.thread_count()
+    run, threads = read_run(out), actor_parameters(job.config).mapper.thread_count()
     with progress("judging", work(run, sequence), console) as advance:
         results = evaluate_run(run, sequence, advance, threads=threads)
     printed = Table(title="LDO-SLAM demo", show_header=False)

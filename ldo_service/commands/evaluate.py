@@ -11,7 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.config import Config, load_config
+from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.evaluation import loops, semantics, trajectory, views
 from ldo_service.evaluation.label_measures import Found
 from ldo_service.evaluation.loops import LoopErrors
@@ -107,10 +107,10 @@ def evaluate(
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
     """
     config = run_config(folder)
-    threads = config.mapper.thread_count()
+    threads = actor_parameters(config).mapper.thread_count()
     distance = Lpips(lpips, threads=threads) if lpips else None
-    run = read_run(folder, has_map=not config.tracker.localise)
-    sequence = open_source(source, config.data.options())
+    run = read_run(folder, has_map=not config.tracker.localization_map)
+    sequence = open_source(source, config.dataset.options())
     run.require_source(sequence)
     with progress("eval", work(run, sequence), Console(stderr=True)) as advance:
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
@@ -143,8 +143,8 @@ def print_results(results: Results, lpips: Path | None, config: Config) -> None:
     if results.loops is not None:
         console.print(loops.PROTOCOL, style="dim")
         console.print(loops_table(results.loops))
-    if config.tracker.localise:
-        console.print(NO_MAP.format(folder=config.tracker.localise), soft_wrap=True)
+    if config.tracker.localization_map:
+        console.print(NO_MAP.format(folder=config.tracker.localization_map), soft_wrap=True)
     else:
         _print_renderings(console, results, lpips)
         _print_labels(console, results, labelled_by(config))

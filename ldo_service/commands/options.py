@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ldo_service.actors.detector import require_detector
 from ldo_service.actors.vlm_labeller import require_labeller
-from ldo_service.config import Config
+from ldo_service.config import Config, actor_parameters
 from ldo_service.runs.job import Advance
 from ldo_service.tracking.keyframe_database import places_of
 
@@ -95,15 +95,16 @@ def localising(config: Config, folder: Path | None) -> Config:
         return config
     folder = folder.expanduser().resolve()
     places_of(folder)
-    tracker = replace(config.tracker, localise=str(folder))
+    tracker = replace(config.tracker, localization_map=str(folder))
     return replace(config, tracker=tracker)
 
 
 def with_usable_networks(config: Config) -> Config:
     """The same. Raises ConfigError when a network that it names cannot be used, which a service
     only warns about."""
-    require_detector(config.detector)
-    require_labeller(config.vlm_labeller)
+    parameters = actor_parameters(config)
+    require_detector(parameters.detector)
+    require_labeller(parameters.vlm_labeller)
     return config
 
 

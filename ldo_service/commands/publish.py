@@ -82,7 +82,7 @@ def publish(
         return
     if rate is not None and not 0 < rate < float("inf"):
         raise ConfigError(f"--rate {rate:g}: must be positive.")
-    sequence = open_source(source, load_config(config, set).data.options())
+    sequence = open_source(source, load_config(config, set).dataset.options())
     indices = Selection(stride, max_frames).indices(sequence)
     with (
         connect(robot, endpoint, keys) as service,

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.client import connect
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, load_config
 from ldo_service.conversions.poses import transform
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import open_labeller
@@ -109,11 +109,15 @@ def _texts_of(model: str, run: Path | None) -> Encode:
 
 
 def _labeller_of(run: Path) -> VlmLabellerConfig | None:
-    """None where it had no pair, or its settings are of another version."""
+    """Return the settings of the run's labeller; None where it had no pair.
+
+    Raises:
+        NotCompared: The configuration of the run cannot be read, or is of an earlier version.
+    """
     try:
-        config = load_config(run / "config.yaml").vlm_labeller
-    except ConfigError:
-        return None
+        config = actor_parameters(load_config(run / "config.yaml")).vlm_labeller
+    except ConfigError as error:
+        raise NotCompared(f"{run / 'config.yaml'}: {error} `--model NAME` names a pair.") from error
     return config if config.model else None
 
 

@@ -10,7 +10,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.config import Config, load_config
+from ldo_service.config import Config, checked, load_config
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
@@ -107,7 +107,7 @@ def run(
     with_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
-    sequence = open_source(source, settings.data.options())
+    sequence = open_source(source, settings.dataset.options())
     job = Job(
         *(sequence, out, settings, selection, console.print),
         refine=refine,
@@ -168,7 +168,7 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
         tracker = replace(tracker, hold_out=hold_out)
     if threads is not None:
         mapper = replace(mapper, threads=threads)
-    return replace(config, tracker=tracker, mapper=mapper)
+    return checked(replace(config, tracker=tracker, mapper=mapper))
 
 
 def require_none_of(option: str, is_given: object, others: Mapping[str, object]) -> None:

@@ -104,8 +104,8 @@ def record(
     A service that runs already cannot begin to: what its actors hold would be missing. Stop it and
     record in its --state, and it goes on with its map.
 
-    640x480 at 30 Hz makes 100 MB a second; record.max_gb bounds it. `ldo replay DIR --verify` lives
-    it again, and DIR is a data set for every verb that takes a SOURCE.
+    640x480 at 30 Hz makes 100 MB a second; recording.max_gb bounds it. `ldo replay DIR --verify`
+    lives it again, and DIR is a data set for every verb that takes a SOURCE.
 
       ldo record recordings/desk
       ldo publish synthetic:room --rate 15      (in another terminal)

@@ -1,5 +1,9 @@
 """ldo config"""
 
+from typing import Annotated
+
+import tyro
+
 from ldo_service.config import explained_yaml, load_config
 
 from .options import ConfigFile, Settings
@@ -8,10 +12,15 @@ from .options import ConfigFile, Settings
 def show_config(
     config: ConfigFile = None,
     set: Settings = (),
+    all_: Annotated[
+        bool, tyro.conf.arg(name="all", help="print advanced settings too; they may change")
+    ] = False,
 ) -> None:
-    """Print the whole effective configuration as YAML, the reason for each default beside it.
+    """Print the effective configuration as YAML, with the reason for each default.
+
+    Without --all it has the public settings, and the advanced ones that differ from their defaults.
 
     ldo config > my.yaml            then delete what you do not change
     ldo run SOURCE --out DIR --config my.yaml
     """
-    print(explained_yaml(load_config(config, set)), end="")
+    print(explained_yaml(load_config(config, set), with_advanced=all_), end="")

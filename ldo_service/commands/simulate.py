@@ -46,7 +46,7 @@ def simulate(
     console = Console(stderr=True, highlight=False)
     settings = with_options(load_config(config, set), hold_out=None, threads=threads)
     with_usable_networks(settings)
-    sequence = open_source(source, settings.data.options())
+    sequence = open_source(source, settings.dataset.options())
     selection = Selection(stride, max_frames)
     with progress("simulate", len(selection.indices(sequence)), console) as advance:
         made = simulate_graph(sequence, settings, selection, console.print, advance)

@@ -12,12 +12,12 @@ from rich.console import Console
 
 from ldo_service.client import connect
 from ldo_service.config import load_config
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import ConfigError
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 from ldo_service.viewer.live import live
 from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source
+from ldo_service.viewer.view_config import ViewerConfig, viewer_config
 
 from .options import ConfigFile, Endpoint, KeysFolder, Robot, Settings
 from .query import LIVE
@@ -44,7 +44,7 @@ def view(
       ldo view live --endpoint tls/mule.local:7447 --keys keys/desk
     """
     require_viser()
-    chosen = load_config(config, set).viewer
+    chosen = viewer_config(load_config(config, set).viewer)
     with suppress(KeyboardInterrupt), source_of(where, robot, endpoint, keys, chosen) as source:
         title = robot if where == LIVE else Path(where).resolve().name
         serve_window(source, chosen, f"ldo view {title}")

@@ -1,16 +1,35 @@
-"""Configuration: every setting, its default, its unit and its reason.
+"""Configuration: settings with defaults, units and reasons, and what the actors get of them.
 
 A configuration file lists only what differs:
 
     tracker:
       hold_out: 5
     service:
-      spawned: [optimizer, mapper]
+      process_actors: [optimizer, mapper]
 
-An unknown key is an error that names the nearest one; `ldo config` prints the whole.
+An unknown setting is an error that names the nearest one. `ldo config` prints the public settings,
+`ldo config --all` prints all of them.
 """
 
-from .loading import config_of, config_yaml, explained_yaml, load_config
+from .loading import checked, config_of, load_config
+from .parameters import (
+    actor_parameters,
+    latency_frames,
+    recording_parameters,
+    stage_parameters,
+)
+from .printing import config_yaml, explained_yaml
 from .sections import Config
 
-__all__ = ["Config", "config_of", "config_yaml", "explained_yaml", "load_config"]
+__all__ = [
+    "Config",
+    "actor_parameters",
+    "checked",
+    "config_of",
+    "config_yaml",
+    "explained_yaml",
+    "latency_frames",
+    "load_config",
+    "recording_parameters",
+    "stage_parameters",
+]

@@ -1,12 +1,11 @@
-"""Reading, checking and explaining of configurations: defaults, YAML files and single settings."""
+"""Reading and checking of configurations: defaults, YAML files and single settings."""
 
 import dataclasses
 import difflib
-import inspect
 import re
 import typing
 from collections.abc import Sequence
-from math import inf
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +15,28 @@ import yaml
 from ldo_service.errors import ConfigError
 from ldo_service.storage.yaml_io import plain_text, plain_values
 
+from .moved_settings import refuse_moved, was_section
 from .sections import Config
+
+KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "array": "a list",
+    "object": "a section",
+}
 
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
-    """The defaults, changed by a YAML file, changed by `section.field=value` settings.
+    """Return the defaults, changed by a YAML file, then by single settings.
 
-    Raises ConfigError for what cannot be read, is not known, or makes no sense.
+    Args:
+        path: The YAML file; None reads none.
+        settings: Settings as `section.field=value`.
+
+    Raises:
+        ConfigError: A setting cannot be read, is unknown, has moved, or has a bad value.
     """
     tree = _read(path) if path else {}
     for setting in settings:
@@ -31,26 +45,32 @@ def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Confi
 
 
 def config_of(tree: dict[str, Any]) -> Config:
-    """The defaults, changed by a tree of plain values."""
+    """Return the defaults, changed by a tree of plain values.
+
+    Raises:
+        ConfigError: A setting is unknown, has moved, or has a bad value.
+    """
+    refuse_moved(tree)
     _check_names(tree, Config, "")
+    _refuse_nan(tree, "")
     try:
-        config = msgspec.convert(tree, Config)
-        _refuse_nan(config, "")
-        return config
+        return msgspec.convert(tree, Config)
     except msgspec.ValidationError as error:
-        raise ConfigError(_without_path_sugar(str(error))) from error
+        raise ConfigError(_explained(str(error), tree)) from error
 
 
-def config_yaml(config: Config) -> str:
-    """The whole configuration; reads back as the same."""
-    return plain_text(msgspec.to_builtins(config))
+def checked(config: Config) -> Config:
+    """Return the configuration after a check of all its values.
+
+    A value that `dataclasses.replace` has set is not checked until then.
+
+    Raises:
+        ConfigError: A setting has a bad value.
+    """
+    return config_of(msgspec.to_builtins(config))
 
 
-def explained_yaml(config: Config) -> str:
-    """The whole configuration with the reason for each default beside it."""
-    return "\n".join(_explain(config, 0)) + "\n"
-
-
+# --- reading --------------------------------------------------------------------------------------
 def _read(path: Path) -> dict[str, Any]:
     try:
         tree = plain_values(path.read_text())
@@ -80,69 +100,95 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
         raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
 
 
+# --- checking -------------------------------------------------------------------------------------
 def _check_names(tree: Any, schema: type, prefix: str) -> None:
     if not isinstance(tree, dict):
-        return  # the conversion says what was expected here
+        return  # The conversion says what was expected here.
     types = typing.get_type_hints(schema)
     for name, value in tree.items():
+        path = f"{prefix}{name}"
         if name not in types:
-            near = difflib.get_close_matches(str(name), types, 1)
-            hint = f"Did you mean {prefix}{near[0]}?" if near else f"Known: {', '.join(types)}."
-            raise ConfigError(f"there is no setting {prefix}{name}. {hint}")
+            raise ConfigError(f"there is no setting {path}. {_hint(path, prefix, list(types))}")
         if dataclasses.is_dataclass(types[name]):
-            _check_names(value, types[name], f"{prefix}{name}.")
+            _check_names(value, types[name], f"{path}.")
 
 
-def _refuse_nan(config: Any, prefix: str) -> None:
-    """NaN passes every comparison that a section makes."""
-    for entry in dataclasses.fields(config):
-        value = getattr(config, entry.name)
-        if dataclasses.is_dataclass(value):
-            _refuse_nan(value, f"{prefix}{entry.name}.")
-        elif value != value or (isinstance(value, tuple) and any(v != v for v in value)):
-            raise ConfigError(f"{prefix}{entry.name} is NaN: write a number.")
+def _hint(path: str, prefix: str, names: list[str]) -> str:
+    if was_section(path):
+        return "Its settings have moved: docs/configuration.md lists those of today."
+    near = difflib.get_close_matches(path.removeprefix(prefix), names, 1)
+    if near:
+        return f"Did you mean {prefix}{near[0]}?"
+    return f"Known: {', '.join(names)}."
 
 
-def _without_path_sugar(message: str) -> str:
-    """msgspec ends with "- at `$.tracker.hold_out`": say it as the user wrote it."""
-    return re.sub(r" - at `\$\.?(.*?)`$", r", in \1.", message)
+def _refuse_nan(tree: dict[str, Any], prefix: str) -> None:
+    """Refuse NaN, which passes comparisons."""
+    for name, value in tree.items():
+        path = f"{prefix}{name}"
+        if isinstance(value, dict):
+            _refuse_nan(value, f"{path}.")
+        elif any(isinstance(one, float) and isnan(one) for one in _items(value)):
+            raise ConfigError(f"{path}={_shown(value)} must be a number, not NaN.")
 
 
-_FIELD = re.compile(r"^ {4}(?P<name>\w+): [^#]*(?:#\s*(?P<comment>.*))?$")
-_COMMENT = re.compile(r"^ {4,}# (?P<comment>.+)$")
+def _items(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [value]
 
 
-def _explain(config: Any, depth: int) -> list[str]:
-    comments = _comments(type(config))
-    lines = []
-    for entry in dataclasses.fields(config):
-        value = getattr(config, entry.name)
-        indent = "  " * depth
-        if dataclasses.is_dataclass(value):
-            lines += [f"{indent}{entry.name}:", *_explain(value, depth + 1)]
-        else:
-            plain = msgspec.to_builtins(value)
-            text = plain_text(plain, flow=True, width=inf).splitlines()[0]
-            comment = f"  # {comments[entry.name]}" if entry.name in comments else ""
-            lines.append(f"{indent}{entry.name}: {text}{comment}")
-    return lines or ["  " * depth + "{}"]
+# --- messages -------------------------------------------------------------------------------------
+_PLACE = re.compile(r"^(?P<what>.*?)(?: - at `\$\.?(?P<path>[^\[`]*)(?:\[(?P<item>\d+)\])?.*`)?$")
+_BOUND = re.compile(r"^Expected `\w+` (?P<sign>[<>]=?) (?P<bound>\S+)$")
+_LENGTH = re.compile(r"^Expected `array` of length (?P<at_least>>= )?(?P<length>\d+)")
+_KIND = re.compile(r"^Expected `(?P<kind>\w+)`")
+_SIGNS = {">=": "at least", ">": "greater than", "<=": "at most", "<": "less than"}
 
 
-def _comments(schema: type) -> dict[str, str]:
-    """The comment of each field in the source: beside it, with the lines that continue it, or, of
-    one that has none beside it, the lines above it that begin a sentence."""
-    comments: dict[str, list[str]] = {}
-    last, block = "", list[str]()
-    for line in inspect.getsource(schema).splitlines():
-        if line.startswith(("    def ", "    @")):
-            break
-        if found := _FIELD.match(line):
-            name, beside = found["name"], found["comment"]
-            is_above = not beside and bool(block) and block[0][0].isupper()
-            comments[name] = [beside] if beside else block if is_above else []
-            comments.get(last, []).extend([] if is_above else block)
-            last, block = name, []
-        elif found := _COMMENT.match(line):
-            block.append(found["comment"])
-    comments.get(last, []).extend(block)
-    return {name: " ".join(lines) for name, lines in comments.items() if lines}
+def _explained(message: str, tree: dict[str, Any]) -> str:
+    """Return the message of a failed conversion with the path and the value of the setting."""
+    found = _PLACE.match(message)
+    if not found or not found["path"]:
+        return message
+    path, item = found["path"], found["item"]
+    where = f"{path}={_shown(_value_at(tree, path))}"
+    wanted = _wanted(found["what"], path)
+    if item is not None:
+        return f"{where} must be {wanted} in item {int(item) + 1}."
+    return f"{where} must be {wanted}."
+
+
+def _wanted(what: str, path: str) -> str:
+    if what.startswith("Invalid enum value"):
+        return f"one of {', '.join(repr(choice) for choice in _choices(path))}"
+    if found := _BOUND.match(what):
+        if found["sign"] == ">" and float(found["bound"]) == 0:
+            return "positive"
+        return f"{_SIGNS[found['sign']]} {float(found['bound']):g}"
+    if found := _LENGTH.match(what):
+        least = "at least " if found["at_least"] else ""
+        return f"a list of {least}{found['length']}"
+    if found := _KIND.match(what):
+        return KINDS.get(found["kind"], found["kind"])
+    return what.lower()
+
+
+def _value_at(tree: dict[str, Any], path: str) -> Any:
+    value: Any = tree
+    for name in path.split("."):
+        value = value[name]
+    return value
+
+
+def _choices(path: str) -> tuple[str, ...]:
+    schema: Any = Config
+    for name in path.split("."):
+        schema = typing.get_type_hints(schema)[name]
+    return typing.get_args(schema)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float):
+        return f"{value:g}"
+    return " ".join(plain_text(value, flow=True, width=float("inf")).removesuffix("...\n").split())

@@ -185,7 +185,8 @@ def _spheres(
 @dataclass(frozen=True, slots=True)
 class SleepConfig:
     max_active: int = 1_500_000  # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments.
-    # Between two looks at it, every mapper.changed_keyframes, new and woken ones come on top
+    # Between two looks at it, every mapper.publish.update_interval_keyframes, new and woken ones
+    # come on top
     low_water: float = 0.9  # share of max_active that stays: a batch of 0.1 s now and then
     reach_m: float = 20.0  # beyond, nothing counts as seen: depth cameras measure less far, so
     # nothing is inserted a second time where Gaussians sleep. Nearer, what they measured hides

@@ -25,6 +25,7 @@ from .subgraph import Subgraph, SubgraphConfig, View, follows, is_whole, spread
 from .verification import Check, Proposal, VerificationConfig, Verifier
 
 BYTES = 32  # of an ORB descriptor
+LOOP_MIN_INLIERS = 12  # The tracker needs 15: a closure is verified by surfaces and by the graph.
 BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.int64)
 
 
@@ -94,7 +95,9 @@ class LoopsConfig:
     plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
     places: PlacesConfig = field(default_factory=PlacesConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
-    features: FeatureConfig = field(default_factory=lambda: FeatureConfig(min_inliers=12))
+    features: FeatureConfig = field(
+        default_factory=lambda: FeatureConfig(min_inliers=LOOP_MIN_INLIERS)
+    )
     align: AlignConfig = field(default_factory=AlignConfig)
 
     def __post_init__(self) -> None:

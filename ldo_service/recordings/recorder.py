@@ -185,8 +185,8 @@ class Recorder(Journal):
         self._file.add_entry(Gap(step=step, reason="limit"))
         self._file.close()
         log.error(
-            "%s: the recording has reached record.max_gb, or the disk record.min_free_gb: it ends "
-            "here; the robot goes on",
+            "%s: the recording has reached recording.max_gb, or the disk recording.min_free_gb: it "
+            "ends here; the robot goes on",
             self._file.path,
         )
 

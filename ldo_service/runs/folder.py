@@ -17,7 +17,7 @@ summary.json            counts, speed, memory, versions
 refined/                trajectory, keyframes and map after more iterations, if they were asked for
 
 A run with `--localise` makes no map: keyframes.json, map.ply and places.msgpack stay in the folder
-that config.yaml names in tracker.localise.
+that config.yaml names in tracker.localization_map.
 """
 
 import csv

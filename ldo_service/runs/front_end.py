@@ -22,7 +22,7 @@ from ldo_service import versions
 from ldo_service.actors.detector import Detector
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
-from ldo_service.config import Config
+from ldo_service.config import Config, recording_parameters
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.recordings.mcap_file import ABOUT, McapIndex, Place, RecordingFile
@@ -37,12 +37,15 @@ FRONT_END = "front_end.mcap"  # in the folder of a run
 ACTORS = frozenset({FrameSource.name, Tracker.name, Detector.name})
 TOPICS = {topic.message: topic for topic in (POSE_TRACKED, KEYFRAME_NEW, DETECTION_BOXES)}
 MESSAGES = {topic.name: topic.message for topic in TOPICS.values()}
-DETECTOR_LATENCY = "run.detector_latency_frames"
+DETECTOR_LATENCY = "offline.latency_frames.detector"
 
 
 class FrontEndRecord:
-    """Keeps what is heard, in a context. Of a run that fails, grows past `record.max_gb` or fills
-    the disk nothing is left: it would be no front end for others."""
+    """Record of the front end, kept in a context.
+
+    It is removed when the run fails, grows past `recording.max_gb` or fills the disk: it would be
+    no front end for other runs.
+    """
 
     def __init__(
         self, folder: Path, config: Config, sequence: Sequence, selection: Selection
@@ -54,7 +57,7 @@ class FrontEndRecord:
             "settings": json.dumps(front_end_settings(config)),
             "ldo": versions()["ldo-slam"],
         }
-        self._file = RecordingFile(folder / FRONT_END, about, config.record)
+        self._file = RecordingFile(folder / FRONT_END, about, recording_parameters(config))
 
     def observe(self, message: Message, tick: int) -> None:
         topic = TOPICS.get(type(message))
@@ -63,7 +66,7 @@ class FrontEndRecord:
         body = msgspec.msgpack.encode(message)
         self._file.add(topic.name, topic.message, body, tick, message.stamp_ns)
         if self._file.is_open and self._file.is_over_limit():
-            log.error("%s: no room by record.max_gb and min_free_gb: not kept", self._file.path)
+            log.error("%s: no room by recording.max_gb and min_free_gb: not kept", self._file.path)
             self._drop()
 
     def __enter__(self) -> "FrontEndRecord":
@@ -137,8 +140,8 @@ class FrontEnd:
 def front_end_settings(config: Config) -> dict[str, object]:
     """Those that a front end depends on, by their dotted names."""
     tree = msgspec.to_builtins(config)
-    sections = {name: tree[name] for name in (*sorted(ACTORS), "data")}
-    return {**dict(_leaves("", sections)), DETECTOR_LATENCY: config.run.detector_latency_frames}
+    sections = {name: tree[name] for name in (*sorted(ACTORS), "inference", "dataset")}
+    return {**dict(_leaves("", sections)), DETECTOR_LATENCY: config.offline.latency_frames.detector}
 
 
 def _leaves(prefix: str, tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ldo_service.actors.topology import make_actors
-from ldo_service.config import Config, config_yaml
+from ldo_service.config import Config, actor_parameters, config_yaml, latency_frames
 from ldo_service.errors import DataError
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import MapRefine, Message
@@ -36,7 +36,7 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
             run.repair()
         finally:
             run.close()
-        require_usable(run.record, job.config.run.max_rejected)
+        require_usable(run.record, job.config.offline.max_rejected_ratio)
         if job.refine:
             run.refine()
     return run.record
@@ -49,12 +49,17 @@ class FileRun:
         self._job, self._advance, self._work = job, advance, job.work
         self._frames = job.selection.indices(job.sequence)
         config = with_all_cores(job.config)
-        actors = [a for a in make_actors(config) if not (job.front_end and a.name in ACTORS)]
+        parameters = actor_parameters(config)
+        actors = [
+            actor
+            for actor in make_actors(parameters)
+            if not (job.front_end and actor.name in ACTORS)
+        ]
         self._actors = {actor.name: actor for actor in actors}
         self._reader = Reader(job.sequence, self._frames, job.warn)
-        self.record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
+        self.record = RunFolder(job.folder, config_yaml(job.config), parameters.tracker)
         self._kept: FrontEndRecord | None = None
-        self._clock = LogicalClock(actors, config.run.latency_frames(), self._observe)
+        self._clock = LogicalClock(actors, latency_frames(config), self._observe)
         self._started = Usage.now()
         self._stage_ms: dict[str, Percentiles] = {}
         self._is_finished = False
@@ -154,5 +159,5 @@ def require_usable(record: RunFolder, max_rejected: float) -> None:
     if rejected > max_rejected * frames:
         raise DataError(
             f"{rejected} of {frames} frames could not be used. What could be done is in "
-            f"{record.folder}. Check the data, or raise run.max_rejected."
+            f"{record.folder}. Check the data, or raise offline.max_rejected_ratio."
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from ldo_service.actors.topology import GRAPH, Box
-from ldo_service.config import config_yaml
+from ldo_service.config import actor_parameters, config_yaml, stage_parameters
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.stage import Stage
@@ -44,7 +44,8 @@ class _RealTimeRun:
         self._config = job.config.with_map_folder(folder)
         self._indices = job.selection.indices(job.sequence)
         self._reader = Reader(job.sequence, self._indices, job.warn)
-        self._record = RunFolder(job.folder, config_yaml(job.config), job.config.tracker)
+        tracker = actor_parameters(job.config).tracker
+        self._record = RunFolder(job.folder, config_yaml(job.config), tracker)
         self._step_ms: dict[str, float] = {}
 
     async def go(self) -> RunFolder:
@@ -55,7 +56,7 @@ class _RealTimeRun:
         stop = Stop()
         started = Usage.now()
         async with asyncio.TaskGroup() as group:
-            service = supervise(stages, stop, self._config.service.drain_s)
+            service = supervise(stages, stop, self._config.service.shutdown_timeout_s)
             running = group.create_task(service)
             feeding = group.create_task(self._feed(transport))
             await asyncio.wait({running, feeding}, return_when=asyncio.FIRST_COMPLETED)
@@ -67,10 +68,11 @@ class _RealTimeRun:
     def _stage(self, box: Box, transport: MemoryTransport) -> Stage:
         make = box.make
         assert make is not None
+        parameters = actor_parameters(self._config)
         return Stage(
-            lambda: make(self._config),
+            lambda: make(parameters),
             transport,
-            config=self._config.stage,
+            config=stage_parameters(self._config),
             expected={
                 out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
             },
@@ -118,7 +120,7 @@ class _RealTimeRun:
             for name, value in health.facts.items()
         }
         self._record.close(summarise(self._record, used, frames, rejected, stage_ms, drops, facts))
-        require_usable(self._record, self._config.run.max_rejected)
+        require_usable(self._record, self._config.offline.max_rejected_ratio)
         return self._record
 
 

@@ -11,7 +11,7 @@ import yaml
 
 from ldo_service import kernels, versions
 from ldo_service.actors.topology import box_named
-from ldo_service.config import Config, config_of
+from ldo_service.config import Config, actor_parameters, config_of
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.recordings.replay import Replayed, replay
@@ -46,7 +46,8 @@ class RecordedActor:
         make = box_named(self.name).make
         assert make is not None
         config = _config_of(about)
-        return make(replace(config, mapper=replace(config.mapper, folder=str(folder))))
+        mapper = replace(config.mapper, image_folder=str(folder))
+        return make(actor_parameters(replace(config, mapper=mapper)))
 
     def caveats(self) -> list[str]:
         """Why the bits may differ here although nothing is wrong."""

@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import dataclass
 
 from ldo_service.actors.topology import make_actors
-from ldo_service.config import Config
+from ldo_service.config import Config, actor_parameters, latency_frames
 from ldo_service.errors import DataError
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.runtime.journal import digest
@@ -48,11 +48,11 @@ def simulate_graph(
     Raises DataError when no frame can be read, StageError when an actor fails.
     """
     reader = Reader(sequence, selection.indices(sequence), warn)
-    actors = make_actors(config)
+    actors = make_actors(actor_parameters(config))
     digests = Digests([actor.name for actor in actors])
     with LogicalClock(
         actors,
-        config.run.latency_frames(),
+        latency_frames(config),
         lambda actor, message, _step_ms: digests.observe(actor, message),
     ) as clock:
         for done in clock.run(reader):

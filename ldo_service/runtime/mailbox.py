@@ -90,7 +90,8 @@ class Mailbox:
             elif header is None:
                 self._reject(inlet, "its header cannot be read")
             elif body.nbytes > self._max_bytes and not isinstance(inlet, LosslessInlet):
-                self._reject(inlet, f"{body.nbytes} bytes are more than stage.max_message_mb")
+                limit = "service.max_decoded_message_mb"
+                self._reject(inlet, f"{body.nbytes} bytes are more than {limit}")
             elif inlet.accept(header):
                 self._store(inlet, Delivery(inlet.port, header, body))
             else:

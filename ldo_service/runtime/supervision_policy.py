@@ -48,4 +48,4 @@ class StageConfig:
         ):
             raise ConfigError(f"{self}: counts and times must be positive.")
         if not 0 <= self.nice <= 19:
-            raise ConfigError(f"stage.nice={self.nice}: must be within 0..19.")
+            raise ConfigError(f"supervision.background_nice={self.nice}: must be within 0..19.")

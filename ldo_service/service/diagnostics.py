@@ -61,7 +61,7 @@ def _silent(how_long: str) -> Trouble:
     return Trouble(
         f"has a process, and no heartbeat {how_long}",
         "the process is stopped or its machine overloaded; the service kills and restarts one "
-        "that stays so for service.silent_after_s",
+        "that stays so for service.heartbeat_timeout_s",
     )
 
 
@@ -72,7 +72,7 @@ def _of_steps(health: Health) -> Iterator[Trouble]:
             return
         yield Trouble(
             f"has been busy with one message for {health.busy_s:.0f} s",
-            "give it less work per message; beyond stage.stall_after_s it is given up",
+            "give it less work per message; beyond supervision.step_timeout_s it is given up",
         )
     elif waiting and not health.busy_s and health.step_age_s > IDLE_S and not health.held:
         yield Trouble(
@@ -119,7 +119,7 @@ def _of_models(health: Health) -> Iterator[Trouble]:
     if failed := facts.get("inferences_failed"):
         yield Trouble(
             f"had {failed:.0f} inferences fail, and these keyframes have no labels",
-            "the log of `ldo serve` has the first of them; try detector.network.providers=[cpu]",
+            "the log of `ldo serve` has the first of them; try inference.providers=[cpu]",
         )
     if facts.get("labeller_failing"):
         yield Trouble(
@@ -167,7 +167,7 @@ def _of_answers(health: Health) -> Iterator[str]:
     if untold := health.facts.get("answers_without_logprobs"):
         yield (
             f"had {untold:.0f} answers without log-probabilities, which count as "
-            "vlm_labeller.http.confidence_untold sure"
+            "vlm_labeller.http.default_confidence sure"
         )
     if refused := health.facts.get("names_refused"):
         yield f"refused {refused:.0f} names that were to be added: the log says why"

@@ -19,7 +19,13 @@ import zenoh
 
 from ldo_service import kernels, versions
 from ldo_service.actors.topology import GRAPH, Box, box_named
-from ldo_service.config import Config, config_yaml
+from ldo_service.config import (
+    Config,
+    actor_parameters,
+    config_yaml,
+    recording_parameters,
+    stage_parameters,
+)
 from ldo_service.errors import ConfigError, StageError
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import new_path, prepare_recording
@@ -58,7 +64,7 @@ def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recor
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return Recorder(new_path(folder, actor), about, config.record)
+        return Recorder(new_path(folder, actor), about, recording_parameters(config))
     except OSError as error:
         raise ConfigError(f"{folder} cannot be recorded to: {error.strerror}.") from error
 
@@ -84,8 +90,8 @@ class Service:
         check_graph(GRAPH)
         self.config.check_patience()
         self._require_known(self.only)
-        self._require_known(self.config.service.spawned)
-        names, silent_after_s = [box.name for box in GRAPH], self.config.service.silent_after_s
+        self._require_known(self.config.service.process_actors)
+        names, silent_after_s = [box.name for box in GRAPH], self.config.service.heartbeat_timeout_s
         health = HealthCollector(self.network.robot, names, silent_after_s)
         if self.recording and not self.only:
             prepare_recording(self.recording)
@@ -119,7 +125,7 @@ class Service:
         log.info("serving %s on %s", ", ".join(r.name for r in runners), self.network.endpoint)
         watchdog.tell("READY=1")
         try:
-            await supervise(runners, stop, self.config.service.drain_s)
+            await supervise(runners, stop, self.config.service.shutdown_timeout_s)
         finally:
             watchdog.tell("STOPPING=1")
             pings.cancel()
@@ -152,7 +158,7 @@ class Service:
         for box in GRAPH:
             if self.only and box.name not in self.only:
                 continue
-            if not self.only and box.name in self.config.service.spawned:
+            if not self.only and box.name in self.config.service.process_actors:
                 children[box.name] = self._child(box, transport)
                 runners.append(children[box.name])
             else:
@@ -168,13 +174,13 @@ class Service:
 
         make = box.make
         assert make is not None
-        config = self.config.with_map_folder(self.state / "map")
+        parameters = actor_parameters(self.config.with_map_folder(self.state / "map"))
         try:
             return Stage(
-                lambda: make(config),
+                lambda: make(parameters),
                 transport,
-                config=self.config.stage,
-                store=FolderStore(self.state / "state", syncs=self.config.service.sync_state),
+                config=stage_parameters(self.config),
+                store=FolderStore(self.state / "state", syncs=self.config.service.fsync),
                 expected={
                     out.topic.name: lossless_consumers(GRAPH, out.topic.name) for out in box.outputs
                 },
@@ -202,7 +208,7 @@ class Service:
             *("--config", str(config), "--state", str(self.state)),
             *(("--record", str(self.recording)) if self.recording else ()),
         )
-        stage = self.config.stage
+        stage = stage_parameters(self.config)
         return ChildProcess(
             box.name,
             command,
@@ -210,7 +216,7 @@ class Service:
             max_restarts=stage.max_restarts,
             restart_window_s=stage.restart_window_s,
             restart_delay_s=stage.restart_delay_s,
-            silent_after_s=self.config.service.silent_after_s,
+            silent_after_s=self.config.service.heartbeat_timeout_s,
         )
 
     async def _stop_with_parent(self, stop: Stop) -> None:

@@ -7,7 +7,6 @@ from itertools import islice
 from typing import get_args
 
 from ldo_service.client import Client
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.conversions.frames import camera_of
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
@@ -39,6 +38,7 @@ from . import panel
 from .lines import MOST_SIGHTS
 from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
 from .scene import Layer, Scene, Sight, sights_of
+from .view_config import ViewerConfig
 
 MOST_ACTORS = 64  # whose health is told; a name is what a message says
 MOST_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with

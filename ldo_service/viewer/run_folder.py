@@ -7,7 +7,6 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import DataError
 from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.gaussians.pruning import weightiest
@@ -18,6 +17,7 @@ from ldo_service.runs.records import LOOPS, OBJECTS, read_loops, read_objects, r
 
 from . import panel
 from .scene import Layer, Scene, sights_of, thinned
+from .view_config import ViewerConfig
 
 Signature = tuple[int, int]  # time of the last change, ns, and size, bytes
 

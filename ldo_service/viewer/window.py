@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import viser
 
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import ConfigError, LdoError
 from ldo_service.maps.object_search import Answer, answer
 from ldo_service.schemas import MapObject
@@ -32,6 +31,7 @@ from .lines import (
 )
 from .panel import escaped
 from .scene import Layer, Scene, Source, splats_of
+from .view_config import ViewerConfig
 
 FLIGHT_STEPS, FLIGHT_STEP_S = 30, 1 / 30
 THICK_PX, VERY_THICK_PX = 1.5, 4.0

@@ -11,6 +11,7 @@ import pytest
 
 from ldo_service.actors.vlm_labeller import VlmLabeller, VlmLabellerConfig, require_labeller
 from ldo_service.config import Config
+from ldo_service.config.network_settings import VlmLabellerSettings
 from ldo_service.detection.labellers import Opinion
 from ldo_service.detection.labellers.chat_completion import HttpConfig
 from ldo_service.detection.labellers.http_endpoint import EndpointConfig
@@ -315,7 +316,8 @@ async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelOpen]:
     """A life with two regions and a name between them."""
     transport, heard = MemoryTransport(), []
     transport.subscribe(LABEL_OPEN.name, lambda _, body: heard.append(decode(body, LabelOpen)))
-    whole = Config(vlm_labeller=config)
+    settings = VlmLabellerSettings(config.model, config.url, class_names=config.names)
+    whole = Config(vlm_labeller=settings)
     journal = open_recorder(folder, "vlm_labeller", "robot", whole)
     one = Stage(lambda: VlmLabeller(config), transport, config=QUICK, journal=journal)
     mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)

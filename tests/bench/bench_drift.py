@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.actors.topology import make_actors
-from ldo_service.config import Config, load_config
+from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
@@ -36,7 +36,7 @@ from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, Message, TrackedPose
 from tests.runs.mistaken import Drift, DriftingTracker, standing_in
 
-NO_LOOPS = "loop_closer.is_on=false"
+NO_LOOPS = "loop_closer.enabled=false"
 NONE = Drift(scale=0.0, aside=0.0, turn_rad_per_m=0.0)
 
 
@@ -69,8 +69,9 @@ class Watched:
 def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
     """A run, judged."""
     config = with_all_cores(config)
-    actors = {actor.name: actor for actor in make_actors(config)}
-    actors["tracker"] = DriftingTracker(config.tracker, drift)
+    parameters = actor_parameters(config)
+    actors = {actor.name: actor for actor in make_actors(parameters)}
+    actors["tracker"] = DriftingTracker(parameters.tracker, drift)
     tracker, *others = [Watched(actors[name]) for name in ("tracker", "loop_closer", "mapper")]
     prepare(folder, overwrite=False)
     with standing_in(*actors.values()):

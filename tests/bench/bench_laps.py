@@ -21,7 +21,7 @@ import numpy as np
 
 from ldo_service.actors.mapper import Mapper, MapperConfig, Output
 from ldo_service.actors.topology import make_actors
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, latency_frames, load_config
 from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.conversions.poses import pose_message
 from ldo_service.datasets import Sequence
@@ -177,10 +177,11 @@ def main() -> None:
     sequence = open_source(arguments.source)
     per_lap = len(range(0, len(sequence), arguments.stride))
     poses = true_poses(sequence)[:: arguments.stride] if arguments.true_poses else None
-    mapper = TimedMapper(config.mapper, per_lap, poses)
-    actors = [mapper if actor.name == "mapper" else actor for actor in make_actors(config)]
+    parameters = actor_parameters(config)
+    mapper = TimedMapper(parameters.mapper, per_lap, poses)
+    actors = [mapper if actor.name == "mapper" else actor for actor in make_actors(parameters)]
     print("".join(f"{title:>10}" for title in COLUMNS))
-    with LogicalClock(actors, config.run.latency_frames()) as clock:
+    with LogicalClock(actors, latency_frames(config)) as clock:
         for tick in clock.run(laps_of(sequence, arguments.laps, arguments.stride)):
             if (tick + 1) % per_lap == 0:
                 report(mapper.mapped, tick // per_lap)

@@ -39,7 +39,8 @@ from ldo_service.transport.zenoh_transport import open_session
 from tests.faults.camera import frames
 from tests.ports import free_endpoint
 
-LIGHT = ("mapper.iterations=2", "mapper.threads=1", "service.spawned=[]")  # a process per robot
+# A robot has one process.
+LIGHT = ("mapper.iterations=2", "mapper.threads=1", "service.process_actors=[]")
 SAMPLE_S = 2.0
 RECENT = 30  # samples: a minute
 SETTLE_S = 30.0  # to find the rate that can be sustained

@@ -28,7 +28,7 @@ from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, latency_frames, load_config
 from ldo_service.conversions.poses import transform
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.loops import (
@@ -89,19 +89,20 @@ def coarse_ms(repeats: int = 20) -> float:
 def tracked(sequence: Sequence, model: str) -> list[Taken]:
     """What the loop closer would be given."""
     config = load_config()
+    parameters = actor_parameters(config)
     taken: list[Taken] = []
     actors = [
-        FrameSource(config.frame_source),
-        Tracker(config.tracker),
+        FrameSource(parameters.frame_source),
+        Tracker(parameters.tracker),
         Detector(DetectorConfig(model=model)),
-        Optimizer(config.optimizer),
+        Optimizer(parameters.optimizer),
     ]
 
     def observe(_actor: str, message: Message, _ms: float) -> None:
         if isinstance(message, Taken):
             taken.append(message)
 
-    with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
+    with LogicalClock(actors, latency_frames(config), observe) as clock:
         for _ in clock.run(Reader(sequence, Selection().indices(sequence), print)):
             pass
     return taken

@@ -26,7 +26,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.topology import make_actors
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, latency_frames, load_config
 from ldo_service.runtime import Actor
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.runtime.process import give_back_free_memory, resident_mb
@@ -119,7 +119,7 @@ def _referents(one: object) -> list[object]:
 # --- the journey ----------------------------------------------------------------------------------
 def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sample]:
     config, scene = load_config(settings=[*LIGHT, *settings]), frames()
-    actors, made, laps = make_actors(config), 0, 0
+    actors, made, laps = make_actors(actor_parameters(config)), 0, 0
 
     def observe(_actor: str, message: Message, _step_ms: float) -> None:
         nonlocal made
@@ -127,7 +127,7 @@ def journey(keyframes: int, most_laps: int, settings: list[str]) -> Iterator[Sam
 
     for actor in actors:
         keep_state(actor)
-    with LogicalClock(actors, config.run.latency_frames(), observe) as clock:
+    with LogicalClock(actors, latency_frames(config), observe) as clock:
         while made < keyframes and laps < most_laps:
             for _tick in clock.run(lap(scene, laps)):
                 pass

@@ -24,12 +24,12 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.client import Client, connect
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.datasets import open_sequence
 from ldo_service.schemas import TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
 from ldo_service.viewer.live import live
+from ldo_service.viewer.view_config import ViewerConfig
 from ldo_service.viewer.window import open_window
 from tests.service.conftest import LiveService, live_service
 

@@ -33,7 +33,7 @@ def test_nobody_to_look_at_is_a_configuration_error(capsys) -> None:
 
 
 @pytest.mark.parametrize(
-    "setting", ["viewer.most_gaussians=0", "viewer.update_s=0", "viewer.port=70000"]
+    "setting", ["viewer.max_gaussians=0", "viewer.update_interval_s=0", "viewer.port=70000"]
 )
 def test_limits_that_make_no_sense_are_refused(capsys, run: Path, setting: str) -> None:
     code, _, err = ldo(capsys, "view", run, "--set", setting)

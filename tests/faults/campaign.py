@@ -70,7 +70,7 @@ KEPT = ("tracker", *TAKERS)  # have something to lose
 DISK_AND_NETWORK = {"full disk": 3, "bad disk": 3, "network": 3}
 APART = {"kill": 10, "stop": 1, "hang": 2, "service": 1, **DISK_AND_NETWORK}
 TOGETHER = {"service": 10, "optimizer": 2, "hang in main": 1, **DISK_AND_NETWORK}
-SYNCED = "service.sync_state=true"
+SYNCED = "service.fsync=true"
 
 
 @dataclass

@@ -20,7 +20,7 @@ from ldo_service.actors.mapper import Mapper
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import Client, connect
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, load_config
 from ldo_service.conversions.objects import map_objects
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
@@ -39,10 +39,19 @@ from .witness import Witness
 PROGRAM = Path(__file__).with_name("faulty_service.py")
 PATIENCE_S = 120.0  # on a machine with much else to do
 ACTORS = tuple(box.name for box in GRAPH)
-ALL_APART = f"service.spawned=[{','.join(ACTORS)}]"
+ALL_APART = f"service.process_actors=[{','.join(ACTORS)}]"
 LIGHT = (  # what is tested is the runtime: little work for each keyframe, and little patience
-    *("mapper.iterations=2", "mapper.threads=1", "stage.stall_after_s=4", "stage.heartbeat_s=0.25"),
-    *("service.silent_after_s=5", "stage.max_restarts=1000", "service.drain_s=60"),
+    *(
+        "mapper.iterations=2",
+        "mapper.threads=1",
+        "supervision.step_timeout_s=4",
+        "supervision.heartbeat_s=0.25",
+    ),
+    *(
+        "service.heartbeat_timeout_s=5",
+        "supervision.max_restarts=1000",
+        "service.shutdown_timeout_s=60",
+    ),
     "detector.model=demo",  # finds some objects in the room
 )
 
@@ -181,12 +190,13 @@ class Life:
         shutil.rmtree(copy, ignore_errors=True)
         shutil.copytree(self.state / "map", copy)
         config = load_config(settings=self.settings).with_map_folder(copy)
+        parameters = actor_parameters(config)
 
         def mapper() -> Mapper:
-            return Mapper(config.mapper)
+            return Mapper(parameters.mapper)
 
         def optimizer() -> Optimizer:
-            return Optimizer(config.optimizer)
+            return Optimizer(parameters.optimizer)
 
         said = [
             *successor(mapper(), past, mapper).resumed(),

@@ -90,7 +90,7 @@ NETWORK = bytes_of(SQUARES["yolox"].write)
 
 TARGETS = [
     Target("config.yaml", as_file("config.yaml", config), [CONFIG]),
-    Target("--set", setting, [b"tracker.hold_out=5", b"data.T_color_depth=[1, 0]"]),
+    Target("--set", setting, [b"tracker.hold_out=5", b"dataset.T_color_depth=[1, 0]"]),
     Target("suite", as_file("suite.yaml", lambda path: load_suite(str(path))), [SUITE]),
     Target("names of robots", of_names(Network), [b"mule", b"../up"]),
     Target("endpoints", of_names(lambda text: Network("r", text).address), [b"tcp/[::1]:7447"]),

@@ -245,7 +245,7 @@ def test_the_recording_ends_at_its_limit(
     assert isinstance(last, Gap)
     assert last.reason == "limit"
     assert last.step == len(steps(tmp_path)) < 40
-    assert caplog.text.count("record.max_gb") == 1
+    assert caplog.text.count("recording.max_gb") == 1
     assert files(tmp_path)[0].is_whole
 
 

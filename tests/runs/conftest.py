@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.topology import GRAPH
-from ldo_service.config import Config, load_config
+from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.conversions.frames import camera_rgbd_message
 from ldo_service.conversions.poses import pose_message
 from ldo_service.datasets import Sequence
@@ -25,19 +25,20 @@ from tests.runtime.cast import eventually, running, send
 FRAMES = 30
 ROUGH = "mapper.iterations=2"  # so few that it is quick, so many that keyframes move
 REFINING = tuple(
-    f"mapper.builder.optimiser.{rate}=0.001" for rate in ("rotation_rate_rad", "translation_rate_m")
+    f"mapper.learning_rate.{rate}=0.001" for rate in ("pose_rotation_rad", "pose_translation_m")
 )
 CONFIG = load_config(settings=(ROUGH, *REFINING))
 
 
 def stages(folder: Path, transport: MemoryTransport, config: Config) -> list[Stage]:
     made: list[Stage] = []
+    parameters = actor_parameters(config)
     for box in GRAPH:
         assert box.make is not None
         make, topics = box.make, [out.topic.name for out in box.outputs]
         made.append(
             Stage(
-                lambda make=make: make(config),
+                lambda make=make: make(parameters),
                 transport,
                 expected={name: lossless_consumers(GRAPH, name) for name in topics},
                 journal=open_recorder(folder, box.name, "robot", config),

@@ -1,7 +1,11 @@
 """Runs whose map need not be beautiful, and a camera that is carried off and comes back."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
@@ -9,6 +13,7 @@ from ldo_service.geometry import RawFrame, Trajectory
 from ldo_service.runs.folder import prepare
 from ldo_service.runs.job import Job
 from ldo_service.runs.source import Selection, Warn
+from ldo_service.tracking.submaps import SegmentConfig
 
 ROUGH = "mapper.iterations=1"  # as fast as can be, with every part of the mapper in use
 
@@ -27,18 +32,18 @@ def job(
     return Job(sequence, folder, config, Selection(max_frames=frames), warn, prior=prior)
 
 
-SOON = tuple(
-    f"tracker.odometry.segments.{setting}"
-    for setting in (
-        "begin_after_s=0.06",
-        "look_every=3",
-        "confirm_after=2",
-        "confirm_apart_rad=0.05",
-    )
-)
+SOON = ("tracker.submaps.start_after_lost_s=0.06",)
 AND_BACK = [*range(0, 24, 2), *range(60, 66), *range(1, 23, 2)]  # a short walk: here, away, here
-LONG_AGO = "loop_closer.loops.retrieval.exclude_frames=5"  # its first frames, at its end
+LONG_AGO = "loop_closer.retrieval.min_gap_frames=5"  # its first frames, at its end
 HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
+
+
+@contextmanager
+def quick_submaps() -> Iterator[None]:
+    """Let every tracker that is made from a configuration join submaps after a few frames."""
+    quick = partial(SegmentConfig, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
+    with patch("ldo_service.config.parameters.SegmentConfig", quick):
+        yield
 
 
 class Rearranged(Sequence):

@@ -8,9 +8,8 @@ from unittest.mock import patch
 import numpy as np
 
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
-from ldo_service.actors.topology import make_actors
+from ldo_service.actors.topology import ActorParameters, make_actors
 from ldo_service.actors.tracker import Tracker, TrackerConfig
-from ldo_service.config import Config
 from ldo_service.conversions.poses import measured_message
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -132,8 +131,8 @@ def standing_in(*actors: Actor) -> Iterator[None]:
     """Within, runs over files have these in place of those of the same names."""
     names = {actor.name: actor for actor in actors}
 
-    def made(config: Config) -> Sequence[Actor]:
-        return [names.get(actor.name, actor) for actor in make_actors(config)]
+    def made(parameters: ActorParameters) -> Sequence[Actor]:
+        return [names.get(actor.name, actor) for actor in make_actors(parameters)]
 
     with patch("ldo_service.runs.offline.make_actors", made):
         yield

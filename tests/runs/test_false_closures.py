@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, load_config
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
@@ -68,7 +68,8 @@ def test_four_false_closures_are_not_believed(kitchen: Sequence, tmp_path: Path)
     pairs = half_a_metre_apart(without.keyframes)
     assert len(pairs) == len(SHARES)
     same = {new: (old, np.eye(4)) for new, old in pairs.items()}
-    with standing_in(MistakenLoopCloser(load_config(settings=(ROUGH,)).loop_closer, same)):
+    parameters = actor_parameters(load_config(settings=(ROUGH,)))
+    with standing_in(MistakenLoopCloser(parameters.loop_closer, same)):
         planted = run(kitchen, tmp_path / "planted")
     told = {(c["reference"], c["keyframe"]): c["is_believed"] for c in planted.closures}
     false = {(old, new) for new, old in pairs.items()}

@@ -102,8 +102,8 @@ def test_another_map_is_made_of_the_same_poses(room: Sequence, whole: Path, tmp_
 def test_a_setting_that_would_have_no_effect_is_refused(walk: Sequence, whole: Path) -> None:
     with pytest.raises(ConfigError, match=r"tracker\.hold_out is 5 and was 0 when"):
         opened(whole, walk, "tracker.hold_out=5")
-    with pytest.raises(ConfigError, match=r"run\.detector_latency_frames is 4 and was 3"):
-        opened(whole, walk, "run.detector_latency_frames=4")
+    with pytest.raises(ConfigError, match=r"offline\.latency_frames\.detector is 4 and was 3"):
+        opened(whole, walk, "offline.latency_frames.detector=4")
 
 
 def test_other_frames_are_refused(room: Sequence, walk: Sequence, whole: Path) -> None:
@@ -148,7 +148,7 @@ def test_a_run_that_fails_leaves_none_for_others(
 
 
 def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -> None:
-    tight = "record.max_gb=0.0000001"
+    tight = "recording.max_gb=0.0000001"
     asked = job(Rearranged(room, AND_BACK), tmp_path / "out", tight)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ldo_service.recordings.mcap_file.CHECK_EVERY_BYTES", 1000)

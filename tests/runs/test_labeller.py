@@ -16,12 +16,12 @@ from tests.detection.labellers.server import Server, hangs, says, sends, serving
 from .jobs import job
 
 FRAMES = 16
-QUICK = ("endpoint.timeout_s=0.2", "endpoint.attempts=1", "endpoint.per_minute=1000000000.0")
+QUICK = ("timeout_s=0.2", "max_attempts=1", "max_requests_per_minute=1000000000.0")
 
 
 def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -> RunFolder:
     """With a labeller that answers so many frames late."""
-    settings = [f"run.vlm_labeller_latency_frames={latency}", "mapper.threads=1"]
+    settings = [f"offline.latency_frames.vlm_labeller={latency}", "mapper.threads=1"]
     if server:
         settings += [f"vlm_labeller.http.{setting}" for setting in QUICK]
         settings += [f"vlm_labeller.url={server.url}"]

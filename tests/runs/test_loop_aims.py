@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.config import load_config
+from ldo_service.config import actor_parameters, load_config
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.results import Results, evaluate_run
 from ldo_service.runs.finished import read_run
@@ -33,7 +33,9 @@ def judged(
     config = load_config(settings=("tracker.hold_out=5",))
     prepare(folder, overwrite=False)
     job = Job(sequence, folder, config, Selection(max_frames=frames), print)
-    with standing_in(*([DriftingTracker(config.tracker, drift)] if drift else [])):
+    with standing_in(
+        *([DriftingTracker(actor_parameters(config).tracker, drift)] if drift else [])
+    ):
         run_over_file(job, lambda *_: None)
     threads = os.cpu_count() or 1
     return evaluate_run(read_run(folder), sequence, lambda _: None, threads=threads)

@@ -166,7 +166,7 @@ def test_a_run_with_a_detector_says_what_each_gaussian_of_the_map_is(
     room: Sequence, finished: Path, tmp_path: Path
 ) -> None:
     model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
-    settings = (f"detector.model={model}", "detector.network.score_min=0.02")
+    settings = (f"detector.model={model}", "detector.min_score=0.02")
     record = run(room, tmp_path / "out", *settings)
     saved, gaussians = MapFolder(tmp_path / "out").semantics(), record.follower.map
     assert saved is not None

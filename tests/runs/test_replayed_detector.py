@@ -19,7 +19,7 @@ FRAMES = 8
 
 def test_boxes_replay_and_another_network_is_noticed(room: Sequence, tmp_path: Path) -> None:
     model = changed("yolov5", width=320, height=256).write(tmp_path / "squares.onnx")
-    settings = (ROUGH, f"detector.model={model}", "detector.network.score_min=0")
+    settings = (ROUGH, f"detector.model={model}", "detector.min_score=0")
     asyncio.run(live(tmp_path / "recording", room, load_config(settings=settings), FRAMES))
     replayed = replay_recording(tmp_path / "recording", "detector", "mapper")
     assert replayed["detector"].made["detection/boxes"] >= 1

@@ -1,10 +1,13 @@
 """Names from a server outside, recorded and lived again bit for bit without it."""
 
 import asyncio
+from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
+from ldo_service.regions.region_tracker import RegionConfig
 from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime.journal import Step
 from ldo_service.runtime.stage import Stage
@@ -15,8 +18,8 @@ from tests.runs.conftest import live
 from tests.runs.jobs import ROUGH
 
 FRAMES = 12
-REGIONS = "mapper.semantics.naming.regions"
-SOON = (ROUGH, f"{REGIONS}.patience=0", f"{REGIONS}.per_keyframe=4")  # the stream is short
+SOON = (ROUGH, "mapper.open_vocabulary.requests_per_keyframe=4")  # The stream is short.
+IMPATIENT = partial(RegionConfig, patience=0)
 
 
 def has_answers(stages: dict[str, Stage]) -> bool:
@@ -36,8 +39,9 @@ def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_pat
     with serving(says("samovar", 0.9)) as server:
         settings = (*SOON, f"vlm_labeller.url={server.url}")
         config = load_config(settings=settings)
-        asyncio.run(live(tmp_path / "recording", room, config, FRAMES, until=has_answers))
+        with patch("ldo_service.config.parameters.RegionConfig", IMPATIENT):
+            asyncio.run(live(tmp_path / "recording", room, config, FRAMES, until=has_answers))
+            replayed = replay_recording(tmp_path / "recording", "mapper", "vlm_labeller")
     assert "samovar" in names_taken(tmp_path / "recording")
-    replayed = replay_recording(tmp_path / "recording", "mapper", "vlm_labeller")
     assert replayed["mapper"].made["label/request"] >= 1
     assert replayed["mapper"].made["map/objects"] >= 1

@@ -25,7 +25,7 @@ def rounds(room: Sequence) -> Rearranged:
 @pytest.fixture(scope="module")
 def finished(rounds: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rounds") / "out"
-    run_over_file(job(rounds, folder, "tracker.odometry.returning.after=8"), lambda *_: None)
+    run_over_file(job(rounds, folder, "tracker.keyframes.reuse_after=8"), lambda *_: None)
     return folder
 
 

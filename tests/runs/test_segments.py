@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,13 @@ from ldo_service.runs.offline import run_over_file
 from ldo_service.runs.simulation import simulate_graph
 from ldo_service.runs.source import Selection
 
-from .jobs import AWAY, BACK, HERE, ROUGH, SOON, Rearranged, job
+from .jobs import AWAY, BACK, HERE, ROUGH, SOON, Rearranged, job, quick_submaps
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _submaps_are_joined_soon() -> Iterator[None]:
+    with quick_submaps():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +80,7 @@ def test_the_map_is_whole(finished: Path) -> None:
 def test_what_was_joined_is_fitted_again_at_the_end(
     finished: Path, returning: Rearranged, tmp_path: Path
 ) -> None:
-    paid, due = "mapper.paid_iterations=0", "mapper.due_iterations=0"
+    paid, due = "mapper.refit.iterations_per_keyframe=0", "mapper.refit.iterations=0"
     left, never = tmp_path / "left", tmp_path / "never"
     run_over_file(job(returning, left, *SOON, paid), lambda *_: None)
     run_over_file(job(returning, never, *SOON, due), lambda *_: None)

@@ -82,7 +82,7 @@ def test_one_inverted_pixel_of_a_keyframe_reaches_tracker_and_map(
 
 
 def test_the_latency_is_an_input(room: Sequence, made: dict[str, Made]) -> None:
-    later = simulated(room, "run.optimizer_latency_frames=6")
+    later = simulated(room, "offline.latency_frames.optimizer=6")
     assert later["frame_source"] == made["frame_source"]
     assert later["tracker"] != made["tracker"]
 
@@ -134,7 +134,7 @@ def squares(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
     """Settings of a detector that finds what is red, green or blue, however pale."""
     path = tmp_path_factory.mktemp("model") / "squares.onnx"
     model = changed("yolov5", width=320, height=256).write(path)
-    return f"detector.model={model}", "detector.network.score_min=0.02"
+    return f"detector.model={model}", "detector.min_score=0.02"
 
 
 def test_a_labelled_map_does_not_depend_on_threads(

@@ -27,10 +27,10 @@ SILENT = 20  # of these frames, before the first answer
 LATE = 5  # keyframes, at least, of that answer
 # A frame that nobody took, and the first while not all are there for its keyframe
 LOST_AFTER_S = 5.0
-LIGHT = ("detector.model=demo", "mapper.iterations=2", "stage.heartbeat_s=0.1")
+LIGHT = ("detector.model=demo", "mapper.iterations=2", "supervision.heartbeat_s=0.1")
 PATIENT = (  # it may take for ever
-    *("http.endpoint.timeout_s=600", "http.endpoint.patience_s=600"),
-    *("http.endpoint.per_minute=1000000", "http.views=1"),
+    *("http.timeout_s=600", "http.deadline_s=600"),
+    *("http.max_requests_per_minute=1000000", "http.max_views=1"),
 )
 
 
@@ -124,7 +124,7 @@ def test_nobody_waits_for_a_slow_labeller_and_its_answers_lie_where_it_was_asked
     guide = Guide(sequence, range(len(sequence)), waits=True)
     with serving(guide) as server:
         use = [f"vlm_labeller.{setting}" for setting in (f"url={server.url}", *PATIENT)]
-        use += ["stage.stall_after_s=1500", "service.control_timeout_s=1500"]
+        use += ["supervision.step_timeout_s=1500", "service.control_timeout_s=1500"]
         with walk(tmp_path / "slow", sequence, *use, guide=guide) as walker:
             slow = walker.heard
             # it is asked, and says nothing

@@ -77,7 +77,7 @@ def _iterations(service: LiveService) -> float:
 
 @pytest.mark.slow
 def test_an_actor_that_does_not_obey_gives_exit_code_4(tmp_path: Path) -> None:
-    arguments = ("--set", "service.control_timeout_s=1", "--set", "service.silent_after_s=30")
+    arguments = ("--set", "service.control_timeout_s=1", "--set", "service.heartbeat_timeout_s=30")
     with live_service(tmp_path, *arguments) as service:
         service.wait_for_actors()
         stopped = service.health["optimizer"].pid

@@ -8,7 +8,7 @@ from ldo_service.schemas import DetectionBoxes
 from tests.detection.networks import changed
 from tests.service.conftest import live_service, wait_until
 
-APART = ("--set", "service.spawned=[detector]", "--set", "mapper.iterations=2")
+APART = ("--set", "service.process_actors=[detector]", "--set", "mapper.iterations=2")
 
 
 @pytest.mark.slow
@@ -19,7 +19,7 @@ def test_every_keyframe_is_answered_whatever_the_network_is(
     model = changed("yolox", width=320, height=256).write(tmp_path / "squares.onnx")
     if is_garbage:
         model.write_bytes(b"garbage")
-    use = ("--set", f"detector.model={model}", "--set", "detector.network.score_min=0")
+    use = ("--set", f"detector.model={model}", "--set", "detector.min_score=0")
     boxes: list[DetectionBoxes] = []
     with live_service(tmp_path, *APART, *use) as service:
         with service.client.listen("detection/boxes", DetectionBoxes, keep=64) as inbox:

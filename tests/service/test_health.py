@@ -21,7 +21,7 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
         code, out, _ = ldo(capsys, "doctor", "--endpoint", service.endpoint)
         return code, " ".join(out.split())
 
-    with live_service(tmp_path, "--set", "service.silent_after_s=60") as service:
+    with live_service(tmp_path, "--set", "service.heartbeat_timeout_s=60") as service:
         service.wait_for_actors()
 
         def is_well() -> bool:

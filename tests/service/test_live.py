@@ -20,7 +20,12 @@ from tests.service.conftest import LDO, PATIENCE, is_running, live_service, wait
 EXAMPLES = Path(__file__).parent.parent.parent / "examples"
 EVERY_ACTOR = tuple(box.name for box in GRAPH)
 # A light map: what is watched here is the runtime, and a process that starts anew needs its core.
-APART = ("--set", f"service.spawned=[{','.join(EVERY_ACTOR)}]", "--set", "mapper.iterations=2")
+APART = (
+    "--set",
+    f"service.process_actors=[{','.join(EVERY_ACTOR)}]",
+    "--set",
+    "mapper.iterations=2",
+)
 
 
 def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from ldo_service.transport.zenoh_transport import Network, open_session
 from tests.service.conftest import PATIENCE, LiveService, live_service, wait_until
 
 PROGRAM = Path(__file__).with_name("troubled_service.py")
-APART = ("--set", "service.spawned=[optimizer,tracker]")
+APART = ("--set", "service.process_actors=[optimizer,tracker]")
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> lis
 def test_a_handler_that_hangs_costs_its_process_which_is_started_again(
     troubled: Callable, room: Sequence, tmp_path: Path
 ) -> None:
-    with troubled("hang", *APART, "--set", "stage.stall_after_s=4") as service:
+    with troubled("hang", *APART, "--set", "supervision.step_timeout_s=4") as service:
         service.wait_for_actors()
         tracked(service, room, range(20))
         first = service.update_health()["tracker"].pid
@@ -111,7 +111,7 @@ def not_frames(good: CameraRgbd) -> Iterator[bytes]:
     yield msgpack.packb({**fields, "camera": {**fields["camera"], "fx": float("nan")}})
     yield msgpack.packb({**fields, "depth_scale": 0.0})
     yield b"\x81\xa1y" + b"\x91" * 100_000
-    yield bytes(65_000_000)  # over stage.max_message_mb
+    yield bytes(65_000_000)  # over service.max_decoded_message_mb
 
 
 def test_what_is_no_frame_is_rejected_and_counted_while_the_stream_goes_on(

@@ -23,7 +23,7 @@ def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
     vocabulary(tmp_path / "bpe.txt.gz")
     (tmp_path / "names.txt").write_text("red\n")
     use = ("--set", f"vlm_labeller.model={tmp_path}")
-    use += ("--set", f"vlm_labeller.names={tmp_path / 'names.txt'}")
+    use += ("--set", f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
     with live_service(tmp_path, *use) as service:
         service.wait_for_actors()
         command = [*LDO, "control", "add-label", "fire hydrant", "--endpoint", service.endpoint]
@@ -47,14 +47,14 @@ ROUGH = ("--set", "mapper.iterations=2")
 
 
 def asking(url: str, *settings: str) -> tuple[str, ...]:
-    use = (f"vlm_labeller.url={url}", *(f"vlm_labeller.http.endpoint.{s}" for s in settings))
+    use = (f"vlm_labeller.url={url}", *(f"vlm_labeller.http.{s}" for s in settings))
     return (*ROUGH, *(word for setting in use for word in ("--set", setting)))
 
 
 def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequence) -> None:
     """The model says nothing else, and without the name on the list nobody would believe it."""
     (tmp_path / "names.txt").write_text("red\n")
-    names = ("--set", f"vlm_labeller.names={tmp_path / 'names.txt'}")
+    names = ("--set", f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
     with (
         serving(says("fire hydrant", 0.9)) as server,
         live_service(tmp_path, *asking(server.url), *names) as service,
@@ -81,7 +81,7 @@ def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequen
 @pytest.mark.slow
 def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path) -> None:
     """Every frame has its pose while it is busy; what it never says labels nothing."""
-    slow = asking("", "timeout_s=5.0", "attempts=1")
+    slow = asking("", "timeout_s=5.0", "max_attempts=1")
     with serving(hangs) as server:
         use = [word.replace("url=", f"url={server.url}") for word in slow]
         with live_service(tmp_path, *use) as service:
@@ -110,7 +110,7 @@ def test_a_name_added_while_it_runs_is_found_on_what_is_seen_after(tmp_path: Pat
     """The built-in networks in the flat, from a list that lacks the name."""
     (tmp_path / "names.txt").write_text("couch\nlamp\ncabinet\nwindow\ndoor\n")
     demo = ("detector.model=demo", "vlm_labeller.model=demo", "mapper.iterations=2")
-    use = (*demo, f"vlm_labeller.names={tmp_path / 'names.txt'}")
+    use = (*demo, f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
     with (
         live_service(tmp_path, *(word for one in use for word in ("--set", one))) as service,
         service.client.listen("map/objects", MapObjects) as objects,

@@ -39,7 +39,7 @@ def meet_trouble(frame: int) -> None:
 def troubled(box: topology.Box) -> topology.Box:
     if box.name != "tracker":
         return box
-    return replace(box, make=lambda config: TroubledTracker(config.tracker))
+    return replace(box, make=lambda parameters: TroubledTracker(parameters.tracker))
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.viewer.flight import view_of
 from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source
+from ldo_service.viewer.view_config import ViewerConfig
 from ldo_service.viewer.window import Window, open_window
 from tests.service.conftest import LDO, live_service
 from tests.viewer.browser import Page, browser

@@ -11,7 +11,6 @@ import pytest
 import zenoh
 
 from ldo_service.client import connect
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.schemas import Health, Message, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
@@ -29,6 +28,7 @@ from ldo_service.transport.certificate_authority import Authority
 from ldo_service.transport.keys import Keys
 from ldo_service.transport.zenoh_transport import Network, open_session
 from ldo_service.viewer.live import Live, live
+from ldo_service.viewer.view_config import ViewerConfig
 from tests.maps.streams import ChangingMap
 from tests.ports import free_endpoint
 from tests.schemas.examples import EXAMPLES

@@ -4,7 +4,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.conversions.frames import camera_of
 from ldo_service.conversions.poses import correction_message, pose_message
 from ldo_service.geometry import se3
@@ -21,6 +20,7 @@ from ldo_service.schemas import (
     TrackedPose,
 )
 from ldo_service.viewer.live import FACTS_EVERY_S, MOST_ACTORS, LiveScene
+from ldo_service.viewer.view_config import ViewerConfig
 from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES
 

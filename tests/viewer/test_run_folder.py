@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import DataError
 from ldo_service.gaussians.file_formats import read_ply, write_ply
 from ldo_service.gaussians.pruning import weights
@@ -17,6 +16,7 @@ from ldo_service.runs.records import write_objects
 from ldo_service.schemas import MapObjects, ObjectView
 from ldo_service.viewer.panel import escaped
 from ldo_service.viewer.run_folder import PARTS, RunFolder
+from ldo_service.viewer.view_config import ViewerConfig
 from tests.schemas.examples import EXAMPLES
 
 CONFIG = ViewerConfig()

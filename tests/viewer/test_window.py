@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ldo_service.config.sections import ViewerConfig
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.transport.endpoint import LOOPBACK
 from ldo_service.viewer.scene import splats_of
+from ldo_service.viewer.view_config import ViewerConfig
 from ldo_service.viewer.window import Server, Window, open_window
 from tests.viewer.staged import EVERY_LAYER, GREEN, RED, Staged, chair, scene_of, wall
 

@@ -187,7 +187,7 @@ class HttpLabeller:
         if not self._names:
             raise ConfigError(
                 f"{self.identity} may answer any name, {name!r} too: a list that one could add to "
-                "is given with vlm_labeller.names."
+                "is given with vlm_labeller.class_names."
             )
         if canonical(name) not in self._names:
             self._names.append(canonical(name))

@@ -25,7 +25,7 @@ class EndpointConfig:
     attempts: int = 3
     backoff_s: float = 0.5  # before the second attempt; doubled before each further one
     patience_s: float = 40.0  # of a region, with all its views, attempts and waits; below
-    # stage.stall_after_s, at which an actor is given up
+    # supervision.step_timeout_s, at which an actor is given up
     per_minute: float = 60.0  # attempts, evenly spaced
     rest_s: float = 10.0  # after a question that failed, nothing is asked; doubled with each more
     rest_most_s: float = 300.0

@@ -1,0 +1,358 @@
+"""Parameters of the actors and of the runtime, made from the configuration.
+
+This is the one place that knows where a setting is used. A value that several actors share is set
+once and given to all of them here. What no setting changes keeps the default of its class, which
+stands beside the code with the reason.
+"""
+
+from ldo_service.actors.frame_source import FrameSourceConfig
+from ldo_service.actors.loop_closer import LoopCloserConfig
+from ldo_service.actors.mapper import MapperConfig
+from ldo_service.actors.optimizer import OptimizerConfig
+from ldo_service.actors.topology import ActorParameters
+from ldo_service.actors.tracker import CameraExtrinsics, TrackerConfig
+from ldo_service.detection.dynamic_classes import MovableConfig
+from ldo_service.gaussians.adam import AdamConfig
+from ldo_service.gaussians.densification import InsertionConfig
+from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
+from ldo_service.gaussians.loss import LossWeights
+from ldo_service.gaussians.map_builder import MapBuilderConfig
+from ldo_service.gaussians.optimizer import OptimiserConfig
+from ldo_service.gaussians.pruning import PruningConfig
+from ldo_service.gaussians.visibility import SleepConfig
+from ldo_service.loop_closing import LoopsConfig
+from ldo_service.loop_closing.consistency_check import PlausibilityConfig
+from ldo_service.loop_closing.loop_detector import LOOP_MIN_INLIERS
+from ldo_service.loop_closing.object_points import LandmarkConfig
+from ldo_service.loop_closing.place_database import RetrievalConfig
+from ldo_service.loop_closing.pose_estimation import SurfaceFitConfig
+from ldo_service.loop_closing.subgraph import SubgraphConfig
+from ldo_service.loop_closing.verification import VerificationConfig
+from ldo_service.pose_graph.factors import NoiseConfig
+from ldo_service.pose_graph.landmarks import LandmarksConfig
+from ldo_service.pose_graph.loop_closures import ClosuresConfig
+from ldo_service.pose_graph.pose_graph import KeyframeGraphConfig
+from ldo_service.recordings.mcap_file import RecordConfig
+from ldo_service.regions.foreground import ForegroundConfig
+from ldo_service.regions.open_vocabulary import NamingConfig
+from ldo_service.regions.region_proposals import TriggerConfig
+from ldo_service.regions.region_tracker import RegionConfig
+from ldo_service.runtime.supervision_policy import StageConfig
+from ldo_service.semantics.data_association import AssociationConfig
+from ldo_service.semantics.gaussian_labels import ConsistencyConfig, LabelConfig
+from ldo_service.semantics.label_assignment import AssignmentConfig
+from ldo_service.semantics.objects import ObjectsConfig
+from ldo_service.semantics.semantic_fusion import FusionConfig, LabellingConfig
+from ldo_service.semantics.semantic_map import SemanticMapConfig
+from ldo_service.tracking.alignment import AlignConfig, ResidualConfig
+from ldo_service.tracking.features import FeatureConfig
+from ldo_service.tracking.keyframe_database import PlacesConfig
+from ldo_service.tracking.keyframes import KeyframeConfig
+from ldo_service.tracking.motion_segmentation import MovingConfig
+from ldo_service.tracking.odometry import OdometryConfig
+from ldo_service.tracking.odometry_prior import PriorConfig
+from ldo_service.tracking.pyramid import DepthNoise, PyramidConfig
+from ldo_service.tracking.relocalization import RelocalisationConfig, ReturnConfig
+from ldo_service.tracking.submaps import SegmentConfig
+from ldo_service.tracking.tracking_quality import JudgementConfig
+from ldo_service.tracking.window import WindowConfig
+
+from .network_parameters import detector_parameters, labeller_parameters
+from .sections import Config
+
+FOREGROUND = ForegroundConfig()  # The labels, the regions and the landmarks of loops use one test.
+
+
+def actor_parameters(config: Config) -> ActorParameters:
+    """Return what the actors are made from."""
+    return ActorParameters(
+        frame_source=FrameSourceConfig(max_skew_s=config.frame_source.max_skew_s),
+        tracker=_tracker(config),
+        detector=detector_parameters(config),
+        vlm_labeller=labeller_parameters(config),
+        mapper=_mapper(config),
+        loop_closer=_loop_closer(config),
+        optimizer=_optimizer(config),
+    )
+
+
+def stage_parameters(config: Config) -> StageConfig:
+    """Return how the stages of actors are supervised."""
+    supervision = config.supervision
+    return StageConfig(
+        max_restarts=supervision.max_restarts,
+        heartbeat_s=supervision.heartbeat_s,
+        stall_after_s=supervision.step_timeout_s,
+        evict_after_s=supervision.evict_after_s,
+        nice=supervision.background_nice,
+        max_message_mb=config.service.max_decoded_message_mb,
+    )
+
+
+def recording_parameters(config: Config) -> RecordConfig:
+    """Return the limits of a recording."""
+    recording = config.recording
+    return RecordConfig(max_gb=recording.max_gb, min_free_gb=recording.min_free_gb)
+
+
+def latency_frames(config: Config) -> dict[str, int]:
+    """Return the latency of each actor on the logical clock, in frames."""
+    latency = config.offline.latency_frames
+    return {
+        "detector": latency.detector,
+        "loop_closer": latency.loop_closer,
+        "mapper": latency.mapper,
+        "optimizer": latency.optimizer,
+        "vlm_labeller": latency.vlm_labeller,
+    }
+
+
+# --- shared by several actors ---------------------------------------------------------------------
+def _dynamic_classes(config: Config) -> MovableConfig:
+    return MovableConfig(classes=config.detector.dynamic_classes)
+
+
+def _pyramid(config: Config) -> PyramidConfig:
+    image = config.tracker.image
+    return PyramidConfig(
+        working_width_px=image.width_px, levels=image.pyramid_levels, max_depth_m=image.max_depth_m
+    )
+
+
+def _align(config: Config) -> AlignConfig:
+    noise = config.tracker.depth_noise
+    return AlignConfig(
+        residuals=ResidualConfig(
+            noise=DepthNoise(floor_m=noise.floor_m, growth_per_m=noise.growth_per_m)
+        ),
+        iterations=config.tracker.alignment.max_iterations,
+    )
+
+
+def _places(config: Config) -> PlacesConfig:
+    return PlacesConfig(count=config.tracker.relocalization.max_keyframes)
+
+
+# --- the tracker ----------------------------------------------------------------------------------
+def _tracker(config: Config) -> TrackerConfig:
+    tracker = config.tracker
+    mounting = tracker.T_base_camera
+    return TrackerConfig(
+        T_base_camera=CameraExtrinsics(mounting.translation_m, mounting.quaternion_wxyz),
+        odometry=OdometryConfig(
+            pyramid=_pyramid(config),
+            align=_align(config),
+            features=FeatureConfig(count=tracker.features.max_features),
+            keyframes=_keyframes(config),
+            window=WindowConfig(measurements=tracker.window.max_measurements),
+            places=_places(config),
+            relocalisation=RelocalisationConfig(
+                alike=tracker.relocalization.appearance_candidates,
+                across_scales=tracker.relocalization.sift_candidates,
+            ),
+            returning=ReturnConfig(after=tracker.keyframes.reuse_after),
+            segments=SegmentConfig(begin_after_s=tracker.submaps.start_after_lost_s),
+            judgement=JudgementConfig(
+                min_overlap=tracker.quality.weak_overlap,
+                weak_residual=tracker.quality.weak_residual_ratio,
+                lost_residual=tracker.quality.lost_residual_ratio,
+                lost_overlap=tracker.quality.lost_overlap,
+            ),
+            moving=MovingConfig(is_on=tracker.dynamics.enabled),
+            movable=_dynamic_classes(config),
+            prior=PriorConfig(
+                max_gap_s=tracker.odometry_prior.max_gap_s,
+                max_carried_s=tracker.odometry_prior.max_dead_reckoning_s,
+            ),
+        ),
+        localise=tracker.localization_map,
+        hold_out=tracker.hold_out,
+    )
+
+
+def _keyframes(config: Config) -> KeyframeConfig:
+    keyframes = config.tracker.keyframes
+    return KeyframeConfig(
+        min_overlap=keyframes.min_overlap,
+        max_rotation_rad=keyframes.max_rotation_rad,
+        max_translation=keyframes.max_translation_ratio,
+        min_frames=keyframes.min_interval_frames,
+        max_frames=keyframes.max_interval_frames,
+        supporting=keyframes.mapping_only_ratio,
+    )
+
+
+# --- the mapper -----------------------------------------------------------------------------------
+def _mapper(config: Config) -> MapperConfig:
+    mapper = config.mapper
+    return MapperConfig(
+        builder=_map_builder(config),
+        semantics=_semantics(config),
+        iterations=mapper.iterations,
+        folder=mapper.image_folder,
+        threads=mapper.threads,
+        snapshot_keyframes=mapper.publish.snapshot_interval_keyframes,
+        part_gaussians=mapper.publish.max_gaussians_per_message,
+        changed_keyframes=mapper.publish.update_interval_keyframes,
+        checkpoint_keyframes=mapper.checkpoint_interval_keyframes,
+        due_iterations=mapper.refit.iterations,
+        paid_iterations=mapper.refit.iterations_per_keyframe,
+    )
+
+
+def _map_builder(config: Config) -> MapBuilderConfig:
+    mapper, rates, loss = config.mapper, config.mapper.learning_rate, config.mapper.loss
+    return MapBuilderConfig(
+        insertion=InsertionConfig(
+            max_transmittance=mapper.densify.max_transmittance,
+            coarsest_px=mapper.densify.max_cell_px,
+        ),
+        optimiser=OptimiserConfig(
+            adam=AdamConfig(
+                mean_m=rates.mean_m,
+                log_scale=rates.log_scale,
+                quat=rates.quaternion,
+                opacity_logit=rates.opacity_logit,
+                color=rates.color,
+            ),
+            loss=LossWeights(l1=loss.l1, d_ssim=loss.d_ssim, depth=loss.depth),
+            max_sigma_px=loss.max_sigma_px,
+            rotation_rate_rad=rates.pose_rotation_rad,
+            translation_rate_m=rates.pose_translation_m,
+        ),
+        pruning=PruningConfig(min_opacity=mapper.prune.min_opacity),
+        store=KeyframeStoreConfig(
+            cache_mb=mapper.keyframe_images.memory_mb,
+            quota_mb=mapper.keyframe_images.disk_mb,
+            most=mapper.keyframe_images.max_keyframes,
+        ),
+        sleep=SleepConfig(max_active=mapper.offload.max_resident_gaussians),
+        prune_keyframes=mapper.prune.interval_keyframes,
+        seed=mapper.seed,
+    )
+
+
+def _semantics(config: Config) -> SemanticMapConfig:
+    objects, paper = config.mapper.objects, config.paper
+    return SemanticMapConfig(
+        labelling=_labelling(config),
+        objects=ObjectsConfig(
+            association=AssociationConfig(
+                min_iou=objects.min_iou, max_depth_gap_m=paper.max_depth_gap_m
+            ),
+            min_keyframes=objects.min_observations,
+            max_divergence=paper.object_max_divergence_nats,
+            miss_limit=objects.max_misses,
+            max_objects=objects.max_objects,
+        ),
+        naming=_naming(config),
+        movable=_dynamic_classes(config),
+        most_names=config.mapper.semantics.max_label_names,
+    )
+
+
+def _labelling(config: Config) -> LabellingConfig:
+    paper = config.paper
+    return LabellingConfig(
+        region=paper.label_region,
+        foreground=FOREGROUND,
+        assignment=AssignmentConfig(
+            rule=paper.assignment_rule,
+            min_overlap=config.mapper.semantics.min_overlap,
+            max_depth_gap_m=paper.max_depth_gap_m,
+        ),
+        fusion=FusionConfig(
+            rule=paper.fusion_rule,
+            beta=paper.fusion_beta,
+            epsilon=paper.fusion_epsilon,
+            fixed_alpha=paper.fusion_fixed_weight,
+        ),
+        labels=LabelConfig(
+            ema=paper.ema_rule,
+            keep=paper.ema_keep_ratio,
+            miss_limit=paper.label_max_misses,
+            hold_back=paper.ema_hold_back_ratio,
+        ),
+        consistency=ConsistencyConfig(
+            sigma_m=paper.consistency_sigma_m,
+            radius_m=paper.consistency_radius_m,
+            rate=paper.consistency_rate,
+        ),
+    )
+
+
+def _naming(config: Config) -> NamingConfig:
+    naming = config.mapper.open_vocabulary
+    return NamingConfig(
+        trigger=TriggerConfig(sure=naming.confident_score, foreground=FOREGROUND),
+        regions=RegionConfig(
+            per_keyframe=naming.requests_per_keyframe, boxes_vote=naming.detector_votes
+        ),
+        least_sure=naming.min_confidence,
+    )
+
+
+# --- loops and the graph --------------------------------------------------------------------------
+def _loop_closer(config: Config) -> LoopCloserConfig:
+    closer, paper = config.loop_closer, config.paper
+    return LoopCloserConfig(
+        is_on=closer.enabled,
+        loops=LoopsConfig(
+            stages=closer.retrieval.mode,
+            subgraphs=SubgraphConfig(
+                least=paper.subgraph_min_keyframes, most=paper.subgraph_max_keyframes
+            ),
+            retrieval=RetrievalConfig(
+                exclude_frames=closer.retrieval.min_gap_frames,
+                candidates=closer.retrieval.max_candidates,
+                min_similarity=closer.retrieval.min_similarity,
+                count=closer.retrieval.max_subgraphs,
+            ),
+            verification=VerificationConfig(
+                landmarks=LandmarkConfig(
+                    foreground=FOREGROUND, max_divergence=paper.loop_max_divergence_nats
+                ),
+                fit=SurfaceFitConfig(
+                    min_overlap=closer.verification.min_overlap,
+                    max_rmse_m=closer.verification.max_rmse_m,
+                ),
+                min_inliers=closer.verification.min_inliers,
+            ),
+            plausibility=PlausibilityConfig(
+                drift_m=closer.drift_gate.max_drift_m, drift=closer.drift_gate.max_drift_ratio
+            ),
+            places=_places(config),
+            pyramid=_pyramid(config),
+            features=FeatureConfig(
+                count=config.tracker.features.max_features, min_inliers=LOOP_MIN_INLIERS
+            ),
+            align=_align(config),
+        ),
+        movable=_dynamic_classes(config),
+    )
+
+
+def _optimizer(config: Config) -> OptimizerConfig:
+    optimizer, paper = config.optimizer, config.paper
+    return OptimizerConfig(
+        graph=KeyframeGraphConfig(
+            noise=NoiseConfig(
+                drift_rad_per_sqrt_m=optimizer.noise.drift_rad_per_sqrt_m,
+                drift_m_per_sqrt_m=optimizer.noise.drift_m_per_sqrt_m,
+                sigma_loop_rad=optimizer.noise.loop_rotation_rad,
+                sigma_loop_m=optimizer.noise.loop_translation_m,
+            ),
+            closures=ClosuresConfig(
+                most_sigmas=optimizer.loop_closures.max_residual_sigmas,
+                most=optimizer.loop_closures.max_closures,
+            ),
+            condense_keyframes=paper.marginalization_interval_keyframes,
+        ),
+        landmarks=LandmarksConfig(
+            lambda_sem=paper.lambda_sem,
+            w_sem=paper.w_sem,
+            most=optimizer.landmarks.max_landmarks,
+            schedule=optimizer.landmarks.schedule,
+        ),
+        uses_objects=optimizer.landmarks.enabled,
+    )

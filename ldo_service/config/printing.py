@@ -1,0 +1,118 @@
+"""Printing of configurations, with the reason for each default beside it."""
+
+import dataclasses
+import inspect
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import msgspec
+
+from ldo_service.storage.yaml_io import plain_text
+
+from .sections import Config
+from .values import ADVANCED
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One settable value: its path, its value as YAML, and the comment of its field."""
+
+    path: str
+    value: Any
+    text: str
+    comment: str
+    is_public: bool
+
+
+def config_yaml(config: Config) -> str:
+    """Return the whole configuration as YAML, which reads back as the same."""
+    return plain_text(msgspec.to_builtins(config))
+
+
+def explained_yaml(config: Config, *, with_advanced: bool = False) -> str:
+    """Return the configuration as YAML with comments.
+
+    Without `with_advanced` it has the public settings, and those advanced ones that differ from
+    their defaults: so it reads back as the same configuration.
+
+    Args:
+        config: The configuration.
+        with_advanced: Print advanced settings too, as `ldo config --all` does.
+    """
+    defaults = {setting.path: setting.value for setting in settings_of(Config())}
+    lines: list[str] = []
+    opened: list[str] = []
+    for setting in settings_of(config):
+        is_default = setting.value == defaults[setting.path]
+        if not (setting.is_public or with_advanced) and is_default:
+            continue
+        *sections, name = setting.path.split(".")
+        for depth, section in enumerate(sections):
+            if opened[depth : depth + 1] != [section]:
+                opened = [*sections[: depth + 1]]
+                lines.append(f"{'  ' * depth}{section}:")
+        opened = sections
+        lines.append(f"{'  ' * len(sections)}{name}: {setting.text}  # {setting.comment}")
+    return "\n".join(lines) + "\n"
+
+
+def settings_of(config: Config) -> list[Setting]:
+    """Return every settable value, in the order of the sections."""
+    return list(_settings(config, ""))
+
+
+def section_titles() -> dict[str, str]:
+    """Return the first sentence of the docstring of each section, by its path."""
+    return dict(_titles(Config(), ""))
+
+
+def _settings(section: Any, prefix: str) -> Iterator[Setting]:
+    comments = _comments(type(section))
+    for entry in dataclasses.fields(section):
+        path, value = f"{prefix}{entry.name}", getattr(section, entry.name)
+        if dataclasses.is_dataclass(value):
+            yield from _settings(value, f"{path}.")
+        else:
+            plain = msgspec.to_builtins(value)
+            text = plain_text(plain, flow=True, width=inf).splitlines()[0]
+            comment = comments.get(entry.name, "")
+            yield Setting(path, value, text, comment, ADVANCED not in entry.metadata)
+
+
+def _titles(section: Any, prefix: str) -> Iterator[tuple[str, str]]:
+    for entry in dataclasses.fields(section):
+        path, value = f"{prefix}{entry.name}", getattr(section, entry.name)
+        if dataclasses.is_dataclass(value):
+            text = " ".join((inspect.getdoc(type(value)) or "").split())
+            yield path, re.split(r"(?<=\.) ", text)[0]
+            yield from _titles(value, f"{path}.")
+
+
+_FIELD = re.compile(r"^ {4}(?P<name>\w+): [^#]*(?:#\s*(?P<comment>.*))?$")
+_COMMENT = re.compile(r"^ {4,}# (?P<comment>.+)$")
+
+
+def _comments(schema: type) -> dict[str, str]:
+    """Return the comment of each field in the source.
+
+    It stands beside the field, with the lines that continue it, or, if there is none beside it, in
+    the lines above it that begin a sentence.
+    """
+    comments: dict[str, list[str]] = {}
+    last, block = "", list[str]()
+    for line in inspect.getsource(schema).splitlines():
+        if line.startswith(("    def ", "    @")):
+            break
+        if found := _FIELD.match(line):
+            name, beside = found["name"], found["comment"]
+            is_above = not beside and bool(block) and block[0][0].isupper()
+            comments[name] = [beside] if beside else block if is_above else []
+            comments.get(last, []).extend([] if is_above else block)
+            last, block = name, []
+        elif found := _COMMENT.match(line):
+            block.append(found["comment"])
+    comments.get(last, []).extend(block)
+    return {name: " ".join(lines) for name, lines in comments.items() if lines}
