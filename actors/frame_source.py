@@ -16,7 +16,7 @@ import numpy as np
 
 from ldo_service.conversions.frames import camera_of, raw_frame_of, rgbd_message
 from ldo_service.conversions.poses import transform
-from ldo_service.errors import ConfigError, DataError
+from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import codecs
 from ldo_service.geometry.frames import RawFrame, Rectifier, in_metres
 from ldo_service.geometry.registration import register_depth
@@ -48,7 +48,10 @@ class FrameSourceConfig:
                 f"FrameSourceConfig.restart_after_s={self.restart_after_s:g} must be positive."
             )
         if min(self.pair_buffer, self.min_side_px) < 1:
-            raise ConfigError(f"{self}: pair_buffer and min_side_px must be at least 1.")
+            raise ConfigError(
+                named(self, "pair_buffer", "min_side_px")
+                + ": pair_buffer and min_side_px must be at least 1."
+            )
 
 
 class FrameSource(Actor):

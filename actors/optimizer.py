@@ -25,7 +25,7 @@ from ldo_service.conversions.poses import (
     measurements_of,
     transform,
 )
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.pose_graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
@@ -63,7 +63,10 @@ class OptimizerConfig:
 
     def __post_init__(self) -> None:
         if min(self.most_early, self.cameras) < 1:
-            raise ConfigError(f"{self}: most_early and cameras must be at least 1.")
+            raise ConfigError(
+                named(self, "most_early", "cameras")
+                + ": most_early and cameras must be at least 1."
+            )
 
 
 class Optimizer(Actor):

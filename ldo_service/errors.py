@@ -85,3 +85,14 @@ class ReplayDiverged(LdoError):
         )
         self.actor, self.step, self.what = actor, step, what
         self.recorded, self.replayed = recorded, replayed
+
+
+def named(parameters: object, *fields: str) -> str:
+    """Return fields of a parameter object with their values, to begin an error with.
+
+    Args:
+        parameters: An instance of a dataclass such as `WindowConfig`.
+        fields: Names of the fields that the error is about.
+    """
+    owner = type(parameters).__name__
+    return ", ".join(f"{owner}.{field}={getattr(parameters, field)!r}" for field in fields)

@@ -7,7 +7,7 @@ from weakref import ref
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.kernels import _adam
 
 from .model import GaussianMap, aligned_rows
@@ -31,9 +31,15 @@ class AdamConfig:
     def __post_init__(self) -> None:
         rates = (self.mean_m, self.log_scale, self.quat, self.opacity_logit, self.color)
         if not min(rates) >= 0:
-            raise ConfigError(f"{self}: learning rates must not be negative.")
+            raise ConfigError(
+                named(self, "mean_m", "log_scale", "quat", "opacity_logit", "color")
+                + ": learning rates must not be negative."
+            )
         if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1 and self.epsilon > 0):
-            raise ConfigError(f"{self}: betas must lie in [0, 1), epsilon above 0.")
+            raise ConfigError(
+                named(self, "beta1", "beta2", "epsilon")
+                + ": betas must lie in [0, 1), epsilon above 0."
+            )
 
     def rates(self) -> np.ndarray:
         """Per field of a row [16] float32."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
@@ -34,7 +34,10 @@ class WindowConfig:
         if not (min(shares) >= 0 and sum(shares) <= 1):
             raise ConfigError(f"newest_share and covisible_share {shares} must not exceed 1.")
         if min(self.recent, self.earlier) < 0 or not 0 <= self.min_shared <= 1:
-            raise ConfigError(f"{self}: counts must not be negative, min_shared within 0..1.")
+            raise ConfigError(
+                named(self, "min_shared", "recent", "earlier")
+                + ": counts must not be negative, min_shared within 0..1."
+            )
 
 
 class Fitting:

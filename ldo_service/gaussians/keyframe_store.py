@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, DataError
+from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import Camera
 from ldo_service.geometry.point_records import PoseTable
 from ldo_service.storage.checksummed_folder import SealedFolder
@@ -36,7 +36,8 @@ class KeyframeStoreConfig:
     def __post_init__(self) -> None:
         if not (self.cache_mb >= 0 and self.quota_mb > 0 and min(self.newest_kept, self.most) >= 1):
             raise ConfigError(
-                f"{self}: cache_mb must be at least 0, quota_mb positive, the others at least 1."
+                named(self, "cache_mb", "quota_mb", "most", "newest_kept")
+                + ": cache_mb must be at least 0, quota_mb positive, the others at least 1."
             )
 
 

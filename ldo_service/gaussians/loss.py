@@ -6,7 +6,7 @@ from math import log10
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.kernels import _loss
 
 from .exposure import Exposure
@@ -22,7 +22,9 @@ class LossWeights:
 
     def __post_init__(self) -> None:
         if not min(self.l1, self.d_ssim, self.depth) >= 0:
-            raise ConfigError(f"{self}: weights must not be negative.")
+            raise ConfigError(
+                named(self, "l1", "d_ssim", "depth") + ": weights must not be negative."
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.point_records import PoseTable
 
@@ -52,7 +52,10 @@ class MapBuilderConfig:
 
     def __post_init__(self) -> None:
         if self.prune_keyframes < 1 or min(self.refined_m, self.refined_rad, self.seed) < 0:
-            raise ConfigError(f"{self}: prune_keyframes at least 1, the others not negative.")
+            raise ConfigError(
+                named(self, "prune_keyframes", "refined_m", "refined_rad", "seed")
+                + ": prune_keyframes at least 1, the others not negative."
+            )
 
 
 class MapBuilder:

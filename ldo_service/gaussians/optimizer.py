@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
 from .adam import Adam, AdamConfig
@@ -80,7 +80,14 @@ class OptimiserConfig:
         rates = (self.rotation_rate_rad, self.translation_rate_m)
         if not (min(rates) >= 0 and 0 <= self.exposure_share <= 1 and self.needle_weight >= 0):
             raise ConfigError(
-                f"{self}: rates and weights must not be negative, exposure_share within 0..1."
+                named(
+                    self,
+                    "needle_weight",
+                    "exposure_share",
+                    "rotation_rate_rad",
+                    "translation_rate_m",
+                )
+                + ": rates and weights must not be negative, exposure_share within 0..1."
             )
         if self.usual_reach < 1:
             raise ConfigError(f"usual_reach={self.usual_reach} must be at least 1.")

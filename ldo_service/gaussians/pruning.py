@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
 
@@ -27,9 +27,15 @@ class PruningConfig:
         if not 0 <= self.min_opacity < 1:
             raise ConfigError(f"min_opacity={self.min_opacity} must be in [0, 1).")
         if self.confirm_keyframes < 1 or not self.min_weight_px >= 0:
-            raise ConfigError(f"{self}: confirm_keyframes at least 1, min_weight_px at least 0.")
+            raise ConfigError(
+                named(self, "confirm_keyframes", "min_weight_px")
+                + ": confirm_keyframes at least 1, min_weight_px at least 0."
+            )
         if not (self.max_relative_scale > 1 and self.neighbourhood_m > 0):
-            raise ConfigError(f"{self}: max_relative_scale above 1, neighbourhood_m positive.")
+            raise ConfigError(
+                named(self, "max_relative_scale", "neighbourhood_m")
+                + ": max_relative_scale above 1, neighbourhood_m positive."
+            )
 
 
 def superfluous(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
@@ -86,9 +92,15 @@ class MergingConfig:
 
     def __post_init__(self) -> None:
         if self.keyframes_apart < 1 or self.neighbours < 1:
-            raise ConfigError(f"{self}: keyframes_apart and neighbours must be at least 1.")
+            raise ConfigError(
+                named(self, "keyframes_apart", "neighbours")
+                + ": keyframes_apart and neighbours must be at least 1."
+            )
         if min(self.off_m, self.reach_sigmas, self.max_color) <= 0 or not 0 <= self.min_cosine <= 1:
-            raise ConfigError(f"{self}: off_m, reach_sigmas, max_color positive, a cosine 0..1.")
+            raise ConfigError(
+                named(self, "off_m", "reach_sigmas", "min_cosine", "max_color")
+                + ": off_m, reach_sigmas, max_color positive, a cosine 0..1."
+            )
 
 
 def doubled(

@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 
 from .densification import with_small_holes_filled
@@ -197,9 +197,14 @@ class SleepConfig:
 
     def __post_init__(self) -> None:
         if not (self.max_active >= 1 and 0 < self.low_water <= 1):
-            raise ConfigError(f"{self}: max_active must be at least 1, low_water in (0, 1].")
+            raise ConfigError(
+                named(self, "max_active", "low_water")
+                + ": max_active must be at least 1, low_water in (0, 1]."
+            )
         if not (self.reach_m > 0 and self.clump_m > 0):
-            raise ConfigError(f"{self}: reach_m and clump_m must be positive.")
+            raise ConfigError(
+                named(self, "reach_m", "clump_m") + ": reach_m and clump_m must be positive."
+            )
 
 
 @dataclass(frozen=True, slots=True)

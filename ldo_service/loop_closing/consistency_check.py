@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.tracking.motion import extent
@@ -31,7 +31,9 @@ class PlausibilityConfig:
 
     def __post_init__(self) -> None:
         if min(getattr(self, name) for name in self.__slots__) < 0 or self.rival_inliers > 1:
-            raise ConfigError(f"{self}: nothing may be negative, rival_inliers at most 1.")
+            raise ConfigError(
+                named(self, *self.__slots__) + ": nothing may be negative, rival_inliers at most 1."
+            )
 
 
 class Plausibility:

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.tracking.alignment import AlignConfig
 from ldo_service.tracking.features import FeatureConfig
@@ -38,7 +38,10 @@ class VisualWordsConfig:
 
     def __post_init__(self) -> None:
         if min(self.count, self.learned_at_once) < 1 or not 0 <= self.apart_bits < 8 * BYTES:
-            raise ConfigError(f"{self}: counts must be at least 1, apart_bits within 0..255.")
+            raise ConfigError(
+                named(self, "count", "apart_bits", "learned_at_once")
+                + ": counts must be at least 1, apart_bits within 0..255."
+            )
 
 
 class VisualWords:

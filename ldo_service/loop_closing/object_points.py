@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import ForegroundConfig, foreground, surfaces
 from ldo_service.semantics.distributions import dense, divergence, entropy, sparse
@@ -28,9 +28,15 @@ class LandmarkConfig:
 
     def __post_init__(self) -> None:
         if min(self.same_m, self.reach_m, self.max_divergence) <= 0:
-            raise ConfigError(f"{self}: same_m, reach_m and max_divergence must be positive.")
+            raise ConfigError(
+                named(self, "same_m", "max_divergence", "reach_m")
+                + ": same_m, reach_m and max_divergence must be positive."
+            )
         if self.min_inliers < 4 or self.iterations < 1:
-            raise ConfigError(f"{self}: min_inliers must be at least 4, iterations at least 1.")
+            raise ConfigError(
+                named(self, "min_inliers", "iterations")
+                + ": min_inliers must be at least 4, iterations at least 1."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

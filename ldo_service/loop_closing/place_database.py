@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.semantics.gaussian_labels import MOST_LABELS
 from ldo_service.tracking.keyframe_database import gaps
 
@@ -86,10 +86,14 @@ class RetrievalConfig:
     def __post_init__(self) -> None:
         if self.exclude_frames < 0 or self.candidates < 1 or self.count < 3:
             raise ConfigError(
-                f"{self}: exclude_frames must not be negative, candidates at least 1 and count 3."
+                named(self, "exclude_frames", "candidates", "count")
+                + ": exclude_frames must not be negative, candidates at least 1 and count 3."
             )
         if not (0 <= self.min_similarity <= 1 and self.min_appearance >= 0):
-            raise ConfigError(f"{self}: min_similarity must be within 0..1.")
+            raise ConfigError(
+                named(self, "min_similarity", "min_appearance")
+                + ": min_similarity must be within 0..1."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.se3 import align
 
@@ -89,10 +89,14 @@ class SurfaceFitConfig:
     def __post_init__(self) -> None:
         if min(self.gate_m, self.max_rmse_m) <= 0 or self.gate_share < 0:
             raise ConfigError(
-                f"{self}: gate_m and max_rmse_m must be positive, gate_share not < 0."
+                named(self, "gate_m", "gate_share", "max_rmse_m")
+                + ": gate_m and max_rmse_m must be positive, gate_share not < 0."
             )
         if not (0 <= self.min_overlap <= 1 and 0 <= self.max_conflict <= 1):
-            raise ConfigError(f"{self}: min_overlap and max_conflict must be within 0..1.")
+            raise ConfigError(
+                named(self, "min_overlap", "max_conflict")
+                + ": min_overlap and max_conflict must be within 0..1."
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.tracking.keyframe_database import Place
 from ldo_service.tracking.motion import extent
@@ -29,9 +29,14 @@ class SubgraphConfig:
 
     def __post_init__(self) -> None:
         if not 1 <= self.kept_views <= self.most or not 1 <= self.least <= self.most:
-            raise ConfigError(f"{self}: 1 <= least <= most and 1 <= kept_views <= most are needed.")
+            raise ConfigError(
+                named(self, "least", "most", "kept_views")
+                + ": 1 <= least <= most and 1 <= kept_views <= most are needed."
+            )
         if not (self.turned_rad > 0 and self.gap_rad > 0):
-            raise ConfigError(f"{self}: turned_rad and gap_rad must be positive.")
+            raise ConfigError(
+                named(self, "turned_rad", "gap_rad") + ": turned_rad and gap_rad must be positive."
+            )
 
 
 @dataclass(frozen=True, eq=False)

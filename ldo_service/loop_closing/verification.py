@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.tracking.alignment import AlignConfig, Alignment, align
@@ -53,12 +53,25 @@ class VerificationConfig:
 
     def __post_init__(self) -> None:
         if self.min_inliers < 6 or self.pairs < 1:
-            raise ConfigError(f"{self}: inliers must be at least 6, pairs at least 1.")
+            raise ConfigError(
+                named(self, "min_inliers", "pairs")
+                + ": inliers must be at least 6, pairs at least 1."
+            )
         if not 0 <= self.blind_overlap <= 1:
             raise ConfigError(f"blind_overlap={self.blind_overlap:g} must be within 0..1.")
         angles = (self.witness_rad, self.refined_rad, self.refined_landmarks_rad)
         if min(*angles, self.map_witness_rad) <= 0 or self.map_pairs < 0:
-            raise ConfigError(f"{self}: angles must be positive, map_pairs not negative.")
+            raise ConfigError(
+                named(
+                    self,
+                    "witness_rad",
+                    "map_pairs",
+                    "map_witness_rad",
+                    "refined_rad",
+                    "refined_landmarks_rad",
+                )
+                + ": angles must be positive, map_pairs not negative."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

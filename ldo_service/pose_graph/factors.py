@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
@@ -46,10 +46,11 @@ class NoiseConfig:
 
     def __post_init__(self) -> None:
         optional = ("drift_rad_per_sqrt_m", "drift_m_per_sqrt_m", "turn_m_per_rad")
-        if any(getattr(self, n) <= 0 for n in self.__slots__ if n not in optional):
-            raise ConfigError(f"{self}: every sigma must be positive.")
+        sigmas = [name for name in self.__slots__ if name not in optional]
+        if min(getattr(self, name) for name in sigmas) <= 0:
+            raise ConfigError(named(self, *sigmas) + ": every sigma must be positive.")
         if min(getattr(self, name) for name in optional) < 0:
-            raise ConfigError(f"{self}: drift must not be negative.")
+            raise ConfigError(named(self, *optional) + ": drift must not be negative.")
         if self.independent_sights > 1:
             raise ConfigError(f"independent_sights={self.independent_sights:g} must be at most 1.")
 

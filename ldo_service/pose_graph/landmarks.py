@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
 from .factors import NoiseConfig, Sight, pack_sights, unpack_sights
@@ -54,9 +54,23 @@ class LandmarksConfig:
     def __post_init__(self) -> None:
         counts = (self.most_sights, self.misses, self.vague_misses, self.most, self.most_waiting)
         if min(counts) < 1 or self.least_sights < 2:
-            raise ConfigError(f"{self}: counts must be at least 1, least_sights at least 2.")
+            raise ConfigError(
+                named(
+                    self,
+                    "least_sights",
+                    "most_sights",
+                    "misses",
+                    "vague_misses",
+                    "most",
+                    "most_waiting",
+                )
+                + ": counts must be at least 1, least_sights at least 2."
+            )
         if min(self.lambda_sem, self.due_weight, self.least_parallax_rad) <= 0 or self.w_sem < 0:
-            raise ConfigError(f"{self}: weights and angles must be positive.")
+            raise ConfigError(
+                named(self, "lambda_sem", "w_sem", "least_parallax_rad", "due_weight")
+                + ": weights and angles must be positive."
+            )
 
 
 @dataclass(frozen=True, slots=True)

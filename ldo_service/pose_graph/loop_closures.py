@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .factors import pack_relative, unpack_relative
@@ -32,9 +32,15 @@ class ClosuresConfig:
 
     def __post_init__(self) -> None:
         if min(self.most_cost, self.most_sigmas) <= 0 or self.rivals < 0:
-            raise ConfigError(f"{self}: gates must be positive, counts not negative.")
+            raise ConfigError(
+                named(self, "most_cost", "most_sigmas", "rivals")
+                + ": gates must be positive, counts not negative."
+            )
         if min(self.most, self.doubts, self.remembered) < 1:
-            raise ConfigError(f"{self}: most, doubts and remembered must be at least 1.")
+            raise ConfigError(
+                named(self, "most", "doubts", "remembered")
+                + ": most, doubts and remembered must be at least 1."
+            )
 
 
 @dataclass(frozen=True, slots=True)

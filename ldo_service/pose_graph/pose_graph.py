@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .component_merging import T_new_old, best_without, contradicted, judged
@@ -40,7 +40,12 @@ class KeyframeGraphConfig:
     def __post_init__(self) -> None:
         counts = self.condense_keyframes, self.window_keyframes, self.most_changes
         if min(*counts, self.keyframes_each) < 1:
-            raise ConfigError(f"{self}: keyframes and changes must be at least 1.")
+            raise ConfigError(
+                named(
+                    self, "condense_keyframes", "window_keyframes", "keyframes_each", "most_changes"
+                )
+                + ": keyframes and changes must be at least 1."
+            )
         if self.most_bent < 0:
             raise ConfigError(f"most_bent={self.most_bent:g} must not be negative.")
 

@@ -26,7 +26,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from zstandard import ZstdError, frame_content_size
 
-from ldo_service.errors import ConfigError, DataError
+from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.runtime.journal import CHANNELS, Entry
 
 log = logging.getLogger(__name__)
@@ -146,7 +146,9 @@ class RecordConfig:
 
     def __post_init__(self) -> None:
         if self.max_gb <= 0 or self.queue_mb <= 0 or self.min_free_gb < 0:
-            raise ConfigError(f"{self}: sizes must be positive.")
+            raise ConfigError(
+                named(self, "max_gb", "min_free_gb", "queue_mb") + ": sizes must be positive."
+            )
 
 
 class RecordingFile:

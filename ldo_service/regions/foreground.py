@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
 
@@ -28,11 +28,20 @@ class ForegroundConfig:
     def __post_init__(self) -> None:
         shares = (self.max_step, self.min_cosine, self.min_inside, self.max_gap, self.near_mode)
         if not (min(shares) >= 0 and max(self.min_cosine, self.min_inside) <= 1):
-            raise ConfigError(f"{self}: shares must not be negative, cosine and inside at most 1.")
+            raise ConfigError(
+                named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
+                + ": shares must not be negative, cosine and inside at most 1."
+            )
         if max(shares) > MOST:
-            raise ConfigError(f"{self}: shares may be {MOST:g} at most, which leaves nothing out.")
+            raise ConfigError(
+                named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
+                + f": shares may be {MOST:g} at most, which leaves nothing out."
+            )
         if not (1e-4 <= self.depth_bin <= 1 and 0 <= self.grow_px <= 64):
-            raise ConfigError(f"{self}: depth_bin must be within 1e-4..1, grow_px within 0..64.")
+            raise ConfigError(
+                named(self, "depth_bin", "grow_px")
+                + ": depth_bin must be within 1e-4..1, grow_px within 0..64."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -171,7 +180,8 @@ class NestingConfig:
     def __post_init__(self) -> None:
         if not (0 < self.inside <= 1 and self.times > 1 and self.least_score >= 0):
             raise ConfigError(
-                f"{self}: inside within 0..1, times over 1, least_score not negative."
+                named(self, "inside", "times", "least_score")
+                + ": inside within 0..1, times over 1, least_score not negative."
             )
 
 

@@ -17,7 +17,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .foreground import Foreground
@@ -41,9 +41,14 @@ class SegmentConfig:
 
     def __post_init__(self) -> None:
         if min(self.min_px, self.crease_px) < 1:
-            raise ConfigError(f"{self}: min_px and crease_px must be at least 1.")
+            raise ConfigError(
+                named(self, "min_px", "crease_px") + ": min_px and crease_px must be at least 1."
+            )
         if min(self.max_gap, self.crease, self.color_step, self.color_gap) <= 0:
-            raise ConfigError(f"{self}: gaps and steps must be positive.")
+            raise ConfigError(
+                named(self, "max_gap", "crease", "color_step", "color_gap")
+                + ": gaps and steps must be positive."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.detection.vocabulary import Vocabulary, normalised
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.training_views import View
 
 from .foreground import Claims, Foreground
@@ -36,7 +36,10 @@ class NamingConfig:
 
     def __post_init__(self) -> None:
         if not (0 <= self.reliable <= 1 and 0 <= self.least_sure <= 1) or self.most_open < 1:
-            raise ConfigError(f"{self}: reliable must be within 0..1, most_open at least 1.")
+            raise ConfigError(
+                named(self, "reliable", "least_sure", "most_open")
+                + ": reliable must be within 0..1, most_open at least 1."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 _3X3 = np.ones((3, 3), np.uint8)
@@ -41,11 +41,17 @@ class PlaneConfig:
     def __post_init__(self) -> None:
         shares = self.min_cosine, self.max_step, self.min_share, self.behind
         if not (min(shares) >= 0 and max(shares) <= 1):
-            raise ConfigError(f"{self}: shares and the cosine must be within 0..1.")
+            raise ConfigError(
+                named(self, "min_cosine", "max_step", "min_share", "behind")
+                + ": shares and the cosine must be within 0..1."
+            )
         if min(self.blur_px, self.tolerance, self.step_floor) <= 0 or self.width_px < 16:
-            raise ConfigError(f"{self}: lengths must be positive, width_px at least 16.")
+            raise ConfigError(
+                named(self, "width_px", "blur_px", "step_floor", "tolerance")
+                + ": lengths must be positive, width_px at least 16."
+            )
         if not 0 <= self.gap_px[0] < self.gap_px[1]:
-            raise ConfigError(f"{self}: gap_px must be two ascending distances.")
+            raise ConfigError(named(self, "gap_px") + ": gap_px must be two ascending distances.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
@@ -39,9 +39,23 @@ class TriggerConfig:
         shares = self.sure, self.same_iou, self.fits_iou, self.alike_iou, self.explained
         shares = (*shares, self.max_share, self.min_fill)
         if not (min(shares) >= 0 and max(shares) <= 1):
-            raise ConfigError(f"{self}: shares and scores must be within 0..1.")
+            raise ConfigError(
+                named(
+                    self,
+                    "sure",
+                    "same_iou",
+                    "fits_iou",
+                    "alike_iou",
+                    "explained",
+                    "max_share",
+                    "min_fill",
+                )
+                + ": shares and scores must be within 0..1."
+            )
         if min(self.min_side_px, self.most) < 1:
-            raise ConfigError(f"{self}: sides and counts must be at least 1.")
+            raise ConfigError(
+                named(self, "min_side_px", "most") + ": sides and counts must be at least 1."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .region import (
@@ -69,21 +69,45 @@ class RegionConfig:
     def __post_init__(self) -> None:
         counts = self.views, self.views_first, self.most_questions, self.most, self.at_once
         if min(*counts, self.most_carried) < 1:
-            raise ConfigError(f"{self}: counts must be at least 1.")
+            raise ConfigError(
+                named(
+                    self,
+                    "views",
+                    "views_first",
+                    "most_questions",
+                    "at_once",
+                    "most_carried",
+                    "most",
+                )
+                + ": counts must be at least 1."
+            )
         if self.patience < 0 or self.per_keyframe <= 0:
-            raise ConfigError(f"{self}: patience at least 0, per_keyframe positive.")
+            raise ConfigError(
+                named(self, "patience", "per_keyframe")
+                + ": patience at least 0, per_keyframe positive."
+            )
         if not (0 <= self.least_quality <= 1 and 0 <= self.least_carried <= 1):
-            raise ConfigError(f"{self}: least_quality and least_carried must be within 0..1.")
+            raise ConfigError(
+                named(self, "least_carried", "least_quality")
+                + ": least_quality and least_carried must be within 0..1."
+            )
         if self.views_first > self.views or not self.gain > 1:
-            raise ConfigError(f"{self}: views_first at most views, gain over 1.")
+            raise ConfigError(
+                named(self, "views", "views_first", "gain")
+                + ": views_first at most views, gain over 1."
+            )
         if self.views > MOST_VIEWS:
             raise ConfigError(f"views={self.views}: a labeller is shown up to {MOST_VIEWS}.")
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
             raise ConfigError(
-                f"{self}: overlap within 0..1, max_gap_m positive, least_points at least 1."
+                named(self, "overlap", "max_gap_m", "least_points")
+                + ": overlap within 0..1, max_gap_m positive, least_points at least 1."
             )
         if not (self.answer_weight > 0 and self.least_votes >= 0):
-            raise ConfigError(f"{self}: answer_weight positive, least_votes not negative.")
+            raise ConfigError(
+                named(self, "answer_weight", "least_votes")
+                + ": answer_weight positive, least_votes not negative."
+            )
 
     @property
     def most_boxes(self) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, codecs
 from ldo_service.geometry.codecs import shrunk
 
@@ -22,9 +22,12 @@ class ViewConfig:
 
     def __post_init__(self) -> None:
         if not (self.context >= 0 and min(self.good_side_px, self.sharp) > 0 and self.side_px > 0):
-            raise ConfigError(f"{self}: sizes must be positive.")
+            raise ConfigError(
+                named(self, "context", "side_px", "good_side_px", "sharp")
+                + ": sizes must be positive."
+            )
         if not 0 <= self.least <= 1:
-            raise ConfigError(f"{self}: least must be within 0..1.")
+            raise ConfigError(named(self, "least") + ": least must be within 0..1.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)

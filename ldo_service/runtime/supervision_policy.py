@@ -3,7 +3,7 @@
 from collections import deque
 from dataclasses import dataclass
 
-from ldo_service.errors import ConfigError, RestartsExhausted
+from ldo_service.errors import ConfigError, RestartsExhausted, named
 
 
 class RestartBudget:
@@ -46,6 +46,19 @@ class StageConfig:
             min(*times, self.max_message_mb) <= 0
             or min(self.max_restarts, self.restart_delay_s, self.restart_delay_max_s) < 0
         ):
-            raise ConfigError(f"{self}: counts and times must be positive.")
+            raise ConfigError(
+                named(
+                    self,
+                    "max_restarts",
+                    "restart_window_s",
+                    "restart_delay_s",
+                    "restart_delay_max_s",
+                    "heartbeat_s",
+                    "stall_after_s",
+                    "evict_after_s",
+                    "max_message_mb",
+                )
+                + ": counts and times must be positive."
+            )
         if not 0 <= self.nice <= 19:
             raise ConfigError(f"supervision.background_nice={self.nice}: must be within 0..19.")

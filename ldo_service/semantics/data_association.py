@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .distributions import pooled, shared
@@ -36,9 +36,15 @@ class AssociationConfig:
 
     def __post_init__(self) -> None:
         if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
-            raise ConfigError(f"{self}: min_iou must be in (0, 1], min_shared in 0..1.")
+            raise ConfigError(
+                named(self, "min_iou", "min_shared")
+                + ": min_iou must be in (0, 1], min_shared in 0..1."
+            )
         if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
-            raise ConfigError(f"{self}: max_depth_gap_m positive, counts at least 1.")
+            raise ConfigError(
+                named(self, "max_depth_gap_m", "min_gaussians", "max_regions")
+                + ": max_depth_gap_m positive, counts at least 1."
+            )
         if self.part_inside <= 0:
             raise ConfigError(f"part_inside={self.part_inside:g} must be positive.")
 

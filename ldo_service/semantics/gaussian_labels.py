@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
@@ -32,7 +32,10 @@ class ConsistencyConfig:
 
     def __post_init__(self) -> None:
         if not (self.sigma_m > 0 and self.radius_m > 0 and 0 <= self.rate <= 1):
-            raise ConfigError(f"{self}: lengths must be positive, rate in 0..1.")
+            raise ConfigError(
+                named(self, "sigma_m", "radius_m", "rate")
+                + ": lengths must be positive, rate in 0..1."
+            )
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,9 +104,15 @@ class LabelConfig:
         if self.ema not in ("paper", "corrected"):
             raise ConfigError(f"ema={self.ema!r} must be 'paper' or 'corrected'.")
         if not (0 <= self.keep < 1 and 0 <= self.miss_weight <= 1 and 0 <= self.hold_back <= 1):
-            raise ConfigError(f"{self}: keep in [0, 1), miss_weight and hold_back in 0..1.")
+            raise ConfigError(
+                named(self, "keep", "miss_weight", "hold_back")
+                + ": keep in [0, 1), miss_weight and hold_back in 0..1."
+            )
         if not (1 <= self.miss_limit <= 255 and self.least_px >= 0 and self.usual_extent_m >= 0):
-            raise ConfigError(f"{self}: miss_limit in 1..255, lengths not negative.")
+            raise ConfigError(
+                named(self, "miss_limit", "least_px", "usual_extent_m")
+                + ": miss_limit in 1..255, lengths not negative."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

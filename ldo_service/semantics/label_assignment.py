@@ -10,7 +10,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _labels
 from ldo_service.regions.foreground import Foreground
@@ -30,7 +30,10 @@ class AssignmentConfig:
         if self.rule not in ("coverage", "iou"):
             raise ConfigError(f"rule={self.rule!r} must be 'coverage' or 'iou'.")
         if not (0 <= self.min_overlap <= 1 and self.max_depth_gap_m > 0):
-            raise ConfigError(f"{self}: min_overlap in 0..1, max_depth_gap_m positive.")
+            raise ConfigError(
+                named(self, "min_overlap", "max_depth_gap_m")
+                + ": min_overlap in 0..1, max_depth_gap_m positive."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

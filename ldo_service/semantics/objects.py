@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 
 from .data_association import (
@@ -62,9 +62,25 @@ class ObjectsConfig:
             *(self.candidate_miss_limit, self.max_objects, self.max_candidates),
         )
         if min(counts) < 1 or min(self.max_divergence, self.uncertain_entropy) < 0:
-            raise ConfigError(f"{self}: counts must be at least 1, nats not negative.")
+            raise ConfigError(
+                named(
+                    self,
+                    "min_keyframes",
+                    "max_divergence",
+                    "miss_limit",
+                    "uncertain_miss_limit",
+                    "uncertain_entropy",
+                    "candidate_miss_limit",
+                    "max_objects",
+                    "max_candidates",
+                )
+                + ": counts must be at least 1, nats not negative."
+            )
         if not (0 < self.min_visible <= 1 and 0 < self.merge_overlap <= 1):
-            raise ConfigError(f"{self}: min_visible and merge_overlap must be in (0, 1].")
+            raise ConfigError(
+                named(self, "min_visible", "merge_overlap")
+                + ": min_visible and merge_overlap must be in (0, 1]."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import Camera, se3
@@ -52,7 +52,10 @@ class FusionConfig:
         if self.rule not in ("adaptive", "fixed", "detector"):
             raise ConfigError(f"rule={self.rule!r} must be 'adaptive', 'fixed' or 'detector'.")
         if not (self.beta > 0 and self.epsilon > 0 and 0 <= self.fixed_alpha <= 1):
-            raise ConfigError(f"{self}: beta and epsilon positive, fixed_alpha in 0..1.")
+            raise ConfigError(
+                named(self, "beta", "epsilon", "fixed_alpha")
+                + ": beta and epsilon positive, fixed_alpha in 0..1."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

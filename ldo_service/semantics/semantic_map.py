@@ -8,7 +8,7 @@ import numpy as np
 
 from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
 from ldo_service.detection.vocabulary import Vocabulary
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Contributions
 from ldo_service.gaussians.training_views import View
@@ -39,8 +39,8 @@ class SemanticMapConfig:
     def __post_init__(self) -> None:
         if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MOST_LABELS:
             raise ConfigError(
-                f"{self}: most_waiting at least 0, most_said_again 1, most_names up to "
-                f"{MOST_LABELS}."
+                named(self, "most_names", "most_waiting", "most_said_again")
+                + (f": most_waiting at least 0, most_said_again 1, most_names up to {MOST_LABELS}.")
             )
 
     @property

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import small_gicp
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 
 from .pyramid import Level, Pyramid, Reference
@@ -168,9 +168,15 @@ class ShapeConfig:
 
     def __post_init__(self) -> None:
         if self.level < 0 or self.iterations < 1:
-            raise ConfigError(f"{self}: level must not be negative, iterations at least 1.")
+            raise ConfigError(
+                named(self, "level", "iterations")
+                + ": level must not be negative, iterations at least 1."
+            )
         if not (0 < self.spacing < self.reach and 0 < self.min_partners <= 1):
-            raise ConfigError(f"{self}: 0 < spacing < reach and 0 < min_partners <= 1 are needed.")
+            raise ConfigError(
+                named(self, "spacing", "reach", "min_partners")
+                + ": 0 < spacing < reach and 0 < min_partners <= 1 are needed."
+            )
 
 
 def pose_from_shape(

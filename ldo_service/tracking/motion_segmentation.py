@@ -12,7 +12,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 
 from .pyramid import DepthNoise, Level, Pyramid
@@ -39,7 +39,23 @@ class MovingConfig:
         lengths = (self.least_m, self.sigmas, self.spread_m, self.least_share, self.renewed_share)
         counts = (self.level, self.edge_px, self.streak_px, self.spread_px, self.rim_px)
         if min(lengths) < 0 or min(counts) < 0 or not 1 <= self.gone_frames <= 255:
-            raise ConfigError(f"{self}: nothing negative, gone_frames within 1..255.")
+            raise ConfigError(
+                named(
+                    self,
+                    "level",
+                    "least_m",
+                    "sigmas",
+                    "edge_px",
+                    "least_share",
+                    "streak_px",
+                    "spread_px",
+                    "spread_m",
+                    "rim_px",
+                    "gone_frames",
+                    "renewed_share",
+                )
+                + ": nothing negative, gone_frames within 1..255."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
 KEPT = 64  # poses: a third of a second at 200 Hz, and frames are not tracked later than that
@@ -32,7 +32,17 @@ class PriorConfig:
         times_s = self.max_gap_s, self.restart_after_s, self.max_carried_s
         limits = *times_s, self.max_speed_m_per_s, self.max_turn_rad_per_s
         if not all(limit > 0 for limit in limits):  # NaN fails too
-            raise ConfigError(f"{self}: limits must be positive.")
+            raise ConfigError(
+                named(
+                    self,
+                    "max_gap_s",
+                    "max_speed_m_per_s",
+                    "max_turn_rad_per_s",
+                    "restart_after_s",
+                    "max_carried_s",
+                )
+                + ": limits must be positive."
+            )
         if not self.max_extrapolation_s >= 0:
             raise ConfigError(
                 f"max_extrapolation_s={self.max_extrapolation_s:g}: must be 0 or more."

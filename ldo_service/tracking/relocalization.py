@@ -23,7 +23,7 @@ from itertools import chain, islice
 
 import numpy as np
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
@@ -210,10 +210,13 @@ class ReturnConfig:
 
     def __post_init__(self) -> None:
         if self.after < 0 or self.tries < 1:
-            raise ConfigError(f"{self}: after must be at least 0, tries at least 1.")
+            raise ConfigError(
+                named(self, "after", "tries") + ": after must be at least 0, tries at least 1."
+            )
         if not (self.agreement_rad > 0 and 0 <= self.min_geometric_inliers <= 1):
             raise ConfigError(
-                f"{self}: agreement_rad must be positive, min_geometric_inliers within 0..1."
+                named(self, "agreement_rad", "min_geometric_inliers")
+                + ": agreement_rad must be positive, min_geometric_inliers within 0..1."
             )
 
 

@@ -9,7 +9,7 @@ trajectory falls to under half.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
@@ -30,9 +30,15 @@ class WindowConfig:
 
     def __post_init__(self) -> None:
         if self.measurements < 0 or min(self.reach, self.levels) < 1:
-            raise ConfigError(f"{self}: measurements may be 0, reach and levels at least 1.")
+            raise ConfigError(
+                named(self, "measurements", "reach", "levels")
+                + ": measurements may be 0, reach and levels at least 1."
+            )
         if not (0 < self.min_overlap <= 1 and self.worst_noise >= 1):
-            raise ConfigError(f"{self}: min_overlap must be within 0..1, worst_noise at least 1.")
+            raise ConfigError(
+                named(self, "min_overlap", "worst_noise")
+                + ": min_overlap must be within 0..1, worst_noise at least 1."
+            )
         if not self.iterations or min(self.iterations) < 1:
             raise ConfigError(f"iterations={self.iterations}: at least 1 for each level.")
 

@@ -2,10 +2,12 @@
 
 import re
 from math import inf, nan
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+import ldo_service
 from ldo_service.config import (
     Config,
     actor_parameters,
@@ -132,3 +134,15 @@ def test_every_setting_reaches_what_it_is_for(setting: Setting) -> None:
             assert everything_of(config_of(tree_of(setting.path, value))) != default
             return
     pytest.fail("no other value was taken")
+
+
+def test_no_error_prints_a_whole_parameter_object() -> None:
+    package = Path(ldo_service.__file__).parent
+    folders = [package, *(package / link for link in ("actors", "schemas"))]
+    printing = [
+        path
+        for folder in folders
+        for path in folder.resolve().rglob("*.py")
+        if "{self}" in path.read_text()
+    ]
+    assert printing == []

@@ -11,7 +11,7 @@ from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnec
 from threading import Timer
 from urllib.parse import SplitResult, urlsplit
 
-from ldo_service.errors import ConfigError, EndpointError
+from ldo_service.errors import ConfigError, EndpointError, named
 
 MOST_BYTES = 1 << 20  # of an answer
 TRY_AGAIN = (408, 425, 429, 500, 502, 503, 504)  # what a later attempt may find otherwise
@@ -34,7 +34,18 @@ class EndpointConfig:
     def __post_init__(self) -> None:
         times = (self.timeout_s, self.patience_s, self.per_minute)
         if min(times) <= 0 or min(self.backoff_s, self.rest_s, self.rest_most_s) < 0:
-            raise ConfigError(f"{self}: times must be positive.")
+            raise ConfigError(
+                named(
+                    self,
+                    "timeout_s",
+                    "backoff_s",
+                    "patience_s",
+                    "per_minute",
+                    "rest_s",
+                    "rest_most_s",
+                )
+                + ": times must be positive."
+            )
         if self.patience_s < self.timeout_s:
             raise ConfigError(
                 f"patience_s={self.patience_s:g} must be at least timeout_s={self.timeout_s:g}, "
