@@ -46,6 +46,12 @@ def child(code: str, **options: Any) -> ChildProcess:
     return ChildProcess("child", program, MemoryTransport(), restart_delay_s=0.001, **options)
 
 
+def pid_of(process: ChildProcess) -> int:
+    """Return the number of a process that was started: 0 would be the group of the tests."""
+    assert process.pid
+    return process.pid
+
+
 async def test_a_killed_consumer_nobody_expects_releases_the_window(
     network: Network, client: Callable[[], zenoh.Session], tmp_path: Path
 ) -> None:
@@ -84,9 +90,9 @@ async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
     for value in range(60):
         await send(source, number(value))
         if value == 20:
-            os.kill(process.pid or 0, signal.SIGKILL)
+            os.kill(pid_of(process), signal.SIGKILL)
         if value == 40:
-            os.kill(process.pid or 0, signal.SIGSTOP)
+            os.kill(pid_of(process), signal.SIGSTOP)
     await source.flush()
     assert process.restarts >= 2
     stop.ask()
@@ -122,7 +128,7 @@ async def test_a_cancelled_child_is_gone() -> None:
     async with running(sleeping):
         await eventually(lambda: sleeping.pid is not None)
     with pytest.raises(ProcessLookupError):
-        os.kill(sleeping.pid or 0, 0)
+        os.kill(pid_of(sleeping), 0)
 
 
 async def test_a_child_that_is_drained_while_it_starts_ends() -> None:
