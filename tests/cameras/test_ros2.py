@@ -129,8 +129,10 @@ def publisher(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[str]]
         text=True,
     )
     with process:
-        yield process
-        process.kill()
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def test_a_publisher_passes_on_what_a_bridge_forwards() -> None:

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from itertools import count, cycle
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -160,7 +161,16 @@ class LiveService:
 
     def publisher(self, *arguments: str) -> subprocess.Popen[bytes]:
         command = [*LDO, "publish", *arguments, "--endpoint", self.endpoint]
-        return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        return self.start(command, stderr=subprocess.DEVNULL)
+
+    def start(self, command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
+        """Start a program that is killed with the service, whether the test passes or fails.
+
+        A process that a failed test leaves behind would be reported in a later test.
+        """
+        program = subprocess.Popen(command, **options)
+        self._stack.callback(_end, program)
+        return program
 
     @contextmanager
     def camera(self, frames: FrameSequence, rate_hz: float = 5) -> Iterator[None]:
@@ -193,10 +203,15 @@ class LiveService:
 
     def close(self) -> None:
         self._stack.close()
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.wait()
+        _end(self.process)
         self._log.close()
+
+
+def _end(program: subprocess.Popen[Any]) -> None:
+    program.kill()
+    program.wait()
+    if program.stdout is not None:
+        program.stdout.close()
 
 
 @contextmanager

@@ -41,7 +41,9 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
         assert isinstance(last[0], TrackedPose)
         assert service.client.last("pose/tracked", timeout_s=60) == last
         heard = service.client.messages("health", keep=16)
-        assert {next(heard)[1].actor for _ in range(16)} == set(EVERY_ACTOR)
+        silent = set(EVERY_ACTOR)
+        while silent:
+            silent.discard(next(heard)[1].actor)
         with pytest.raises(ConfigError, match="Did you mean pose/tracked"):
             service.client.last("pose/traked")
         with pytest.raises(ConfigError, match="map/delta keeps no last value"):
@@ -56,8 +58,8 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
 def test_the_examples_run_as_printed(tmp_path: Path) -> None:
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        camera, ours, plain = (
-            subprocess.Popen(
+        _, ours, plain = (
+            service.start(
                 [sys.executable, "-c", _at(service.endpoint, EXAMPLES / name), count],
                 stdout=subprocess.PIPE,
                 text=True,
@@ -73,8 +75,6 @@ def test_the_examples_run_as_printed(tmp_path: Path) -> None:
             lines = printed.splitlines()
             assert len(lines) == 5
             assert all(line.split()[1] == "OK" for line in lines)
-        camera.kill()
-        camera.communicate()
 
 
 def test_the_example_of_an_odometry_is_taken(tmp_path: Path) -> None:
@@ -219,11 +219,7 @@ def test_a_sleeping_subscriber_is_its_own_problem(tmp_path: Path) -> None:
     )
     with live_service(tmp_path) as service:
         service.wait_for_actors()
-        slow = subprocess.Popen([sys.executable, "-c", sleeper, service.endpoint])
-        publisher = service.publisher("synthetic:tour", "--rate", "15", "--max-frames", "200")
+        service.start([sys.executable, "-c", sleeper, service.endpoint])
+        service.publisher("synthetic:tour", "--rate", "15", "--max-frames", "200")
         poses = service.wait_for_poses(150, timeout_s=40)
         assert sum(pose.status == "OK" for pose in poses) >= 145
-        slow.kill()
-        slow.wait()
-        publisher.kill()
-        publisher.wait()
