@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ldo_service.conversions.objects import boxes_message
+from ldo_service.conversions.objects import detections_to_message
 from ldo_service.detection.detectors import Detections, NetworkConfig
 from ldo_service.detection.model_registry import open_detector
 from ldo_service.errors import ConfigError, ModelError
@@ -50,16 +50,16 @@ class Detector(Actor):
 
     def handle(self, message: Keyframe) -> Iterator[DetectionBoxes]:
         if self._network is None:
-            yield boxes_message(message, None, (), "")
+            yield detections_to_message(message, None, (), "")
             return
         found = self._find(message.color.numpy())
-        yield boxes_message(message, found, self._network.labels, self._network.identity)
+        yield detections_to_message(message, found, self._network.labels, self._network.identity)
 
     def _find(self, image: np.ndarray) -> Detections | None:
         """None when the network fails, which is logged once until it works again."""
         assert self._network is not None
         try:
-            found = self._network.find(image)
+            found = self._network.detect(image)
         except ModelError as error:
             if not self._is_failing:
                 log.error("keyframes stay without boxes: %s: %s", self._network.identity, error)
@@ -70,7 +70,7 @@ class Detector(Actor):
         self._boxes += len(found)
         return found
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """`networks_missing`: named in the configuration, and cannot be used."""
         return {
             "networks": float(self._network is not None),

@@ -14,13 +14,17 @@ from functools import partial
 
 import numpy as np
 
-from ldo_service.conversions.frames import camera_of, raw_frame_of, rgbd_message
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.frames import (
+    camera_from_message,
+    frame_to_message,
+    raw_frame_from_message,
+)
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import codecs
-from ldo_service.geometry.frames import RawFrame, Rectifier, in_metres
+from ldo_service.geometry.frames import RawFrame, Rectifier, in_meters
 from ldo_service.geometry.registration import register_depth
-from ldo_service.geometry.stamps import Pairing
+from ldo_service.geometry.stamps import StreamPairer
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
 from ldo_service.schemas.pose import IDENTITY
@@ -29,7 +33,8 @@ from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD, 
 log = logging.getLogger(__name__)
 
 Input = CameraRgbd | CameraColor | CameraDepth
-MANY_LOST = 30  # halves without one pair: a second of frames, no start-up effect any more
+# halves without one pair: a second of frames, no start-up effect any more
+UNPAIRED_WARNING_COUNT = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +85,13 @@ class FrameSource(Actor):
     def handle(self, message: Input) -> Iterator[FrameRgbd]:
         self._notice_restart(message)
         if isinstance(message, CameraRgbd):
-            yield from self._frame(message, partial(raw_frame_of, message, message.frame))
+            yield from self._frame(message, partial(raw_frame_from_message, message, message.frame))
         else:
-            for color, depth in self._paired(message):
-                yield from self._frame(color, partial(joined, color, depth))
+            for color, depth in self._pair(message):
+                yield from self._frame(color, partial(join_halves, color, depth))
 
     # --- pairs ------------------------------------------------------------------------------------
-    def _paired(self, half: CameraColor | CameraDepth) -> list[tuple[CameraColor, CameraDepth]]:
+    def _pair(self, half: CameraColor | CameraDepth) -> list[tuple[CameraColor, CameraDepth]]:
         try:
             if isinstance(half, CameraColor):
                 pairs = list(self._pairing.add_a(half))
@@ -100,7 +105,11 @@ class FrameSource(Actor):
 
     def _warn_when_nothing_pairs(self) -> None:
         lost = self._pairing.lost_a + self._pairing.lost_b
-        if self._pairing.pairs == 0 and lost >= MANY_LOST and not self._has_warned_of_skew:
+        if (
+            self._pairing.pairs == 0
+            and lost >= UNPAIRED_WARNING_COUNT
+            and not self._has_warned_of_skew
+        ):
             self._has_warned_of_skew = True
             log.warning(
                 "%d colour and %d depth images found no partner within %g ms: do both cameras "
@@ -121,7 +130,7 @@ class FrameSource(Actor):
             return
         self._is_rejecting = False
         self._last_stamp_ns = message.stamp_ns
-        yield rgbd_message(frame)
+        yield frame_to_message(frame)
 
     def _require_later(self, message: CameraRgbd | CameraColor) -> None:
         if message.stamp_ns <= self._last_stamp_ns:
@@ -139,8 +148,8 @@ class FrameSource(Actor):
             self._last_stamp_ns = -1
             self._pairing = self._new_pairing()
 
-    def _new_pairing(self) -> Pairing[CameraColor, CameraDepth]:
-        return Pairing(round(self.config.max_skew_s * 1e9), self.config.pair_buffer)
+    def _new_pairing(self) -> StreamPairer[CameraColor, CameraDepth]:
+        return StreamPairer(round(self.config.max_skew_s * 1e9), self.config.pair_buffer)
 
     def _require_usable(self, message: CameraRgbd | CameraColor) -> None:
         width, height = message.camera.width, message.camera.height
@@ -164,7 +173,7 @@ class FrameSource(Actor):
     def restore(self, state: dict[str, int]) -> None:  # type: ignore[override]
         self._last_stamp_ns = state["last_stamp_ns"]
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         skews_ms = self._pairing.skews_ms() or [0.0]
         return {
             "frames_rejected": self._rejected,
@@ -177,14 +186,17 @@ class FrameSource(Actor):
         }
 
 
-def joined(color: CameraColor, depth: CameraDepth) -> RawFrame:
+def join_halves(color: CameraColor, depth: CameraDepth) -> RawFrame:
     """The depth in the colour image, with the colour's stamp, number and camera."""
     image, scale = depth.image, depth.depth_scale
     values = codecs.decode_depth(image.encoding, image.width, image.height, image.data)
     if depth.camera != color.camera or depth.T_color_depth != IDENTITY:
-        depth_m = in_metres(values, scale)
-        cameras = camera_of(depth.camera), camera_of(color.camera)
-        values, scale = register_depth(depth_m, *cameras, transform(depth.T_color_depth)), 1.0
+        depth_m = in_meters(values, scale)
+        cameras = camera_from_message(depth.camera), camera_from_message(color.camera)
+        values, scale = (
+            register_depth(depth_m, *cameras, pose_from_message(depth.T_color_depth)),
+            1.0,
+        )
     image = color.image
     return RawFrame(
         index=color.frame,
@@ -192,5 +204,5 @@ def joined(color: CameraColor, depth: CameraDepth) -> RawFrame:
         color=codecs.decode_color(image.encoding, image.width, image.height, image.data),
         depth=values,
         depth_scale=scale,
-        camera=camera_of(color.camera),
+        camera=camera_from_message(color.camera),
     )

@@ -16,15 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.conversions.frames import keyframe_of
-from ldo_service.conversions.loops import loop_candidate_message, loop_closure_message
-from ldo_service.conversions.objects import boxes_in
-from ldo_service.conversions.poses import keyframe_poses_of, transform
-from ldo_service.detection.dynamic_classes import MovableConfig, movable_pixels
+from ldo_service.conversions.frames import keyframe_from_message
+from ldo_service.conversions.loops import loop_candidate_to_message, loop_closure_to_message
+from ldo_service.conversions.objects import scale_boxes
+from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
+from ldo_service.detection.dynamic_classes import DynamicClassConfig, dynamic_class_mask
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.loop_closing import Finding, LoopsConfig, Recogniser
-from ldo_service.loop_closing.object_points import Sightings, sightings_of
+from ldo_service.loop_closing import LoopCandidateResult, LoopDetector, LoopsConfig
+from ldo_service.loop_closing.object_points import DetectionPoints, locate_detections
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     Correction,
@@ -42,11 +42,11 @@ from ldo_service.schemas.topics import (
     LOOP_CANDIDATE,
     LOOP_CLOSURE,
 )
-from ldo_service.tracking.keyframe_database import Place, place_of
+from ldo_service.tracking.keyframe_database import KeyframeRecord, make_keyframe_record
 
 log = logging.getLogger(__name__)
 
-MOST_WAITING = 16  # keyframes: two windows of boxes; if these wait longer, they were lost
+MAX_PENDING_KEYFRAMES = 16  # keyframes: two windows of boxes; if these wait longer, they were lost
 RECENT_KEYFRAMES = 32  # that the optimizer may not have placed yet, as the tracker keeps
 
 
@@ -54,14 +54,14 @@ RECENT_KEYFRAMES = 32  # that the optimizer may not have placed yet, as the trac
 class LoopCloserConfig:
     is_on: bool = True  # False: no place is recognised, to see what closing loops is worth
     loops: LoopsConfig = field(default_factory=LoopsConfig)
-    movable: MovableConfig = field(default_factory=MovableConfig)
+    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Waiting:
+class PendingKeyframe:
     """A keyframe whose boxes are under way."""
 
-    place: Place
+    place: KeyframeRecord
     frame: int
     stamp_ns: int
     width_px: int  # of the image that the boxes are in
@@ -86,11 +86,11 @@ class LoopCloser(Actor):
     def __init__(self, config: LoopCloserConfig | None = None) -> None:
         super().__init__()
         self.config = config or LoopCloserConfig()
-        self.recogniser = Recogniser(self.config.loops)
+        self.recognizer = LoopDetector(self.config.loops)
         self._vocabulary = Vocabulary()
         self.poses = KeyframePoses()  # of the keyframes kept, and the newest
         self._joined: dict[int, int] = {}  # segments placed in an older one
-        self._waiting: dict[int, Waiting] = {}  # by keyframe
+        self._waiting: dict[int, PendingKeyframe] = {}  # by keyframe
         self._boxes: dict[int, DetectionBoxes] = {}  # that came before their keyframe, or wait
         self._newest = -1  # keyframe taken
         self._accepted = self._refused = self._without_boxes = self._repeated = 0
@@ -104,7 +104,7 @@ class LoopCloser(Actor):
             return
         self._parts = None
         if isinstance(message, Correction):
-            T_map = keyframe_poses_of(message, only=self.poses)
+            T_map = keyframe_poses_from_correction(message, only=self.poses)
             self.poses.correct(message.graph_version, T_map)
             self._saved_poses = None
             self._joined = dict(message.joined)
@@ -114,7 +114,7 @@ class LoopCloser(Actor):
         elif message.keyframe > self._newest or message.keyframe in self._waiting:
             self._boxes[message.keyframe] = message
         for keyframe in self._ready():
-            yield from self._recognise(keyframe)
+            yield from self._recognize(keyframe)
 
     def _take(self, message: Keyframe) -> None:
         if message.keyframe <= self._newest:
@@ -122,57 +122,61 @@ class LoopCloser(Actor):
             return
         self._newest = message.keyframe
         self._saved_poses = None
-        self.poses.chain(
+        self.poses.add(
             message.keyframe,
             message.reference,
-            transform(message.T_reference_keyframe),
-            transform(message.T_odom_keyframe),
+            pose_from_message(message.T_reference_keyframe),
+            pose_from_message(message.T_odom_keyframe),
             message.segment,
         )
         loops = self.config.loops
-        place = place_of(keyframe_of(message, loops.pyramid), loops.features, loops.places)
+        place = make_keyframe_record(
+            keyframe_from_message(message, loops.pyramid), loops.features, loops.places
+        )
         width_px = message.camera.width
-        self._waiting[message.keyframe] = Waiting(place, message.frame, message.stamp_ns, width_px)
+        self._waiting[message.keyframe] = PendingKeyframe(
+            place, message.frame, message.stamp_ns, width_px
+        )
 
     def _ready(self) -> list[int]:
         """Keyframes whose turn it is: boxes come in order, so those of older ones will not come."""
         newest = max(self._boxes.keys() & self._waiting.keys(), default=-1)
         ready = [k for k in self._waiting if k <= newest]
-        late = len(self._waiting) - len(ready) - MOST_WAITING
+        late = len(self._waiting) - len(ready) - MAX_PENDING_KEYFRAMES
         return ready or list(self._waiting)[: max(late, 0)]
 
     # --- recognising ------------------------------------------------------------------------------
-    def _recognise(self, keyframe: int) -> Iterator[LoopClosure | LoopCandidate]:
+    def _recognize(self, keyframe: int) -> Iterator[LoopClosure | LoopCandidate]:
         waiting, boxes = self._waiting.pop(keyframe), self._boxes.pop(keyframe, None)
         self._boxes = {k: b for k, b in self._boxes.items() if k > keyframe}
         self._without_boxes += boxes is None
-        place, sightings = self._seen(waiting, boxes)
-        findings = self.recogniser.add(
+        place, sightings = self._masked_keyframe(waiting, boxes)
+        findings = self.recognizer.add(
             place, waiting.frame, waiting.stamp_ns, sightings, self.poses, self._joined
         )
-        yield from self._told(findings)
-        if not self.recogniser.is_open or keyframe % RECENT_KEYFRAMES == 0:
+        yield from self._to_messages(findings)
+        if not self.recognizer.is_open or keyframe % RECENT_KEYFRAMES == 0:
             self.poses.keep_only(self._needed())
             self._saved_poses = None
 
-    def _seen(
-        self, waiting: Waiting, boxes: DetectionBoxes | None
-    ) -> tuple[Place, Sightings | None]:
+    def _masked_keyframe(
+        self, waiting: PendingKeyframe, boxes: DetectionBoxes | None
+    ) -> tuple[KeyframeRecord, DetectionPoints | None]:
         """The place without what may move by itself, and what stands there."""
         if boxes is None or not boxes.network:
             return waiting.place, None
         place, movable = waiting.place, self.config.movable
         times = waiting.width_px / place.camera.width
-        found = boxes_in(boxes.detections, times)
-        place = place.without(movable_pixels(found, place.depth_m, movable))
+        found = scale_boxes(boxes.detections, times)
+        place = place.without(dynamic_class_mask(found, place.depth_m, movable))
         return place, self._sightings(boxes.detections, place, times)
 
     def _sightings(
-        self, detections: tuple[Detection, ...], place: Place, times: float
-    ) -> Sightings:
+        self, detections: tuple[Detection, ...], place: KeyframeRecord, times: float
+    ) -> DetectionPoints:
         standing = [d for d in detections if d.label not in self.config.movable.classes]
         boxes = np.array([d.box_px for d in standing], float).reshape(-1, 4)
-        return sightings_of(
+        return locate_detections(
             np.array([self._vocabulary.index(d.label) for d in standing], np.uint8),
             np.array([d.score for d in standing], np.float32),
             (boxes + 0.5) / times - 0.5,
@@ -181,7 +185,9 @@ class LoopCloser(Actor):
             self.config.loops.verification.landmarks,
         )
 
-    def _told(self, findings: Iterable[Finding]) -> Iterator[LoopClosure | LoopCandidate]:
+    def _to_messages(
+        self, findings: Iterable[LoopCandidateResult]
+    ) -> Iterator[LoopClosure | LoopCandidate]:
         for finding in findings:
             closure = finding.closure
             if closure is None:
@@ -189,19 +195,19 @@ class LoopCloser(Actor):
             else:
                 self._accepted += 1
                 log.info("keyframe %d closes a loop with %d", closure.b, closure.a)
-                yield loop_closure_message(finding)
-            yield loop_candidate_message(finding)
+                yield loop_closure_to_message(finding)
+            yield loop_candidate_to_message(finding)
 
-    def finish(self) -> Iterator[LoopClosure | LoopCandidate]:
+    def on_stop(self) -> Iterator[LoopClosure | LoopCandidate]:
         """What waits, and the keyframes that a subgraph was begun with."""
         self._parts = None
         for keyframe in list(self._waiting):
-            yield from self._recognise(keyframe)
-        yield from self._told(self.recogniser.rest(self.poses, self._joined))
+            yield from self._recognize(keyframe)
+        yield from self._to_messages(self.recognizer.flush(self.poses, self._joined))
 
     def _needed(self) -> list[int]:
         """Keyframes that are kept as views, and those that the optimizer may not have placed."""
-        views = {v.keyframe for s in self.recogniser.subgraphs for v in s.views}
+        views = {v.keyframe for s in self.recognizer.subgraphs for v in s.views}
         return [k for k in self.poses if k > self._newest - RECENT_KEYFRAMES or k in views]
 
     # --- state ------------------------------------------------------------------------------------
@@ -213,7 +219,7 @@ class LoopCloser(Actor):
         return self._parts
 
     def _all_parts(self) -> dict[str, Any]:
-        state = self.recogniser.state()
+        state = self.recognizer.snapshot()
         subgraphs = {f"subgraph_{s['keyframes'][0]}": s for s in state.pop("subgraphs")}
         views = {f"view_{view['place']['id']}": view for view in state.pop("views")}
         waiting = {f"waiting_{k}": w.place.packed for k, w in self._waiting.items()}
@@ -242,22 +248,22 @@ class LoopCloser(Actor):
             return [state[name] for name in sorted(names, key=lambda n: int(n[len(kind) :]))]
 
         kept = {"subgraphs": parts("subgraph_"), "views": parts("view_")}
-        self.recogniser.restore({**now, **kept, "words": state["words"]})
+        self.recognizer.restore({**now, **kept, "words": state["words"]})
         self._waiting = {
-            int(k): Waiting(Place.unpacked(state[f"waiting_{k}"]), *facts)
+            int(k): PendingKeyframe(KeyframeRecord.unpack(state[f"waiting_{k}"]), *facts)
             for k, facts in now["waiting"].items()
         }
         boxes = [decode(body, DetectionBoxes) for body in now["boxes"]]
         self._boxes = {one.keyframe: one for one in boxes}
         self._newest, self._joined = now["newest"], dict(map(tuple, now["joined"]))
-        self._vocabulary = Vocabulary.unpacked(now["vocabulary"])
+        self._vocabulary = Vocabulary.unpack(now["vocabulary"])
         self.poses = KeyframePoses()
         self.poses.restore(state["poses"])
         self._parts = self._saved_poses = None
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
-            "subgraphs": len(self.recogniser.subgraphs),
+            "subgraphs": len(self.recognizer.subgraphs),
             "loops_accepted": self._accepted,
             "loops_refused": self._refused,
             "keyframes_without_boxes": self._without_boxes,  # that never came

@@ -22,17 +22,25 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.conversions.frames import mask_of, rgbd_of
-from ldo_service.conversions.objects import claims_of, label_request_message, observation_messages
-from ldo_service.conversions.poses import keyframe_poses_of, pose_message, transform
+from ldo_service.conversions.frames import frame_from_message, mask_from_array
+from ldo_service.conversions.objects import (
+    detections_from_message,
+    label_request_to_message,
+    observations_to_messages,
+)
+from ldo_service.conversions.poses import (
+    keyframe_poses_from_correction,
+    pose_from_message,
+    pose_to_message,
+)
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians.loop_refit import MapRepair, RepairConfig
+from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.maps.publisher import MapTeller, ObjectsTeller, Occasion, Pace
-from ldo_service.maps.relative_measurements import KeyframeLinks
-from ldo_service.regions.region import Answer
+from ldo_service.maps.publisher import MapPublisher, MessageContext, ObjectPublisher, PublishConfig
+from ldo_service.maps.relative_measurements import RelativeMeasurements
+from ldo_service.regions.region import RegionLabelResult
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     AnchorMotion,
@@ -64,7 +72,7 @@ from ldo_service.schemas.topics import (
     MAP_VIEW,
     OBJECT_OBSERVATION,
 )
-from ldo_service.semantics.semantic_map import Learnt, SemanticMap, SemanticMapConfig
+from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap, SemanticMapConfig
 
 Output = (
     ModelView
@@ -132,13 +140,13 @@ class MapperConfig:
     def thread_count(self) -> int:
         return self.threads or max(1, (os.cpu_count() or 1) - 1)
 
-    def pace(self) -> Pace:
+    def pace(self) -> PublishConfig:
         """Of telling others."""
-        return Pace(**{f.name: getattr(self, f.name) for f in fields(Pace)})
+        return PublishConfig(**{f.name: getattr(self, f.name) for f in fields(PublishConfig)})
 
-    def repair(self) -> RepairConfig:
+    def repair(self) -> LoopRefitConfig:
         """After corrections."""
-        return RepairConfig(**{f.name: getattr(self, f.name) for f in fields(RepairConfig)})
+        return LoopRefitConfig(**{f.name: getattr(self, f.name) for f in fields(LoopRefitConfig)})
 
 
 class Mapper(Actor):
@@ -174,12 +182,12 @@ class Mapper(Actor):
         self._semantics = SemanticMap(
             self._map, self.config.semantics, has_labeller=has_labeller, threads=threads
         )
-        self._objects_teller = ObjectsTeller()
+        self._objects_teller = ObjectPublisher()
         self._poses = KeyframePoses()
-        self._links = KeyframeLinks(self._poses, self.config.measured_keyframes)
-        self._teller = MapTeller(self._map, self.config.pace())
+        self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
+        self._teller = MapPublisher(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
-        self._repair = MapRepair(self._map, self.config.repair())
+        self._repair = LoopRefit(self._map, self.config.repair())
         self._checkpoint: dict[str, Any] = {}
         self._repeated = 0
 
@@ -190,7 +198,7 @@ class Mapper(Actor):
             case DetectionBoxes():
                 yield from self._take_boxes(message)
             case LabelOpen():
-                yield from self._take_name(message)
+                yield from self._take_label(message)
             case Correction():
                 yield from self._correct(message)
             case MapRefine():
@@ -203,27 +211,27 @@ class Mapper(Actor):
     # --- keyframes --------------------------------------------------------------------------------
     def _add(self, message: Keyframe) -> Iterator[Output]:
         # place it
-        T_map_keyframe = self._poses.chain(
+        T_map_keyframe = self._poses.add(
             message.keyframe,
             message.reference,
-            transform(message.T_reference_keyframe),
-            transform(message.T_odom_keyframe),
+            pose_from_message(message.T_reference_keyframe),
+            pose_from_message(message.T_odom_keyframe),
             message.segment,
         )
         self._links.add(message)
         self._newest = (message.stamp_ns, message.keyframe)
         # map it
-        frame = rgbd_of(message)
-        moving = mask_of(message.is_moving)
+        frame = frame_from_message(message)
+        moving = mask_from_array(message.is_moving)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
-        learnt = self._semantics.mapped(message.keyframe)
+        learnt = self._semantics.on_keyframe_mapped(message.keyframe)
         self._repair.with_keyframe(is_behind=self._waiting() > 0)
         # tell
         yield from self._refinement()
-        yield from self._teller.keyframe(self._now())
+        yield from self._teller.on_keyframe(self._message_context())
         yield self._view(message)
-        yield from self._teller.snapshot_when_due(self._now())
-        yield from self._tell_learnt(learnt, message.stamp_ns)
+        yield from self._teller.snapshot_if_due(self._message_context())
+        yield from self._publish_semantics(learnt, message.stamp_ns)
 
     def _iterations(self) -> int:
         """Fewer, the more keyframes wait: then the map is behind, and each is optimised again as
@@ -235,14 +243,14 @@ class Mapper(Actor):
         )
 
     def _waiting(self) -> int:
-        return self.situation.waiting.get(KEYFRAME_NEW, 0)
+        return self.situation.backlog.get(KEYFRAME_NEW, 0)
 
     def _refine(self, message: MapRefine) -> Iterator[Output]:
         self._repair.refine(message.iterations, (message.first_rate, message.last_rate))
         self._semantics.refresh()
         self._checkpoint = {}  # is due: half a minute of work, and perhaps no keyframe follows
         yield from self._refinement()
-        yield from self._teller.deltas(self._now(), with_changed=True)
+        yield from self._teller.deltas(self._message_context(), with_changed=True)
         yield from self._objects()
 
     def _refinement(self) -> Iterator[KeyframeRefinement]:
@@ -255,20 +263,22 @@ class Mapper(Actor):
         """Followers are told of labels with what changes next. Where nobody looked, nothing was
         missed."""
         vocabulary = self._semantics.vocabulary
-        claims = claims_of(message, vocabulary) if message.network else None
-        learnt = self._semantics.claim(message.keyframe, claims)
-        yield from self._tell_learnt(learnt, message.stamp_ns)
+        claims = detections_from_message(message, vocabulary) if message.network else None
+        learnt = self._semantics.add_detections(message.keyframe, claims)
+        yield from self._publish_semantics(learnt, message.stamp_ns)
 
-    def _take_name(self, message: LabelOpen) -> Iterator[Output]:
-        answer = Answer(message.label, message.confidence, message.others)
-        if self._semantics.answer(message.region, message.keyframe, answer):
+    def _take_label(self, message: LabelOpen) -> Iterator[Output]:
+        answer = RegionLabelResult(message.label, message.confidence, message.others)
+        if self._semantics.apply_label(message.region, message.keyframe, answer):
             yield from self._objects()
 
-    def _tell_learnt(self, learnt: Learnt | None, stamp_ns: int) -> Iterator[Output]:
+    def _publish_semantics(
+        self, learnt: KeyframeSemantics | None, stamp_ns: int
+    ) -> Iterator[Output]:
         if learnt is not None:
             names = self._semantics.names
-            yield from observation_messages(learnt.observed, names, learnt.keyframe, stamp_ns)
-            yield from (label_request_message(region, stamp_ns) for region in learnt.asked)
+            yield from observations_to_messages(learnt.observed, names, learnt.keyframe, stamp_ns)
+            yield from (label_request_to_message(region, stamp_ns) for region in learnt.asked)
             yield from self._objects()
 
     def _objects(self) -> Iterator[MapObjects]:
@@ -282,61 +292,65 @@ class Mapper(Actor):
     def _correct(self, message: Correction) -> Iterator[Output]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
         held = self._links.acknowledged(message.refinements)
-        self._poses.correct(message.graph_version, keyframe_poses_of(message), held=held)
-        self._repair.note(self._poses)
-        motions = tuple(self._motion(keyframe) for keyframe in self._misplaced())
+        self._poses.correct(
+            message.graph_version, keyframe_poses_from_correction(message), held=held
+        )
+        self._repair.mark_moved(self._poses)
+        motions = tuple(self._motion(keyframe) for keyframe in self._moved_keyframes())
         if motions:
-            T_new_old = {m.keyframe: transform(m.T_new_old) for m in motions}
+            T_new_old = {m.keyframe: pose_from_message(m.T_new_old) for m in motions}
             self._map.move(T_new_old)
             self._semantics.objects.move(T_new_old)
-            yield self._teller.delta(self._now(), motions=motions)
+            yield self._teller.delta(self._message_context(), motions=motions)
             yield from self._objects()
 
-    def _misplaced(self) -> list[int]:
+    def _moved_keyframes(self) -> list[int]:
         """Keyframes that are so far from where their Gaussians are that it shows; too little to
         show adds up until it is enough."""
         config, placed = self.config, self._map.views.poses
         T_now, T_gaussians = self._poses.of(placed), placed.of(placed)
-        shows = se3.differ(T_now, T_gaussians, config.motion_min_m, config.motion_min_rad)
+        shows = se3.transforms_differ(
+            T_now, T_gaussians, config.motion_min_m, config.motion_min_rad
+        )
         return np.array(list(placed), np.int64)[shows].tolist()
 
     def _motion(self, keyframe: int) -> AnchorMotion:
         """From where its Gaussians are to where the keyframe is."""
         T_map_gaussians = self._map.views.poses[keyframe]
-        T_new_old = pose_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
+        T_new_old = pose_to_message(self._poses[keyframe] @ se3.inverse(T_map_gaussians))
         return AnchorMotion(keyframe=keyframe, T_new_old=T_new_old)
 
     # --- messages ---------------------------------------------------------------------------------
-    def _now(self) -> Occasion:
-        return Occasion(self._newest[0], self._poses.version, self._semantics.names)
+    def _message_context(self) -> MessageContext:
+        return MessageContext(self._newest[0], self._poses.version, self._semantics.names)
 
     def _view(self, keyframe: Keyframe) -> ModelView:
         views, k = self._map.views, keyframe.keyframe
-        rendering = self._map.shown(k, contributions=self._semantics.is_used)
+        rendering = self._map.render_keyframe(k, contributions=self._semantics.is_used)
         return ModelView(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.keyframe,
             version=self._teller.version,
             graph_version=self._poses.version,
             camera=keyframe.camera,
-            T_map_camera=pose_message(views.poses[k]),
+            T_map_camera=pose_to_message(views.poses[k]),
             color=Array.of(to_bytes(views.exposures[k].applied(rendering.color))),
             depth_m=Array.of(rendering.median_depth_m),
             opacity=Array.of(to_bytes(rendering.opacity)),
         )
 
-    def resumed(self) -> Iterator[Output]:
+    def on_restored(self) -> Iterator[Output]:
         """The whole map: followers may have missed deltas, and late joiners find nothing else."""
         if self._map.size():
-            yield from self._teller.snapshot(self._now())
+            yield from self._teller.snapshot(self._message_context())
             yield from self._objects()
 
-    def finish(self) -> Iterator[Output]:
+    def on_stop(self) -> Iterator[Output]:
         """The whole map, so that whoever listens ends with it."""
         if self._map.size():
             self._repair.at_end()
             self._semantics.refresh()
-            yield from self._teller.snapshot(self._now())
+            yield from self._teller.snapshot(self._message_context())
             yield from self._objects()
 
     # --- state ------------------------------------------------------------------------------------
@@ -354,7 +368,7 @@ class Mapper(Actor):
         self._checkpoint = {}
         return self.snapshot()
 
-    def saved(self) -> None:
+    def on_saved(self) -> None:
         self._map.saved()
 
     def _put_away(self) -> None:
@@ -365,7 +379,7 @@ class Mapper(Actor):
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
             "told": self._teller.state(),
-            **self._repair.state(),
+            **self._repair.snapshot(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
@@ -379,11 +393,11 @@ class Mapper(Actor):
         self._teller.restore(saved["told"])
         self._repair.restore(saved)
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
-            **self._repair.facts(),
+            **self._repair.metrics(),
             **self._map.statistics(),
             **self._semantics.statistics(),
         }

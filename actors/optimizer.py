@@ -17,19 +17,24 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ldo_service.conversions.frames import camera_of
-from ldo_service.conversions.objects import dense_distribution, landmark_message
+from ldo_service.conversions.frames import camera_from_message
+from ldo_service.conversions.objects import dense_distribution, landmark_to_message
 from ldo_service.conversions.poses import (
-    correction_message,
-    measured_of,
-    measurements_of,
-    transform,
+    correction_to_message,
+    measurements_from_message,
+    pose_from_message,
+    relative_pose_from_message,
 )
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
-from ldo_service.pose_graph.landmarks import CLASSES, Landmarks, LandmarksConfig, Observation
-from ldo_service.pose_graph.pose_graph import KeyframeGraph, KeyframeGraphConfig
+from ldo_service.pose_graph.landmarks import (
+    MAX_CLASSES,
+    ObjectLandmarkConfig,
+    ObjectLandmarks,
+    Observation,
+)
+from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import (
     Correction,
@@ -55,8 +60,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class OptimizerConfig:
-    graph: KeyframeGraphConfig = field(default_factory=KeyframeGraphConfig)
-    landmarks: LandmarksConfig = field(default_factory=LandmarksConfig)
+    graph: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+    landmarks: ObjectLandmarkConfig = field(default_factory=ObjectLandmarkConfig)
     uses_objects: bool = True  # False: poses alone, to see what landmarks are worth
     most_early: int = 512  # closures and observations that wait for their keyframe; it is under way
     cameras: int = 64  # of the newest keyframes: observations come a few keyframes late
@@ -84,8 +89,8 @@ class Optimizer(Actor):
     def __init__(self, config: OptimizerConfig | None = None) -> None:
         super().__init__()
         self.config = config or OptimizerConfig()
-        self._graph = KeyframeGraph(self.config.graph)
-        self._landmarks = Landmarks(self.config.landmarks, self.config.graph.noise)
+        self._graph = PoseGraph(self.config.graph)
+        self._landmarks = ObjectLandmarks(self.config.landmarks, self.config.graph.noise)
         self._classes: list[str] = ["other"]  # as they were first named
         self._cameras: dict[int, Camera] = {}  # of the newest keyframes
         self._version = 0
@@ -124,7 +129,7 @@ class Optimizer(Actor):
                 self._take(message)
         yield self._correction(message.stamp_ns)
 
-    def resumed(self) -> Iterator[Correction]:
+    def on_restored(self) -> Iterator[Correction]:
         """The last one may not have been sent."""
         if len(self._graph):
             yield self._correction(self._stamp_ns)
@@ -134,24 +139,24 @@ class Optimizer(Actor):
         if not self._early:
             self._refinements = self._waiting_number
         closures = self._graph.closures
-        return correction_message(
+        return correction_to_message(
             stamp_ns,
             self._version,
             self._graph.poses(),
             self._refinements,
             self._joined(),
             closures=closures.accepted,
-            not_believed=sorted({*closures.refused, *closures.left}),
+            not_believed=sorted({*closures.rejected, *closures.removed}),
             landmarks=self._placed_landmarks(),
         )
 
     # --- keyframes --------------------------------------------------------------------------------
     def _take(self, message: Keyframe) -> None:
         """Place it; then what waited for it."""
-        if self._landmarks.is_due():
-            self._landmarks.settle(self._graph)
+        if self._landmarks.needs_update():
+            self._landmarks.update_graph(self._graph)
         self._add(message)
-        self._cameras[message.keyframe] = camera_of(message.camera)
+        self._cameras[message.keyframe] = camera_from_message(message.camera)
         while len(self._cameras) > self.config.cameras:
             del self._cameras[next(iter(self._cameras))]
         self._refine(())
@@ -166,29 +171,29 @@ class Optimizer(Actor):
         self._early = {pair: p for pair, p in asked.items() if p.keyframe > newest}
         if known:
             self._refined += len(known)
-            self._graph.replace([measured_of(pose) for pose in known.values()])
+            self._graph.replace([relative_pose_from_message(pose) for pose in known.values()])
 
     def _add(self, message: Keyframe) -> None:
-        T_odom_keyframe = transform(message.T_odom_keyframe)
+        T_odom_keyframe = pose_from_message(message.T_odom_keyframe)
         newest = self._newest.get(message.segment)
-        known = [m for m in measurements_of(message) if m.a in self._graph]
+        known = [m for m in measurements_from_message(message) if m.a in self._graph]
         if newest is None:
-            self._begin(message, T_odom_keyframe)
+            self._add_first_keyframe(message, T_odom_keyframe)
         elif known:
             self._graph.add(*known)
         else:
-            self._bridge(newest, message.keyframe, T_odom_keyframe)
+            self._add_odometry_fallback(newest, message.keyframe, T_odom_keyframe)
         self._newest[message.segment] = (message.keyframe, T_odom_keyframe)
         for pose in message.joins:
             self._join(pose)
 
-    def _begin(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
+    def _add_first_keyframe(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
         """The first keyframe of a segment; where it is among the others, nobody knows yet."""
         self._first[message.segment] = message.keyframe
         T_map_keyframe = T_map_segment(message.segment) @ T_odom_keyframe
         self._graph.add_first(message.keyframe, T_map_keyframe)
 
-    def _bridge(
+    def _add_odometry_fallback(
         self, newest: tuple[int, np.ndarray], keyframe: int, T_odom_keyframe: np.ndarray
     ) -> None:
         """Nothing that it was measured from was received: odometry from the newest stands in."""
@@ -196,7 +201,7 @@ class Optimizer(Actor):
         known, T_odom_known = newest
         log.warning("keyframe %d: its reference is missing, joined to %d", keyframe, known)
         T_known_keyframe = se3.inverse(T_odom_known) @ T_odom_keyframe
-        self._graph.add(self._graph.missed_odometry(known, keyframe, T_known_keyframe))
+        self._graph.add(self._graph.odometry_fallback(known, keyframe, T_known_keyframe))
 
     def _join(self, pose: MeasuredPose) -> None:
         """A keyframe in one of another segment; where loops joined these by now, it is judged as a
@@ -205,10 +210,10 @@ class Optimizer(Actor):
             log.warning("keyframe %d joins %d, which is missing", pose.keyframe, pose.reference)
             return
         before = self._joined()
-        self._graph.close(measured_of(pose))
-        self._tell_joined(before)
+        self._graph.add_loop_closure(relative_pose_from_message(pose))
+        self._log_merged(before)
 
-    def _tell_joined(self, before: dict[int, int]) -> None:
+    def _log_merged(self, before: dict[int, int]) -> None:
         for segment, older in self._joined().items() - before.items():
             log.info("segment %d is placed in %d now", segment, older)
 
@@ -217,24 +222,26 @@ class Optimizer(Actor):
         """Judge closures whose keyframes are known; False: there were none."""
         known = [c for c in self._early_closures if self._is_known(c.pose)]
         later = [c for c in self._early_closures if not self._is_known(c.pose)]
-        self._early_closures = self._bounded(later)
+        self._early_closures = self._keep_newest(later)
         for closure in known:
-            self._judge(closure)
+            self._check_closure(closure)
         return bool(known)
 
     def _is_known(self, pose: MeasuredPose) -> bool:
         return pose.reference in self._graph and pose.keyframe in self._graph
 
-    def _judge(self, closure: LoopClosure) -> None:
+    def _check_closure(self, closure: LoopClosure) -> None:
         before = self._joined()
         weight = self._landmarks.weight(closure.entropy)
-        measured = measured_of(closure.pose)
-        verdict = self._graph.close(replace(measured, information=weight * measured.information))
+        measured = relative_pose_from_message(closure.pose)
+        verdict = self._graph.add_loop_closure(
+            replace(measured, information=weight * measured.information)
+        )
         pair = closure.pose.reference, closure.pose.keyframe
         log.info("loop %d-%d is %s", *pair, "closed" if verdict.is_accepted else "not believed")
         for reference, keyframe in verdict.dropped:
             log.info("loop %d-%d is taken back: others refute it", reference, keyframe)
-        self._tell_joined(before)
+        self._log_merged(before)
 
     def _observe(self) -> None:
         """Take note of objects in keyframes that are known; the graph learns of them later."""
@@ -247,14 +254,14 @@ class Optimizer(Actor):
                 later.append(seen)
             else:
                 self._too_late += 1
-        self._early_observations = self._bounded(later)
+        self._early_observations = self._keep_newest(later)
 
     def _observation(self, seen: ObjectObservation, camera: Camera) -> Observation:
         return Observation(
             seen.keyframe,
             seen.object,
             np.array(seen.box_px),
-            dense_distribution(seen.distribution, self._class, CLASSES),
+            dense_distribution(seen.distribution, self._class, MAX_CLASSES),
             seen.entropy,
             seen.is_miss,
             np.array(astuple(camera)[:6]),
@@ -262,11 +269,11 @@ class Optimizer(Actor):
 
     def _class(self, name: str) -> int:
         """Its index; of one too many that of `other`."""
-        if name not in self._classes and len(self._classes) < CLASSES:
+        if name not in self._classes and len(self._classes) < MAX_CLASSES:
             self._classes.append(name)
         return self._classes.index(name) if name in self._classes else 0
 
-    def _bounded(self, waiting: list[Any]) -> list[Any]:
+    def _keep_newest(self, waiting: list[Any]) -> list[Any]:
         """The newest; what waits for a keyframe that was lost is given up in the end."""
         excess = max(0, len(waiting) - self.config.most_early)
         self._too_early += excess
@@ -275,7 +282,7 @@ class Optimizer(Actor):
     def _placed_landmarks(self) -> list[GraphLandmark]:
         known = self._landmarks.known
         return [
-            landmark_message(k, centroid, known[k].distribution, self._classes)
+            landmark_to_message(k, centroid, known[k].distribution, self._classes)
             for k, centroid in self._graph.landmarks().items()
         ]
 
@@ -283,7 +290,9 @@ class Optimizer(Actor):
     def _joined(self) -> dict[int, int]:
         """Segments that are placed in an older one, and in which."""
         segments = {first: segment for segment, first in self._first.items()}
-        placed = {s: segments[self._graph.first_of(first)] for s, first in self._first.items()}
+        placed = {
+            s: segments[self._graph.component_root(first)] for s, first in self._first.items()
+        }
         return {segment: older for segment, older in placed.items() if older < segment}
 
     # --- state ------------------------------------------------------------------------------------
@@ -324,7 +333,7 @@ class Optimizer(Actor):
         self._cameras = {k: Camera(*numbers) for k, numbers in saved["cameras"]}
         self._classes = list(saved["classes"])
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         graph = self._graph
         return {
             "keyframes": len(graph),
@@ -332,8 +341,8 @@ class Optimizer(Actor):
             "optimizations": graph.solved_times,
             "optimizations_saved": self._landmarks.skipped,
             "closures": len(graph.closures.accepted),
-            "closures_refused": len(graph.closures.refused),
-            "closures_dropped": len(graph.closures.left),
+            "closures_refused": len(graph.closures.rejected),
+            "closures_dropped": len(graph.closures.removed),
             "landmarks": len(graph.landmarks()),
             "keyframes_repeated": self._repeated,
             "keyframes_bridged": self._bridged,

@@ -32,7 +32,7 @@ class ActorParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class ActorSpec:
     """An actor of the design, with its ports."""
 
     name: str
@@ -42,11 +42,11 @@ class Box:
     make: Callable[[ActorParameters], Actor]
 
 
-def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]) -> Box:
-    return Box(actor.name, does, actor.inputs, actor.outputs, make)
+def _box(actor: type[Actor], does: str, make: Callable[[ActorParameters], Actor]) -> ActorSpec:
+    return ActorSpec(actor.name, does, actor.inputs, actor.outputs, make)
 
 
-GRAPH: tuple[Box, ...] = (
+GRAPH: tuple[ActorSpec, ...] = (
     _box(
         FrameSource,
         "checks and rectifies camera frames",
@@ -87,7 +87,7 @@ GRAPH: tuple[Box, ...] = (
 )
 
 
-def box_named(name: str) -> Box:
+def actor_spec(name: str) -> ActorSpec:
     """Raises ConfigError for a name that is not in the graph."""
     for box in GRAPH:
         if box.name == name:
@@ -129,11 +129,11 @@ def topics_table() -> str:
         name = f"{topic.name}/<actor>" if topic.is_per_actor else topic.name
         state = " *" if topic.is_state else ""
         takers = ", ".join(f"{who} {policy}" for who, policy in consumers_of(topic)) or "outside"
-        lines.append(f"| `{name}`{state} | {topic.says} | {producer_of(topic)} | {takers} |")
+        lines.append(f"| `{name}`{state} | {topic.description} | {producer_of(topic)} | {takers} |")
     return "\n".join(lines)
 
 
-def drawing(boxes: Iterable[Box] = GRAPH) -> str:
+def mermaid_diagram(boxes: Iterable[ActorSpec] = GRAPH) -> str:
     """The graph in Mermaid: solid arrows are lossless, dashed ones keep the latest."""
     lines = ["flowchart LR", "    camera([camera])", "    odometry([other odometry])"]
     boxes = tuple(boxes)
@@ -147,7 +147,7 @@ def drawing(boxes: Iterable[Box] = GRAPH) -> str:
     return "\n".join(lines)
 
 
-def _makers(topic: t.Topic, boxes: tuple[Box, ...]) -> list[str]:
+def _makers(topic: t.Topic, boxes: tuple[ActorSpec, ...]) -> list[str]:
     makers = [box.name for box in boxes if any(out.topic is topic for out in box.outputs)]
     if topic in t.FROM_ODOMETRY:
         return ["odometry"]

@@ -23,8 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.conversions.frames import keyframe_message, rgbd_of, tracked_pose_message
-from ldo_service.conversions.poses import map_correction_of, transform
+from ldo_service.conversions.frames import (
+    frame_from_message,
+    keyframe_message,
+    tracked_pose_message,
+)
+from ldo_service.conversions.poses import map_correction_of, pose_from_message
 from ldo_service.detection.dynamic_classes import Box
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
@@ -50,7 +54,7 @@ from ldo_service.schemas.topics import (
 from ldo_service.tracking.keyframe_database import places_of
 from ldo_service.tracking.localizer import Localizer
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
-from ldo_service.tracking.odometry_prior import Prior, Verdict
+from ldo_service.tracking.odometry_prior import OdometryPriorBuffer, PriorCheck
 from ldo_service.tracking.tracking_result import TrackingResult
 
 log = logging.getLogger(__name__)
@@ -111,7 +115,7 @@ class Tracker(Actor):
         In(ODOMETRY_PRIOR, Latest(64)),
         In(DETECTION_BOXES, Latest(1)),
     )
-    outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, never_wait=True))
+    outputs = (Out(POSE_TRACKED), Out(KEYFRAME_NEW, is_nonblocking=True))
     is_prompt = True
 
     def __init__(self, config: TrackerConfig | None = None) -> None:
@@ -120,9 +124,9 @@ class Tracker(Actor):
         self._T_base_camera = self.config.T_base_camera.matrix()
         self._odometry = _make_odometry(self.config, self._T_base_camera)
         self._correction = b""  # The last one, encoded.
-        self._prior = Prior()
+        self._prior = OdometryPriorBuffer()
         self._made = self._without_room = self._reused = 0  # Keyframes.
-        self._verdicts: Counter[Verdict] = Counter()  # On poses of the prior.
+        self._verdicts: Counter[PriorCheck] = Counter()  # On poses of the prior.
         self._with_prior = self._without_prior = 0  # Frames, since the prior began.
         self._missed = 0  # Frames in a row that the prior does not reach.
         # Parts of the state, up to the prior, which alone changes between two frames.
@@ -141,13 +145,13 @@ class Tracker(Actor):
             boxes = [_box(detection) for detection in message.detections]
             self._odometry.mask_dynamic_objects(message.keyframe, boxes)
         else:
-            yield from self._track(rgbd_of(message))
+            yield from self._track(frame_from_message(message))
 
     def _track(self, frame: RgbdFrame) -> Iterator[TrackedPose | Keyframe]:
         """Track a frame, and publish its pose and the keyframe that was made of it."""
         hold_out = self.config.hold_out
         is_held_out = hold_out > 0 and frame.index % hold_out == hold_out - 1
-        may_map = not is_held_out and self.has_room(KEYFRAME_NEW)
+        may_map = not is_held_out and self.has_credit(KEYFRAME_NEW)
         result = self._odometry.process(frame, self._prior, may_map=may_map)
         self._count(frame, result, is_held_out)
         if result.awaits_mapping:
@@ -173,11 +177,11 @@ class Tracker(Actor):
             )  # fmt: skip
 
     def _take_prior(self, message: OdometryPrior) -> None:
-        T_odom_base = transform(message.T_odom_base)
+        T_odom_base = pose_from_message(message.T_odom_base)
         config = self.config.odometry.prior
         self._prior, verdict = self._prior.added(message.stamp_ns, T_odom_base, config)
         self._verdicts[verdict] += 1
-        if verdict is not Verdict.FOLLOWS and self._verdicts[verdict] == 1:
+        if verdict is not PriorCheck.FOLLOWS and self._verdicts[verdict] == 1:
             log.warning(
                 "odometry/prior: the pose of stamp %d %s. Further such poses are only counted.",
                 message.stamp_ns, verdict,
@@ -202,12 +206,12 @@ class Tracker(Actor):
         state["order"] = [*places]  # The keyframe used last is the last one.
         own = {name: state.pop(name) for name in OWN_PARTS}
         fix = {"fix": state.pop("fix")} if "fix" in state else {}
-        poses, localise = state.pop("poses"), self.config.localise
+        poses, localize = state.pop("poses"), self.config.localise
         return {
             **{f"place_{number}": place for number, place in places.items()},
             **own,
             "correction": self._correction,
-            "now": {"odometry": state, "poses": poses, "localise": localise},
+            "now": {"odometry": state, "poses": poses, "localise": localize},
             "prior": self._prior.packed,
             **fix,
         }
@@ -232,11 +236,11 @@ class Tracker(Actor):
             {**now["odometry"], **own, "places": places, "poses": now["poses"]},
             None if correction is None else map_correction_of(correction),
         )
-        self._prior, self._parts = Prior.unpacked(state["prior"]), None
+        self._prior, self._parts = OdometryPriorBuffer.unpack(state["prior"]), None
 
-    def facts(self) -> dict[str, float]:
-        refused = self._verdicts[Verdict.LATE] + self._verdicts[Verdict.BROKEN]
-        restarts = self._verdicts[Verdict.RESTARTED] + self._verdicts[Verdict.JUMPED]
+    def metrics(self) -> dict[str, float]:
+        refused = self._verdicts[PriorCheck.LATE] + self._verdicts[PriorCheck.BROKEN]
+        restarts = self._verdicts[PriorCheck.RESTARTED] + self._verdicts[PriorCheck.JUMPED]
         return {
             "keyframes": self._made,
             "keyframes_without_room": self._without_room,

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ldo_service.conversions.frames import crops_of
+from ldo_service.conversions.frames import crops_from_request
 from ldo_service.detection.labellers import Labeller, Opinion
 from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
@@ -28,7 +28,7 @@ from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, EndpointError, FrameError, ModelError
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import LabelAdd, LabelNames, LabelOpen, LabelRequest
-from ldo_service.schemas.labels import MOST_NAMES, MOST_OTHERS
+from ldo_service.schemas.labels import MAX_ALTERNATIVES, MAX_NAMES
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
 from ldo_service.storage.state_store import State
 
@@ -62,7 +62,7 @@ class VlmLabeller(Actor):
     name = "vlm_labeller"
     inputs = (
         In(LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),
-        In(LABEL_ADD, Latest(32), goes_first=True),
+        In(LABEL_ADD, Latest(32), has_priority=True),
     )
     outputs = (Out(LABEL_OPEN), Out(LABEL_NAMES))
 
@@ -78,7 +78,7 @@ class VlmLabeller(Actor):
         self._is_failing = False
         self._named = self._unnamed = self._failures = self._refusals = 0
         try:
-            self._labeller = labeller or opened(self.config)
+            self._labeller = labeller or labeller_from_config(self.config)
         except ConfigError as error:
             log.error("no region is named: %s", error)
 
@@ -90,7 +90,7 @@ class VlmLabeller(Actor):
                 yield self._add(message)
 
     def _answer(self, request: LabelRequest) -> LabelOpen:
-        opinions = self._opinions(request)
+        opinions = self._label_region(request)
         (label, confidence), *others = opinions or [("", 0.0)]
         self._named += bool(label)
         self._unnamed += not label
@@ -101,15 +101,15 @@ class VlmLabeller(Actor):
             label=label,
             confidence=min(confidence, 1.0) if label else 0.0,
             labeller=self._labeller.identity if self._labeller and opinions is not None else "",
-            others=tuple((name, min(sure, 1.0)) for name, sure in others[:MOST_OTHERS]),
+            others=tuple((name, min(sure, 1.0)) for name, sure in others[:MAX_ALTERNATIVES]),
         )
 
-    def _opinions(self, request: LabelRequest) -> list[Opinion] | None:
+    def _label_region(self, request: LabelRequest) -> list[Opinion] | None:
         """None when nobody could look, which is logged once until somebody can again."""
         if self._labeller is None:
             return None
         try:
-            opinions = self._labeller.label(crops_of(request))
+            opinions = self._labeller.label(crops_from_request(request))
         except (ModelError, EndpointError, FrameError) as error:
             if not self._is_failing:
                 log.error("regions stay unnamed: %s: %s", self._labeller.identity, error)
@@ -129,15 +129,15 @@ class VlmLabeller(Actor):
         else:
             log.info("%r is added to the names", message.name)
             self._state = {"added": tuple(dict.fromkeys((*self._state["added"], message.name)))}
-        names = self._labeller.names[:MOST_NAMES] if self._labeller else ()
+        names = self._labeller.names[:MAX_NAMES] if self._labeller else ()
         return LabelNames(stamp_ns=message.stamp_ns, names=names, refused=refused)
 
     def _try_to_add(self, name: str) -> str:
         """Why not; empty when it is done."""
         if self._labeller is None:
             return "there is no labeller: set vlm_labeller.model or vlm_labeller.url."
-        if len(self._labeller.names) >= MOST_NAMES:
-            return f"there are {MOST_NAMES} names already."
+        if len(self._labeller.names) >= MAX_NAMES:
+            return f"there are {MAX_NAMES} names already."
         try:
             self._labeller.add(name)
         except ConfigError as error:
@@ -154,7 +154,7 @@ class VlmLabeller(Actor):
             if refused := self._try_to_add(name):
                 log.error("%r, added before, is left out: %s", name, refused)
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """`labellers_missing`: named in the configuration, and cannot be used."""
         return {
             "labellers": float(self._labeller is not None),
@@ -165,11 +165,11 @@ class VlmLabeller(Actor):
             "regions_unnamed": self._unnamed,
             "names_added": len(self._state["added"]),
             "names_refused": self._refusals,
-            **(self._labeller.facts() if self._labeller else {}),
+            **(self._labeller.metrics() if self._labeller else {}),
         }
 
 
-def opened(config: VlmLabellerConfig) -> Labeller | None:
+def labeller_from_config(config: VlmLabellerConfig) -> Labeller | None:
     """The labeller that a configuration names; None where it names none. Raises ConfigError."""
     if not config.is_chosen:
         return None
@@ -182,4 +182,4 @@ def opened(config: VlmLabellerConfig) -> Labeller | None:
 def require_labeller(config: VlmLabellerConfig) -> None:
     """Raises ConfigError when it cannot be used: a run over a file is asked for it, where a service
     rather goes on without. Whether a server answers is found out when it is asked."""
-    opened(config)
+    labeller_from_config(config)

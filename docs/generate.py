@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ldo_service.actors.topology import drawing, topics_table
+from ldo_service.actors.topology import mermaid_diagram, topics_table
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", ROOT / "docs/architecture.md")
@@ -37,7 +37,7 @@ def _first_sentence(path: Path) -> str:
 
 BLOCKS: dict[str, Callable[[], str]] = {
     "ldo topics --markdown": topics_table,
-    "ldo topics --mermaid": lambda: f"```mermaid\n{drawing()}\n```",
+    "ldo topics --mermaid": lambda: f"```mermaid\n{mermaid_diagram()}\n```",
     "packages": packages_table,
 }
 

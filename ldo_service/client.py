@@ -57,9 +57,9 @@ from ldo_service.schemas.topics import (
     TOPICS,
     Topic,
 )
-from ldo_service.transport.flow_control import ALIVE, Header, Numbers, encode_link
-from ldo_service.transport.keys import Keys
-from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT, Network, open_session
+from ldo_service.transport.flow_control import ALIVE, Header, SequenceTracker, encode_link
+from ldo_service.transport.keys import TlsKeys
+from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT, Endpoint, open_session
 
 M = TypeVar("M", bound=Message)
 log = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ log = logging.getLogger(__name__)
 class Client:
     """A connection to one robot's topics; made by `connect`."""
 
-    def __init__(self, session: zenoh.Session, network: Network) -> None:
+    def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
         self._session, self._network = session, network
         self._sent = self._asked = self._priors = 0
         self._numbers: Counter[type[Message]] = Counter()  # of frames and halves sent
@@ -164,16 +164,16 @@ class Client:
         return self._publishers[kind]
 
     @property
-    def is_heard(self) -> bool:
+    def has_subscriber(self) -> bool:
         """Whether anybody subscribes to this client's camera/rgbd."""
         return self._publisher(CameraRgbd).matching_status.matching
 
-    def wait_until_heard(self, timeout_s: float = 3.0) -> bool:
+    def wait_for_subscriber(self, timeout_s: float = 3.0) -> bool:
         """Who has just connected hears of subscribers a moment later. False: of none in time."""
         until_s = time.monotonic() + timeout_s
-        while not self.is_heard and time.monotonic() < until_s:
+        while not self.has_subscriber and time.monotonic() < until_s:
             time.sleep(0.02)
-        return self.is_heard
+        return self.has_subscriber
 
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
         """Every tracked pose as it comes, for ever; of those not taken in time the newest stay."""
@@ -185,15 +185,15 @@ class Client:
         """Header and message of each sample on a topic, or one of that name, for ever; what a
         producer repeats that was started again is left out. Of those not taken in time the newest
         `keep` stay. Raises ConfigError for a name that no topic has."""
-        topic, numbers = _topic(topic), Numbers()
-        with self._subscriber(topic.subscribed_as, keep) as subscriber:
+        topic, numbers = _topic(topic), SequenceTracker()
+        with self._subscriber(topic.subscription_key, keep) as subscriber:
             for sample in subscriber:
                 header = _header(sample)
-                if numbers.came(header):
+                if numbers.observe(header):
                     yield header, _message(sample, topic.message)
 
     @contextmanager
-    def listen(self, name: str, of: type[M], keep: int = 256) -> Iterator[Callable[[], list[M]]]:
+    def poller(self, name: str, of: type[M], keep: int = 256) -> Iterator[Callable[[], list[M]]]:
         """A function that returns what has come since it was last called; never waits.
 
         `name` may hold `*`, such as `health/*`.
@@ -205,7 +205,7 @@ class Client:
 
             yield inbox
 
-    def last(self, topic: Topic | str, timeout_s: float = 3.0) -> list[Message]:
+    def latest(self, topic: Topic | str, timeout_s: float = 3.0) -> list[Message]:
         """The last value of a state topic, or the one of that name, all its parts; empty when there
         is none yet. Raises ConfigError for a topic that keeps none, and for a name that none has.
         """
@@ -223,10 +223,10 @@ class Client:
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
         """The objects of the map as of now. Raises ConfigError when nobody answers: a map without
         a detector has none."""
-        for message in self.last(MAP_OBJECTS, timeout_s):
+        for message in self.latest(MAP_OBJECTS, timeout_s):
             assert isinstance(message, MapObjects)
             return message
-        if "mapper" in self.alive():
+        if "mapper" in self.live_actors():
             raise ConfigError(
                 "the map has no objects yet, which takes a keyframe, also after a restart, and a "
                 "detector that looked at it: `ldo serve --set detector.model=...`; `ldo models` "
@@ -235,7 +235,7 @@ class Client:
             )
         raise self._nobody("answers", MAP_OBJECTS)
 
-    def alive(self, timeout_s: float = 1.0) -> set[str]:
+    def live_actors(self, timeout_s: float = 1.0) -> set[str]:
         """Names of the actors whose process is there."""
         expression = self._network.expression(f"{ALIVE}/*")
         replies = self._session.liveliness().get(expression, timeout=timeout_s)
@@ -290,7 +290,7 @@ class Client:
         except ValueError as error:
             raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from error
         until_s = time.monotonic() + timeout_s
-        with self.listen(LABEL_NAMES.name, LabelNames) as inbox:
+        with self.poller(LABEL_NAMES.name, LabelNames) as inbox:
             self._ask(LABEL_ADD, message, min(timeout_s, 3.0))
             while time.monotonic() < until_s:
                 for answer in inbox():
@@ -370,6 +370,6 @@ def connect(
 
     Raises ConfigError when nobody answers, or refuses the keys.
     """
-    network = Network(robot, endpoint, Keys.of(keys))
+    network = Endpoint(robot, endpoint, TlsKeys.of(keys))
     with open_session(network) as session:
         yield Client(session, network)

@@ -91,7 +91,7 @@ def named(parameters: object, *fields: str) -> str:
     """Return fields of a parameter object with their values, to begin an error with.
 
     Args:
-        parameters: An instance of a dataclass such as `WindowConfig`.
+        parameters: An instance of a dataclass such as `ViewSamplingConfig`.
         fields: Names of the fields that the error is about.
     """
     owner = type(parameters).__name__

@@ -16,13 +16,13 @@ from typing import Any
 import pytest
 
 from ldo_service.recordings.recording import recorded_actors
-from ldo_service.recordings.replay import Replayed
+from ldo_service.recordings.replay import ReplayReport
 from ldo_service.runs.replayed import RecordedActor, open_recording
 
-__all__ = ["RecordedActor", "Replayed", "recorded", "replay_recording"]
+__all__ = ["RecordedActor", "ReplayReport", "recorded", "replay_recording"]
 
 
-def replay_recording(folder: Path | str, *actors: str) -> dict[str, Replayed]:
+def replay_recording(folder: Path | str, *actors: str) -> dict[str, ReplayReport]:
     """Replay the recorded actors, or some, and count what they did.
 
     Raises ReplayDiverged at the first difference, DataError for a recording with a gap.

@@ -5,8 +5,8 @@ import msgspec
 from ldo_service.schemas.frames import MAX_PIXELS
 from ldo_service.schemas.message import Message, require_count, require_finite
 
-LONGEST_LABEL = 100  # characters
-MOST_DETECTIONS = 10_000
+MAX_LABEL_LENGTH = 100  # characters
+MAX_DETECTIONS = 10_000
 TOLERANCE_PX = 1e-3  # of rounding, beyond the edge of the image
 
 
@@ -19,8 +19,8 @@ class Detection(msgspec.Struct, frozen=True, kw_only=True):
     box_px: tuple[float, float, float, float]  # x0, y0, x1, y1 in the image of the keyframe
 
     def __post_init__(self) -> None:
-        if not 0 < len(self.label) <= LONGEST_LABEL:
-            raise ValueError(f"a label of {len(self.label)} characters: 1 to {LONGEST_LABEL}")
+        if not 0 < len(self.label) <= MAX_LABEL_LENGTH:
+            raise ValueError(f"a label of {len(self.label)} characters: 1 to {MAX_LABEL_LENGTH}")
         require_finite("score and box_px", (self.score, *self.box_px))
         if not 0 <= self.score <= 1:
             raise ValueError(f"score {self.score:g} must be within 0..1")
@@ -45,8 +45,8 @@ class DetectionBoxes(Message, frozen=True, kw_only=True):
         require_count("keyframe", self.keyframe)
         if self.width < 1 or self.height < 1 or self.width * self.height > MAX_PIXELS:
             raise ValueError(f"image size {self.width}x{self.height} is empty or over {MAX_PIXELS}")
-        if len(self.detections) > MOST_DETECTIONS:
-            raise ValueError(f"{len(self.detections)} detections are over {MOST_DETECTIONS}")
+        if len(self.detections) > MAX_DETECTIONS:
+            raise ValueError(f"{len(self.detections)} detections are over {MAX_DETECTIONS}")
         if self.detections and not self.network:
             raise ValueError("there are detections, and no network that made them")
         for detection in self.detections:

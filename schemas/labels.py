@@ -1,13 +1,13 @@
 """Regions that are to be named from an open vocabulary, and their names."""
 
-from ldo_service.schemas.detections import LONGEST_LABEL
+from ldo_service.schemas.detections import MAX_LABEL_LENGTH
 from ldo_service.schemas.frames import Image
 from ldo_service.schemas.message import Message, require_count, require_finite
 
-MOST_CROPS = 8
-MOST_OTHERS = 8  # guesses beside the label
-MOST_CROP_PX = 1 << 20  # of one crop: networks look at 0.1 megapixels
-MOST_NAMES = 10_000
+MAX_CROPS = 8
+MAX_ALTERNATIVES = 8  # guesses beside the label
+MAX_CROP_PX = 1 << 20  # of one crop: networks look at 0.1 megapixels
+MAX_NAMES = 10_000
 Box = tuple[float, float, float, float]
 
 
@@ -28,8 +28,8 @@ class LabelRequest(Message, frozen=True, kw_only=True):
         x0, y0, x1, y1 = self.box_px
         if not (x0 < x1 and y0 < y1):
             raise ValueError(f"box {self.box_px} is empty")
-        if not 0 < len(self.crops) <= MOST_CROPS:
-            raise ValueError(f"{len(self.crops)} crops: 1 to {MOST_CROPS}")
+        if not 0 < len(self.crops) <= MAX_CROPS:
+            raise ValueError(f"{len(self.crops)} crops: 1 to {MAX_CROPS}")
         for crop in self.crops:
             _require_crop(crop)
         _require_opinion(self.label, self.score)
@@ -53,8 +53,8 @@ class LabelOpen(Message, frozen=True, kw_only=True):
         _require_opinion(self.label, self.confidence)
         if self.label and not self.labeller:
             raise ValueError("there is a label, and no labeller that gave it")
-        if len(self.others) > MOST_OTHERS:
-            raise ValueError(f"{len(self.others)} others are over {MOST_OTHERS}")
+        if len(self.others) > MAX_ALTERNATIVES:
+            raise ValueError(f"{len(self.others)} others are over {MAX_ALTERNATIVES}")
         for other in self.others:
             _require_opinion(*other)
         names = [self.label, *(name for name, _ in self.others)]
@@ -69,8 +69,8 @@ class LabelAdd(Message, frozen=True, kw_only=True):
     name: str
 
     def check(self) -> None:
-        if not 0 < len(self.name.strip()) <= LONGEST_LABEL:
-            raise ValueError(f"a name of {len(self.name)} characters: 1 to {LONGEST_LABEL}")
+        if not 0 < len(self.name.strip()) <= MAX_LABEL_LENGTH:
+            raise ValueError(f"a name of {len(self.name)} characters: 1 to {MAX_LABEL_LENGTH}")
 
 
 class LabelNames(Message, frozen=True, kw_only=True):
@@ -80,21 +80,21 @@ class LabelNames(Message, frozen=True, kw_only=True):
     refused: str = ""  # why what was asked last was not done; empty: it was
 
     def check(self) -> None:
-        if len(self.names) > MOST_NAMES:
-            raise ValueError(f"{len(self.names)} names are over {MOST_NAMES}")
+        if len(self.names) > MAX_NAMES:
+            raise ValueError(f"{len(self.names)} names are over {MAX_NAMES}")
 
 
 def _require_crop(crop: Image) -> None:
     if crop.encoding not in ("rgb8", "bgr8", "jpeg", "png"):
         raise ValueError(f"a crop cannot be encoded as {crop.encoding}")
-    if crop.width * crop.height > MOST_CROP_PX:
-        raise ValueError(f"a crop of {crop.width}x{crop.height} is over {MOST_CROP_PX} pixels")
+    if crop.width * crop.height > MAX_CROP_PX:
+        raise ValueError(f"a crop of {crop.width}x{crop.height} is over {MAX_CROP_PX} pixels")
 
 
 def _require_opinion(label: str, score: float) -> None:
     require_finite("confidence", (score,))
-    if len(label) > LONGEST_LABEL:
-        raise ValueError(f"a label of {len(label)} characters: at most {LONGEST_LABEL}")
+    if len(label) > MAX_LABEL_LENGTH:
+        raise ValueError(f"a label of {len(label)} characters: at most {MAX_LABEL_LENGTH}")
     if not 0 <= score <= 1:
         raise ValueError(f"confidence {score:g} must be within 0..1")
     if score > 0 and not label:

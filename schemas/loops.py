@@ -6,7 +6,7 @@ from ldo_service.schemas.keyframe import MeasuredPose
 from ldo_service.schemas.message import Message, require_count, require_finite
 
 Evidence = Literal["", "landmarks", "features", "map"]
-LONGEST_REASON = 100  # characters
+MAX_REASON_LENGTH = 100  # characters
 
 
 class LoopClosure(Message, frozen=True, kw_only=True):
@@ -26,7 +26,7 @@ class LoopClosure(Message, frozen=True, kw_only=True):
             raise ValueError(
                 f"keyframe {self.pose.keyframe} closes a loop with the newer {self.pose.reference}"
             )
-        require_share("overlap", self.overlap)
+        require_fraction("overlap", self.overlap)
         require_not_negative("rmse_m", self.rmse_m)
         require_not_negative("entropy", self.entropy)
 
@@ -53,18 +53,18 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
         for name in ("keyframe", "reference", "inliers"):
             require_count(name, getattr(self, name))
         for name in ("similarity", "appearance", "overlap"):
-            require_share(name, getattr(self, name))
+            require_fraction(name, getattr(self, name))
         for name in ("divergence", "entropy", "rmse_m"):
             require_not_negative(name, getattr(self, name))
-        if len(self.refused) > LONGEST_REASON:
+        if len(self.refused) > MAX_REASON_LENGTH:
             raise ValueError(
-                f"a reason of {len(self.refused)} characters: at most {LONGEST_REASON}"
+                f"a reason of {len(self.refused)} characters: at most {MAX_REASON_LENGTH}"
             )
         if not self.refused and not self.evidence:
             raise ValueError("a candidate without evidence cannot be accepted")
 
 
-def require_share(name: str, value: float) -> None:
+def require_fraction(name: str, value: float) -> None:
     if not 0 <= value <= 1:  # NaN is refused too
         raise ValueError(f"{name} is {value:g}, must be within 0..1")
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.schemas.array import Array
-from ldo_service.schemas.detections import LONGEST_LABEL
+from ldo_service.schemas.detections import MAX_LABEL_LENGTH
 from ldo_service.schemas.frames import CameraModel
 from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Pose
@@ -131,7 +131,7 @@ class ModelView(Message, frozen=True, kw_only=True):
         self.opacity.require("opacity", "u1", size)
 
 
-MOST_ITERATIONS = 500  # half a minute in which no keyframe is mapped
+MAX_ITERATIONS = 500  # half a minute in which no keyframe is mapped
 
 
 class MapRefine(Message, frozen=True, kw_only=True):
@@ -143,22 +143,24 @@ class MapRefine(Message, frozen=True, kw_only=True):
 
     def check(self) -> None:
         require_count("iterations", self.iterations)
-        if self.iterations > MOST_ITERATIONS:
-            raise ValueError(f"{self.iterations} iterations: ask for {MOST_ITERATIONS} at a time")
+        if self.iterations > MAX_ITERATIONS:
+            raise ValueError(f"{self.iterations} iterations: ask for {MAX_ITERATIONS} at a time")
         require_finite("rates", (self.first_rate, self.last_rate))
         if not (0 < self.first_rate <= 1 and 0 < self.last_rate <= 1):
             raise ValueError(f"rates {self.first_rate} and {self.last_rate} must be in (0, 1]")
 
 
-MOST_NAMES = 256  # what one byte can number
+MAX_NAMES = 256  # what one byte can number
 
 
 def require_names(names: tuple[str, ...]) -> None:
-    if len(names) > MOST_NAMES:
-        raise ValueError(f"{len(names)} label_names are over {MOST_NAMES}")
+    if len(names) > MAX_NAMES:
+        raise ValueError(f"{len(names)} label_names are over {MAX_NAMES}")
     longest = max(map(len, names), default=0)
-    if longest > LONGEST_LABEL:
-        raise ValueError(f"a name of {longest} characters in label_names is over {LONGEST_LABEL}")
+    if longest > MAX_LABEL_LENGTH:
+        raise ValueError(
+            f"a name of {longest} characters in label_names is over {MAX_LABEL_LENGTH}"
+        )
 
 
 def require_weights(labels: Array) -> None:

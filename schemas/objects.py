@@ -4,13 +4,13 @@ import itertools
 
 import msgspec
 
-from ldo_service.schemas.detections import LONGEST_LABEL
+from ldo_service.schemas.detections import MAX_LABEL_LENGTH
 from ldo_service.schemas.map import require_version
 from ldo_service.schemas.message import Message, require_count, require_finite
 from ldo_service.schemas.pose import Pose
 
-MOST_OBJECTS = 10_000
-MOST_CLASSES = 32  # of one distribution
+MAX_OBJECTS = 10_000
+MAX_CLASSES = 32  # of one distribution
 ROUNDING = 1e-3  # of a sum of probabilities
 
 Vector3 = tuple[float, float, float]
@@ -72,8 +72,8 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         for name in ("id", "seen", "missed", "first_keyframe", "last_keyframe"):
             require_count(name, getattr(self, name))
-        if not 0 < len(self.name) <= LONGEST_LABEL:
-            raise ValueError(f"a name of {len(self.name)} characters: 1 to {LONGEST_LABEL}")
+        if not 0 < len(self.name) <= MAX_LABEL_LENGTH:
+            raise ValueError(f"a name of {len(self.name)} characters: 1 to {MAX_LABEL_LENGTH}")
         require_finite("object", (self.confidence, *self.centroid, *self.covariance, *self.size))
         if not 0 <= self.confidence <= 1:
             raise ValueError(f"confidence {self.confidence:g} must be within 0..1")
@@ -97,8 +97,8 @@ class MapObjects(Message, frozen=True, kw_only=True):
     def check(self) -> None:
         require_version(self.version, self.graph_version)
         ids = [one.id for one in self.objects]
-        if len(ids) > MOST_OBJECTS:
-            raise ValueError(f"{len(ids)} objects are over {MOST_OBJECTS}")
+        if len(ids) > MAX_OBJECTS:
+            raise ValueError(f"{len(ids)} objects are over {MAX_OBJECTS}")
         if any(b <= a for a, b in itertools.pairwise(ids)):
             raise ValueError("ids of objects must be ascending")
 
@@ -113,14 +113,14 @@ def require_box(box_px: Box) -> None:
 def require_distribution(distribution: Distribution) -> None:
     weights = [weight for _, weight in distribution]
     require_finite("distribution", weights)
-    if not 0 < len(weights) <= MOST_CLASSES:
-        raise ValueError(f"a distribution over {len(weights)} classes: 1 to {MOST_CLASSES}")
+    if not 0 < len(weights) <= MAX_CLASSES:
+        raise ValueError(f"a distribution over {len(weights)} classes: 1 to {MAX_CLASSES}")
     if len({name for name, _ in distribution}) != len(weights):
         raise ValueError("a distribution names a class twice")
     if min(weights) < 0 or sum(weights) > 1 + ROUNDING:
         raise ValueError(f"probabilities {weights} must not be negative, nor sum to more than 1")
-    if any(not 0 < len(name) <= LONGEST_LABEL for name, _ in distribution):
-        raise ValueError(f"names of classes have 1 to {LONGEST_LABEL} characters")
+    if any(not 0 < len(name) <= MAX_LABEL_LENGTH for name, _ in distribution):
+        raise ValueError(f"names of classes have 1 to {MAX_LABEL_LENGTH} characters")
 
 
 def require_entropy(entropy: float) -> None:

@@ -27,14 +27,14 @@ ROBOT_PREFIX = "ldo"
 class Topic:
     name: str
     message: type[Message]
-    says: str
+    description: str
     is_state: bool = False
     key: str | None = None  # field by which `Latest(per_key=True)` tells messages apart
     answer: type[Message] | None = None  # where `message` is what a query asks
     is_per_actor: bool = False  # each says it on a name of its own below this one
 
     @property
-    def subscribed_as(self) -> str:
+    def subscription_key(self) -> str:
         """The name of all that is said on it."""
         return f"{self.name}/*" if self.is_per_actor else self.name
 

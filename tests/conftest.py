@@ -11,8 +11,8 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence, open_sequence
 from ldo_service.runs.folder import CAMERA, prepare
-from ldo_service.runs.job import Job
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.job import RunOptions
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
 
@@ -53,8 +53,8 @@ def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("run") / "room"
     prepare(folder, overwrite=False)
     config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))
-    job = Job(open_sequence(str(room_folder)), folder, config, Selection(), print)
-    run_over_file(job, lambda *_: None)
+    job = RunOptions(open_sequence(str(room_folder)), folder, config, Selection(), print)
+    run_offline(job, lambda *_: None)
     return folder
 
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from ldo_service.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.synthetic.flat.catalog import CATALOG
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES, COCO_COUNT
 
 INPUT_PX = (320, 256)  # width, height
 STRIDES_PX = (8, 16, 32)
 CELL_COUNT = sum(INPUT_PX[1] // s * (INPUT_PX[0] // s) for s in STRIDES_PX)
-THINGS = tuple(name for name in CLASS_NAMES if name in CATALOGUE)
-NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOGUE)  # those first
+THINGS = tuple(name for name in CLASS_NAMES if name in CATALOG)
+NAMES = tuple(name for name in CLASS_NAMES[:COCO_COUNT] if name in CATALOG)  # those first
 NOTHING = len(THINGS)
 
 SIDES_PX = ((0, 56), (40, 130), (96, 1000))  # root of the boxes' area that each grid is for
@@ -20,7 +20,7 @@ BOXES_CELLS = 1.5  # from the middle of a cell to each side of its box, at first
 COVERED, OF_OBJECT = 0.4, 0.25  # of a cell, or of an object, so that the cell tells of the object
 UNCLEAR = 0.3  # of a cell covered by things of which none is told: it learns nothing
 NOTHING_WEIGHT = 0.1  # of a cell of the finest grid without a thing
-SMALLEST_PX = 20  # visible of an object that is told
+MIN_PX = 20  # visible of an object that is told
 ID_COUNT = 256
 
 
@@ -48,7 +48,7 @@ class Visible:
 def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
     """What a plane of ids [H, W] shows; `names` [256] are those of the ids, -1 for none."""
     pixels = np.bincount(plane.ravel(), minlength=ID_COUNT)
-    ids = np.flatnonzero((pixels >= SMALLEST_PX) & (names >= 0))
+    ids = np.flatnonzero((pixels >= MIN_PX) & (names >= 0))
     extents = ndimage.find_objects(plane)
     boxes = [
         (columns.start, rows.start, columns.stop, rows.stop)
@@ -57,7 +57,7 @@ def visible(plane: np.ndarray, names: np.ndarray) -> Visible:
     return Visible(ids, names[ids], np.array(boxes, np.float32).reshape(-1, 4), pixels[ids])
 
 
-def told(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
+def make_targets(plane: np.ndarray, objects: Visible) -> tuple[np.ndarray, ...]:
     """Names [N], weights [N], boxes [N, 4] and whether to tell them [N], of all cells.
 
     A cell tells of the smallest object that covers enough of it, or that it covers enough of.

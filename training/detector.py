@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from cells import BOXES_CELLS, INPUT_PX, STRIDES_PX, THINGS, grid
-from layers import Graph, Live, Statistics, Weights, merged, residual
+from layers import Graph, JaxNetwork, Statistics, Weights, merged, residual
 from views import Views
 
 import training
@@ -24,7 +24,7 @@ BOX_WEIGHT, FIT_WEIGHT = 1.5, 1.0  # beside the names' entropy
 TOLD = (4, 1, len(THINGS) + 1)  # sides of the box, fit of the box, names and nothing
 
 
-def network(net: Live | Graph, image) -> list:
+def network(net: JaxNetwork | Graph, image) -> list:
     """For each grid: 4 distances in cells from a cell's middle, a logit of the fit, and names'."""
     fine, middle, coarse = _trunk(net, image)
     return [
@@ -32,7 +32,7 @@ def network(net: Live | Graph, image) -> list:
     ]
 
 
-def _trunk(net: Live | Graph, image) -> tuple:
+def _trunk(net: JaxNetwork | Graph, image) -> tuple:
     """What is seen, on each grid."""
     x = residual(net, merged(net, image, "stem", 32, side=4), "stage4", 32)
     fine = merged(net, x, "down8", 64)
@@ -47,7 +47,7 @@ def _trunk(net: Live | Graph, image) -> tuple:
     return fine, middle, coarse
 
 
-def _neck(net: Live | Graph, fine, middle, coarse) -> list:
+def _neck(net: JaxNetwork | Graph, fine, middle, coarse) -> list:
     """What is seen at large helps at small: pooled, enlarged and added."""
     x = net.conv(coarse, "pool.in", WIDE, size=1)
     wide = net.widest(x)
@@ -58,12 +58,12 @@ def _neck(net: Live | Graph, fine, middle, coarse) -> list:
     return [net.conv(f, "fuse8", WIDE), m, c]
 
 
-def _head(net: Live | Graph, x, stride_px: int):
+def _head(net: JaxNetwork | Graph, x, stride_px: int):
     x = net.conv(x, f"told{stride_px}", TOLD_BY)
     return net.linear(x, f"tell{stride_px}", sum(TOLD))
 
 
-def predicted(net: Live, images):
+def predicted(net: JaxNetwork, images):
     """Corners [B, N, 4] in pixels, logits of the fit [B, N] and of names and nothing [B, N, T + 1].
 
     images  [B, H, W, 3] in 0..1
@@ -84,7 +84,7 @@ def loss(weights: Weights, batch: tuple):
            [B, N], boxes [B, N, 4] in pixels, and whether it is to tell the box [B, N]
     """
     images, names, shares, boxes, tells_box = batch
-    corners, fit, logits = predicted(Live(weights), images.astype(jnp.float32) / 255)
+    corners, fit, logits = predicted(JaxNetwork(weights), images.astype(jnp.float32) / 255)
     total = shares.sum()
     right = jnp.take_along_axis(jax.nn.log_softmax(logits), names[..., None], -1)[..., 0]
     iou, giou = overlaps(corners, boxes)
@@ -110,7 +110,7 @@ def _area(boxes):
 
 
 @dataclass(frozen=True, slots=True)
-class First:
+class FirstStage:
     """A trained first look: weights, and the statistics of its normalised layers."""
 
     weights: Weights
@@ -118,21 +118,21 @@ class First:
 
     def look(self, images: np.ndarray) -> tuple[np.ndarray, ...]:
         """Corners, fits and logits as `predicted`, of images [B, H, W, 3] uint8."""
-        live = Live(self.weights, self.statistics)
+        live = JaxNetwork(self.weights, self.statistics)
         told = predicted(live, jnp.asarray(images, jnp.float32) / 255)
         return tuple(map(np.asarray, told))
 
 
-def train(material: Views, steps: Sequence[int], seed: int) -> First:
+def train(material: Views, steps: Sequence[int], seed: int) -> FirstStage:
     """In rounds of so many steps: `training.ROUND_RATES`."""
     rng = np.random.default_rng([seed, 1])
-    live = Live({}, rng=rng)
+    live = JaxNetwork({}, rng=rng)
     network(live, jnp.zeros((1, *INPUT_PX[::-1], 3)))
     rounds = [batches(material, rng, SMALL), batches(material, np.random.default_rng([seed, 6]))]
     learned = training.fit_in_rounds(loss, live.weights, rounds, steps, RATE)
     rng = np.random.default_rng([seed, 4])
     images = (batch[0].astype(np.float32) / 255 for batch in batches(material, rng))
-    return First(learned, training.statistics(network, learned, images))
+    return FirstStage(learned, training.statistics(network, learned, images))
 
 
 def looked(graph: Graph) -> tuple[str, str, str]:

@@ -16,15 +16,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from crops import DEVIATION, INPUT_PX, MARGIN, MEAN, crop, cut, enlarged, framed, resized
-from layers import Graph, Live, Statistics, Weights, merged, residual
-from views import Seen, Views
-from wear import repainted, worsened
+from layers import Graph, JaxNetwork, Statistics, Weights, merged, residual
+from views import Views, VisibleBoxes
+from wear import degrade, recolor
 
-from ldo_service.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.synthetic.flat.catalog import CATALOG
 from ldo_service.synthetic.flat.scene_object import BUILDING, CLASS_NAMES
 
 DIMENSIONS = 96
-NAMES = tuple(name for name in CLASS_NAMES if name in CATALOGUE or name in BUILDING.split())
+NAMES = tuple(name for name in CLASS_NAMES if name in CATALOG or name in BUILDING.split())
 
 SIDE_MIN_PX, FILLED_MIN = 6, 0.12  # of a box that is learned from, and its share that is the object
 CUT_MOST = 0.5  # of a box, without so much of one side
@@ -49,7 +49,7 @@ class Framing:
 ABOUT_THINGS = Framing((0.0, 0.25), 0.08, 0.3)
 
 
-def network(net: Live | Graph, image) -> list:
+def network(net: JaxNetwork | Graph, image) -> list:
     """[N, 1, 1, D], before it is brought to length 1."""
     x = residual(net, merged(net, image, "stem", 64, side=4), "stage4", 64)
     x = net.conv(x, "down8", 128, stride=2)
@@ -72,30 +72,30 @@ class Pair:
 
     def images(self, crops: np.ndarray, with_mirror: bool = True) -> np.ndarray:
         """Vectors [N, D] of crops [N, 64, 64, 3] uint8, each seen from both sides of a mirror."""
-        live = Live(self.weights, self.statistics)
+        live = JaxNetwork(self.weights, self.statistics)
         sides = (crops, crops[:, :, ::-1])[: 1 + with_mirror]
-        return np.asarray(unit(sum(network(live, normalised(side))[:, 0, 0] for side in sides)))
+        return np.asarray(unit(sum(network(live, normalized(side))[:, 0, 0] for side in sides)))
 
 
 def unit(x):
     return x / jnp.sqrt((x * x).sum(-1, keepdims=True) + 1e-12)
 
 
-def normalised(crops):
+def normalized(crops):
     return (jnp.asarray(crops, jnp.float32) / 255 - MEAN) / DEVIATION
 
 
 def loss(weights: Weights, batch: tuple):
     """Cross entropy of the names, of crops [N, 64, 64, 3] uint8 and their names' indices [N]."""
     crops, names = batch
-    images = unit(network(Live(weights), normalised(crops))[:, 0, 0])
+    images = unit(network(JaxNetwork(weights), normalized(crops))[:, 0, 0])
     logits = SCALE * images @ unit(weights["texts.kernel"]).T
     told = jax.nn.log_softmax(logits)
     right = jnp.take_along_axis(told, names[:, None], 1)[:, 0]
     return -((1 - SMOOTHING) * right + SMOOTHING * told.mean(-1)).mean()
 
 
-def learnable(seen: Seen) -> tuple[Seen, np.ndarray]:
+def learnable(seen: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
     """The boxes that show enough of their object, and their indices into NAMES."""
     sides = seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]
     chosen = seen.chosen(
@@ -139,7 +139,7 @@ class Shown:
 
 def shown_in(
     material: Views,
-    seen: Seen,
+    seen: VisibleBoxes,
     row: int,
     side_px: int,
     rng: np.random.Generator,
@@ -164,10 +164,10 @@ def shown_in(
 def example(
     shown: Shown, before: Shown | None, side_px: int, rng: np.random.Generator
 ) -> np.ndarray:
-    color = repainted(shown.color, shown.plane, rng)
+    color = recolor(shown.color, shown.plane, rng)
     if before is not None:
         _cover(color, before, rng)
-    taken = framed(worsened(color, rng, BLUR_PX * side_px), side_px)
+    taken = framed(degrade(color, rng, BLUR_PX * side_px), side_px)
     return taken[:, ::-1] if rng.random() < 0.5 else taken
 
 
@@ -182,7 +182,7 @@ def _cover(color: np.ndarray, by: Shown, rng: np.random.Generator) -> None:
     color[there][is_it] = by.color[own][is_it]
 
 
-def crops_of(seen: Seen, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def crops_of(seen: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Crops of what frames show, and their names' indices."""
     seen, names = learnable(seen)
     rows = zip(seen.frames, seen.boxes_px, strict=True)

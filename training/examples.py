@@ -6,9 +6,9 @@ from itertools import islice
 
 import cv2
 import numpy as np
-from cells import ID_COUNT, INPUT_PX, THINGS, told, visible
-from views import Seen, Views
-from wear import BLUR_PX, repainted, worsened
+from cells import ID_COUNT, INPUT_PX, THINGS, make_targets, visible
+from views import Views, VisibleBoxes
+from wear import BLUR_PX, degrade, recolor
 
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
 
@@ -50,7 +50,7 @@ def _shuffled(count: int, rng: np.random.Generator) -> Iterator[int]:
 
 def _names_of_ids(material: Views) -> np.ndarray:
     """Names [F, 256] of the ids of each frame, -1 for none."""
-    seen: Seen = material.seen
+    seen: VisibleBoxes = material.seen
     names = np.full((len(material.colors), ID_COUNT), -1)
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(THINGS)}
     named = seen.chosen(seen.instances > 0)
@@ -74,14 +74,14 @@ def _example(
     if zoom < 1:  # made worse when it is small: that is less
         color = cv2.resize(color, size_px, interpolation=cv2.INTER_AREA)
         plane = cv2.resize(plane, size_px, interpolation=cv2.INTER_NEAREST)
-    color = worsened(repainted(color, plane, rng), rng, BLUR_PX * min(zoom, 1))
+    color = degrade(recolor(color, plane, rng), rng, BLUR_PX * min(zoom, 1))
     image = np.full((*canvas.size_px[::-1], 3), PADDING, np.uint8)
     ids = np.zeros(image.shape[:2], np.uint8)
     image[shown] = cv2.resize(color, size_px)
     ids[shown] = cv2.resize(plane, size_px, interpolation=cv2.INTER_NEAREST)
     if rng.random() < 0.5:
         image, ids = image[:, ::-1], ids[:, ::-1]
-    return image, *told(ids, visible(ids, names))
+    return image, *make_targets(ids, visible(ids, names))
 
 
 def _windows(

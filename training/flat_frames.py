@@ -2,12 +2,12 @@
 
 import numpy as np
 import views
-from views import Seen
+from views import VisibleBoxes
 
 from ldo_service.synthetic.flat import FlatSequence
 
 
-def flat_frames(stride: int) -> tuple[list[np.ndarray], Seen]:
+def flat_frames(stride: int) -> tuple[list[np.ndarray], VisibleBoxes]:
     """Every `stride`-th frame as recorded, and what it shows."""
     sequence = FlatSequence.named("flat")
     indices = range(0, len(sequence), stride)

@@ -22,9 +22,9 @@ from inventory import (
 )
 
 from ldo_service.synthetic.flat.building import HEIGHT_M
-from ldo_service.synthetic.flat.catalogue import CATALOGUE
-from ldo_service.synthetic.flat.paint import Paints
-from ldo_service.synthetic.flat.scene_object import Heading, Placement, Thing
+from ldo_service.synthetic.flat.catalog import CATALOG
+from ldo_service.synthetic.flat.paint import Materials
+from ldo_service.synthetic.flat.scene_object import Heading, Placement, SceneObject
 
 Point = tuple[float, float, float]
 
@@ -43,25 +43,25 @@ class Builder:
     """A room that is being furnished."""
 
     rng: np.random.Generator
-    paint: Paints
+    paint: Materials
     size_m: tuple[float, float]
     doorway: tuple[np.ndarray, np.ndarray]  # low and high corner [3] of what stays free
-    things: list[Thing] = field(default_factory=list)
+    things: list[SceneObject] = field(default_factory=list)
     _extents: list[tuple[np.ndarray, np.ndarray]] = field(default_factory=list)
 
-    def build(self, label: str, heading: Heading, shapes: tuple[int, ...] = ()) -> Thing:
+    def build(self, label: str, heading: Heading, shapes: tuple[int, ...] = ()) -> SceneObject:
         """One of its shapes at the origin."""
         shape = int(self.rng.choice(shapes or range(SHAPES.get(label, 1))))
-        solids = CATALOGUE[label](self.paint, shape)
+        solids = CATALOG[label](self.paint, shape)
         turned = Placement((0.0, 0.0, 0.0), heading)
-        return Thing(label, tuple(turned(solid) for solid in solids))
+        return SceneObject(label, tuple(turned(solid) for solid in solids))
 
     def put(
-        self, thing: Thing, places: Iterable[Point], carrier: Thing | None = None
-    ) -> Thing | None:
+        self, thing: SceneObject, places: Iterable[Point], carrier: SceneObject | None = None
+    ) -> SceneObject | None:
         """Where it first meets nothing but its carrier, or nowhere."""
         for at in places:
-            placed = Thing(thing.label, tuple(Placement(at)(solid) for solid in thing.solids))
+            placed = SceneObject(thing.label, tuple(Placement(at)(solid) for solid in thing.solids))
             if self._is_free(*extent(placed), carrier):
                 self.things.append(placed)
                 self._extents.append(extent(placed))
@@ -71,7 +71,7 @@ class Builder:
     def between(self, low: float, high: float) -> float:
         return float(low + (high - low) * self.rng.random())
 
-    def _is_free(self, low: np.ndarray, high: np.ndarray, carrier: Thing | None) -> bool:
+    def _is_free(self, low: np.ndarray, high: np.ndarray, carrier: SceneObject | None) -> bool:
         half = np.array(self.size_m) / 2 + 1e-3
         if (low[:2] < -half).any() or (high[:2] > half).any() or high[2] > HEIGHT_M:
             return False
@@ -106,7 +106,7 @@ def furnish(builder: Builder) -> None:
         _place(builder, thing, _anywhere(builder))
 
 
-def _place(builder: Builder, thing: Thing, places: Iterable[Point]) -> None:
+def _place(builder: Builder, thing: SceneObject, places: Iterable[Point]) -> None:
     """With what belongs to it: chairs at a table, things on it."""
     placed = builder.put(thing, places)
     if placed is not None:
@@ -115,7 +115,7 @@ def _place(builder: Builder, thing: Thing, places: Iterable[Point]) -> None:
         _load(builder, placed)
 
 
-def _seat(builder: Builder, table: Thing) -> None:
+def _seat(builder: Builder, table: SceneObject) -> None:
     """Put chairs at its long sides, pushed under it more or less."""
     low, high = extent(table)
     across = int(np.argmin((high - low)[:2]))
@@ -138,23 +138,27 @@ def _some(rng: np.random.Generator, labels: tuple[str, ...], least: int, most: i
 
 
 def _turned(
-    builder: Builder, thing: Thing, ways: Sequence[Heading] = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)
-) -> Thing:
+    builder: Builder,
+    thing: SceneObject,
+    ways: Sequence[Heading] = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT),
+) -> SceneObject:
     """To one of these sides, and a little more."""
     quarter = ways[int(builder.rng.integers(len(ways)))]
     askew = ASKEW[int(builder.rng.integers(len(ASKEW)))]
     turns = (Placement((0.0, 0.0, 0.0), quarter), Placement((0.0, 0.0, 0.0), askew))
-    return Thing(thing.label, tuple(turns[0](turns[1](solid)) for solid in thing.solids))
+    return SceneObject(thing.label, tuple(turns[0](turns[1](solid)) for solid in thing.solids))
 
 
-def _along_walls(builder: Builder, thing: Thing, on_floor: bool) -> tuple[Thing, list[Point]]:
+def _along_walls(
+    builder: Builder, thing: SceneObject, on_floor: bool
+) -> tuple[SceneObject, list[Point]]:
     """The thing facing away from one wall, and places where its back touches that wall."""
     wall = int(builder.rng.integers(4))
     heading = (TO_FRONT, TO_BACK, TO_LEFT, TO_RIGHT)[wall]
     if thing.label == "door":  # its leaf lies along the wall
         heading = (TO_RIGHT, TO_LEFT, TO_FRONT, TO_BACK)[wall]
     turned = Placement((0.0, 0.0, 0.0), heading)
-    thing = Thing(thing.label, tuple(turned(solid) for solid in thing.solids))
+    thing = SceneObject(thing.label, tuple(turned(solid) for solid in thing.solids))
     low, high = extent(thing)
     half = np.array(builder.size_m) / 2
     axis, sign = ((1, 1.0), (1, -1.0), (0, 1.0), (0, -1.0))[wall]
@@ -174,7 +178,7 @@ def _anywhere(builder: Builder) -> Iterator[Point]:
         yield builder.between(-half[0], half[0]), builder.between(-half[1], half[1]), 0.0
 
 
-def _load(builder: Builder, carrier: Thing) -> None:
+def _load(builder: Builder, carrier: SceneObject) -> None:
     """Put what belongs there onto tables, seats and shelves."""
     for space in _spaces(carrier):
         for label in _some(builder.rng, space.labels, 1, space.most):
@@ -196,7 +200,7 @@ def _places_in(
         yield float(at_x), float(at_y), float(space.low[2])
 
 
-def _spaces(carrier: Thing) -> Iterator[_Space]:
+def _spaces(carrier: SceneObject) -> Iterator[_Space]:
     """On tables, seats and boards."""
     low, high = extent(carrier)
     above = high + np.array([0.0, 0.0, HEADROOM_M])
@@ -217,7 +221,7 @@ def _at_height(corner: np.ndarray, z_m: float) -> np.ndarray:
     return np.array([corner[0], corner[1], z_m])
 
 
-def extent(thing: Thing) -> tuple[np.ndarray, np.ndarray]:
+def extent(thing: SceneObject) -> tuple[np.ndarray, np.ndarray]:
     """Low and high corner [3] along the axes."""
-    centre, size = thing.bounds_m
-    return centre - size / 2, centre + size / 2
+    center, size = thing.bounds_m
+    return center - size / 2, center + size / 2

@@ -1,7 +1,7 @@
 """Convolutional networks written once and read twice: by JAX to train them, as ONNX to ship them.
 
-A network is a function of a reader and its input. The readers have the same methods; `Live` holds
-arrays [N, H, W, C], `Graph` names of tensors [1, C, H, W].
+A network is a function of a reader and its input. The readers have the same methods; `JaxNetwork`
+holds arrays [N, H, W, C], `Graph` names of tensors [1, C, H, W].
 """
 
 from collections.abc import Mapping
@@ -21,7 +21,7 @@ UNFOLDED_PX = 9  # of an image up to which a product is faster to train than XLA
 OPSET, IR_VERSION = 17, 8  # what onnxruntime 1.18 reads
 
 
-class Live:
+class JaxNetwork:
     """Arrays. Missing weights are drawn when there is a generator for them.
 
     weights     by name
@@ -240,13 +240,13 @@ def unfolded(x, size: int, stride: int):
     return jnp.concatenate(parts, axis=-1)
 
 
-def merged(net: Live | Graph, x, name: str, channels: int, side: int = 2):
+def merged(net: JaxNetwork | Graph, x, name: str, channels: int, side: int = 2):
     """Squares of pixels become one, each by all of them: Liu et al., ConvNeXt, CVPR 2022. Beside a
     convolution of 3x3 pixels with stride 2, a quarter of the time of training."""
     return net.conv(net.folded(x, side), name, channels, size=1)
 
 
-def residual(net: Live | Graph, x, name: str, channels: int):
+def residual(net: JaxNetwork | Graph, x, name: str, channels: int):
     """A bottleneck beside the way straight through."""
     inner = net.conv(x, f"{name}.in", channels // 2, size=1)
     return net.add(x, net.conv(inner, f"{name}.out", channels))

@@ -10,7 +10,7 @@ import numpy as np
 from furnishing import Builder, furnish
 
 from ldo_service.synthetic.flat.building import DOOR_HEIGHT_M, DOOR_WIDTH_M, HEIGHT_M, WALL_M, Panel
-from ldo_service.synthetic.flat.paint import Paints, materials
+from ldo_service.synthetic.flat.paint import Materials, materials
 from ldo_service.synthetic.flat.scene import Flat
 from ldo_service.synthetic.flat.scene_object import CEILING, FLOOR, WALL
 from ldo_service.synthetic.solids import Solid
@@ -29,7 +29,7 @@ def room(seed: int) -> Flat:
     door_m = float(rng.uniform(-0.25, 0.25)) * size_m[0]
     low = np.array([door_m - DOOR_WIDTH_M / 2, -size_m[1] / 2, 0.0])
     doorway = low, low + np.array([DOOR_WIDTH_M, 0.6, DOOR_HEIGHT_M])
-    builder = Builder(rng, Paints(rng), size_m, doorway)
+    builder = Builder(rng, Materials(rng), size_m, doorway)
     furnish(builder)
     panels = tuple(_panels(rng, size_m, door_m))
     things = tuple(builder.things)

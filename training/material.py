@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import views
-from views import Seen, Views
+from views import Views, VisibleBoxes
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,11 +28,11 @@ class Rooms:
             self._joined([part.regions for part in parts]),
         )
 
-    def _joined(self, parts: list[Seen]) -> Seen:
+    def _joined(self, parts: list[VisibleBoxes]) -> VisibleBoxes:
         tables = [part.table() for part in parts]
         for k, table in enumerate(tables):
             table[:, 0] += k * self.frames
-        return Seen.of(np.concatenate(tables))
+        return VisibleBoxes.of(np.concatenate(tables))
 
 
 def render_all(rooms: list[Rooms], folder: Path, processes: int) -> None:

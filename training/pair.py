@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from crops import INPUT_PX, crop, enlarged
 from encoder import BATCH, DIMENSIONS, NAMES, RATE, Framing, Pair
-from layers import Live
+from layers import JaxNetwork
 from regions import NO_THING
-from views import Seen, Views
+from views import Views, VisibleBoxes
 
 import training
 from ldo_service.regions.region_views import ViewConfig
@@ -34,7 +34,7 @@ MARGIN = ViewConfig().context  # of a region's sides, that a labeller's crop has
 def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
     """In rounds of so many steps, each with its share of the rate: see `training.fit_in_rounds`."""
     rng = np.random.default_rng([seed, 2])
-    live = Live({}, rng=rng)
+    live = JaxNetwork({}, rng=rng)
     encoder.network(live, jnp.zeros((1, INPUT_PX, INPUT_PX, 3)))
     texts = rng.standard_normal((len(NAMES), DIMENSIONS)).astype(np.float32)
     weights = live.weights | {"texts.kernel": texts}
@@ -49,7 +49,7 @@ def train(material: Views, steps: Sequence[int], seed: int) -> Pair:
     weights = training.fit(encoder.loss, weights, both, steps[1], second)
     texts = np.asarray(encoder.unit(jnp.asarray(weights.pop("texts.kernel"))))
     again = batches(material, np.random.default_rng([seed, 5]))
-    inputs = (np.asarray(encoder.normalised(crops)) for crops, _ in again)
+    inputs = (np.asarray(encoder.normalized(crops)) for crops, _ in again)
     statistics = training.statistics(encoder.network, weights, inputs)
     return Pair(weights, statistics, texts, (*NAMES, NO_NAME))
 
@@ -82,14 +82,14 @@ def batches(material: Views, rng: np.random.Generator, side_px: int = INPUT_PX) 
         yield np.concatenate((crops, others)), np.concatenate((told, names[rows]))
 
 
-def named(regions: Seen) -> tuple[Seen, np.ndarray]:
+def named(regions: VisibleBoxes) -> tuple[VisibleBoxes, np.ndarray]:
     """Regions that have a name, and its index: after NAMES comes NO_NAME."""
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(NAMES)} | {NO_THING: len(NAMES)}
     chosen = regions.chosen(np.array([k in own for k in regions.class_ids.tolist()], bool))
     return chosen, np.array([own[k] for k in chosen.class_ids.tolist()], np.int64)
 
 
-def crops_of(regions: Seen, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def crops_of(regions: VisibleBoxes, colors: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Crops of regions as a labeller sees them, and their names' indices."""
     regions, names = named(regions)
     rows = zip(regions.frames, regions.boxes_px, strict=True)

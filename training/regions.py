@@ -7,15 +7,16 @@ regions that a labeller is asked about, many are just that.
 from collections.abc import Iterator
 
 import numpy as np
-from wear import worsened
+from wear import degrade
 
 from ldo_service.geometry import Camera
-from ldo_service.regions.geometric_segmentation import segments
-from ldo_service.regions.region_proposals import TriggerConfig, regions_of_image
+from ldo_service.regions.geometric_segmentation import segment_geometry
+from ldo_service.regions.region_proposals import RegionProposalConfig, regions_of_image
 from ldo_service.synthetic.flat.render import Rendering
 from ldo_service.synthetic.flat.sensor import measured_depth_m
 
-TRIGGER = TriggerConfig(min_side_px=12)  # of frames half as wide as those that it is made for
+# of frames half as wide as those that it is made for
+TRIGGER = RegionProposalConfig(min_side_px=12)
 BLUR_PX = 4.0
 NO_THING = -1  # in place of a class
 OWN = 0.7  # share of a region that one thing has, to be that thing
@@ -29,7 +30,7 @@ def regions(frame: Rendering, lens: Camera, rng: np.random.Generator) -> Iterato
     sharp = np.floor(np.clip(frame.light, 0, 1) * 255 + 0.5).astype(np.uint8)
     measured_m = measured_depth_m(frame, lens.fx, rng)
     depth_m = np.where(measured_m > 0, measured_m, frame.depth_m).astype(np.float32)
-    shown = segments(worsened(sharp, rng, BLUR_PX), depth_m, lens, TRIGGER.segments)
+    shown = segment_geometry(degrade(sharp, rng, BLUR_PX), depth_m, lens, TRIGGER.segments)
     visible_px = np.bincount(frame.instance_ids.ravel())
     for region in regions_of_image(shown, depth_m.shape, TRIGGER):
         own = frame.instance_ids[region.part.image(depth_m.shape)]

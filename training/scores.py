@@ -10,7 +10,7 @@ import encoder
 import numpy as np
 import onnxruntime
 from crops import planes
-from views import Seen
+from views import VisibleBoxes
 
 import examples
 from ldo_service.synthetic.flat.scene_object import CLASS_NAMES
@@ -77,7 +77,9 @@ def find(network: onnxruntime.InferenceSession, color: np.ndarray) -> Found:
     return Found(np.clip(boxes, 0, [*FRAME_PX] * 2), scores[kept], class_ids[kept])
 
 
-def detection(found: Iterable[Found], seen: Seen, at: float = 0.25) -> dict[str, ClassScore]:
+def detection(
+    found: Iterable[Found], seen: VisibleBoxes, at: float = 0.25
+) -> dict[str, ClassScore]:
     """Per class, with boxes of `seen` in pixels of FRAME_PX; small objects count neither way."""
     frames = list(found)
     truth = of_coco(seen)
@@ -92,18 +94,18 @@ def mean_average_precision(scores: dict[str, ClassScore]) -> float:
     return float(np.mean([score.average_precision for score in scores.values()]))
 
 
-def of_coco(seen: Seen) -> Seen:
+def of_coco(seen: VisibleBoxes) -> VisibleBoxes:
     """The objects of the classes that the detector has, with its class ids."""
     own = {CLASS_NAMES.index(name): k for k, name in enumerate(cells.NAMES)}
     chosen = seen.chosen(np.array([k in own for k in seen.class_ids.tolist()]))
     return replace(chosen, class_ids=np.array([own[k] for k in chosen.class_ids.tolist()]))
 
 
-def _counts(truth: Seen) -> np.ndarray:
+def _counts(truth: VisibleBoxes) -> np.ndarray:
     return truth.pixels >= SHARE_MIN * FRAME_PX[0] * FRAME_PX[1]
 
 
-def _class_score(frames: list[Found], truth: Seen, class_id: int, at: float) -> ClassScore:
+def _class_score(frames: list[Found], truth: VisibleBoxes, class_id: int, at: float) -> ClassScore:
     """Boxes by falling score, each taking the free object that it overlaps most."""
     counts = _counts(truth)
     rows = []  # score, is a hit

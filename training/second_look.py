@@ -17,7 +17,7 @@ import numpy as np
 from cells import CELL_COUNT, INPUT_PX, NAMES, THINGS
 from crops import DEVIATION, MARGIN, MEAN, crop, enlarged
 from crops import INPUT_PX as CROP_PX
-from detector import First
+from detector import FirstStage
 from encoder import Pair, embedded
 from layers import Graph
 from onnx import TensorProto
@@ -28,7 +28,7 @@ DISTINCT_IOU = 0.7  # boxes that overlap more are looked at once
 FIRST_WEIGHT, SECOND_WEIGHT = 0.5, 0.6  # the best on the rooms for calibration
 
 
-def export(first: First, pair: Pair, scale: float, path: Path) -> None:
+def export(first: FirstStage, pair: Pair, scale: float, path: Path) -> None:
     """Write the detector; `scale` calibrates the pair's cosines."""
     graph = Graph(first.weights, first.statistics)
     # the first look
@@ -49,7 +49,7 @@ def export(first: First, pair: Pair, scale: float, path: Path) -> None:
 
 
 def output(
-    first: First, pair: Pair, scale: float, image: np.ndarray, is_chosen: np.ndarray
+    first: FirstStage, pair: Pair, scale: float, image: np.ndarray, is_chosen: np.ndarray
 ) -> np.ndarray:
     """The plain twin [N, 4 + C] for an image [H, W, 3] uint8; `is_chosen` [N] for a second look."""
     corners, fit, logits = (part[0] for part in first.look(image[None]))
@@ -140,6 +140,6 @@ def _write(graph: Graph, corners: str, cells: str, scores: str) -> None:
     scores = graph.node("Transpose", scores, perm=[1, 0])
     scores = graph.node("Unsqueeze", scores, graph.integers(0))
     low, high = graph.split(graph.node("Transpose", corners, perm=[0, 2, 1]), (2, 2))
-    centres = graph.node("Mul", graph.node("Add", low, high), graph.number(0.5))
+    centers = graph.node("Mul", graph.node("Add", low, high), graph.number(0.5))
     extents = graph.node("Sub", high, low)
-    graph.node("Concat", centres, extents, scores, axis=1, output="output0")
+    graph.node("Concat", centers, extents, scores, axis=1, output="output0")

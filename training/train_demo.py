@@ -34,12 +34,12 @@ import numpy as np
 import pair
 import scores
 import second_look
-from detector import First
+from detector import FirstStage
 from encoder import Pair
 from flat_frames import flat_frames
 from material import Rooms, render_all
-from views import Seen, Views
-from wear import worsened
+from views import Views, VisibleBoxes
+from wear import degrade
 
 TRAINING = Rooms(range(200, 488), 8)
 CALIBRATION = Rooms(range(160, 172), 12)
@@ -104,7 +104,7 @@ def start_logging() -> None:
     cv2.setNumThreads(1)
 
 
-def train_detector(work: Path, steps: Sequence[int]) -> First:
+def train_detector(work: Path, steps: Sequence[int]) -> FirstStage:
     start_logging()
     return detector.train(TRAINING.load(work), steps, SEED)
 
@@ -114,7 +114,7 @@ def train_encoder(work: Path, steps: Sequence[int]) -> Pair:
     return pair.train(TRAINING.load(work), steps, SEED)
 
 
-def export(first: First, both: Pair, work: Path, out: Path) -> None:
+def export(first: FirstStage, both: Pair, work: Path, out: Path) -> None:
     """Calibrate, write the files, and require that they tell what was trained."""
     views = CALIBRATION.load(work)
     colors = _as_recorded(views)
@@ -165,11 +165,11 @@ def score(work: Path, out: Path) -> dict:
 def _as_recorded(views: Views) -> list[np.ndarray]:
     """Frames made worse as a camera does, each in its own way, always the same."""
     return [
-        worsened(color, np.random.default_rng([SEED, 3, k])) for k, color in enumerate(views.colors)
+        degrade(color, np.random.default_rng([SEED, 3, k])) for k, color in enumerate(views.colors)
     ]
 
 
-def _scored(out: Path, colors: list[np.ndarray], seen: Seen) -> dict:
+def _scored(out: Path, colors: list[np.ndarray], seen: VisibleBoxes) -> dict:
     network = scores.session(out / "detector.onnx")
     found = [scores.find(network, color) for color in colors]
     scale = scores.FRAME_PX[0] / colors[0].shape[1]

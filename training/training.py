@@ -17,7 +17,7 @@ from threading import Thread
 import jax
 import numpy as np
 import optax
-from layers import Live, Statistics, Weights
+from layers import JaxNetwork, Statistics, Weights
 from optax.contrib import MuonDimensionNumbers, muon
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ ROUND_RATES = (1.0, 0.5)  # shares of the rate
 NEWTON_SCHULZ_STEPS = 3  # with the better start of Grishina et al., 2025, as good as 5
 ADAM_RMS = 0.2  # of its usual steps
 DECAY = 0.02  # of weights, times the rate
-LONGEST_STEP = 10.0  # norm of a gradient
+MAX_STEP = 10.0  # norm of a gradient
 REPORT_STEPS = 100
 MEAN_STEPS = 200  # that the weights are averaged over, about
 STATISTICS_BATCHES = 24  # that the normalisation's means and variances are taken over
@@ -50,7 +50,7 @@ def fit_in_rounds(
 def fit(loss: Callable, weights: Weights, batches: Iterable, steps: int, rate: float) -> Weights:
     """The running mean of weights after one step of descent of `loss(weights, batch)` a batch."""
     descent = optax.chain(
-        optax.clip_by_global_norm(LONGEST_STEP),
+        optax.clip_by_global_norm(MAX_STEP),
         muon(
             -1.0,  # the rate comes later: up the gradient until then
             ns_steps=NEWTON_SCHULZ_STEPS,
@@ -92,13 +92,13 @@ def pace(number: int, steps: int) -> float:
 
 
 def statistics(
-    network: Callable[[Live, np.ndarray], object], weights: Weights, inputs: Iterable
+    network: Callable[[JaxNetwork, np.ndarray], object], weights: Weights, inputs: Iterable
 ) -> Statistics:
     """Mean and variance of each normalised layer over some batches, for use after training."""
 
     @jax.jit
     def observe(batch):
-        live = Live(weights)
+        live = JaxNetwork(weights)
         network(live, batch)
         return live.observed
 

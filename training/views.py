@@ -28,7 +28,7 @@ PURITY = 0.8  # of such a window
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class VisibleBoxes:
     """B boxes in F frames.
 
     frames     [B] index of the frame
@@ -47,10 +47,10 @@ class Seen:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def chosen(self, which: np.ndarray) -> "Seen":
-        return Seen(*(getattr(self, name)[which] for name in self.__slots__))
+    def chosen(self, which: np.ndarray) -> "VisibleBoxes":
+        return VisibleBoxes(*(getattr(self, name)[which] for name in self.__slots__))
 
-    def scaled(self, scale: float) -> "Seen":
+    def scaled(self, scale: float) -> "VisibleBoxes":
         """In frames of another size."""
         return replace(self, boxes_px=self.boxes_px * scale, pixels=self.pixels * scale**2)
 
@@ -60,9 +60,9 @@ class Seen:
         return np.column_stack(columns)
 
     @staticmethod
-    def of(table: np.ndarray) -> "Seen":
+    def of(table: np.ndarray) -> "VisibleBoxes":
         ids = table[:, :3].astype(np.int64)
-        return Seen(*ids.T, table[:, 3:7], table[:, 7])
+        return VisibleBoxes(*ids.T, table[:, 3:7], table[:, 7])
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,15 +75,15 @@ class Views:
 
     colors: np.ndarray
     instances: np.ndarray
-    seen: Seen
-    regions: Seen
+    seen: VisibleBoxes
+    regions: VisibleBoxes
 
 
 def camera() -> Camera:
     """The flat's lens."""
     focal_px = FOCAL_PER_WIDTH * WIDTH_PX
-    centre_px = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
-    return Camera(WIDTH_PX, HEIGHT_PX, focal_px, focal_px, *centre_px)
+    center_px = (WIDTH_PX - 1) / 2, (HEIGHT_PX - 1) / 2
+    return Camera(WIDTH_PX, HEIGHT_PX, focal_px, focal_px, *center_px)
 
 
 def render(seed: int, count: int) -> Views:
@@ -118,13 +118,13 @@ def cached(folder: Path, seed: int, count: int) -> Views:
             regions=views.regions.table(),
         )
     with np.load(file) as stored:
-        tables = (Seen.of(stored[name]) for name in ("seen", "regions"))
+        tables = (VisibleBoxes.of(stored[name]) for name in ("seen", "regions"))
         return Views(stored["colors"], stored["instances"], *tables)
 
 
 def seen_in(
     planes: list[tuple[np.ndarray, np.ndarray]], rng: np.random.Generator | None = None
-) -> Seen:
+) -> VisibleBoxes:
     """Objects in frames of class and instance ids [H, W]; with `rng`, bare walls and floors too."""
     rows = [
         (frame, *row)
@@ -137,8 +137,8 @@ def seen_in(
     return _seen(rows)
 
 
-def _seen(rows: Sequence[tuple]) -> Seen:
-    return Seen.of(np.array(rows, float).reshape(-1, 8))
+def _seen(rows: Sequence[tuple]) -> VisibleBoxes:
+    return VisibleBoxes.of(np.array(rows, float).reshape(-1, 8))
 
 
 def _objects(class_ids: np.ndarray, instance_ids: np.ndarray) -> Iterator[tuple]:
@@ -167,11 +167,11 @@ def _poses(flat: Flat, count: int, rng: np.random.Generator) -> np.ndarray:
     """T_world_camera [count, 4, 4] of eyes where nothing stands; of a few that look anywhere, those
     before which most things are."""
     boxes = [thing.bounds_m for thing in flat.things]
-    centres_m = np.array([centre for centre, _ in boxes])
+    centers_m = np.array([center for center, _ in boxes])
     found = []
     for _ in range(count):
         glances = [_glance(flat, boxes, rng) for _ in range(GLANCES)]
-        found.append(max(glances, key=lambda T: _things_before(T, centres_m)))
+        found.append(max(glances, key=lambda T: _things_before(T, centers_m)))
     return np.array(found)
 
 
@@ -189,9 +189,9 @@ def _glance(
             return look_at(eye, eye + np.array([*way, rng.uniform(*GAZE_SLOPE)]))
 
 
-def _things_before(T_world_camera: np.ndarray, centres_m: np.ndarray) -> int:
+def _things_before(T_world_camera: np.ndarray, centers_m: np.ndarray) -> int:
     """How many have their middle in the image, and are near."""
-    x, y, z = ((centres_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
+    x, y, z = ((centers_m - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]).T
     half_x, half_y = 0.5 / FOCAL_PER_WIDTH, 0.5 * HEIGHT_PX / WIDTH_PX / FOCAL_PER_WIDTH
     is_near = (z > 0) & (z < NEAR_M)
     return int(np.sum(is_near & (np.abs(x) < half_x * z) & (np.abs(y) < half_y * z)))

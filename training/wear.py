@@ -13,7 +13,7 @@ REPAINTED_SHARE = 0.6  # of objects
 REPAINT, REPAINT_TINT, REPAINT_MOST = 0.35, 0.25, 2.5  # deviations of logarithms; largest factor
 
 
-def worsened(image: np.ndarray, rng: np.random.Generator, blur_px: float = BLUR_PX) -> np.ndarray:
+def degrade(image: np.ndarray, rng: np.random.Generator, blur_px: float = BLUR_PX) -> np.ndarray:
     """A frame [H, W, 3] uint8 of another exposure and tint, blurred by motion, with noise."""
     values = image.astype(np.float32)
     if rng.random() < SWAP_SHARE:
@@ -32,7 +32,7 @@ def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
     return DRAWN[start : start + count].reshape(shape)
 
 
-def repainted(image: np.ndarray, plane: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def recolor(image: np.ndarray, plane: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A frame [H, W, 3] uint8 whose objects, ids in `plane`, have other brightness and hue."""
     factors = np.exp(
         REPAINT * rng.standard_normal((256, 1)) + REPAINT_TINT * rng.standard_normal((256, 3))

@@ -12,7 +12,7 @@ from ldo_service.schemas import CameraModel, CameraRgbd, Image
 
 WAIT_MS = 5000  # for a frame: the first may take two seconds
 GRID = 16, 12  # points over the image that the lens is fitted at
-WORST_FIT_PX = 0.5  # of OpenCV's lens against the device's own
+MAX_FIT_PX = 0.5  # of OpenCV's lens against the device's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def camera_model(rs: Any, intrinsics: Any) -> CameraModel:
     if any(intrinsics.coeffs):
         seen, x, y = _seen_through(rs, intrinsics)
         distortion, error_px = _fitted(seen, x, y, max(fx, fy))
-        if error_px > WORST_FIT_PX:
+        if error_px > MAX_FIT_PX:
             raise ConfigError(
                 f"the lens of this RealSense ({intrinsics.model}) differs from OpenCV's model by "
                 f"{error_px:.1f} px: it is too wide for this."

@@ -14,7 +14,7 @@ from threading import Condition
 import zenoh
 
 from ldo_service.errors import ConfigError, FrameError
-from ldo_service.geometry.stamps import Pairing
+from ldo_service.geometry.stamps import StreamPairer
 from ldo_service.schemas import CameraModel, CameraRgbd
 
 from .ros_messages import (
@@ -31,7 +31,7 @@ KEEP = 4  # samples of a topic that wait: a burst, as the service's own input ke
 PAIR_BUFFER = 8  # halves that wait for the other: 0.27 s at 30 Hz
 RESTARTED_AFTER_NS = 1_000_000_000  # a stamp so much earlier is no jitter
 SILENT_AFTER_S = 5.0  # what does not come is said so often
-MOST_REASONS = 20  # that are said; a stream of garbage has a new one each time
+MAX_REASONS = 20  # that are said; a stream of garbage has a new one each time
 Say = Callable[[str], None]
 
 
@@ -140,7 +140,7 @@ class RosCamera:
         except FrameError as error:
             self.rejected += 1
             reason = f"{topic}: {str(error)[:30]}"
-            if reason not in self._reasons and len(self._reasons) < MOST_REASONS:
+            if reason not in self._reasons and len(self._reasons) < MAX_REASONS:
                 self._say(f"{topic}: {error} Further ones are only counted.")
                 self._reasons.add(reason)
 
@@ -154,7 +154,7 @@ class RosCamera:
             depth = read_depth(body, topic)
             yield from self._pairing_at(depth.stamp_ns).add_b(depth)
 
-    def _pairing_at(self, stamp_ns: int) -> Pairing[RosImage, RosImage]:
+    def _pairing_at(self, stamp_ns: int) -> StreamPairer[RosImage, RosImage]:
         """A new one where a driver that started again, or a bag, counts from an earlier time."""
         if stamp_ns < self._newest_ns - RESTARTED_AFTER_NS:
             self._say("stamps went back: the camera has started again.")
@@ -162,8 +162,8 @@ class RosCamera:
         self._newest_ns = max(self._newest_ns, stamp_ns)
         return self._pairing
 
-    def _new_pairing(self) -> Pairing[RosImage, RosImage]:
-        return Pairing(round(self._topics.max_skew_s * 1e9), PAIR_BUFFER)
+    def _new_pairing(self) -> StreamPairer[RosImage, RosImage]:
+        return StreamPairer(round(self._topics.max_skew_s * 1e9), PAIR_BUFFER)
 
     def _frame(self, color: RosImage, depth: RosImage) -> CameraRgbd:
         if self._camera is None:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ldo_service.errors import ConfigError, FrameError
-from ldo_service.geometry.codecs import announced_size
+from ldo_service.geometry.codecs import read_image_size
 from ldo_service.schemas import CameraModel, CameraRgbd, Image
 from ldo_service.schemas.frames import MAX_PIXELS, ImageEncoding
 
@@ -181,7 +181,7 @@ def _pixels(message: Any, dtype: np.dtype, channels: int) -> np.ndarray:
 def _compressed(message: Any, start: int, depth_scale: float = 1.0) -> RosImage:
     """Passed on as it is: the service decompresses it."""
     data = memoryview(message.data.tobytes())[start:]
-    size = announced_size(data)
+    size = read_image_size(data)
     if size is None:
         raise FrameError(
             f"{len(data)} bytes, said to be {message.format[:40]!r}, are neither PNG nor JPEG."

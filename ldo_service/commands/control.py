@@ -6,10 +6,10 @@ import tyro
 
 from ldo_service.client import Client, connect
 from ldo_service.errors import ConfigError, StageError
-from ldo_service.schemas.map import MOST_ITERATIONS
+from ldo_service.schemas.map import MAX_ITERATIONS
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-from .options import Endpoint, KeysFolder, Robot
+from .options import EndpointAddress, KeysFolder, Robot
 
 Verb = Annotated[
     Literal["pause", "resume", "save", "reset", "refine", "add-label"],
@@ -25,7 +25,7 @@ Name = Annotated[
     str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help="of add-label, such as samovar")
 ]
 Iterations = Annotated[
-    int, tyro.conf.arg(metavar="N", help=f"of refine, at most {MOST_ITERATIONS} at a time")
+    int, tyro.conf.arg(metavar="N", help=f"of refine, at most {MAX_ITERATIONS} at a time")
 ]
 
 
@@ -33,7 +33,7 @@ def control(
     verb: Verb,
     name: Name = "",
     robot: Robot = "robot",
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
     iterations: Iterations = 200,
 ) -> None:
@@ -55,7 +55,7 @@ def control(
             names = service.add_label(name)
             print(f"{name} is added: regions are named from {len(names)} names.")
         else:
-            obey(service, verb)
+            run_control_verb(service, verb)
 
 
 def ask_to_refine(service: Client, iterations: int) -> None:
@@ -67,7 +67,7 @@ def ask_to_refine(service: Client, iterations: int) -> None:
     print(f"the mapper was asked for {iterations} iterations.")
 
 
-def obey(service: Client, verb: str) -> None:
+def run_control_verb(service: Client, verb: str) -> None:
     """Raises StageError when an actor does not."""
     answer = service.control(verb)
     if not answer.ok:

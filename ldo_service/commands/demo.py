@@ -14,8 +14,8 @@ from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.evaluation.results import Results, evaluate_run, work
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
-from ldo_service.runs.job import Job
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.job import RunOptions
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.records import read_objects
 from ldo_service.runs.source import Selection
 from ldo_service.schemas import MapObjects
@@ -51,9 +51,9 @@ def demo(
     prepare(out, overwrite)
     with progress("ray casting", FRAMES, console) as advance:
         prerender(sequence.config, min(os.cpu_count() or 1, PROCESSES), range(FRAMES), advance)
-    job = Job(sequence, out, demo_config(), Selection(max_frames=FRAMES), console.print)
+    job = RunOptions(sequence, out, demo_config(), Selection(max_frames=FRAMES), console.print)
     with progress("tracking and mapping", job.work, console) as advance:
-        record = run_over_file(job, advance)
+        record = run_offline(job, advance)
     run, threads = read_run(out), actor_parameters(job.config).mapper.thread_count()
     with progress("judging", work(run, sequence), console) as advance:
         results = evaluate_run(run, sequence, advance, threads=threads)

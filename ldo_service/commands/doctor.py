@@ -19,10 +19,10 @@ from ldo_service.detection.model_registry import Models
 from ldo_service.errors import ConfigError, LdoError, ModelError
 from ldo_service.schemas import Health
 from ldo_service.schemas.topics import HEALTH
-from ldo_service.service.diagnostics import Seen, remarks, troubles
+from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-from .options import Endpoint, KeysFolder, Robot
+from .options import EndpointAddress, KeysFolder, Robot
 
 LIBRARIES = {  # name on the package index: name to import
     "numpy": "numpy",
@@ -59,7 +59,7 @@ class Finding:
 
 
 def doctor(
-    robot: Robot = "robot", endpoint: Endpoint = DEFAULT_ENDPOINT, keys: KeysFolder = None
+    robot: Robot = "robot", endpoint: EndpointAddress = DEFAULT_ENDPOINT, keys: KeysFolder = None
 ) -> None:
     """Say what this machine has, what is missing and how to get it, and how a running service is.
 
@@ -150,39 +150,41 @@ def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
         yield from of_actor(actor)
 
 
-def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[Seen]:
+def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatus]:
     """Every actor of the graph, listened to for a while. Raises ConfigError when nobody answers."""
     heard: dict[str, tuple[float, Health]] = {}
     with (
         connect(robot, endpoint, keys) as client,
-        client.listen(HEALTH.subscribed_as, Health) as inbox,
+        client.poller(HEALTH.subscription_key, Health) as inbox,
     ):
         until_s = time.monotonic() + LISTEN_S
         while time.monotonic() < until_s:
             for health in inbox():
                 heard[health.actor] = (time.monotonic(), health)
             time.sleep(0.05)
-        alive, now_s = client.alive(), time.monotonic()
+        alive, now_s = client.live_actors(), time.monotonic()
     names = [box.name for box in GRAPH]
     names += sorted((set(heard) | alive) - set(names))  # of a later version
     return [_seen(name, name in alive, heard.get(name), now_s) for name in names]
 
 
-def _seen(name: str, has_token: bool, last: tuple[float, Health] | None, now_s: float) -> Seen:
+def _seen(
+    name: str, has_token: bool, last: tuple[float, Health] | None, now_s: float
+) -> ActorStatus:
     if last is None:
-        return Seen(name, has_token, None, LISTEN_S)
+        return ActorStatus(name, has_token, None, LISTEN_S)
     heard_at_s, health = last
-    return Seen(name, has_token, health, LISTEN_S, heartbeat_age_s=now_s - heard_at_s)
+    return ActorStatus(name, has_token, health, LISTEN_S, heartbeat_age_s=now_s - heard_at_s)
 
 
-def of_actor(actor: Seen) -> Iterator[Finding]:
+def of_actor(actor: ActorStatus) -> Iterator[Finding]:
     """How it is, then what is wrong with it."""
-    wrong = list(troubles(actor))
+    wrong = list(diagnose(actor))
     if actor.health is not None:
         yield Finding("bad" if wrong else "ok", _in_numbers(actor.health))
     for trouble in wrong:
         yield Finding("bad", f"{actor.actor} {trouble}")
-    for remark in remarks(actor):
+    for remark in notes(actor):
         yield Finding("note", f"{actor.actor} {remark}")
 
 

@@ -13,14 +13,14 @@ from rich.table import Table
 
 from ldo_service.config import Config, actor_parameters, load_config
 from ldo_service.evaluation import loops, semantics, trajectory, views
-from ldo_service.evaluation.label_measures import Found
+from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.loops import LoopErrors
 from ldo_service.evaluation.lpips import Lpips
-from ldo_service.evaluation.results import Results, evaluate_run, plain, work
+from ldo_service.evaluation.results import Results, evaluate_run, to_json, work
 from ldo_service.evaluation.semantics import GATES, LabelErrors
 from ldo_service.evaluation.trajectory import TrajectoryErrors
 from ldo_service.evaluation.views import RenderingErrors
-from ldo_service.runs.finished import read_run, written
+from ldo_service.runs.finished import read_run, require_file
 from ldo_service.runs.source import open_source
 
 from .options import Json, Source, progress
@@ -66,7 +66,7 @@ def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
     return table
 
 
-def _shares(found: Found, what: str) -> tuple[str, str]:
+def _shares(found: DetectionCounts, what: str) -> tuple[str, str]:
     return (
         f"{_percent(found.recall)} of {found.wanted:,} {what}",
         f"{_percent(found.precision)} of {found.named:,}",
@@ -116,14 +116,14 @@ def evaluate(
         results = evaluate_run(run, sequence, advance, distance=distance, threads=threads)
     if json_:
         told = {"lpips": lpips and str(lpips), "labelled_by": labelled_by(config)}
-        print(json.dumps({**plain(results), **told}, indent=1))
+        print(json.dumps({**to_json(results), **told}, indent=1))
     else:
         print_results(results, lpips, config)
 
 
 def run_config(folder: Path) -> Config:
     """The configuration that a run was made with."""
-    return load_config(written(folder, "config.yaml"))
+    return load_config(require_file(folder, "config.yaml"))
 
 
 def labelled_by(config: Config) -> dict[str, str]:

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.storage.yaml_io import plain_text
+from ldo_service.storage.yaml_io import dump_yaml
 from ldo_service.transport.access_control import EVERY_ROBOT, Access, Role, read_access
 from ldo_service.transport.endpoint import CLOSED, MAX_MESSAGE_MB
 from ldo_service.transport.keys import ACCESS, router_settings
@@ -113,21 +113,21 @@ def keys(verb: Verb) -> None:
         access = read_access(verb.folder / ACCESS)
         print(router_yaml(access, verb.keys, verb.port), end="")
         return
-    from ldo_service.transport.certificate_authority import Authority
+    from ldo_service.transport.certificate_authority import CertificateAuthority
 
     match verb:
         case New():
-            Authority.new(verb.folder, verb.days)
+            CertificateAuthority.new(verb.folder, verb.days)
             print(f"{verb.folder} is an authority: `ldo keys add` makes keys. ca.key stays here.")
         case Add():
-            authority = Authority(verb.folder)
+            authority = CertificateAuthority(verb.folder)
             made = authority.add(verb.name, verb.role, verb.robot, verb.days, verb.host)
             print(f"{made} is what {verb.name} needs: copy it there, for --keys.")
         case List():
-            table = _table(Authority(verb.folder))
+            table = _table(CertificateAuthority(verb.folder))
             Console(highlight=False, markup=False, soft_wrap=True).print(table)
         case Remove():
-            Authority(verb.folder).remove(verb.name)
+            CertificateAuthority(verb.folder).remove(verb.name)
             print(
                 f"{verb.name} may do nothing any more, where services have the new {ACCESS} and "
                 "were started anew."
@@ -150,7 +150,7 @@ def router_yaml(access: Access, folder: Path, port: int) -> str:
         for name in sections:
             section = section.setdefault(name, {})
         section[last] = value
-    return plain_text(file, flow=None, width=100)
+    return dump_yaml(file, flow=None, width=100)
 
 
 def _table(authority: Any) -> Table:

@@ -15,7 +15,7 @@ from ldo_service.client import Client
 from ldo_service.errors import ConfigError
 from ldo_service.runs.source import Selection
 from ldo_service.schemas import CameraRgbd
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 
 REALSENSE, ROS2 = "realsense", "ros2"
@@ -83,7 +83,7 @@ class RosOptions:
 
 
 def frames_of_ros(
-    options: RosOptions, service: Network, say: Say
+    options: RosOptions, service: Endpoint, say: Say
 ) -> Generator[CameraRgbd, None, None]:
     """Raises ConfigError where nobody could get them."""
     if service.keys is not None and not options.bridge:
@@ -92,12 +92,12 @@ def frames_of_ros(
             "router of its own, and name its address with --bridge."
         )
     camera = RosCamera(options.topics(), say)
-    bridge = Network(service.robot, options.bridge or service.endpoint)
-    return _told_at_the_end(camera, bridge, say)
+    bridge = Endpoint(service.robot, options.bridge or service.endpoint)
+    return _report_at_end(camera, bridge, say)
 
 
-def _told_at_the_end(
-    camera: RosCamera, bridge: Network, say: Say
+def _report_at_end(
+    camera: RosCamera, bridge: Endpoint, say: Say
 ) -> Generator[CameraRgbd, None, None]:
     with open_session(bridge) as session:
         try:
@@ -119,7 +119,7 @@ def relay(
     service: Client, frames: Iterable[CameraRgbd], chosen: Selection, restamp: bool, say: Say
 ) -> None:
     """Send every n-th frame, until there are `chosen.max_frames`, or Ctrl-C."""
-    if not service.wait_until_heard():
+    if not service.wait_for_subscriber():
         say("nobody listens to camera/rgbd yet: is the service of this robot running?")
     sent = 0
     try:

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from ldo_service import demo_networks
 from ldo_service.detection.detectors import NetworkConfig
-from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, Pair
+from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, EncoderFiles
 from ldo_service.detection.model_registry import Model, Models
 from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, LdoError, ModelError
@@ -66,12 +66,12 @@ class Add:
     def is_pair(self) -> bool:
         return any((self.text, self.vocabulary, self.embeddings))
 
-    def pair(self) -> Pair:
+    def pair(self) -> EncoderFiles:
         """Raises ConfigError for half a pair."""
         files = self.file, self.text, self.vocabulary, self.embeddings
         image, text, vocabulary, embeddings = (file and file.expanduser() for file in files)
         assert image is not None
-        return Pair(image, text, vocabulary, embeddings)
+        return EncoderFiles(image, text, vocabulary, embeddings)
 
 
 @dataclass(frozen=True)
@@ -124,15 +124,15 @@ def add(verb: Add) -> None:
 
 def _add_detector(verb: Add) -> Model:
     config = NetworkConfig(layout=verb.layout or "", names=verb.names)
-    return Models().add(verb.name, verb.file.expanduser(), config, _licence(verb.licence))
+    return Models().add(verb.name, verb.file.expanduser(), config, _license(verb.licence))
 
 
 def _add_pair(verb: Add) -> Model:
     if verb.layout:
         raise ConfigError(f"--layout {verb.layout} is of a detector, and a pair was named.")
     names = read_names(Path(verb.names).expanduser()) if verb.names else ()
-    licence = _licence(verb.licence)
-    return Models().add_pair(verb.name, verb.pair(), DualEncoderConfig(), names, licence)
+    license = _license(verb.licence)
+    return Models().add_pair(verb.name, verb.pair(), DualEncoderConfig(), names, license)
 
 
 def show(console: Console) -> None:
@@ -144,9 +144,9 @@ def show(console: Console) -> None:
             model = registered.get(name)
             model.verify()
             about = model.about
-            licence = (about.licence.strip().splitlines() or ["not stated"])[0]
+            license = (about.licence.strip().splitlines() or ["not stated"])[0]
             table.add_row(
-                *(name, about.layout, str(len(about.classes)), licence[:40]),
+                *(name, about.layout, str(len(about.classes)), license[:40]),
                 *(about.sha256[:12], "ok"),
             )
         except ModelError:
@@ -161,7 +161,7 @@ def show(console: Console) -> None:
         raise LdoError(f"{damaged} of the above must be removed and added again.")
 
 
-def _licence(text: str) -> str:
+def _license(text: str) -> str:
     """The text of a file, or the text itself."""
     path = Path(text)
     try:

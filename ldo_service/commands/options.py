@@ -64,7 +64,7 @@ StateFolder = Annotated[
         "temporary folder",
     ),
 ]
-Localise = Annotated[
+Localize = Annotated[
     Path | None,
     tyro.conf.arg(
         metavar="DIR",
@@ -74,7 +74,7 @@ Localise = Annotated[
 Robot = Annotated[
     str, tyro.conf.arg(metavar="NAME", help="second part of every topic: ldo/NAME/...")
 ]
-Endpoint = Annotated[
+EndpointAddress = Annotated[
     str, tyro.conf.arg(metavar="ADDRESS", help="where the service's router listens")
 ]
 KeysFolder = Annotated[
@@ -89,7 +89,7 @@ Overwrite = Annotated[bool, tyro.conf.arg(help="replace an earlier run in the fo
 Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing else")]
 
 
-def localising(config: Config, folder: Path | None) -> Config:
+def localizing(config: Config, folder: Path | None) -> Config:
     """The configuration with --localise. Raises DataError for a folder without a map."""
     if folder is None:
         return config

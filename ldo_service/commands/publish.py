@@ -12,12 +12,12 @@ from rich.console import Console
 from ldo_service.cameras import realsense
 from ldo_service.client import Client, connect
 from ldo_service.config import load_config
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry.sequence import Sequence
 from ldo_service.runs.source import Selection, open_source
-from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Network
-from ldo_service.transport.keys import Keys
+from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
+from ldo_service.transport.keys import TlsKeys
 
 from .live_camera import (
     REALSENSE,
@@ -28,7 +28,16 @@ from .live_camera import (
     relay,
     require_no_sequence,
 )
-from .options import ConfigFile, Endpoint, KeysFolder, MaxFrames, Robot, Settings, Stride, progress
+from .options import (
+    ConfigFile,
+    EndpointAddress,
+    KeysFolder,
+    MaxFrames,
+    Robot,
+    Settings,
+    Stride,
+    progress,
+)
 
 FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
 MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad
@@ -41,7 +50,7 @@ def publish(
         tyro.conf.arg(metavar="SOURCE", help="a data set, as of `ldo run`; `realsense`; or `ros2`"),
     ],
     robot: Robot = "robot",
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
     rate: Annotated[
         float | None, tyro.conf.arg(metavar="HZ", help="frames per second; default: as recorded")
@@ -71,7 +80,7 @@ def publish(
     console = Console(stderr=True, highlight=False, soft_wrap=True)
     if source in (REALSENSE, ROS2):
         require_no_sequence(source, rate=rate, config=config, set=set)
-        network, chosen = Network(robot, endpoint, Keys.of(keys)), Selection(stride, max_frames)
+        network, chosen = Endpoint(robot, endpoint, TlsKeys.of(keys)), Selection(stride, max_frames)
         live = (
             realsense.frames(usb.stream())
             if source == REALSENSE
@@ -88,7 +97,7 @@ def publish(
         connect(robot, endpoint, keys) as service,
         progress("publish", len(indices), console) as advance,
     ):
-        service.wait_until_heard()
+        service.wait_for_subscriber()
         camera = Camera(service, sequence, restamp, console.print)
         for done, index in enumerate(paced(sequence, indices, rate), 1):
             camera.send(index)
@@ -111,7 +120,7 @@ class Camera:
     def send(self, index: int) -> None:
         self._notice_listeners()
         try:
-            message = camera_rgbd_message(self._sequence.read(index))
+            message = raw_frame_to_message(self._sequence.read(index))
         except FrameError as error:
             if self.bad == 0:
                 self._say(f"{error} It is left out; further bad frames are only counted.")
@@ -124,7 +133,7 @@ class Camera:
         self.unheard += not self._was_heard
 
     def _notice_listeners(self) -> None:
-        is_heard = self._service.is_heard
+        is_heard = self._service.has_subscriber
         if self._was_heard and not is_heard:
             self._say("nobody listens to camera/rgbd: is the service still running?")
         self._was_heard = is_heard

@@ -14,19 +14,19 @@ from rich.table import Table
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.client import connect
 from ldo_service.config import actor_parameters, load_config
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
 from ldo_service.detection.model_registry import open_labeller
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
-from ldo_service.maps.object_search import Answer, answer
+from ldo_service.maps.object_search import ObjectMatch, find_objects
 from ldo_service.runs.records import read_objects
 from ldo_service.schemas import MapObjects, TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
-from ldo_service.semantics.text_search import Encode, NotCompared
+from ldo_service.semantics.text_search import Encode, TextComparisonError
 from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-from .options import Endpoint, Json, KeysFolder, Robot
+from .options import EndpointAddress, Json, KeysFolder, Robot
 
 LIVE = "live"
 
@@ -39,7 +39,7 @@ def query(
     ],
     text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT", help="its name")],
     robot: Robot = "robot",
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
     model: Annotated[
         str,
@@ -63,7 +63,7 @@ def query(
     is_live = where == LIVE
     found, eye = _live(robot, endpoint, keys) if is_live else _of_run(Path(where).expanduser())
     encode = _texts_of(model, None if is_live else Path(where).expanduser())
-    answers = answer(text, found, eye, encode)
+    answers = find_objects(text, found, eye, encode)
     if json_:
         print(json.dumps([_plain(one) for one in answers]))
     else:
@@ -80,13 +80,13 @@ def _of_run(folder: Path) -> tuple[MapObjects, np.ndarray | None]:
 def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.ndarray | None]:
     """The objects, and where the camera is."""
     with connect(robot, endpoint, keys) as service:
-        found, poses = service.objects(), service.last(POSE_TRACKED)
+        found, poses = service.objects(), service.latest(POSE_TRACKED)
     eye = None
     for pose in poses:
         assert isinstance(pose, TrackedPose)
         if pose.segment:
             continue  # where that is in the map is not known
-        eye = (transform(pose.T_map_odom) @ transform(pose.T_odom_camera))[:3, 3]
+        eye = (pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera))[:3, 3]
     return found, eye
 
 
@@ -99,11 +99,11 @@ def _texts_of(model: str, run: Path | None) -> Encode:
             return open_labeller(model, DualEncoderConfig()).texts.encode(texts)
         had = None if run is None else _labeller_of(run)
         if had is None:
-            raise NotCompared("`--model NAME` names a pair of encoders that can.")
+            raise TextComparisonError("`--model NAME` names a pair of encoders that can.")
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)
         except ConfigError as error:
-            raise NotCompared(f"{error} `--model NAME` names another pair.") from error
+            raise TextComparisonError(f"{error} `--model NAME` names another pair.") from error
 
     return encode
 
@@ -117,11 +117,13 @@ def _labeller_of(run: Path) -> VlmLabellerConfig | None:
     try:
         config = actor_parameters(load_config(run / "config.yaml")).vlm_labeller
     except ConfigError as error:
-        raise NotCompared(f"{run / 'config.yaml'}: {error} `--model NAME` names a pair.") from error
+        raise TextComparisonError(
+            f"{run / 'config.yaml'}: {error} `--model NAME` names a pair."
+        ) from error
     return config if config.model else None
 
 
-def _plain(one: Answer) -> dict[str, object]:
+def _plain(one: ObjectMatch) -> dict[str, object]:
     pose = one.T_map_object
     return {
         **{name: value for name, value in asdict(one).items() if name != "T_map_object"},
@@ -129,7 +131,7 @@ def _plain(one: Answer) -> dict[str, object]:
     }
 
 
-def _table(answers: list[Answer]) -> Table:
+def _table(answers: list[ObjectMatch]) -> Table:
     table = Table("id", "name", "score", "centre m", "size m", "distance m")
     for one in answers:
         away = "" if one.distance is None else f"{one.distance:.2f}"

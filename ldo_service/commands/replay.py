@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.recordings.replay import Replayed
+from ldo_service.recordings.replay import ReplayReport
 from ldo_service.runs.replayed import RecordedActor, open_recording
 
 from .options import Recording, progress
@@ -44,7 +44,7 @@ def replay(
 
 def _replay(
     recorded: RecordedActor, verify: bool, console: Console, advance: Callable[[], None]
-) -> Replayed:
+) -> ReplayReport:
     replayed = recorded.replay(advance)
     for note in replayed.notes:
         console.print(f"note: {note}", soft_wrap=True)
@@ -55,7 +55,7 @@ def _replay(
     return replayed
 
 
-def _table(rows: list[Replayed]) -> Table:
+def _table(rows: list[ReplayReport]) -> Table:
     table = Table("actor", "steps", "took", "made", "same")
     for row in rows:
         same = "yes" if row.difference is None else f"until\n{row.difference.step}"
@@ -64,7 +64,7 @@ def _table(rows: list[Replayed]) -> Table:
     return table
 
 
-def _life(row: Replayed) -> Iterator[str]:
+def _life(row: ReplayReport) -> Iterator[str]:
     """Its name, and what did not go smoothly."""
     yield row.actor
     if row.starts != 1:

@@ -14,22 +14,22 @@ from ldo_service.config import Config, checked, load_config
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Trajectory
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.runs.folder import RunFolder, prepare
+from ldo_service.runs.folder import RunWriter, prepare
 from ldo_service.runs.front_end import FrontEnd
-from ldo_service.runs.job import Advance, Job
-from ldo_service.runs.offline import run_over_file
-from ldo_service.runs.realtime import run_in_real_time
+from ldo_service.runs.job import Advance, RunOptions
+from ldo_service.runs.offline import run_offline
+from ldo_service.runs.realtime import run_realtime
 from ldo_service.runs.source import Selection, open_source
 
 from .options import (
     ConfigFile,
-    Localise,
+    Localize,
     MaxFrames,
     Overwrite,
     Settings,
     Source,
     Stride,
-    localising,
+    localizing,
     progress,
     with_usable_networks,
 )
@@ -59,7 +59,7 @@ def run(
             metavar="N", help="fit the map for N more iterations at the end, into DIR/refined"
         ),
     ] = 0,
-    localise: Localise = None,
+    localise: Localize = None,
     prior: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -103,12 +103,12 @@ def run(
     require_separate(localise, out, refine)
     console = Console(stderr=True)
     settings = with_options(load_config(config, set), hold_out, threads)
-    settings = localising(settings, localise)
+    settings = localizing(settings, localise)
     with_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.dataset.options())
-    job = Job(
+    job = RunOptions(
         *(sequence, out, settings, selection, console.print),
         refine=refine,
         prior=Trajectory.load(prior) if prior else None,
@@ -116,15 +116,17 @@ def run(
         keep_front_end=keep_front_end,
     )
     prepare(out, overwrite)
-    record = carried_out(job, run_in_real_time if realtime else run_over_file, console)
+    record = execute(job, run_realtime if realtime else run_offline, console)
     Console().print(summary_table(record.summary, out))
     if record.summary["gaussians_apart"]:
-        Console().print(apart(record.summary["gaussians_apart"]), style="dim")
+        Console().print(format_unmerged(record.summary["gaussians_apart"]), style="dim")
     if localise:
-        Console().print(localised(record.statuses, localise), style="dim")
+        Console().print(format_localization(record.statuses, localise), style="dim")
 
 
-def carried_out(job: Job, go: Callable[[Job, Advance], RunFolder], console: Console) -> RunFolder:
+def execute(
+    job: RunOptions, go: Callable[[RunOptions, Advance], RunWriter], console: Console
+) -> RunWriter:
     with progress("run", job.work, console) as advance:
         try:
             return go(job, advance)
@@ -145,14 +147,14 @@ def kept_front_end(
     return FrontEnd.open(run, settings, sequence, selection)
 
 
-def apart(gaussians: int) -> str:
+def format_unmerged(gaussians: int) -> str:
     return (
         f"map.ply leaves out {gaussians:,} Gaussians: the camera was lost, went on, and nothing it "
         "saw from then on was recognised, so where they belong is not known."
     )
 
 
-def localised(statuses: dict[str, int], folder: Path) -> str:
+def format_localization(statuses: dict[str, int], folder: Path) -> str:
     if statuses["OK"] + statuses["WEAK"] == 0:
         return (
             f"No frame was recognised: is {folder} a map of this place, seen from about the same "
@@ -178,11 +180,11 @@ def require_none_of(option: str, is_given: object, others: Mapping[str, object])
         raise ConfigError(f"{option} and {wrong[0]} do not go together: leave one of them out.")
 
 
-def require_separate(localise: Path | None, out: Path, refine: int) -> None:
+def require_separate(localize: Path | None, out: Path, refine: int) -> None:
     """A map that is localised in stays as it is."""
-    if localise and refine:
+    if localize and refine:
         raise ConfigError("--localise leaves the map as it is: leave out --refine.")
-    if localise and localise.expanduser().resolve() == out.expanduser().resolve():
+    if localize and localize.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(f"--out {out} would replace the map to localise in: choose another.")
 
 

@@ -9,19 +9,19 @@ import tyro
 from ldo_service.config import load_config
 from ldo_service.service.service import Service
 from ldo_service.service.state_folder import state_folder
-from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Network
-from ldo_service.transport.keys import Keys
+from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
+from ldo_service.transport.keys import TlsKeys
 
 from .options import (
     ConfigFile,
-    Endpoint,
+    EndpointAddress,
     KeysFolder,
-    Localise,
+    Localize,
     Only,
     Robot,
     Settings,
     StateFolder,
-    localising,
+    localizing,
 )
 
 WithoutKeys = Annotated[
@@ -39,12 +39,12 @@ Metrics = Annotated[
 
 def serve(
     robot: Robot = "robot",
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     only: Only = (),
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
-    localise: Localise = None,
+    localise: Localize = None,
     record: Annotated[
         Path | None,
         tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
@@ -61,9 +61,9 @@ def serve(
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
-    settings = localising(load_config(config, set), localise)
-    folder_of_keys = Keys.of(keys or settings.service.keys or None)
-    network = Network(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
+    settings = localizing(load_config(config, set), localise)
+    folder_of_keys = TlsKeys.of(keys or settings.service.keys or None)
+    network = Endpoint(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
     is_router = not (only or join)
     if is_router and not without_keys:
         network.require_safe()
@@ -88,12 +88,12 @@ def record(
         tyro.conf.arg(metavar="DIR", help="new folder: a file per actor, in the MCAP format"),
     ],
     robot: Robot = "robot",
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     only: Only = (),
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
-    localise: Localise = None,
+    localise: Localize = None,
     keys: KeysFolder = None,
     without_keys: WithoutKeys = False,
     join: Join = False,

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ldo_service.config import load_config
-from ldo_service.runs.simulation import Made, simulate_graph
+from ldo_service.runs.simulation import ActorDigest, simulate_graph
 from ldo_service.runs.source import Selection, open_source
 
 from .options import (
@@ -56,7 +56,7 @@ def simulate(
         Console().print(_table(made))
 
 
-def _table(made: dict[str, Made]) -> Table:
+def _table(made: dict[str, ActorDigest]) -> Table:
     table = Table("actor", "messages", "digest")
     for actor, digest in made.items():
         table.add_row(actor, str(digest.messages), digest.digest)

@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.suites import Entry, Work, load_suite, markdown
+from ldo_service.suites import SuiteRun, SuiteRunner, load_suite, markdown
 
 from .options import Overwrite, Settings
 
@@ -40,12 +40,12 @@ def suite(
       ldo suite my-suite.yaml --data ~/data --out suites/mine
     """
     chosen = load_suite(name)
-    work = Work(chosen, data.expanduser(), out.expanduser(), set, overwrite)
+    work = SuiteRunner(chosen, data.expanduser(), out.expanduser(), set, overwrite)
     _require_folder(work.out)
     console, total = Console(stderr=True), len(work.entries())
-    done: list[Entry] = []
+    done: list[SuiteRun] = []
 
-    def begun(entry: Entry) -> None:
+    def begun(entry: SuiteRun) -> None:
         done.append(entry)
         console.print(f"{len(done)} of {total}: {entry.folder}", highlight=False)
 

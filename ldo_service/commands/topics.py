@@ -7,7 +7,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from ldo_service.actors.topology import consumers_of, drawing, producer_of, topics_table
+from ldo_service.actors.topology import consumers_of, mermaid_diagram, producer_of, topics_table
 from ldo_service.schemas.json_schema import json_schema
 from ldo_service.schemas.topics import TOPICS
 
@@ -35,7 +35,7 @@ def topics(
     elif markdown:
         print(topics_table())
     elif mermaid:
-        print(drawing())
+        print(mermaid_diagram())
     else:
         console = Console()
         if not console.is_terminal:

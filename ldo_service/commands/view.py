@@ -19,7 +19,7 @@ from ldo_service.viewer.run_folder import RunFolder
 from ldo_service.viewer.scene import Source
 from ldo_service.viewer.view_config import ViewerConfig, viewer_config
 
-from .options import ConfigFile, Endpoint, KeysFolder, Robot, Settings
+from .options import ConfigFile, EndpointAddress, KeysFolder, Robot, Settings
 from .query import LIVE
 
 
@@ -30,7 +30,7 @@ def view(
         tyro.conf.arg(metavar="DIR|live", help="folder of a run, or the running service"),
     ],
     robot: Robot = "robot",
-    endpoint: Endpoint = DEFAULT_ENDPOINT,
+    endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
     config: ConfigFile = None,
     set: Settings = (),

@@ -13,7 +13,7 @@ import msgspec
 import yaml
 
 from ldo_service.errors import ConfigError
-from ldo_service.storage.yaml_io import plain_text, plain_values
+from ldo_service.storage.yaml_io import dump_yaml, load_yaml
 
 from .moved_settings import refuse_moved, was_section
 from .sections import Config
@@ -73,7 +73,7 @@ def checked(config: Config) -> Config:
 # --- reading --------------------------------------------------------------------------------------
 def _read(path: Path) -> dict[str, Any]:
     try:
-        tree = plain_values(path.read_text())
+        tree = load_yaml(path.read_text())
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
@@ -95,7 +95,7 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
         if not isinstance(tree, dict):
             raise ConfigError(f"--set {setting}: {section} is no section.")
     try:
-        tree[last] = plain_values(value)
+        tree[last] = load_yaml(value)
     except yaml.YAMLError as error:
         raise ConfigError(f"--set {setting}: the value is not valid YAML: {error}") from error
 
@@ -191,4 +191,4 @@ def _shown(value: Any) -> str:
         return value
     if isinstance(value, float):
         return f"{value:g}"
-    return " ".join(plain_text(value, flow=True, width=float("inf")).removesuffix("...\n").split())
+    return " ".join(dump_yaml(value, flow=True, width=float("inf")).removesuffix("...\n").split())

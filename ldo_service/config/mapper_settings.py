@@ -6,7 +6,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from ldo_service.errors import ConfigError
-from ldo_service.semantics.gaussian_labels import MOST_LABELS
+from ldo_service.semantics.gaussian_labels import MAX_LABELS
 
 from .values import (
     NonNegativeFloat,
@@ -111,7 +111,7 @@ class SemanticsSettings:
     # A Gaussian takes the label of a region that covers so much of it. This is theta_IoU (III.A).
     min_overlap: Ratio = advanced(0.3)
     # The vocabulary holds so many names. A later name becomes `other`.
-    max_label_names: Annotated[int, Meta(ge=1, le=MOST_LABELS)] = advanced(MOST_LABELS)
+    max_label_names: Annotated[int, Meta(ge=1, le=MAX_LABELS)] = advanced(MAX_LABELS)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from ldo_service.actors.vlm_labeller import VlmLabellerConfig
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers.chat_completion import HttpConfig
 from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig
-from ldo_service.detection.labellers.http_endpoint import EndpointConfig
+from ldo_service.detection.labellers.http_endpoint import HttpClientConfig
 
 from .sections import Config
 
@@ -49,7 +49,7 @@ def labeller_parameters(config: Config) -> VlmLabellerConfig:
             model=http.model,
             views=http.max_views,
             confidence_untold=http.default_confidence,
-            endpoint=EndpointConfig(
+            endpoint=HttpClientConfig(
                 timeout_s=http.timeout_s,
                 attempts=http.max_attempts,
                 patience_s=http.deadline_s,

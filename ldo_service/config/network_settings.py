@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from ldo_service.detection.dynamic_classes import MovableConfig
+from ldo_service.detection.dynamic_classes import DynamicClassConfig
 from ldo_service.errors import ConfigError
 
 from .values import (
@@ -29,7 +29,7 @@ class DetectorSettings:
     # Boxes with a lower score are ignored. The default is that of YOLOv5 and YOLOX.
     min_score: Ratio = 0.25
     # Things of these COCO classes may move by themselves, so no pose and no loop relies on them.
-    dynamic_classes: tuple[str, ...] = MovableConfig().classes
+    dynamic_classes: tuple[str, ...] = DynamicClassConfig().classes
     # This is the layout of the output. Empty recognizes it by the shape of the output.
     layout: Literal["", "yolov5", "yolox", "yolov8"] = advanced("")
     # A network with a free input size is given this width and height.

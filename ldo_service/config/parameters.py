@@ -11,50 +11,50 @@ from ldo_service.actors.mapper import MapperConfig
 from ldo_service.actors.optimizer import OptimizerConfig
 from ldo_service.actors.topology import ActorParameters
 from ldo_service.actors.tracker import CameraExtrinsics, TrackerConfig
-from ldo_service.detection.dynamic_classes import MovableConfig
+from ldo_service.detection.dynamic_classes import DynamicClassConfig
 from ldo_service.gaussians.adam import AdamConfig
-from ldo_service.gaussians.densification import InsertionConfig
+from ldo_service.gaussians.densification import DensificationConfig
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
 from ldo_service.gaussians.loss import LossWeights
 from ldo_service.gaussians.map_builder import MapBuilderConfig
-from ldo_service.gaussians.optimizer import OptimiserConfig
+from ldo_service.gaussians.optimizer import GaussianOptimizerConfig
 from ldo_service.gaussians.pruning import PruningConfig
-from ldo_service.gaussians.visibility import SleepConfig
+from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.loop_closing import LoopsConfig
-from ldo_service.loop_closing.consistency_check import PlausibilityConfig
+from ldo_service.loop_closing.consistency_check import ConsistencyCheckConfig
 from ldo_service.loop_closing.loop_detector import LOOP_MIN_INLIERS
 from ldo_service.loop_closing.object_points import LandmarkConfig
 from ldo_service.loop_closing.place_database import RetrievalConfig
-from ldo_service.loop_closing.pose_estimation import SurfaceFitConfig
+from ldo_service.loop_closing.pose_estimation import DepthConsistencyConfig
 from ldo_service.loop_closing.subgraph import SubgraphConfig
 from ldo_service.loop_closing.verification import VerificationConfig
 from ldo_service.pose_graph.factors import NoiseConfig
-from ldo_service.pose_graph.landmarks import LandmarksConfig
-from ldo_service.pose_graph.loop_closures import ClosuresConfig
-from ldo_service.pose_graph.pose_graph import KeyframeGraphConfig
+from ldo_service.pose_graph.landmarks import ObjectLandmarkConfig
+from ldo_service.pose_graph.loop_closures import LoopClosureConfig
+from ldo_service.pose_graph.pose_graph import PoseGraphConfig
 from ldo_service.recordings.mcap_file import RecordConfig
 from ldo_service.regions.foreground import ForegroundConfig
-from ldo_service.regions.open_vocabulary import NamingConfig
-from ldo_service.regions.region_proposals import TriggerConfig
-from ldo_service.regions.region_tracker import RegionConfig
-from ldo_service.runtime.supervision_policy import StageConfig
+from ldo_service.regions.open_vocabulary import OpenVocabularyConfig
+from ldo_service.regions.region_proposals import RegionProposalConfig
+from ldo_service.regions.region_tracker import RegionTrackerConfig
+from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.semantics.data_association import AssociationConfig
 from ldo_service.semantics.gaussian_labels import ConsistencyConfig, LabelConfig
 from ldo_service.semantics.label_assignment import AssignmentConfig
 from ldo_service.semantics.objects import ObjectsConfig
-from ldo_service.semantics.semantic_fusion import FusionConfig, LabellingConfig
+from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.tracking.alignment import AlignConfig, ResidualConfig
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import PlacesConfig
+from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.motion_segmentation import MovingConfig
+from ldo_service.tracking.motion_segmentation import MotionSegmentationConfig
 from ldo_service.tracking.odometry import OdometryConfig
 from ldo_service.tracking.odometry_prior import PriorConfig
 from ldo_service.tracking.pyramid import DepthNoise, PyramidConfig
-from ldo_service.tracking.relocalization import RelocalisationConfig, ReturnConfig
-from ldo_service.tracking.submaps import SegmentConfig
-from ldo_service.tracking.tracking_quality import JudgementConfig
+from ldo_service.tracking.relocalization import KeyframeReuseConfig, RelocalizationConfig
+from ldo_service.tracking.submaps import SubmapConfig
+from ldo_service.tracking.tracking_quality import TrackingQualityConfig
 from ldo_service.tracking.window import WindowConfig
 
 from .network_parameters import detector_parameters, labeller_parameters
@@ -76,10 +76,10 @@ def actor_parameters(config: Config) -> ActorParameters:
     )
 
 
-def stage_parameters(config: Config) -> StageConfig:
+def stage_parameters(config: Config) -> SupervisionConfig:
     """Return how the stages of actors are supervised."""
     supervision = config.supervision
-    return StageConfig(
+    return SupervisionConfig(
         max_restarts=supervision.max_restarts,
         heartbeat_s=supervision.heartbeat_s,
         stall_after_s=supervision.step_timeout_s,
@@ -108,8 +108,8 @@ def latency_frames(config: Config) -> dict[str, int]:
 
 
 # --- shared by several actors ---------------------------------------------------------------------
-def _dynamic_classes(config: Config) -> MovableConfig:
-    return MovableConfig(classes=config.detector.dynamic_classes)
+def _dynamic_classes(config: Config) -> DynamicClassConfig:
+    return DynamicClassConfig(classes=config.detector.dynamic_classes)
 
 
 def _pyramid(config: Config) -> PyramidConfig:
@@ -129,8 +129,8 @@ def _align(config: Config) -> AlignConfig:
     )
 
 
-def _places(config: Config) -> PlacesConfig:
-    return PlacesConfig(count=config.tracker.relocalization.max_keyframes)
+def _places(config: Config) -> KeyframeDatabaseConfig:
+    return KeyframeDatabaseConfig(count=config.tracker.relocalization.max_keyframes)
 
 
 # --- the tracker ----------------------------------------------------------------------------------
@@ -146,19 +146,19 @@ def _tracker(config: Config) -> TrackerConfig:
             keyframes=_keyframes(config),
             window=WindowConfig(measurements=tracker.window.max_measurements),
             places=_places(config),
-            relocalisation=RelocalisationConfig(
+            relocalisation=RelocalizationConfig(
                 alike=tracker.relocalization.appearance_candidates,
                 across_scales=tracker.relocalization.sift_candidates,
             ),
-            returning=ReturnConfig(after=tracker.keyframes.reuse_after),
-            segments=SegmentConfig(begin_after_s=tracker.submaps.start_after_lost_s),
-            judgement=JudgementConfig(
+            returning=KeyframeReuseConfig(after=tracker.keyframes.reuse_after),
+            segments=SubmapConfig(begin_after_s=tracker.submaps.start_after_lost_s),
+            judgement=TrackingQualityConfig(
                 min_overlap=tracker.quality.weak_overlap,
                 weak_residual=tracker.quality.weak_residual_ratio,
                 lost_residual=tracker.quality.lost_residual_ratio,
                 lost_overlap=tracker.quality.lost_overlap,
             ),
-            moving=MovingConfig(is_on=tracker.dynamics.enabled),
+            moving=MotionSegmentationConfig(is_on=tracker.dynamics.enabled),
             movable=_dynamic_classes(config),
             prior=PriorConfig(
                 max_gap_s=tracker.odometry_prior.max_gap_s,
@@ -203,11 +203,11 @@ def _mapper(config: Config) -> MapperConfig:
 def _map_builder(config: Config) -> MapBuilderConfig:
     mapper, rates, loss = config.mapper, config.mapper.learning_rate, config.mapper.loss
     return MapBuilderConfig(
-        insertion=InsertionConfig(
+        insertion=DensificationConfig(
             max_transmittance=mapper.densify.max_transmittance,
             coarsest_px=mapper.densify.max_cell_px,
         ),
-        optimiser=OptimiserConfig(
+        optimiser=GaussianOptimizerConfig(
             adam=AdamConfig(
                 mean_m=rates.mean_m,
                 log_scale=rates.log_scale,
@@ -226,7 +226,7 @@ def _map_builder(config: Config) -> MapBuilderConfig:
             quota_mb=mapper.keyframe_images.disk_mb,
             most=mapper.keyframe_images.max_keyframes,
         ),
-        sleep=SleepConfig(max_active=mapper.offload.max_resident_gaussians),
+        sleep=OffloadConfig(max_active=mapper.offload.max_resident_gaussians),
         prune_keyframes=mapper.prune.interval_keyframes,
         seed=mapper.seed,
     )
@@ -251,9 +251,9 @@ def _semantics(config: Config) -> SemanticMapConfig:
     )
 
 
-def _labelling(config: Config) -> LabellingConfig:
+def _labelling(config: Config) -> SemanticFusionConfig:
     paper = config.paper
-    return LabellingConfig(
+    return SemanticFusionConfig(
         region=paper.label_region,
         foreground=FOREGROUND,
         assignment=AssignmentConfig(
@@ -281,11 +281,11 @@ def _labelling(config: Config) -> LabellingConfig:
     )
 
 
-def _naming(config: Config) -> NamingConfig:
+def _naming(config: Config) -> OpenVocabularyConfig:
     naming = config.mapper.open_vocabulary
-    return NamingConfig(
-        trigger=TriggerConfig(sure=naming.confident_score, foreground=FOREGROUND),
-        regions=RegionConfig(
+    return OpenVocabularyConfig(
+        trigger=RegionProposalConfig(sure=naming.confident_score, foreground=FOREGROUND),
+        regions=RegionTrackerConfig(
             per_keyframe=naming.requests_per_keyframe, boxes_vote=naming.detector_votes
         ),
         least_sure=naming.min_confidence,
@@ -312,13 +312,13 @@ def _loop_closer(config: Config) -> LoopCloserConfig:
                 landmarks=LandmarkConfig(
                     foreground=FOREGROUND, max_divergence=paper.loop_max_divergence_nats
                 ),
-                fit=SurfaceFitConfig(
+                fit=DepthConsistencyConfig(
                     min_overlap=closer.verification.min_overlap,
                     max_rmse_m=closer.verification.max_rmse_m,
                 ),
                 min_inliers=closer.verification.min_inliers,
             ),
-            plausibility=PlausibilityConfig(
+            plausibility=ConsistencyCheckConfig(
                 drift_m=closer.drift_gate.max_drift_m, drift=closer.drift_gate.max_drift_ratio
             ),
             places=_places(config),
@@ -335,20 +335,20 @@ def _loop_closer(config: Config) -> LoopCloserConfig:
 def _optimizer(config: Config) -> OptimizerConfig:
     optimizer, paper = config.optimizer, config.paper
     return OptimizerConfig(
-        graph=KeyframeGraphConfig(
+        graph=PoseGraphConfig(
             noise=NoiseConfig(
                 drift_rad_per_sqrt_m=optimizer.noise.drift_rad_per_sqrt_m,
                 drift_m_per_sqrt_m=optimizer.noise.drift_m_per_sqrt_m,
                 sigma_loop_rad=optimizer.noise.loop_rotation_rad,
                 sigma_loop_m=optimizer.noise.loop_translation_m,
             ),
-            closures=ClosuresConfig(
+            closures=LoopClosureConfig(
                 most_sigmas=optimizer.loop_closures.max_residual_sigmas,
                 most=optimizer.loop_closures.max_closures,
             ),
             condense_keyframes=paper.marginalization_interval_keyframes,
         ),
-        landmarks=LandmarksConfig(
+        landmarks=ObjectLandmarkConfig(
             lambda_sem=paper.lambda_sem,
             w_sem=paper.w_sem,
             most=optimizer.landmarks.max_landmarks,

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 
-from ldo_service.storage.yaml_io import plain_text
+from ldo_service.storage.yaml_io import dump_yaml
 
 from .sections import Config
 from .values import ADVANCED
@@ -29,7 +29,7 @@ class Setting:
 
 def config_yaml(config: Config) -> str:
     """Return the whole configuration as YAML, which reads back as the same."""
-    return plain_text(msgspec.to_builtins(config))
+    return dump_yaml(msgspec.to_builtins(config))
 
 
 def explained_yaml(config: Config, *, with_advanced: bool = False) -> str:
@@ -77,7 +77,7 @@ def _settings(section: Any, prefix: str) -> Iterator[Setting]:
             yield from _settings(value, f"{path}.")
         else:
             plain = msgspec.to_builtins(value)
-            text = plain_text(plain, flow=True, width=inf).splitlines()[0]
+            text = dump_yaml(plain, flow=True, width=inf).splitlines()[0]
             comment = comments.get(entry.name, "")
             yield Setting(path, value, text, comment, ADVANCED not in entry.metadata)
 

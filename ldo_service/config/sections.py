@@ -42,7 +42,7 @@ class Config:
     supervision: SupervisionSettings = field(default_factory=SupervisionSettings)
     viewer: ViewerSettings = field(default_factory=ViewerSettings)
 
-    def check_patience(self) -> None:
+    def check_timeouts(self) -> None:
         """Check that a service does not give up an actor that waits for a labeller's server.
 
         Raises:

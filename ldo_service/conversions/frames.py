@@ -21,10 +21,10 @@ from ldo_service.tracking.motion_segmentation import resized
 from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of
 from ldo_service.tracking.tracking_result import NewKeyframe, TrackingResult
 
-from .poses import matrix6_message, measured_message, pose_message, transform
+from .poses import matrix6_to_message, pose_from_message, pose_to_message, relative_pose_to_message
 
 
-def camera_message(camera: Camera) -> CameraModel:
+def camera_to_message(camera: Camera) -> CameraModel:
     return CameraModel(
         width=camera.width,
         height=camera.height,
@@ -36,28 +36,28 @@ def camera_message(camera: Camera) -> CameraModel:
     )
 
 
-def camera_of(model: CameraModel) -> Camera:
+def camera_from_message(model: CameraModel) -> Camera:
     return Camera(
         model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion
     )
 
 
-def rgbd_message(frame: RgbdFrame) -> FrameRgbd:
+def frame_to_message(frame: RgbdFrame) -> FrameRgbd:
     return FrameRgbd(
         stamp_ns=frame.stamp_ns,
         frame=frame.index,
-        camera=camera_message(frame.camera),
+        camera=camera_to_message(frame.camera),
         color=Array.of(frame.color),
         depth_m=Array.of(frame.depth_m),
     )
 
 
-def rgbd_of(message: FrameRgbd | Keyframe) -> RgbdFrame:
+def frame_from_message(message: FrameRgbd | Keyframe) -> RgbdFrame:
     """The frame of a message; its arrays are read-only views."""
     return RgbdFrame(
         color=message.color.numpy(),
         depth_m=message.depth_m.numpy(),
-        camera=camera_of(message.camera),
+        camera=camera_from_message(message.camera),
         stamp_ns=message.stamp_ns,
         index=message.frame,
     )
@@ -72,13 +72,13 @@ def tracked_pose_message(
         stamp_ns=frame.stamp_ns,
         frame=frame.index,
         status=result.status.value,
-        T_odom_camera=pose_message(result.T_odom_camera),
-        T_map_odom=pose_message(result.T_map_odom),
+        T_odom_camera=pose_to_message(result.T_odom_camera),
+        T_map_odom=pose_to_message(result.T_map_odom),
         graph_version=result.graph_version,
         reference=result.reference,
-        T_reference_camera=pose_message(result.T_reference_camera),
+        T_reference_camera=pose_to_message(result.T_reference_camera),
         keyframe=None if keyframe is None else keyframe.id,
-        covariance=matrix6_message(np.linalg.pinv(result.information, hermitian=True)),
+        covariance=matrix6_to_message(np.linalg.pinv(result.information, hermitian=True)),
         inlier_fraction=result.inlier_fraction,
         residual_color=result.intensity_sigma,
         residual_depth=result.depth_noise_scale,
@@ -86,7 +86,7 @@ def tracked_pose_message(
         iterations=result.iterations,
         method=result.method,
         disagreement=result.hypothesis_spread_rad,
-        T_base_camera=pose_message(T_base_camera),
+        T_base_camera=pose_to_message(T_base_camera),
         segment=result.submap,
     )
 
@@ -98,34 +98,34 @@ def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyf
         stamp_ns=frame.stamp_ns,
         keyframe=keyframe.id,
         frame=frame.index,
-        camera=camera_message(frame.camera),
+        camera=camera_to_message(frame.camera),
         color=Array.of(frame.color),
         depth_m=Array.of(frame.depth_m),
         reference=None if result.reference == keyframe.id else result.reference,
-        T_reference_keyframe=pose_message(result.T_reference_camera),
-        information=matrix6_message(result.information),
-        T_odom_keyframe=pose_message(result.T_odom_camera),
+        T_reference_keyframe=pose_to_message(result.T_reference_camera),
+        information=matrix6_to_message(result.information),
+        T_odom_keyframe=pose_to_message(result.T_odom_camera),
         overlap=result.overlap,
-        window=tuple(map(measured_message, keyframe.window)),
-        is_moving=mask_message(result.dynamic_mask, frame.camera),
+        window=tuple(map(relative_pose_to_message, keyframe.window)),
+        is_moving=mask_to_array(result.dynamic_mask, frame.camera),
         segment=keyframe.submap,
-        joins=() if merge is None else (measured_message(merge),),
+        joins=() if merge is None else (relative_pose_to_message(merge),),
     )
 
 
-def keyframe_of(message: Keyframe, config: PyramidConfig) -> TrackedKeyframe:
+def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> TrackedKeyframe:
     """A keyframe that others can be aligned to, without what moves in it."""
-    view = pyramid_of(rgbd_of(message), config)
+    view = pyramid_of(frame_from_message(message), config)
     return TrackedKeyframe(
         view,
-        transform(message.T_odom_keyframe),
+        pose_from_message(message.T_odom_keyframe),
         message.keyframe,
         message.segment,
-        left_out=resized(mask_of(message.is_moving), view.levels[0].depth_m.shape),
+        ignore_mask=resized(mask_from_array(message.is_moving), view.levels[0].depth_m.shape),
     )
 
 
-def mask_message(mask: np.ndarray | None, camera: Camera) -> Array:
+def mask_to_array(mask: np.ndarray | None, camera: Camera) -> Array:
     """A mask [h, w] bool of any size as u1 [H, W] of the camera's; [0, 0] where nothing is set."""
     if mask is None or not mask.any():
         return NO_MASK
@@ -133,17 +133,17 @@ def mask_message(mask: np.ndarray | None, camera: Camera) -> Array:
     return Array.of(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST))
 
 
-def mask_of(array: Array) -> np.ndarray | None:
+def mask_from_array(array: Array) -> np.ndarray | None:
     """[H, W] bool; None where there is none."""
     return array.numpy() > 0 if array.data.nbytes else None
 
 
-def crops_of(request: LabelRequest) -> list[np.ndarray]:
+def crops_from_request(request: LabelRequest) -> list[np.ndarray]:
     """Each [h, w, 3] uint8 RGB. Raises FrameError for bytes that are no such image."""
     return [codecs.decode_color(c.encoding, c.width, c.height, c.data) for c in request.crops]
 
 
-def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
+def raw_frame_to_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgbd:
     """A camera's frame for the wire: colour raw, depth raw or compressed with zstd."""
     height, width = raw.depth.shape
     depth = np.asarray(raw.depth, np.float32) if raw.depth.dtype == np.float64 else raw.depth
@@ -154,7 +154,7 @@ def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgb
     return CameraRgbd(
         stamp_ns=raw.stamp_ns,
         frame=raw.index,
-        camera=camera_message(raw.camera),
+        camera=camera_to_message(raw.camera),
         color=Image(
             encoding="rgb8", width=width, height=height, data=memoryview(raw.color.tobytes())
         ),
@@ -163,7 +163,7 @@ def camera_rgbd_message(raw: RawFrame, compress_depth: bool = True) -> CameraRgb
     )
 
 
-def raw_frame_of(message: CameraRgbd, index: int) -> RawFrame:
+def raw_frame_from_message(message: CameraRgbd, index: int) -> RawFrame:
     """The frame as the camera delivered it, decompressed. Raises DataError."""
     color, depth = message.color, message.depth
     return RawFrame(
@@ -172,5 +172,5 @@ def raw_frame_of(message: CameraRgbd, index: int) -> RawFrame:
         color=codecs.decode_color(color.encoding, color.width, color.height, color.data),
         depth=codecs.decode_depth(depth.encoding, depth.width, depth.height, depth.data),
         depth_scale=message.depth_scale,
-        camera=camera_of(message.camera),
+        camera=camera_from_message(message.camera),
     )

@@ -1,28 +1,30 @@
 """Conversions between messages and numerics: loop closures and candidates."""
 
-from ldo_service.loop_closing import Finding
+from ldo_service.loop_closing import LoopCandidateResult
 from ldo_service.schemas import (
     LoopCandidate,
     LoopClosure,
 )
 
-from .poses import measured_message
+from .poses import relative_pose_to_message
 
 
-def loop_closure_message(finding: Finding) -> LoopClosure:
+def loop_closure_to_message(finding: LoopCandidateResult) -> LoopClosure:
     """Raises ValueError for a candidate that was refused."""
     if finding.closure is None:
-        raise ValueError(f"a candidate that was refused is no closure: {finding.check.refused}")
+        raise ValueError(
+            f"a candidate that was refused is no closure: {finding.check.rejected_reason}"
+        )
     return LoopClosure(
         stamp_ns=finding.check.proposal.new.stamp_ns,
-        pose=measured_message(finding.closure),
+        pose=relative_pose_to_message(finding.closure),
         overlap=finding.check.overlap,
         rmse_m=finding.check.rmse_m,
         entropy=finding.check.proposal.semantics.entropy,
     )
 
 
-def loop_candidate_message(finding: Finding) -> LoopCandidate:
+def loop_candidate_to_message(finding: LoopCandidateResult) -> LoopCandidate:
     check, old, new = finding.check, finding.likeness.subgraph, finding.new
     proposal = check.proposal
     return LoopCandidate(
@@ -39,5 +41,5 @@ def loop_candidate_message(finding: Finding) -> LoopCandidate:
         entropy=proposal.semantics.entropy,
         overlap=check.overlap,
         rmse_m=check.rmse_m,
-        refused=check.refused,
+        refused=check.rejected_reason,
     )

@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.detection.detectors import Detections
 from ldo_service.detection.dynamic_classes import Box as MovableBox
 from ldo_service.detection.vocabulary import Vocabulary
-from ldo_service.regions.foreground import Claims
+from ldo_service.regions.foreground import RegionDetections
 from ldo_service.regions.region import Region
 from ldo_service.schemas import (
     Detection,
@@ -23,12 +23,12 @@ from ldo_service.schemas import (
 from ldo_service.schemas.objects import Box, Distribution
 from ldo_service.semantics.distributions import entropy, sparse
 from ldo_service.semantics.object_landmarks import distributions, labels_of
-from ldo_service.semantics.objects import Observed
+from ldo_service.semantics.objects import ObjectUpdate
 
-from .poses import pose_message
+from .poses import pose_to_message
 
 
-def boxes_message(
+def detections_to_message(
     keyframe: Keyframe, found: Detections | None, labels: Sequence[str], network: str
 ) -> DetectionBoxes:
     """What a network found in a keyframe; `labels` are the names of its classes. None: it did not
@@ -49,17 +49,17 @@ def boxes_message(
     )
 
 
-def claims_of(message: DetectionBoxes, vocabulary: Vocabulary) -> Claims:
+def detections_from_message(message: DetectionBoxes, vocabulary: Vocabulary) -> RegionDetections:
     """What the detector says; new names get an index."""
     found = message.detections
-    return Claims.of_detector(
+    return RegionDetections.of_detector(
         np.array([one.box_px for one in found], np.float32).reshape(-1, 4),
         np.array([vocabulary.index(one.label) for one in found], np.int64),
         np.array([one.score for one in found], np.float32),
     )
 
 
-def label_request_message(region: Region, stamp_ns: int) -> LabelRequest:
+def label_request_to_message(region: Region, stamp_ns: int) -> LabelRequest:
     """What is asked about a region; `stamp_ns` is that of its newest keyframe."""
     crops = (
         Image(encoding="jpeg", width=v.width, height=v.height, data=memoryview(v.jpeg))
@@ -76,14 +76,14 @@ def label_request_message(region: Region, stamp_ns: int) -> LabelRequest:
     )
 
 
-def landmark_message(
+def landmark_to_message(
     landmark: int, centroid: np.ndarray, p: np.ndarray, names: Sequence[str]
 ) -> GraphLandmark:
     """`names` of the classes that have been seen; what `p` [C] gives to others is on none."""
     return GraphLandmark(
         object=landmark,
         centroid=_vector3(centroid),
-        distribution=_distribution_message(p[: len(names)], names),
+        distribution=_distribution_to_message(p[: len(names)], names),
         entropy=max(float(entropy(p)), 0.0),
     )
 
@@ -102,10 +102,10 @@ def map_objects(table: np.ndarray, names: Sequence[str]) -> tuple[MapObject, ...
     """Of landmarks [K], in their order."""
     p = distributions(table)
     columns = zip(table, labels_of(table).tolist(), p, entropy(p).tolist(), strict=True)
-    return tuple(_object_message(*column, names) for column in columns)
+    return tuple(_object_to_message(*column, names) for column in columns)
 
 
-def _object_message(
+def _object_to_message(
     landmark: np.void, label: int, p: np.ndarray, entropy: float, names: Sequence[str]
 ) -> MapObject:
     T, views = landmark["T_map_object"], landmark["view_keyframes"]
@@ -115,9 +115,9 @@ def _object_message(
         confidence=min(float(p[label]), 1.0),
         centroid=_vector3(landmark["centroid"]),
         covariance=tuple(landmark["covariance"].ravel().tolist()),
-        T_map_object=pose_message(T),
+        T_map_object=pose_to_message(T),
         size=_vector3(landmark["size"]),
-        distribution=_distribution_message(p, names),
+        distribution=_distribution_to_message(p, names),
         entropy=max(entropy, 0.0),
         seen=int(landmark["seen"]),
         missed=int(landmark["missed"]),
@@ -130,8 +130,8 @@ def _object_message(
     )
 
 
-def observation_messages(
-    observed: Observed, names: Sequence[str], keyframe: int, stamp_ns: int
+def observations_to_messages(
+    observed: ObjectUpdate, names: Sequence[str], keyframe: int, stamp_ns: int
 ) -> list[ObjectObservation]:
     """What a keyframe shows of objects, and what it misses."""
     return [
@@ -140,7 +140,7 @@ def observation_messages(
             keyframe=keyframe,
             object=seen.object,
             box_px=_box(seen.box),
-            distribution=_distribution_message(seen.distribution, names),
+            distribution=_distribution_to_message(seen.distribution, names),
             entropy=max(float(seen.entropy), 0.0),
             is_miss=seen.is_miss,
         )
@@ -148,7 +148,7 @@ def observation_messages(
     ]
 
 
-def _distribution_message(p: np.ndarray, names: Sequence[str]) -> Distribution:
+def _distribution_to_message(p: np.ndarray, names: Sequence[str]) -> Distribution:
     labels, weights = sparse(p)
     pairs = zip(labels, weights, strict=True)
     return tuple((names[int(label)], float(weight)) for label, weight in pairs if weight > 0)
@@ -164,7 +164,7 @@ def _box(box: np.ndarray) -> Box:
     return x0, y0, x1, y1
 
 
-def boxes_in(detections: Sequence[Detection], times: float) -> list[MovableBox]:
+def scale_boxes(detections: Sequence[Detection], times: float) -> list[MovableBox]:
     """Detections as edges of pixels, in an image that is so many times smaller."""
     return [
         MovableBox(one.label, *((edge + 0.5) / times for edge in one.box_px)) for one in detections

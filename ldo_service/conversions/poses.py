@@ -19,52 +19,52 @@ from ldo_service.schemas import (
 from ldo_service.tracking.map_frame import MapCorrection
 
 
-def pose_message(T: np.ndarray) -> Pose:
+def pose_to_message(T: np.ndarray) -> Pose:
     """T [4, 4] for the wire."""
     x, y, z = (float(v) for v in T[:3, 3])
     qw, qx, qy, qz = (float(v) for v in se3.quaternion(T[:3, :3]))
     return Pose((x, y, z), (qw, qx, qy, qz))
 
 
-def transform(pose: Pose) -> np.ndarray:
+def pose_from_message(pose: Pose) -> np.ndarray:
     """T [4, 4] of a pose from the wire."""
     return se3.from_quaternion(np.array(pose.translation), np.array(pose.quaternion))
 
 
-def matrix6_message(matrix: np.ndarray) -> tuple[float, ...]:
+def matrix6_to_message(matrix: np.ndarray) -> tuple[float, ...]:
     return tuple(float(v) for v in np.asarray(matrix).ravel())
 
 
-def measured_message(measured: RelativePose) -> MeasuredPose:
+def relative_pose_to_message(measured: RelativePose) -> MeasuredPose:
     return MeasuredPose(
         reference=measured.a,
         keyframe=measured.b,
-        T_reference_keyframe=pose_message(measured.T_a_b),
-        information=matrix6_message(measured.information),
+        T_reference_keyframe=pose_to_message(measured.T_a_b),
+        information=matrix6_to_message(measured.information),
     )
 
 
-def measured_of(message: MeasuredPose) -> RelativePose:
+def relative_pose_from_message(message: MeasuredPose) -> RelativePose:
     return RelativePose(
         message.reference,
         message.keyframe,
-        transform(message.T_reference_keyframe),
+        pose_from_message(message.T_reference_keyframe),
         np.array(message.information).reshape(6, 6),
     )
 
 
-def measurements_of(keyframe: Keyframe) -> list[RelativePose]:
+def measurements_from_message(keyframe: Keyframe) -> list[RelativePose]:
     """All that a keyframe was measured from, its reference first; none for the first keyframe."""
-    window = [measured_of(pose) for pose in keyframe.window]
+    window = [relative_pose_from_message(pose) for pose in keyframe.window]
     if keyframe.reference is None:
         return window
-    T_reference_keyframe = transform(keyframe.T_reference_keyframe)
+    T_reference_keyframe = pose_from_message(keyframe.T_reference_keyframe)
     information = np.array(keyframe.information).reshape(6, 6)
     first = RelativePose(keyframe.reference, keyframe.keyframe, T_reference_keyframe, information)
     return [first, *window]
 
 
-def correction_message(
+def correction_to_message(
     stamp_ns: int,
     graph_version: int,
     T_map_keyframe: dict[int, np.ndarray],
@@ -90,7 +90,7 @@ def correction_message(
     )
 
 
-def keyframe_poses_of(
+def keyframe_poses_from_correction(
     correction: Correction, only: Iterable[int] | None = None
 ) -> dict[int, np.ndarray]:
     """T_map_keyframe [4, 4] by keyframe id; of `only` those and the newest one it names."""
@@ -110,5 +110,5 @@ def map_correction_of(correction: Correction) -> MapCorrection:
     return MapCorrection(
         version=correction.graph_version,
         roots=dict(correction.joined),
-        read_poses=partial(keyframe_poses_of, correction),
+        read_poses=partial(keyframe_poses_from_correction, correction),
     )

@@ -96,7 +96,7 @@ def read_transform(path: Path) -> np.ndarray | None:
             f"{path}, line 1: expected a rigid 4x4 transform by rows, found {T.tolist()}. "
             "Check that it holds a rotation and a translation in metres."
         )
-    return se3.orthonormalised(T)
+    return se3.orthonormalize(T)
 
 
 def read_intrinsics(path: Path, size: int, image: tuple[int, int]) -> Camera:
@@ -170,7 +170,7 @@ def numbered(folder: Path, pattern: str) -> dict[int, Path]:
     return {int(match[1]): path for match, path in matches if match}
 
 
-def paired(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> NumberedFrames:
+def pair_by_number(color: dict[int, Path], depth: dict[int, Path], folder: Path) -> NumberedFrames:
     """Frames of equal numbers. Raises DataError, which names `folder`, when there are none."""
     numbers = sorted(color.keys() & depth.keys())
     if not numbers:

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from ldo_service.errors import FrameError
-from ldo_service.geometry.codecs import announced_size
+from ldo_service.geometry.codecs import read_image_size
 
 # The last bytes of a complete file. OpenCV decodes what is there of a cut one without complaint.
 _ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8\xff": b"\xff\xd9"}
-MOST_PIXELS = 1 << 25  # as of images in messages
+MAX_PIXELS = 1 << 25  # as of images in messages
 _TRAILING_BYTES = 64  # some writers pad their files
 
 
@@ -78,10 +78,10 @@ def _decode(path: Path, flags: int) -> np.ndarray:
 
 def _require_size(path: Path, data: bytes) -> None:
     """Before memory is taken for it."""
-    size = announced_size(memoryview(data))
+    size = read_image_size(memoryview(data))
     if size is None:
         raise FrameError(f"{path} is not a readable image, PNG or JPEG: copy or download it again.")
-    if size[0] * size[1] > MOST_PIXELS:
+    if size[0] * size[1] > MAX_PIXELS:
         raise FrameError(f"{path} says that it has {size[0]}x{size[1]} pixels: no camera has that.")
 
 

@@ -22,10 +22,10 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory, se3
 from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 
-from .files import Calibration, is_rigid, number, numbered, paired, pinhole, read_json
+from .files import Calibration, is_rigid, number, numbered, pair_by_number, pinhole, read_json
 from .images import read_color, read_depth, read_labels
 
-MOST_CLASSES = 256  # of images with 8 bits
+MAX_CLASSES = 256  # of images with 8 bits
 
 
 class ReplicaLabels:
@@ -64,10 +64,10 @@ def _class_names(path: Path) -> tuple[str, ...]:
         names = {int(number): str(name) for number, name in found.items()}
     except (AttributeError, TypeError, ValueError):
         names = {}
-    if not names or not 0 <= min(names) <= max(names) < MOST_CLASSES:
+    if not names or not 0 <= min(names) <= max(names) < MAX_CLASSES:
         raise DataError(
             f'{path}: expected "classes", an object of names by numbers from 0 to '
-            f"{MOST_CLASSES - 1}."
+            f"{MAX_CLASSES - 1}."
         )
     return tuple(names.get(number, "") for number in range(max(names) + 1))
 
@@ -79,7 +79,7 @@ class ReplicaSequence(Sequence):
         self._folder = folder
         color = numbered(folder / "results", r"frame(\d+)\.(?:jpg|jpeg|png)")
         depth = numbered(folder / "results", r"depth(\d+)\.png")
-        self._files = paired(color, depth, folder / "results")
+        self._files = pair_by_number(color, depth, folder / "results")
         calibration = _calibration(folder)
         self.depth_scale = calibration.depth_scale
         super().__init__(folder.resolve().name, calibration.camera, self._files.stamps_ns)
@@ -141,4 +141,4 @@ def _pose(path: Path, line_number: int, line: str) -> np.ndarray:
             f"{path}, line {line_number}: expected the 16 numbers of a rigid 4x4 camera-to-world "
             f"matrix by rows, found {line[:80]!r}."
         )
-    return se3.orthonormalised(T_world_camera)
+    return se3.orthonormalize(T_world_camera)

@@ -23,7 +23,7 @@ from ldo_service.geometry import RawFrame, Trajectory, se3
 from ldo_service.geometry.registration import resample_color
 from ldo_service.geometry.sequence import Sequence
 
-from .files import numbered, paired, read_intrinsics, read_trajectory, read_transform
+from .files import numbered, pair_by_number, read_intrinsics, read_trajectory, read_transform
 from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
@@ -35,7 +35,7 @@ class ScanNetSequence(Sequence):
 
     def __init__(self, folder: Path, options: SequenceOptions) -> None:
         self._folder = folder
-        self._files = paired(
+        self._files = pair_by_number(
             numbered(folder / "color", r"(\d+)\.(?:jpg|jpeg|png)"),
             numbered(folder / "depth", r"(\d+)\.png"),
             folder,

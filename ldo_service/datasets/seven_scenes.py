@@ -21,7 +21,7 @@ import numpy as np
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
 
-from .files import numbered, paired, read_intrinsics, read_trajectory
+from .files import numbered, pair_by_number, read_intrinsics, read_trajectory
 from .images import first_size, read_color, read_depth
 from .rig import Rig, SequenceOptions
 
@@ -44,7 +44,7 @@ class SevenScenesSequence(Sequence):
     """Frames that have both colour and depth, in order of their numbers."""
 
     def __init__(self, folder: Path, options: SequenceOptions) -> None:
-        self._files = paired(
+        self._files = pair_by_number(
             numbered(folder, r"frame-(\d+)\.color\.(?:png|jpg|jpeg)"),
             numbered(folder, r"frame-(\d+)\.depth\.png"),
             folder,

@@ -7,7 +7,7 @@ They are trained by `training/train_demo.py` of the repository. `detector.model`
 from pathlib import Path
 
 NAME = "demo"
-LICENCE = "Apache-2.0"
+LICENSE = "Apache-2.0"
 DETECTOR = Path(__file__).with_name("detector.onnx")
 IMAGE_ENCODER = Path(__file__).with_name("image_encoder.onnx")
 TEXT_EMBEDDINGS = Path(__file__).with_name("text_embeddings.npz")

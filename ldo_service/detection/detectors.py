@@ -10,7 +10,7 @@ from ldo_service.errors import ConfigError, ModelError
 
 from .onnx_network import Network, sha256
 from .vocabulary import canonical, class_names, read_names
-from .yolo import EXPECTED, Letterbox, layout_named, non_maximum_suppression, recognise
+from .yolo import EXPECTED, Letterbox, detect_layout, layout_named, non_maximum_suppression
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class OnnxDetector:
             self._network = Network(path, self.config.providers, self.config.threads)
             self._input, self.input_px = _image_input(self._network, self.config.input_px)
             output = self._output(_noise(self.input_px))
-            self._head = recognise(output, self.input_px, self.config.layout)
+            self._head = detect_layout(output, self.input_px, self.config.layout)
             metadata = self._network.metadata.get("names")
             self.names = class_names(self._head.class_count, names, metadata)
         except ModelError as error:
@@ -113,7 +113,7 @@ class OnnxDetector:
         """What it runs on, as onnxruntime names it."""
         return self._network.providers
 
-    def find(self, image: np.ndarray) -> Detections:
+    def detect(self, image: np.ndarray) -> Detections:
         """The objects in an image [H, W, 3] uint8 RGB.
 
         The same image gives the same bits on the CPU with one thread. Raises ModelError when the
@@ -122,7 +122,7 @@ class OnnxDetector:
         config, layout = self.config, self._head.layout
         # fit it into the input
         height, width = image.shape[:2]
-        letterbox = Letterbox.fit((width, height), self.input_px, layout.is_centred)
+        letterbox = Letterbox.fit((width, height), self.input_px, layout.is_centered)
         canvas = letterbox.canvas(image)
         # run the network
         pixels = canvas if layout.is_rgb else canvas[..., ::-1]

@@ -12,7 +12,7 @@ CORE = 0.5  # of a box's width and height, in its middle: mostly the thing itsel
 
 
 @dataclass(frozen=True, slots=True)
-class MovableConfig:
+class DynamicClassConfig:
     classes: tuple[str, ...] = (  # of COCO's: alive, or driven; what is carried moves with a person
         *("person", "bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra"),
         *("giraffe", "bicycle", "car", "motorcycle", "bus", "train", "truck", "boat", "airplane"),
@@ -40,7 +40,9 @@ class Box:
         return Box(self.label, *(edge / times for edge in edges))
 
 
-def movable_pixels(boxes: Sequence[Box], depth_m: np.ndarray, config: MovableConfig) -> np.ndarray:
+def dynamic_class_mask(
+    boxes: Sequence[Box], depth_m: np.ndarray, config: DynamicClassConfig
+) -> np.ndarray:
     """Pixels [H, W] bool of the things in `boxes` that may move by themselves.
 
     Of a box the pixels count that lie within `reach_m` of its foreground in depth [H, W], in m, and
@@ -57,7 +59,7 @@ def movable_pixels(boxes: Sequence[Box], depth_m: np.ndarray, config: MovableCon
     return out
 
 
-def _foreground(depth_m: np.ndarray, core: np.ndarray, config: MovableConfig) -> np.ndarray:
+def _foreground(depth_m: np.ndarray, core: np.ndarray, config: DynamicClassConfig) -> np.ndarray:
     measured = depth_m[core & (depth_m > 0)]
     if not measured.size:
         return np.ones(depth_m.shape, bool)

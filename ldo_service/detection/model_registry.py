@@ -21,7 +21,11 @@ from pathlib import Path
 import msgspec
 
 from ldo_service import demo_networks
-from ldo_service.detection.labellers.dual_encoder import DualEncoder, DualEncoderConfig, Pair
+from ldo_service.detection.labellers.dual_encoder import (
+    DualEncoder,
+    DualEncoderConfig,
+    EncoderFiles,
+)
 from ldo_service.errors import ConfigError, ModelError
 from ldo_service.storage.atomic_write import folder_made_atomically
 
@@ -36,7 +40,7 @@ IMAGES = (FILE, "image_encoder.onnx")  # as a folder that is not registered may 
 CLIP = "clip"  # layout of a pair
 
 
-class About(msgspec.Struct, frozen=True, kw_only=True):
+class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
     """What is known of a registered network."""
 
     sha256: str
@@ -51,7 +55,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 class Model:
     name: str
     folder: Path
-    about: About
+    about: ModelInfo
 
     @property
     def file(self) -> Path:
@@ -77,29 +81,29 @@ class Models:
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder or default_folder()
 
-    def add(self, name: str, file: Path, config: NetworkConfig, licence: str = "") -> Model:
+    def add(self, name: str, file: Path, config: NetworkConfig, license: str = "") -> Model:
         """Copy and register a network that is a detector, all of it or nothing.
 
         Raises ConfigError for a name that is taken or none, ModelError for a file that cannot be
         used.
         """
-        return self._add(name, [file], lambda folder: _fill(folder, file, config, licence))
+        return self._add(name, [file], lambda folder: _fill(folder, file, config, license))
 
     def add_pair(
         self,
         name: str,
-        pair: Pair,
+        pair: EncoderFiles,
         config: DualEncoderConfig,
         names: Sequence[str] = (),
-        licence: str = "",
+        license: str = "",
     ) -> Model:
         """The same for a pair of encoders, see `DualEncoder`; `names` are kept with it."""
         files = [file for file in (pair.image, pair.text, pair.vocabulary, pair.embeddings) if file]
         return self._add(
-            name, files, lambda folder: _fill_pair(folder, pair, config, names, licence)
+            name, files, lambda folder: _fill_pair(folder, pair, config, names, license)
         )
 
-    def _add(self, name: str, files: Sequence[Path], fill: Callable[[Path], About]) -> Model:
+    def _add(self, name: str, files: Sequence[Path], fill: Callable[[Path], ModelInfo]) -> Model:
         _require_name(name)
         if (self.folder / name).exists():
             raise ConfigError(
@@ -132,7 +136,7 @@ class Models:
         self._require_known(name)
         folder = self.folder / name
         try:
-            about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=About)
+            about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=ModelInfo)
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ModelError(
                 f"{folder / ABOUT} cannot be read ({error}): `ldo models remove {name}` and add it "
@@ -219,16 +223,18 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
     return DualEncoder(_pair_in(found.folder), config, names or found.about.classes, name=model)
 
 
-def _pair_in(folder: Path) -> Pair:
+def _pair_in(folder: Path) -> EncoderFiles:
     def here(*parts: str) -> Path | None:
         return next((folder / part for part in parts if (folder / part).is_file()), None)
 
-    return Pair(here(*IMAGES) or folder / FILE, here(TEXT), here(VOCABULARY), here(*EMBEDDINGS))
+    return EncoderFiles(
+        here(*IMAGES) or folder / FILE, here(TEXT), here(VOCABULARY), here(*EMBEDDINGS)
+    )
 
 
 def _fill_pair(
-    folder: Path, pair: Pair, config: DualEncoderConfig, names: Sequence[str], licence: str
-) -> About:
+    folder: Path, pair: EncoderFiles, config: DualEncoderConfig, names: Sequence[str], license: str
+) -> ModelInfo:
     labeller = DualEncoder(pair, config, names)
     suffix = pair.embeddings.suffix if pair.embeddings else ""
     embeddings = next((part for part in EMBEDDINGS if part.endswith(suffix)), EMBEDDINGS[0])
@@ -239,11 +245,11 @@ def _fill_pair(
         if file:
             shutil.copyfile(file, folder / part)
     checksums = {part: sha256(folder / part) for part, file in copies.items() if file}
-    about = About(
+    about = ModelInfo(
         sha256=checksums.pop(FILE),
         layout=CLIP,
         classes=labeller.words,
-        licence=licence,
+        licence=license,
         source=pair.image.name,
         parts=checksums,
     )
@@ -251,16 +257,16 @@ def _fill_pair(
     return about
 
 
-def _fill(folder: Path, file: Path, config: NetworkConfig, licence: str) -> About:
+def _fill(folder: Path, file: Path, config: NetworkConfig, license: str) -> ModelInfo:
     """A folder for the model; what is described is the copy."""
     folder.mkdir()
     shutil.copyfile(file, folder / FILE)
     detector = OnnxDetector(folder / FILE, config, name=str(file))
-    about = About(
+    about = ModelInfo(
         sha256=sha256(folder / FILE),
         layout=detector.layout,
         classes=detector.names,
-        licence=licence,
+        licence=license,
         source=file.name,
     )
     (folder / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=1))
@@ -286,6 +292,6 @@ def _open_demo_labeller(config: DualEncoderConfig, names: Sequence[str] = ()) ->
 
     Raises ConfigError for a name that is not in the table: there is no text encoder.
     """
-    pair = Pair(demo_networks.IMAGE_ENCODER, embeddings=demo_networks.TEXT_EMBEDDINGS)
+    pair = EncoderFiles(demo_networks.IMAGE_ENCODER, embeddings=demo_networks.TEXT_EMBEDDINGS)
     settings = replace(config, nothing=config.nothing or demo_networks.NOTHING)
     return DualEncoder(pair, settings, names, name=demo_networks.NAME)

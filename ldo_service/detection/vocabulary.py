@@ -36,14 +36,14 @@ FIRST_NAMES = ("background", "other", *COCO)
 CAP = 256  # C_max: what one byte can number
 
 
-def normalised(name: str) -> str:
+def normalized(name: str) -> str:
     """In lower case, with single spaces for spaces, hyphens and underscores: "TV-screen" is
     "tv screen"."""
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
 def is_name(text: object) -> bool:
-    return isinstance(text, str) and 0 < len(normalised(text)) <= LONGEST
+    return isinstance(text, str) and 0 < len(normalized(text)) <= LONGEST
 
 
 def class_names(
@@ -108,7 +108,7 @@ def _of_metadata(text: str) -> tuple[str, ...]:
 
 def canonical(name: str) -> str:
     """The one name of those that mean the same: "Sofa" is "couch"."""
-    plain = normalised(name)
+    plain = normalized(name)
     return _table("same").get(plain, plain)
 
 
@@ -195,7 +195,7 @@ class Vocabulary:
         return {"cap": self.cap, "names": list(self._names), "refused": self.refused}
 
     @staticmethod
-    def unpacked(packed: dict[str, Any]) -> "Vocabulary":
+    def unpack(packed: dict[str, Any]) -> "Vocabulary":
         """As it was, whatever has become a synonym since. Raises ValueError when these are not the
         names of a vocabulary."""
         names, vocabulary = packed["names"], Vocabulary(packed["cap"])

@@ -41,7 +41,7 @@ class Layout:
     boxes_per_cell: int
     has_objectness: bool
     is_channels_first: bool  # [1, channels, N]
-    is_centred: bool  # the image in the input
+    is_centered: bool  # the image in the input
     is_rgb: bool  # else BGR
     value_scale: float  # of pixels 0..255
 
@@ -49,9 +49,9 @@ class Layout:
 LAYOUTS = {
     layout.name: layout
     for layout in (
-        Layout("yolov5", 3, True, False, is_centred=True, is_rgb=True, value_scale=1 / 255),
-        Layout("yolox", 1, True, False, is_centred=False, is_rgb=False, value_scale=1.0),
-        Layout("yolov8", 1, False, True, is_centred=True, is_rgb=True, value_scale=1 / 255),
+        Layout("yolov5", 3, True, False, is_centered=True, is_rgb=True, value_scale=1 / 255),
+        Layout("yolox", 1, True, False, is_centered=False, is_rgb=False, value_scale=1.0),
+        Layout("yolov8", 1, False, True, is_centered=True, is_rgb=True, value_scale=1 / 255),
     )
 }
 
@@ -65,10 +65,10 @@ class Grid:
     strides_px: np.ndarray
     boxes_per_cell: int
 
-    def cells_apart(self, centres_px: np.ndarray) -> float:
+    def cells_apart(self, centers_px: np.ndarray) -> float:
         """Distance of boxes [N, 2] from the middles of their cells, in cells, in the median."""
         middles_px = self.corners_px + self.strides_px / 2
-        return float(np.median(np.abs(centres_px - middles_px) / self.strides_px))
+        return float(np.median(np.abs(centers_px - middles_px) / self.strides_px))
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class Head:
             return np.hstack((corners + boxes[:, :2] * strides, np.exp(boxes[:, 2:]) * strides))
 
 
-def recognise(output: np.ndarray, input_px: tuple[int, int], wanted: str = "") -> Head:
+def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "") -> Head:
     """What an output of the network means.
 
     output    what it makes of an image, all outputs but this one being absent
@@ -249,12 +249,12 @@ class Letterbox:
     offset_px: tuple[int, int]
 
     @staticmethod
-    def fit(image_px: tuple[int, int], input_px: tuple[int, int], is_centred: bool) -> "Letterbox":
+    def fit(image_px: tuple[int, int], input_px: tuple[int, int], is_centered: bool) -> "Letterbox":
         """Centred as YOLOv5 has it, or in the upper left corner as YOLOX does."""
         scale = min(input_px[0] / image_px[0], input_px[1] / image_px[1])
         inner = max(1, round(image_px[0] * scale)), max(1, round(image_px[1] * scale))
         room = input_px[0] - inner[0], input_px[1] - inner[1]
-        offset = (room[0] // 2, room[1] // 2) if is_centred else (0, 0)
+        offset = (room[0] // 2, room[1] // 2) if is_centered else (0, 0)
         return Letterbox(image_px, input_px, inner, offset)
 
     def canvas(self, image: np.ndarray) -> np.ndarray:

@@ -1,17 +1,17 @@
 """How good a run is: trajectories, rendered views, pictures of both."""
 
 from .pictures import contact_sheet, depth_picture, trajectory_picture
-from .trajectory import ErrorStatistics, TrajectoryErrors, align, evaluate_trajectory
+from .trajectory import ErrorStatistics, TrajectoryErrors, evaluate_trajectory, fit_rigid_transform
 from .views import depth_error, psnr, ssim
 
 __all__ = [
     "ErrorStatistics",
     "TrajectoryErrors",
-    "align",
     "contact_sheet",
     "depth_error",
     "depth_picture",
     "evaluate_trajectory",
+    "fit_rigid_transform",
     "psnr",
     "ssim",
     "trajectory_picture",

@@ -11,9 +11,9 @@ from ldo_service.gaussians import (
     Exposure,
     GaussianMap,
     LossWeights,
-    Rasteriser,
-    Reached,
+    Rasterizer,
     RowGradients,
+    VisibleGaussians,
     image_loss,
 )
 from ldo_service.geometry import Camera, se3
@@ -66,15 +66,15 @@ class Iteration:
         for keyframe, part in enumerate(_shares(elsewhere, n)):
             self.gaussians.add(walls(part, camera, keyframe), 1 + keyframe)
         self.gaussians.move_anchors(_turned_away(range(1, 1 + len(_shares(elsewhere, n)))))
-        self._rasteriser, self._adam = Rasteriser(threads=threads), Adam()
+        self._rasterizer, self._adam = Rasterizer(threads=threads), Adam()
         self._color, self._depth_m = noise_frame(camera)
         self._exposure = Exposure()
         self._planes = self.forward()
         self._by_planes = np.empty_like(self._planes)
 
     def forward(self) -> np.ndarray:
-        """Planes [5, H, W], as `Rasteriser.render`."""
-        self._planes = self._rasteriser.render(
+        """Planes [5, H, W], as `Rasterizer.render`."""
+        self._planes = self._rasterizer.render(
             self.gaussians.rows, self.camera, np.eye(4), bounds=self.gaussians.bounds
         )
         return self._planes
@@ -87,11 +87,11 @@ class Iteration:
 
     def backward(self) -> RowGradients:
         """Derivatives by rows and pose, alone."""
-        return self._rasteriser.gradients(self._by_planes)
+        return self._rasterizer.gradients(self._by_planes)
 
-    def descent(self) -> Reached:
+    def descent(self) -> VisibleGaussians:
         """Derivatives by rows and pose, and with them a step of Adam."""
-        return self._adam.descend(self.gaussians, self._rasteriser, self._by_planes, rate=0.1)
+        return self._adam.step_fused(self.gaussians, self._rasterizer, self._by_planes, rate=0.1)
 
     def steps(self) -> Steps:
         return {"forward": self.forward, "loss": self.loss, "descent": self.descent}

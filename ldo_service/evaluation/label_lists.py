@@ -5,18 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldo_service.detection.vocabulary import COCO, canonical, coco_class, normalised
+from ldo_service.detection.vocabulary import COCO, canonical, coco_class, normalized
 from ldo_service.errors import DataError
 from ldo_service.geometry.sequence import VOID_NAMES
 
 BACKGROUND = "background"
 BUILDING = frozenset({BACKGROUND, "wall", "floor", "ceiling"})  # what no map names
 VOID, UNKNOWN = 255, 254  # truth that does not count; a name of the map that is not in the list
-MOST_NAMES = UNKNOWN
+MAX_NAMES = UNKNOWN
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class LabelList:
+class LabelSet:
     """Names by index, background first.
 
     name    what to call the list in tables
@@ -44,23 +44,23 @@ class LabelList:
         return table
 
 
-def coco_list(class_names: Iterable[str]) -> LabelList:
+def coco_list(class_names: Iterable[str]) -> LabelSet:
     """Background and the classes of COCO among those of a data set, by the table of synonyms; all
     that COCO has no class for is background, `other` is unknown."""
     mapped = {coco_class(name) for name in class_names}
-    return LabelList("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
+    return LabelSet("COCO", (BACKGROUND, *(n for n in COCO if n in mapped)), _in_coco)
 
 
-def full_list(class_names: Iterable[str]) -> LabelList:
+def full_list(class_names: Iterable[str]) -> LabelSet:
     """Background and all objects of a data set; those that COCO has a class for go by its name.
 
     Raises DataError for more than an image of labels can tell apart.
     """
     placed = (place_of_object(name) for name in class_names if not is_void(name))
     names = tuple(dict.fromkeys((BACKGROUND, *placed)))
-    if len(names) > MOST_NAMES:
-        raise DataError(f"{len(names)} names of objects: at most {MOST_NAMES} can be judged.")
-    return LabelList("all names", names, place_of_object)
+    if len(names) > MAX_NAMES:
+        raise DataError(f"{len(names)} names of objects: at most {MAX_NAMES} can be judged.")
+    return LabelSet("all names", names, place_of_object)
 
 
 def object_labels(map_names: Sequence[str]) -> np.ndarray:
@@ -71,7 +71,7 @@ def object_labels(map_names: Sequence[str]) -> np.ndarray:
 
 
 def is_void(name: str) -> bool:
-    return normalised(name) in VOID_NAMES
+    return normalized(name) in VOID_NAMES
 
 
 def place_of_object(name: str) -> str:

@@ -9,12 +9,12 @@ from ldo_service.detection.vocabulary import COCO
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import FrameLabels
 
-from .label_lists import BACKGROUND, VOID, LabelList, place_of_object
+from .label_lists import BACKGROUND, VOID, LabelSet, place_of_object
 
 NEAREST_M = 0.05  # in front of the second camera
 SAME_SURFACE = 0.02  # difference of depths, of the depth
 
-LEAST_SHARE = 0.005  # of the pixels of a view: an object smaller than that need not be found
+MIN_SHARE = 0.005  # of the pixels of a view: an object smaller than that need not be found
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -72,15 +72,17 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class DetectionCounts:
     """right of `wanted` that there are, and of `named` that are said to be."""
 
     right: int = 0
     wanted: int = 0
     named: int = 0
 
-    def __add__(self, other: "Found") -> "Found":
-        return Found(self.right + other.right, self.wanted + other.wanted, self.named + other.named)
+    def __add__(self, other: "DetectionCounts") -> "DetectionCounts":
+        return DetectionCounts(
+            self.right + other.right, self.wanted + other.wanted, self.named + other.named
+        )
 
     @property
     def recall(self) -> float:
@@ -99,9 +101,9 @@ class OpenNames:
     wall can be called by a wrong name.
     """
 
-    def __init__(self, labels: LabelList, map_names: Sequence[str]) -> None:
+    def __init__(self, labels: LabelSet, map_names: Sequence[str]) -> None:
         """`labels` is the full list of a data set, `map_names` are by label of the map."""
-        self.pixels = Found()
+        self.pixels = DetectionCounts()
         self._of_map = labels.of_map(map_names)
         self._is_named = _table(map_names)
         self._is_wanted = _table(labels.names)
@@ -112,7 +114,7 @@ class OpenNames:
         """truth [H, W] uint8, index in the list or VOID; shown [H, W] uint8, label of the map."""
         self._add_pixels(truth, shown)
         sizes = np.bincount(frame.instance_ids.ravel())
-        for instance in np.flatnonzero(sizes >= LEAST_SHARE * truth.size).tolist():
+        for instance in np.flatnonzero(sizes >= MIN_SHARE * truth.size).tolist():
             mask = (frame.instance_ids == instance) & (truth != VOID)
             if mask.any():
                 votes = np.bincount(shown[mask], minlength=256)
@@ -124,15 +126,17 @@ class OpenNames:
         truth, shown = truth[counted], shown[counted]
         named, wanted = self._is_named[shown], self._is_wanted[truth]
         right = named & (self._of_map[shown] == truth)
-        self.pixels += Found(*(int(np.count_nonzero(kind)) for kind in (right, wanted, named)))
+        self.pixels += DetectionCounts(
+            *(int(np.count_nonzero(kind)) for kind in (right, wanted, named))
+        )
 
     @property
-    def objects(self) -> Found:
+    def objects(self) -> DetectionCounts:
         called = {instance: int(votes.argmax()) for instance, votes in self._votes.items()}
         named = [instance for instance, label in called.items() if self._is_named[label]]
         right = [i for i in named if self._of_map[called[i]] == self._truth[i]]
         wanted = [truth for truth in self._truth.values() if self._is_wanted[truth]]
-        return Found(len(right), len(wanted), len(named))
+        return DetectionCounts(len(right), len(wanted), len(named))
 
 
 def is_beyond_coco(name: str) -> bool:

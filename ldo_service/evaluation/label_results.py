@@ -12,8 +12,8 @@ from ldo_service.detection.vocabulary import COCO
 from ldo_service.geometry.sequence import Sequence
 
 from .finished_run import FinishedRun
-from .label_lists import UNKNOWN, VOID, LabelList, full_list
-from .label_measures import Found, class_ious
+from .label_lists import UNKNOWN, VOID, LabelSet, full_list
+from .label_measures import DetectionCounts, class_ious
 from .pictures import Color, contact_sheet, legend
 from .semantics import GATES, LabelErrors, LabelView, ListErrors, labelled_maps
 from .sheet import VIEWS, shrunk
@@ -33,7 +33,7 @@ ERRORS = {
     "another object": CONFUSED,
 }
 
-FEWEST_OBJECTS = 0.02  # of the pixels of a frame that is shown
+MIN_OBJECTS = 0.02  # of the pixels of a frame that is shown
 FIGURES = ("mean_iou", "object_iou", "weighted_iou", "mean_accuracy", "pixel_accuracy")
 
 
@@ -70,7 +70,7 @@ def label_sheet(
 
 
 def _pictures(
-    color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelList, colors: np.ndarray
+    color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelSet, colors: np.ndarray
 ) -> list[np.ndarray]:
     return [
         color,
@@ -92,17 +92,17 @@ def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
 
 def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """[H, W, 3] uint8, each object in its colour."""
-    grey = _grey(color)
-    mixed = (1 - PAINT) * grey + PAINT * colors[labels]
-    return np.where(labels[..., None] > 0, np.round(mixed), grey).astype(np.uint8)
+    gray = _gray(color)
+    mixed = (1 - PAINT) * gray + PAINT * colors[labels]
+    return np.where(labels[..., None] > 0, np.round(mixed), gray).astype(np.uint8)
 
 
 def error_colors(
-    color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelList
+    color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelSet
 ) -> np.ndarray:
     """[H, W, 3] uint8, by `ERRORS`; grey where both are background or truth does not count."""
     is_object, is_shown = truth > 0, shown > 0
-    picture = _grey(color).astype(np.uint8)
+    picture = _gray(color).astype(np.uint8)
     has_class = np.isin(truth, [k for k, name in enumerate(labels.names) if name in COCO])
     picture[is_object & ~is_shown] = BEYOND
     picture[has_class & ~is_shown] = MISSED
@@ -113,10 +113,10 @@ def error_colors(
     return picture
 
 
-def _grey(color: np.ndarray) -> np.ndarray:
+def _gray(color: np.ndarray) -> np.ndarray:
     """Bright, so that colours stand out."""
-    grey = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[..., None].astype(np.float32)
-    return np.repeat(np.round(96 + 0.5 * grey), 3, axis=2)
+    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[..., None].astype(np.float32)
+    return np.repeat(np.round(96 + 0.5 * gray), 3, axis=2)
 
 
 def _color(rgb: np.ndarray) -> Color:
@@ -148,7 +148,7 @@ def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, st
     shares = {}
     for frame, counts in zip(errors.frames, errors.confusions, strict=True):
         objects = counts.sum() - counts[0, 0]  # that there are, or that are shown
-        if objects > FEWEST_OBJECTS * counts.sum():
+        if objects > MIN_OBJECTS * counts.sum():
             shares[frame] = float(np.diag(counts)[1:].sum() / objects)
     ranked = sorted(shares, key=lambda frame: (shares[frame], frame))
     places = np.unique(np.round(np.linspace(0, len(ranked) - 1, count)).astype(int))
@@ -189,7 +189,7 @@ def _plain_figures(row: ListErrors, gate: float) -> dict[str, Any]:
     return {"classes": figures.classes, **plain}
 
 
-def _plain(found: Found) -> dict[str, Any]:
+def _plain(found: DetectionCounts) -> dict[str, Any]:
     return {
         "right": found.right,
         "wanted": found.wanted,

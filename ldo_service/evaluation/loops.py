@@ -11,7 +11,7 @@ from ldo_service.geometry.sequence import Sequence as Frames
 from .trajectory import ASSOCIATION_TOLERANCE_S
 
 APART_FRAMES = 100
-LEAST_OVERLAP = 0.3
+MIN_OVERLAP = 0.3
 KEPT_ACROSS, ASKED_ACROSS = 160, 40  # pixels in a row of depth, and those asked for a partner
 SAME_M, SAME_SHARE = 0.05, 0.03  # of depth: nearer to each other two depths are one surface
 LEFTOVER, LEAST = 5, 3  # keyframes of a subgraph that loops.json does not name
@@ -26,7 +26,7 @@ against the true one. Time: of the whole search over its candidates, per candida
 
 
 @dataclass(frozen=True, slots=True)
-class PairCompared:
+class ComparedPair:
     """Two subgraphs, by the ids of their keyframes."""
 
     newer: tuple[int, ...]
@@ -46,7 +46,7 @@ class LoopClosed:
 
 @dataclass(frozen=True, slots=True)
 class FoundLoops:
-    candidates: tuple[PairCompared, ...]
+    candidates: tuple[ComparedPair, ...]
     closures: tuple[LoopClosed, ...]
 
 
@@ -188,9 +188,9 @@ def _are_partners(new: SeenKeyframe, old: SeenKeyframe) -> bool:
     if abs(new.frame - old.frame) <= APART_FRAMES:
         return False
     looks_away = new.T_world_camera[:3, 2] @ old.T_world_camera[:3, 2] < 0
-    if looks_away or overlap(new, old) <= LEAST_OVERLAP:
+    if looks_away or overlap(new, old) <= MIN_OVERLAP:
         return False
-    return overlap(old, new) > LEAST_OVERLAP
+    return overlap(old, new) > MIN_OVERLAP
 
 
 def _are_known(closure: LoopClosed, keyframes: Mapping[int, SeenKeyframe]) -> bool:

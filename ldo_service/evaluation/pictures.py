@@ -8,7 +8,7 @@ import numpy as np
 
 from ldo_service.geometry import Trajectory, associate, se3
 
-from .trajectory import ASSOCIATION_TOLERANCE_S, FEWEST_POSES, align
+from .trajectory import ASSOCIATION_TOLERANCE_S, MIN_POSES, fit_rigid_transform
 
 Color = tuple[int, int, int]
 BACKGROUND, INK, GRID = (255, 255, 255), (60, 60, 60), (232, 232, 232)
@@ -124,9 +124,9 @@ def _aligned_positions(estimate: Trajectory, truth: Trajectory | None) -> np.nda
     if truth is None:
         return positions
     pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
-    if len(pairs) < FEWEST_POSES:
+    if len(pairs) < MIN_POSES:
         return positions
-    T = align(positions[pairs[:, 0]], truth.T_world_camera[pairs[:, 1], :3, 3])
+    T = fit_rigid_transform(positions[pairs[:, 0]], truth.T_world_camera[pairs[:, 1], :3, 3])
     return se3.transform(T, positions)
 
 

@@ -19,7 +19,7 @@ from .pictures import save_picture, trajectory_picture
 from .semantics import LabelErrors, evaluate_labels
 from .sheet import rendering_sheet
 from .trajectory import TrajectoryErrors, evaluate_trajectory
-from .views import FIGURES, Distance, Judged, RenderedView, RenderingErrors, view_of
+from .views import FIGURES, Distance, EvaluatedFrames, RenderedView, RenderingErrors, view_of
 
 NO_TRUTH = "The source does not say what its pixels show, so the labels of the map are not judged."
 NO_LABELS = "The map has no labels to judge: `ldo run --set detector.model=NAME` makes some."
@@ -28,7 +28,7 @@ NO_LABELS = "The map has no labels to judge: `ldo run --set detector.model=NAME`
 @dataclass(frozen=True, slots=True)
 class Results:
     trajectories: dict[str, TrajectoryErrors] | None  # None without ground truth
-    judged: Judged
+    judged: EvaluatedFrames
     renderings: list[RenderingErrors]
     labels: list[LabelErrors]  # of maps that have some, where the source says what is true
     unlabelled: str  # what is missing where only one of them has labels
@@ -52,7 +52,7 @@ def evaluate_run(
     Raises DataError when a file does not fit or nothing can be judged, ConfigError when a picture
     cannot be written.
     """
-    judged, truth = Judged.of(run.frames), sequence.truth()
+    judged, truth = EvaluatedFrames.of(run.frames), sequence.truth()
     if truth is None and not (judged.posed and run.maps):
         missing = "pose to render from" if run.maps else "map"
         raise DataError(
@@ -81,7 +81,7 @@ def evaluate_run(
 def work(run: FinishedRun, sequence: Sequence) -> int:
     """Frames to render, those to label counted again."""
     labelled = has_labels(run) and sequence.true_labels() is not None
-    return len(Judged.of(run.frames).posed) * (1 + labelled)
+    return len(EvaluatedFrames.of(run.frames).posed) * (1 + labelled)
 
 
 def has_labels(run: FinishedRun) -> bool:
@@ -142,7 +142,7 @@ def draw(folder: Path, pictures: dict[str, np.ndarray]) -> list[Path]:
     return [folder / name for name in pictures]
 
 
-def plain(results: Results) -> dict[str, Any]:
+def to_json(results: Results) -> dict[str, Any]:
     """All of it for JSON, frame by frame; what is no finite number is null."""
     trajectories = results.trajectories
     return {

@@ -14,11 +14,11 @@ from ldo_service.semantics.semantic_fusion import label_image
 from ldo_service.semantics.semantics_file import SavedSemantics
 
 from .finished_run import FinishedRun, PosedMap, RunFrame
-from .label_lists import LabelList, coco_list, full_list, object_labels
+from .label_lists import LabelSet, coco_list, full_list, object_labels
 from .label_measures import (
     Agreement,
     Correspondences,
-    Found,
+    DetectionCounts,
     OpenNames,
     Segmentation,
     agreement,
@@ -26,7 +26,7 @@ from .label_measures import (
     correspondences,
     segmentation,
 )
-from .views import Judged
+from .views import EvaluatedFrames
 
 APART = 3  # frames, between views that ought to agree
 GATES = {"from 0.2 %": 0.002, "all": 0.0}  # share of the pixels that a class must have
@@ -52,7 +52,7 @@ name, precision of those that are called by one; below that, the same of pixels.
 class ListErrors:
     """One list of names: confusions [C, C + 1] of each frame."""
 
-    labels: LabelList
+    labels: LabelSet
     frames: tuple[int, ...]
     confusions: tuple[np.ndarray, ...]
 
@@ -78,8 +78,8 @@ class LabelErrors:
     lists: tuple[ListErrors, ...]
     consistency: Agreement
     pairs: int  # of frames, that consistency is of
-    objects: Found  # with names beyond COCO
-    pixels: Found
+    objects: DetectionCounts  # with names beyond COCO
+    pixels: DetectionCounts
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -120,7 +120,7 @@ class MapLabels:
         return label_image(rows, self._saved.labels, made, camera, T_camera_map, threads=threads)
 
 
-class LabelJudge:
+class LabelEvaluator:
     """Takes view after view of one map."""
 
     def __init__(self, map_names: Sequence[str], class_names: Sequence[str]) -> None:
@@ -157,7 +157,7 @@ class LabelJudge:
 def evaluate_labels(
     sequence: datasets.Sequence,
     run: FinishedRun,
-    judged: Judged,
+    judged: EvaluatedFrames,
     advance: Callable[[int], None],
     *,
     threads: int = 1,
@@ -170,7 +170,7 @@ def evaluate_labels(
     labels, maps = sequence.true_labels(), labelled_maps(sequence, run, threads)
     if labels is None or not maps:
         return []
-    judges = [LabelJudge(map_.names, labels.class_names) for map_ in maps]
+    judges = [LabelEvaluator(map_.names, labels.class_names) for map_ in maps]
     pairs = Pairs(sequence, run)
     for done, frame in enumerate(judged.posed, 1):
         image, truth = sequence[frame.index], labels.frame(frame.index)

@@ -6,11 +6,11 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Trajectory, associate, se3
-from ldo_service.geometry.se3 import align
+from ldo_service.geometry.se3 import fit_rigid_transform
 
 ASSOCIATION_TOLERANCE_S = 0.020
 RPE_INTERVAL_S = 1.0
-FEWEST_POSES = 3  # fewer points do not fix a rotation
+MIN_POSES = 3  # fewer points do not fix a rotation
 
 PROTOCOL = """\
 Estimate and truth are paired by nearest stamp within 20 ms, each pose used once.
@@ -62,7 +62,7 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
     pairs = associated(estimate, truth)
     T_estimate = estimate.T_world_camera[pairs[:, 0]]
     T_truth = truth.T_world_camera[pairs[:, 1]]
-    T_truth_estimate = align(T_estimate[:, :3, 3], T_truth[:, :3, 3])
+    T_truth_estimate = fit_rigid_transform(T_estimate[:, :3, 3], T_truth[:, :3, 3])
     aligned = se3.transform(T_truth_estimate, T_estimate[:, :3, 3])
     interval = _poses_per_interval(estimate.stamps_s[pairs[:, 0]])
     relative = _relative_errors(T_estimate, T_truth, interval)
@@ -79,11 +79,11 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
 def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
     """Index pairs [M, 2] by nearest stamp within 20 ms. Raises DataError below 3 pairs."""
     pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
-    if len(pairs) < FEWEST_POSES:
+    if len(pairs) < MIN_POSES:
         raise DataError(
             f"{len(pairs)} of {len(estimate)} estimated poses have a true pose within 20 ms (the "
             f"estimate spans {_span(estimate)}, the truth {_span(truth)}), and at least "
-            f"{FEWEST_POSES} are needed. Check that both use the same clock."
+            f"{MIN_POSES} are needed. Check that both use the same clock."
         )
     return pairs
 

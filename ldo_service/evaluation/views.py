@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from ldo_service.gaussians.exposure import Exposure, fitted_exposure
+from ldo_service.gaussians.exposure import Exposure, fit_exposure
 from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import Sequence
@@ -172,7 +172,7 @@ def every_pixel(view: RenderedView) -> Images:
 
 def exposure_fitted(view: RenderedView) -> Images:
     shown = view.rendering.color
-    return view.seen, fitted_exposure(shown, view.seen).applied(shown)
+    return view.seen, fit_exposure(shown, view.seen).applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
@@ -193,17 +193,17 @@ TRAINING = {"B training": measured_pixels}
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class EvaluatedFrames:
     """The frames of a run that each protocol asks for; those that are LOST have no pose."""
 
     held_out: tuple[RunFrame, ...]
     training: tuple[RunFrame, ...]
 
     @staticmethod
-    def of(frames: Iterable[RunFrame]) -> "Judged":
+    def of(frames: Iterable[RunFrame]) -> "EvaluatedFrames":
         frames = tuple(frames)
         training = tuple(frame for frame in frames if not frame.is_held_out)
-        return Judged(
+        return EvaluatedFrames(
             tuple(frame for frame in frames if frame.is_held_out), training[::TRAINING_STEP]
         )
 
@@ -230,7 +230,7 @@ def view_of(image: RgbdFrame, posed: PosedMap, frame: RunFrame, threads: int = 1
 
 def evaluate_rendering(
     sequence: Sequence,
-    judged: Judged,
+    judged: EvaluatedFrames,
     maps: Iterable[PosedMap],
     advance: Callable[[int], None],
     *,
@@ -248,14 +248,14 @@ def evaluate_rendering(
         image = sequence[frame.index]
         for posed in maps:
             view = view_of(image, posed, frame, threads)
-            for protocol, errors in judge(view, frame.is_held_out, distance):
+            for protocol, errors in evaluate_view(view, frame.is_held_out, distance):
                 views[posed.name, protocol].append(errors)
         advance(done)
     order = [(posed.name, protocol) for posed in maps for protocol in (*HELD_OUT, *TRAINING)]
     return [RenderingErrors(*key, tuple(views[key])) for key in order if key in views]
 
 
-def judge(
+def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
     """Protocols that a frame belongs to, and its errors by each."""

@@ -1,45 +1,45 @@
 """The map of 3D Gaussians: what it holds, how it is seen, how it grows and how it is optimised."""
 
 from .adam import Adam, AdamConfig
-from .densification import InsertionConfig, insert
-from .exposure import Exposure, estimated_exposure, fitted_exposure
+from .densification import DensificationConfig, densify
+from .exposure import Exposure, estimate_exposure, fit_exposure
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
-from .optimizer import Optimiser, OptimiserConfig
-from .pruning import PruningConfig, superfluous
+from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
+from .pruning import PruningConfig, prunable_mask
 from .renderer import (
     Contributions,
-    Rasteriser,
-    Reached,
+    Rasterizer,
     Rendering,
     RenderMemory,
     RowGradients,
+    VisibleGaussians,
     render,
 )
-from .training_views import View
+from .training_views import TrainingView
 
 __all__ = [
     "Adam",
     "AdamConfig",
     "Contributions",
+    "DensificationConfig",
     "Exposure",
     "GaussianMap",
+    "GaussianOptimizer",
+    "GaussianOptimizerConfig",
     "ImageLoss",
-    "InsertionConfig",
     "LossWeights",
-    "Optimiser",
-    "OptimiserConfig",
     "PruningConfig",
-    "Rasteriser",
-    "Reached",
+    "Rasterizer",
     "RenderMemory",
     "Rendering",
     "RowGradients",
-    "View",
-    "estimated_exposure",
-    "fitted_exposure",
+    "TrainingView",
+    "VisibleGaussians",
+    "densify",
+    "estimate_exposure",
+    "fit_exposure",
     "image_loss",
-    "insert",
+    "prunable_mask",
     "render",
-    "superfluous",
 ]

@@ -11,7 +11,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.kernels import _adam
 
 from .model import GaussianMap, aligned_rows
-from .renderer import AdamStep, Rasteriser, Reached, RowGradients
+from .renderer import AdamStep, Rasterizer, RowGradients, VisibleGaussians
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,9 @@ class Adam:
         self._ids = np.zeros(0, np.int64)
         self._moments = [aligned_rows(0), aligned_rows(0)]  # with room to grow
         self._steps = np.zeros(0, np.int32)
-        self._followed: tuple[ref[GaussianMap], int] | None = None  # whose ids, and which of them
+        self._followed: tuple[ref[GaussianMap], int] | None = (
+            None  # whose ids, and which of them
+        )
 
     def step(
         self,
@@ -94,20 +96,20 @@ class Adam:
         )
         gaussians.touch(gradients.indices)
 
-    def descend(
+    def step_fused(
         self,
         gaussians: GaussianMap,
-        rasteriser: Rasteriser,
+        rasterizer: Rasterizer,
         by_planes: np.ndarray,
         *,
         rate: float = 1.0,
         needle_weight: float = 0.0,
         needle_ratio: float = 1.0,
         max_sigma_px: float = inf,
-    ) -> Reached:
+    ) -> VisibleGaussians:
         """`step` against the gradients of what `rasteriser` last rendered of this map, which are
-        never written out; `Rasteriser` says what `by_planes`, needles and `max_sigma_px` are."""
-        reached = rasteriser.descend(
+        never written out; `Rasterizer` says what `by_planes`, needles and `max_sigma_px` are."""
+        reached = rasterizer.descend(
             by_planes,
             self._step(gaussians, rate),
             needle_weight=needle_weight,

@@ -7,7 +7,7 @@ import numpy as np
 
 
 @dataclass(frozen=True, slots=True)
-class Cells:
+class QuadtreeCells:
     """M squares of pixels that do not overlap: rows [row, row + size), columns likewise; int64."""
 
     row: np.ndarray
@@ -45,7 +45,7 @@ def quadtree(
     coarsest_px: int,
     max_contrast: float,
     max_depth_step: float,
-) -> Cells:
+) -> QuadtreeCells:
     """Split cells of `coarsest_px`, a power of 2, in four until each is uniform.
 
     A cell is uniform where the image gradient over it and a rim of one pixel amounts to no more
@@ -70,7 +70,7 @@ def quadtree(
         levels.append((row * size, column * size, np.full(len(row), size)))
         undecided = (undecided & ~uniform).repeat(2, 0).repeat(2, 1)
         size //= 2
-    return Cells(*(np.concatenate(field) for field in zip(*levels, strict=True)))
+    return QuadtreeCells(*(np.concatenate(field) for field in zip(*levels, strict=True)))
 
 
 def _padded(image: np.ndarray, multiple: int) -> np.ndarray:

@@ -32,7 +32,7 @@ class ChangeLog:
         self._is_changed = np.zeros(0, bool)  # per row of the map, as it was last seen
         self._removed: list[np.ndarray] = []
 
-    def grown(self, gaussians: GaussianMap) -> None:
+    def mark_added(self, gaussians: GaussianMap) -> None:
         """Rows were appended."""
         new = len(gaussians) - len(self._is_changed)
         self._is_changed = np.concatenate([self._is_changed, np.zeros(new, bool)])
@@ -41,7 +41,7 @@ class ChangeLog:
         """The rows where `mask` [N] is true were written to."""
         self._is_changed |= mask
 
-    def removing(self, gaussians: GaussianMap, mask: np.ndarray) -> None:
+    def mark_removed(self, gaussians: GaussianMap, mask: np.ndarray) -> None:
         """The rows where `mask` [N] is true are about to go."""
         ids = gaussians.ids[mask]
         self._removed.append(ids[ids < self._next_untold])
@@ -51,13 +51,13 @@ class ChangeLog:
         """These [L] are gone for good, from where nobody looked."""
         self._removed.append(ids[ids < self._next_untold])
 
-    def woken(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
+    def mark_loaded(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
         """Rows came back as followers hold them."""
         is_changed = np.zeros(len(gaussians), bool)
         is_changed[~np.isin(gaussians.ids, ids, assume_unique=True)] = self._is_changed
         self._is_changed = is_changed
 
-    def take(self, gaussians: GaussianMap, *, with_changed: bool) -> Changes:
+    def drain(self, gaussians: GaussianMap, *, with_changed: bool) -> Changes:
         """What is to be told now; it counts as told. Without `with_changed` the rows that changed
         wait for another time."""
         first_new = int(np.searchsorted(gaussians.ids, self._next_untold))
@@ -72,7 +72,7 @@ class ChangeLog:
             self._next_untold = int(gaussians.ids[-1]) + 1
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
-    def all_told(self, gaussians: GaussianMap) -> None:
+    def mark_all_published(self, gaussians: GaussianMap) -> None:
         """Followers know the whole map, which may be another than it was."""
         newest = int(gaussians.ids[-1]) if len(gaussians) else -1
         self._next_untold = max(self._next_untold, newest + 1)

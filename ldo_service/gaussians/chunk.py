@@ -9,7 +9,7 @@ import zstandard
 
 from ldo_service.errors import DataError
 
-from .model import LABEL_BYTES, ROW, Piece, moved_rows
+from .model import LABEL_BYTES, ROW, GaussianBatch, transform_rows
 
 _HEADER = struct.Struct("<qq")  # anchor, Gaussians
 _LEVEL = 1  # of zstd
@@ -29,19 +29,19 @@ class Chunk:
         """[M] int32, as GaussianMap keeps them."""
         return np.full(len(self.ids), self.anchor, np.int32)
 
-    def piece(self) -> Piece:
-        return Piece(self.ids, self.rows, self.anchors, self.labels)
+    def piece(self) -> GaussianBatch:
+        return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 
     def moved(self, motions: Iterable[np.ndarray]) -> "Chunk":
         """By one motion T_new_old [4, 4] of the anchor after the other, to the bits that
         `GaussianMap.move_anchors` gives. Itself without any."""
         rows = self.rows
         for T_new_old in motions:
-            rows = moved_rows(rows, T_new_old)
+            rows = transform_rows(rows, T_new_old)
         return replace(self, rows=rows)
 
 
-def packed(chunk: Chunk) -> bytes:
+def pack(chunk: Chunk) -> bytes:
     """Ids as differences, rows and labels byte by byte, as the same byte of neighbours is often
     equal."""
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
@@ -51,7 +51,7 @@ def packed(chunk: Chunk) -> bytes:
     return zstandard.ZstdCompressor(level=_LEVEL).compress(body)
 
 
-def unpacked(data: bytes | memoryview) -> Chunk:
+def unpack(data: bytes | memoryview) -> Chunk:
     """The chunk of which `data` is the packed form. Raises DataError for other bytes."""
     try:
         body = zstandard.ZstdDecompressor().decompress(data)

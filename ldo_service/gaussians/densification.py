@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
-from .cells import Cells, quadtree
+from .cells import QuadtreeCells, quadtree
 from .model import ROW, GaussianMap
 from .renderer import Rendering, render
 
@@ -23,7 +23,7 @@ LOW_PASS_TAKEN_BACK_PX2 = 0.2
 
 
 def surfels(
-    cells: Cells,
+    cells: QuadtreeCells,
     color: np.ndarray,
     depth_m: np.ndarray,
     camera: Camera,
@@ -61,7 +61,7 @@ def surfels(
 
 
 def normals_of(
-    cells: Cells, rays: np.ndarray, z: np.ndarray, depth_m: np.ndarray, camera: Camera
+    cells: QuadtreeCells, rays: np.ndarray, z: np.ndarray, depth_m: np.ndarray, camera: Camera
 ) -> np.ndarray:
     """Unit surface normals [M, 3], camera frame, away from the camera.
 
@@ -114,7 +114,7 @@ def _quaternions(R: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
-class InsertionConfig:
+class DensificationConfig:
     """Figures: change of PSNR against these defaults (28.2 dB) on frames held out of 75 of a
     Replica apartment with true poses, every 5th inserted, nothing optimised, pixels without
     opacity left out. The defaults were chosen on the same frames."""
@@ -169,12 +169,12 @@ class InsertionConfig:
             raise ConfigError(f"max_stretch={self.max_stretch} must be at least 1.")
 
 
-def insert(
+def densify(
     gaussians: GaussianMap,
     frame: RgbdFrame,
     T_map_camera: np.ndarray,
     keyframe: int,
-    config: InsertionConfig | None = None,
+    config: DensificationConfig | None = None,
     *,
     before: Rendering | None = None,
     left_out: np.ndarray | None = None,
@@ -187,7 +187,7 @@ def insert(
     new Gaussians, none where depth is missing. Old Gaussians stay as they are. Deterministic: no
     random numbers, and the same bits for any number of threads.
     """
-    config = config or InsertionConfig()
+    config = config or DensificationConfig()
     T_camera_map = se3.inverse(T_map_camera)
 
     def seen() -> Rendering:
@@ -199,7 +199,7 @@ def insert(
     if left_out is not None:
         frame = _without(frame, left_out, before)
     depth_m = with_small_holes_filled(frame.depth_m, config.hole_px)
-    wanted = unexplained(frame, before, config) & (depth_m > 0)
+    wanted = densification_mask(frame, before, config) & (depth_m > 0)
     if left_out is not None:
         wanted &= ~left_out
 
@@ -233,7 +233,9 @@ def insert(
     return ids
 
 
-def unexplained(frame: RgbdFrame, rendering: Rendering, config: InsertionConfig) -> np.ndarray:
+def densification_mask(
+    frame: RgbdFrame, rendering: Rendering, config: DensificationConfig
+) -> np.ndarray:
     """Pixels [H, W] bool that show what the map lacks, and `overlap_px` around them."""
     known = (frame.depth_m > 0) & (rendering.median_depth_m > 0)
     nearer = frame.depth_m < (1 - config.in_front) * nearest_around(
@@ -270,7 +272,11 @@ def with_small_holes_filled(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
 
 
 def correct_colors(
-    colors: np.ndarray, cells: Cells, frame: RgbdFrame, rendering: Rendering, max_step: float
+    colors: np.ndarray,
+    cells: QuadtreeCells,
+    frame: RgbdFrame,
+    rendering: Rendering,
+    max_step: float,
 ) -> None:
     """Add to each of `colors` [M, 3], in place, what its cell lacks in the rendering, at most
     `max_step`."""

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-LEAST_GAIN = 0.1  # below, nothing of the map's brightness can be told from the image
-LEAST_BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of
+MIN_GAIN = 0.1  # below, nothing of the map's brightness can be told from the image
+MIN_BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of
 BLOCKS_ACROSS = 40  # brightness; so many blocks in a row say as much as more would
 SATURATED = 0.97  # of the range: beyond, the sensor says no more
-LEAST_SHARE = 0.15  # of the image that must be comparable
-FEWEST_BLOCKS = 16
+MIN_SHARE = 0.15  # of the image that must be comparable
+MIN_BLOCKS = 16
 OUTLIER_SIGMAS = 2.5
 MAX_GAIN = 3.0  # and its inverse: a stop and a half
 ROUNDS = 6
@@ -20,7 +20,7 @@ ROUNDS = 6
 GAIN_SIGMA = 0.3
 BIAS_SIGMA = 0.02  # of the range
 PATCHES = 50  # that the blocks of an image are worth at most: neighbours err alike
-FIRST_SIGMA, LEAST_SIGMA = 0.05, 0.01  # of a block's colour, at the first round and at the least
+FIRST_SIGMA, MIN_SIGMA = 0.05, 0.01  # of a block's colour, at the first round and at the least
 MAX_SIGMA = 0.1  # beyond, the images show different things
 
 
@@ -47,10 +47,10 @@ class Exposure:
 
     def removed(self, color: np.ndarray) -> np.ndarray:
         """An image [H, W, 3] of this camera at the brightness of the map, in 0..1."""
-        return ((color - self.bias) / np.maximum(self.gain, LEAST_GAIN)).clip(0, 1)
+        return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
-def fitted_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
+def fit_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
     """Least squares fit of gain and bias that take `rendered` to `seen`, both [H, W, 3] in 0..1.
 
     A channel without contrast gets gain one. For evaluation: it uses the image that is judged.
@@ -62,7 +62,7 @@ def fitted_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
     return Exposure.of(np.stack([gain, y.mean(axis=0) - gain * x.mean(axis=0)]))
 
 
-def estimated_exposure(
+def estimate_exposure(
     rendered: np.ndarray, opacity: np.ndarray, seen: np.ndarray, mask: np.ndarray | None = None
 ) -> Exposure | None:
     """Gain and bias of an image against what the map shows at its pose, where it shows enough.
@@ -79,7 +79,7 @@ def estimated_exposure(
     usable &= _averaged(seen.max(axis=0) >= 255 * SATURATED) == 0
     if mask is not None:
         usable &= _averaged(mask > 0) > 0.99
-    if np.count_nonzero(usable) < max(FEWEST_BLOCKS, LEAST_SHARE * usable.size):
+    if np.count_nonzero(usable) < max(MIN_BLOCKS, MIN_SHARE * usable.size):
         return None
     lines = [_robust_line(x[c, usable], y[c, usable]) for c in range(3)]
     is_plausible = all(
@@ -90,7 +90,7 @@ def estimated_exposure(
 
 def _averaged(plane: np.ndarray) -> np.ndarray:
     """Means of square blocks of [H, W]; what is left at two of the edges has none."""
-    block = max(LEAST_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
+    block = max(MIN_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
     height, width = (n // block for n in plane.shape)
     plane = np.ascontiguousarray(plane[: height * block, : width * block], np.float32)
     return cv2.resize(plane, (width, height), interpolation=cv2.INTER_AREA)
@@ -117,7 +117,7 @@ def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
         gain = (bb * right_a - ab * right_b) / determinant
         bias = (aa * right_b - ab * right_a) / determinant
         residual = np.abs(y - gain * x - bias)
-        sigma = max(1.4826 * float(np.median(residual[inlier])), LEAST_SIGMA)
+        sigma = max(1.4826 * float(np.median(residual[inlier])), MIN_SIGMA)
         before, inlier = inlier, residual <= OUTLIER_SIGMAS * sigma
         if np.array_equal(before, inlier):
             break

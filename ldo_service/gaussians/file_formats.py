@@ -53,7 +53,7 @@ TYPES = {
     )
     for name in names
 }
-LONGEST_LINE = 4096  # bytes of a header line; more is no header
+MAX_LINE = 4096  # bytes of a header line; more is no header
 
 SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)]
@@ -136,9 +136,9 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
 
 def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
     """The words of each line between `ply` and `end_header`, without comments."""
-    if file.readline(LONGEST_LINE).rstrip() != b"ply":
+    if file.readline(MAX_LINE).rstrip() != b"ply":
         raise DataError(f"{path} is no PLY file: it does not start with `ply`.")
-    while line := file.readline(LONGEST_LINE):
+    while line := file.readline(MAX_LINE):
         words = line.decode("ascii", "replace").split()
         if words == ["end_header"]:
             return

@@ -12,14 +12,14 @@ from ldo_service.errors import ConfigError, named
 
 from .keyframe_store import KeyframeViews
 from .model import GaussianMap
-from .optimizer import Optimiser, OptimiserConfig
-from .training_views import View, sampled_surface, schedule, shared_surface
+from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
+from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
 TRIES_PER_DRAW = 4  # of keyframes at random, where many see what sleeps
 
 
 @dataclass(frozen=True, slots=True)
-class WindowConfig:
+class ViewSamplingConfig:
     """Which keyframes the map is fitted to when a new one comes. Random ones keep what was learnt:
     +4.2 dB, covisible ones +1.1 dB in the ablations of others (ALGORITHMS, The map)."""
 
@@ -55,15 +55,15 @@ class Fitting:
 
     def __init__(
         self,
-        config: OptimiserConfig,
-        window: WindowConfig,
+        config: GaussianOptimizerConfig,
+        window: ViewSamplingConfig,
         views: KeyframeViews,
         is_awake: Callable[[int], bool],
         *,
         seed: int,
         threads: int,
     ) -> None:
-        self._optimiser = Optimiser(config, threads=threads)
+        self._optimizer = GaussianOptimizer(config, threads=threads)
         self._window, self._views, self._is_awake = window, views, is_awake
         self._seed = seed
         self.iterations = 0
@@ -71,13 +71,13 @@ class Fitting:
 
     def forget_view(self, keyframe: int) -> None:
         """Drop what the optimizer keeps of a keyframe."""
-        self._optimiser.forget_view(keyframe)
+        self._optimizer.forget_view(keyframe)
 
-    def plan(self, newest: View, iterations: int) -> list[int]:
+    def plan(self, newest: TrainingView, iterations: int) -> list[int]:
         """Return which keyframe each iteration takes after a new one."""
         window, rng = self._window, random_for(self._seed, newest.keyframe)
         older = [k for k in self._views.store.keyframes() if k != newest.keyframe]
-        return schedule(
+        return sample_training_views(
             newest.keyframe,
             self._covisible(newest, older, rng),
             older,
@@ -87,7 +87,9 @@ class Fitting:
             covisible_share=window.covisible_share,
         )
 
-    def _covisible(self, newest: View, older: list[int], rng: np.random.Generator) -> list[int]:
+    def _covisible(
+        self, newest: TrainingView, older: list[int], rng: np.random.Generator
+    ) -> list[int]:
         """Those of the recent keyframes, and of a few earlier ones, that see the same surface."""
         window = self._window
         split = max(0, len(older) - window.recent)
@@ -99,14 +101,14 @@ class Fitting:
         return [k for k in (*earlier, *recent) if self._shared(surface, k) >= window.min_shared]
 
     def _shared(self, p_map: np.ndarray, keyframe: int) -> float:
-        return shared_surface(p_map, self._views.cameras[keyframe], self._views.poses[keyframe])
+        return covisibility_ratio(p_map, self._views.cameras[keyframe], self._views.poses[keyframe])
 
     def plan_refinement(self, iterations: int, first: Sequence[int]) -> Iterable[int]:
         """Return `first` and keyframes at random, in turn, until all of `first` are through."""
-        drawn = self._drawn(iterations - len(first))
+        drawn = self._sample_keyframes(iterations - len(first))
         return (k for pair in zip_longest(first, drawn) for k in pair if k is not None)
 
-    def _drawn(self, count: int) -> list[int]:
+    def _sample_keyframes(self, count: int) -> list[int]:
         """So many keyframes at random, one perhaps more than once, that see nothing that sleeps."""
         known = self._views.store.keyframes()
         if not known:
@@ -133,28 +135,28 @@ class Fitting:
         Returns:
             Mask [N] of the Gaussians that changed.
         """
-        steps_before = self._optimiser.steps(gaussians).copy()
+        steps_before = self._optimizer.steps(gaussians).copy()
         plan = list(plan)
         usable = {k for k in set(plan) if self._is_usable(k)}
         self.unusable += len(set(plan)) - len(usable)
         plan = [k for k in plan if k in usable]
         first = next(iter(self._views.poses), None)
-        losses = self._optimiser.optimise(
+        losses = self._optimizer.optimize(
             gaussians, self._views, plan, rates=rates, fixed=first, effort=effort
         )
         self.iterations += len(losses)
-        return self._optimiser.steps(gaussians) != steps_before
+        return self._optimizer.steps(gaussians) != steps_before
 
     def _is_usable(self, keyframe: int) -> bool:
         return self._is_awake(keyframe) and self._views.is_readable(keyframe)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state of the optimizer."""
-        return self._optimiser.snapshot()
+        return self._optimizer.snapshot()
 
     def restore(self, state: Mapping[str, Any], iterations: int) -> None:
         """Go on from a state of the optimizer after so many iterations."""
-        self._optimiser.restore(state)
+        self._optimizer.restore(state)
         self.iterations = iterations
 
 

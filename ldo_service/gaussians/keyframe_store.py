@@ -12,11 +12,11 @@ import numpy as np
 from ldo_service.errors import ConfigError, DataError, named
 from ldo_service.geometry import Camera
 from ldo_service.geometry.point_records import PoseTable
-from ldo_service.storage.checksummed_folder import SealedFolder
+from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
 from .exposure import Exposure
-from .training_views import KeyframeImages, View, packed, unpacked
-from .visibility import BLOCKS, Horizon, PlacedCamera
+from .training_views import KeyframeImages, TrainingView, pack, unpack
+from .visibility import BLOCKS, MaxDepthGrid, PlacedCamera
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class KeyframeStore:
 
     def __init__(self, folder: Path | None, config: KeyframeStoreConfig | None = None) -> None:
         self.config = config or KeyframeStoreConfig()
-        self._files = SealedFolder(folder, "keyframe", _DISK_FULL)
+        self._files = ChecksummedFolder(folder, "keyframe", _DISK_FULL)
         self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # last used last
         self._reads = self._forgotten = self._damaged = 0
         self._make_room()
@@ -62,7 +62,7 @@ class KeyframeStore:
         """Keep copies. A keyframe that is there already is replaced."""
         images = images.owned()
         self._remember(images)
-        self._files.write(images.keyframe, packed(images))
+        self._files.write(images.keyframe, pack(images))
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
@@ -116,7 +116,7 @@ class KeyframeStore:
     def _read(self, keyframe: int) -> KeyframeImages | None:
         self._reads += 1
         try:
-            images = unpacked(self._files.read(keyframe))
+            images = unpack(self._files.read(keyframe))
             if images.keyframe != keyframe:
                 raise DataError(f"the file holds keyframe {images.keyframe}")
         except DataError as error:
@@ -163,15 +163,15 @@ class KeyframeViews:
         self.cameras: dict[int, Camera] = {}
         self.poses = PoseTable()
         self.exposures: dict[int, Exposure] = {}
-        self.horizons: dict[int, Horizon] = {}
+        self.horizons: dict[int, MaxDepthGrid] = {}
 
-    def add(self, view: View) -> list[int]:
+    def add(self, view: TrainingView) -> list[int]:
         """The newest one; those without images, of which only their poses are known from now on."""
         if not self.poses:
             self.store.keep_only(())  # what another journey left in the folder
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
-        self.horizons[view.keyframe] = Horizon.of(view.depth_m)
+        self.horizons[view.keyframe] = MaxDepthGrid.of(view.depth_m)
         return self._forgotten(view.keyframe)
 
     def _forgotten(self, newest: int) -> list[int]:
@@ -183,7 +183,7 @@ class KeyframeViews:
                 del table[keyframe]
         return gone
 
-    def leave_out(self, keyframe: int, pixels: np.ndarray) -> None:
+    def mask_pixels(self, keyframe: int, pixels: np.ndarray) -> None:
         """Those pixels [H, W] bool of its images count no more. Raises KeyError as a view does."""
         images = self.store.get(keyframe)
         if images is None:
@@ -206,14 +206,14 @@ class KeyframeViews:
         """Whether its images are still there, and undamaged."""
         return self.store.get(keyframe) is not None
 
-    def __getitem__(self, keyframe: int) -> View:
+    def __getitem__(self, keyframe: int) -> TrainingView:
         """Raises KeyError when its images were forgotten or cannot be read."""
         images = self.store.get(keyframe)
         if images is None:
             raise KeyError(keyframe)
         return images.view(self.poses[keyframe], self.exposures[keyframe])
 
-    def __setitem__(self, keyframe: int, view: View) -> None:
+    def __setitem__(self, keyframe: int, view: TrainingView) -> None:
         """Take over its camera, pose and exposure."""
         self.cameras[keyframe] = view.camera
         self.poses[keyframe] = view.T_map_camera
@@ -237,5 +237,5 @@ class KeyframeViews:
         self.cameras = dict(zip(keyframes, (Camera(*c) for c in state["cameras"]), strict=True))
         self.poses.become(state["placed"], state["T_map_camera"])
         self.exposures = dict(zip(keyframes, map(Exposure.of, state["exposures"]), strict=True))
-        self.horizons = dict(zip(keyframes, map(Horizon, state["horizons"]), strict=True))
+        self.horizons = dict(zip(keyframes, map(MaxDepthGrid, state["horizons"]), strict=True))
         self.store.keep_only(keyframes)

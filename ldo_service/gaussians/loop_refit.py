@@ -15,7 +15,7 @@ from .map_builder import MapBuilder
 
 
 @dataclass(frozen=True, slots=True)
-class RepairConfig:
+class LoopRefitConfig:
     """See the fields of these names in `MapperConfig`."""
 
     mending_min_m: float
@@ -27,7 +27,7 @@ class RepairConfig:
     paid_iterations: int
 
 
-class MapRepair:
+class LoopRefit:
     """Of a map that is corrected now and then.
 
     A keyframe that a correction moves far may lie over surface that the map holds already: it is to
@@ -38,25 +38,25 @@ class MapRepair:
     keyframes wait no longer than they must.
     """
 
-    def __init__(self, map_: MapBuilder, config: RepairConfig) -> None:
+    def __init__(self, map_: MapBuilder, config: LoopRefitConfig) -> None:
         self.config = config
         self._map = map_
         self._mended = 0  # Gaussians that the map held twice
         self._to_mend: list[int] = []  # keyframes, ascending
         self._due: dict[int, int] = {}  # iterations by torn keyframe
 
-    def note(self, T_map: KeyframePoses) -> None:
+    def mark_moved(self, T_map: KeyframePoses) -> None:
         """Before the Gaussians of keyframes are moved to where these are by now."""
         placed, config = self._map.views.poses, self.config
         keyframes = np.fromiter(placed, np.int64)
         T_now, T_before = T_map.of(placed), placed.of(placed)
         least = config.mending_min_m, config.mending_min_rad
-        far = keyframes[se3.differ(T_now, T_before, *least)]
+        far = keyframes[se3.transforms_differ(T_now, T_before, *least)]
         if not len(far):
             return
         self._to_mend = sorted({*self._to_mend, *far.tolist()})
         T_as_a_whole = T_now[0] @ se3.inverse(T_before[0])
-        torn = keyframes[se3.differ(T_now, T_as_a_whole @ T_before, *least)]
+        torn = keyframes[se3.transforms_differ(T_now, T_as_a_whole @ T_before, *least)]
         self._due |= dict.fromkeys(torn.tolist(), config.due_iterations)
         self._forget()
 
@@ -66,7 +66,7 @@ class MapRepair:
         self._due = {k: left for k, left in self._due.items() if left > 0 and k in known}
 
     @property
-    def due(self) -> int:
+    def pending_iterations(self) -> int:
         """Iterations, at most `due_iterations` for each keyframe with images."""
         return sum(self._due.values())
 
@@ -78,51 +78,52 @@ class MapRepair:
 
     def with_keyframe(self, *, is_behind: bool) -> None:
         """A share of the work; what is due waits while keyframes do (`is_behind`)."""
-        self._mend(self.config.mended_keyframes, self.config.mending_iterations)
+        self._deduplicate(self.config.mended_keyframes, self.config.mending_iterations)
         if not self._due or is_behind:
             return
         most = self.config.paid_iterations
-        payable = sum(self._due[k] for k in self._awake())
+        payable = sum(self._due[k] for k in self._resident_keyframes())
         if payable:
             self.refine(min(most, payable), effort=most)
 
     def at_end(self) -> None:
         """Without iterations: they could move keyframes, and nobody takes a refinement any more."""
-        self._mend(self.config.mended_at_end, iterations=0)
+        self._deduplicate(self.config.mended_at_end, iterations=0)
 
-    def _mend(self, most: int, iterations: int) -> None:
+    def _deduplicate(self, most: int, iterations: int) -> None:
         """The newest first."""
         for _ in range(min(most, len(self._to_mend))):
-            self._mended += self._map.mend(self._to_mend.pop(), iterations)
+            self._mended += self._map.deduplicate_keyframe(self._to_mend.pop(), iterations)
 
     def refine(
         self, iterations: int, rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
     ) -> None:
         """Iterations of the optimiser, see `MapBuilder.refine`: first those that are due."""
-        awake = self._awake()
+        awake = self._resident_keyframes()
         visits = np.repeat(awake, [-(-self._due[k] // 2) for k in awake]).astype(np.int64)
-        order = np.random.default_rng(self.due).permutation(visits)
+        order = np.random.default_rng(self.pending_iterations).permutation(visits)
         torn = order[: -(-iterations // 2)].tolist()
         done = self._map.refine(iterations, rates, first=torn, effort=effort)
         for keyframe, visited in Counter(torn[: -(-done // 2)]).items():
             self._due[keyframe] -= 2 * visited
         self._forget()
 
-    def _awake(self) -> list[int]:
+    def _resident_keyframes(self) -> list[int]:
         """Torn keyframes that see nothing that sleeps: nothing can be fitted to the others."""
         self._forget()
-        return [k for k in self._due if self._map.is_awake(k)]
+        return [k for k in self._due if self._map.is_resident(k)]
 
-    def state(self) -> dict[str, Any]:
+    def snapshot(self) -> dict[str, Any]:
         return {"to_mend": list(self._to_mend), "due": dict(self._due)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._to_mend = list(state["to_mend"])
         self._due = dict(state.get("due", {}))  # states of old know nothing of it
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "keyframes_to_mend": len(self._to_mend),
             "gaussians_mended": self._mended,  # held twice after a correction, and removed
-            "iterations_due": self.due,  # to fit the map again where corrections have torn it
+            # to fit the map again where corrections have torn it
+            "iterations_due": self.pending_iterations,
         }

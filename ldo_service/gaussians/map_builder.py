@@ -13,37 +13,37 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.point_records import PoseTable
 
 from .change_log import ChangeLog, Changes
-from .densification import InsertionConfig, insert
-from .exposure import Exposure, estimated_exposure
-from .fitting import Fitting, WindowConfig, random_for
+from .densification import DensificationConfig, densify
+from .exposure import Exposure, estimate_exposure
+from .fitting import Fitting, ViewSamplingConfig, random_for
 from .keyframe_store import KeyframeStore, KeyframeStoreConfig, KeyframeViews
-from .model import GaussianMap, Piece
-from .offloading import SleepingGaussians, whole_map
-from .optimizer import OptimiserConfig
-from .pruning import MergingConfig, PruningConfig, doubled, superfluous
+from .model import GaussianBatch, GaussianMap
+from .offloading import OffloadedGaussians, iter_all_gaussians
+from .optimizer import GaussianOptimizerConfig
+from .pruning import DeduplicationConfig, PruningConfig, find_duplicates, prunable_mask
 from .renderer import Contributions, Rendering, RenderMemory, render
-from .training_views import View, shown_within
+from .training_views import TrainingView, visible_in_mask
 from .visibility import (
-    AnchorSpheres,
-    Horizon,
+    BoundingSpheres,
+    MaxDepthGrid,
+    OffloadConfig,
     PlacedCamera,
-    SleepConfig,
-    choose_sleepers,
-    clumps_of,
+    chunk_numbers,
+    plan_offload,
 )
 
-MOST_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
+MAX_ITERATIONS_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
 
 
 @dataclass(frozen=True, slots=True)
 class MapBuilderConfig:
-    insertion: InsertionConfig = field(default_factory=InsertionConfig)
-    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
+    insertion: DensificationConfig = field(default_factory=DensificationConfig)
+    optimiser: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)
+    window: ViewSamplingConfig = field(default_factory=ViewSamplingConfig)
     pruning: PruningConfig = field(default_factory=PruningConfig)
-    merging: MergingConfig = field(default_factory=MergingConfig)
+    merging: DeduplicationConfig = field(default_factory=DeduplicationConfig)
     store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)
-    sleep: SleepConfig = field(default_factory=SleepConfig)
+    sleep: OffloadConfig = field(default_factory=OffloadConfig)
     recent_cameras: int = 8  # what the last keyframes see stays awake
     prune_keyframes: int = 5  # between two prunings
     refined_m: float = 2e-4  # a keyframe that the optimiser moved by so much, or
@@ -75,14 +75,14 @@ class MapBuilder:
         """Images of keyframes and sleeping Gaussians go to `folder`, or to a temporary one."""
         self.config = config or MapBuilderConfig()
         self.gaussians = GaussianMap()
-        self.sleeping = SleepingGaussians(folder and folder / "gaussians")
+        self.sleeping = OffloadedGaussians(folder and folder / "gaussians")
         self.views = KeyframeViews(KeyframeStore(folder and folder / "images", self.config.store))
         self._threads, self._memory = threads, RenderMemory()
         self._fitting = Fitting(
             self.config.optimiser,
             self.config.window,
             self.views,
-            self.is_awake,
+            self.is_resident,
             seed=self.config.seed,
             threads=threads,
         )
@@ -108,24 +108,26 @@ class MapBuilder:
         `is_moving` [H, W] bool: pixels that are neither mapped nor fitted.
         Its Gaussians hang on it.
         """
-        self._wake(PlacedCamera(frame.camera, T_map_camera, Horizon.of(frame.depth_m)))
+        self._wake(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._shown = None
-        before = self.seen_from(frame.camera, T_map_camera)
+        before = self.render_from(frame.camera, T_map_camera)
         exposure = self._exposure(frame, before, is_moving)
         self._insert(frame, T_map_camera, keyframe, before, exposure, is_moving)
         counts = None if is_moving is None else (~is_moving).astype(np.uint8)
-        view = replace(View.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts)
+        view = replace(
+            TrainingView.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts
+        )
         self._told[keyframe], self._newest = T_map_camera, keyframe
         for forgotten in self.views.add(view):
             del self._told[forgotten]
             self._fitting.forget_view(forgotten)
-        plan = self._fitting.plan(view, MOST_PER_EFFORT * iterations)
+        plan = self._fitting.plan(view, MAX_ITERATIONS_PER_EFFORT * iterations)
         touched = self._fit(plan, effort=iterations)
         if len(self.views) % self.config.prune_keyframes == 0:
             self._prune_misshapen(touched)
         self._prune_unconfirmed(keyframe)
 
-    def seen_from(
+    def render_from(
         self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
     ) -> Rendering:
         """What the map shows there, of what is awake."""
@@ -139,13 +141,13 @@ class MapBuilder:
             threads=self._threads,
         )
 
-    def shown(self, keyframe: int, *, contributions: bool = False) -> Rendering:
+    def render_keyframe(self, keyframe: int, *, contributions: bool = False) -> Rendering:
         """What it shows where a keyframe stands; rendered once while the map does not change."""
         if self._shown is None or self._shown[0] != keyframe:
             self._shown = None
         if self._shown is None or (contributions and self._shown[1].contributions is None):
             camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
-            self._shown = keyframe, self.seen_from(camera, pose, contributions=contributions)
+            self._shown = keyframe, self.render_from(camera, pose, contributions=contributions)
         return self._shown[1]
 
     def _exposure(
@@ -154,7 +156,7 @@ class MapBuilder:
         """Against the map; where too little of it is in view, as the keyframe before."""
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
         counts = None if is_moving is None else (~is_moving).astype(np.uint8)
-        estimated = estimated_exposure(rendered, before.opacity, seen, counts)
+        estimated = estimate_exposure(rendered, before.opacity, seen, counts)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
         return self.views.exposures[self._newest]
@@ -169,7 +171,7 @@ class MapBuilder:
         is_moving: np.ndarray | None,
     ) -> None:
         color = exposure.removed(frame.color * np.float32(1 / 255))
-        insert(
+        densify(
             self.gaussians,
             replace(frame, color=(255 * color + 0.5).astype(np.uint8)),
             T_map_camera,
@@ -179,9 +181,9 @@ class MapBuilder:
             left_out=is_moving,
             threads=self._threads,
         )
-        self._log.grown(self.gaussians)
+        self._log.mark_added(self.gaussians)
 
-    def leave_out(self, keyframe: int, pixels: np.ndarray) -> int:
+    def mask_pixels(self, keyframe: int, pixels: np.ndarray) -> int:
         """What a keyframe shows there, [H, W] bool, turned out not to belong to the map: it is
         fitted no more, and the Gaussians that the keyframe put there go. How many did.
 
@@ -189,10 +191,10 @@ class MapBuilder:
         """
         self._wake(self.views.placed(keyframe))
         self._shown = None
-        self.views.leave_out(keyframe, pixels)
+        self.views.mask_pixels(keyframe, pixels)
         theirs = np.flatnonzero(self.gaussians.anchors == keyframe)
         camera, T_map_camera = self.views.cameras[keyframe], self.views.poses[keyframe]
-        is_there = shown_within(pixels, self.gaussians.means[theirs], camera, T_map_camera)
+        is_there = visible_in_mask(pixels, self.gaussians.means[theirs], camera, T_map_camera)
         mask = np.zeros(len(self.gaussians), bool)
         mask[theirs[is_there]] = True
         self._remove(mask)
@@ -225,12 +227,12 @@ class MapBuilder:
         self._log.changed(touched)
         return touched
 
-    def is_awake(self, keyframe: int) -> bool:
+    def is_resident(self, keyframe: int) -> bool:
         """Whether all is awake that it may see: else what is would be bent to stand in for it."""
-        return not self.sleeping.seen_from(self.views.placed(keyframe), self._reach_m)
+        return not self.sleeping.visible_chunks(self.views.placed(keyframe), self._reach_m)
 
     # --- after a correction -----------------------------------------------------------------------
-    def mend(self, keyframe: int, iterations: int) -> int:
+    def deduplicate_keyframe(self, keyframe: int, iterations: int) -> int:
         """A keyframe that was laid over earlier ones: what the map holds twice there is held once,
         and a few iterations fit it to the keyframe. How many Gaussians went; none where its images
         are forgotten.
@@ -241,7 +243,9 @@ class MapBuilder:
             return 0
         self._shown = None
         self._wake(self.views.placed(keyframe))
-        mask = doubled(self.gaussians.rows, self.gaussians.anchors, keyframe, self.config.merging)
+        mask = find_duplicates(
+            self.gaussians.rows, self.gaussians.anchors, keyframe, self.config.merging
+        )
         self._remove(mask)
         self._fit([keyframe] * iterations)
         return int(np.count_nonzero(mask))
@@ -251,7 +255,7 @@ class MapBuilder:
         """Among those that the window reached, so that it costs no more in a larger map."""
         among = np.flatnonzero(touched)
         mask = np.zeros(len(self.gaussians), bool)
-        mask[among] = superfluous(self.gaussians.rows[among], self.config.pruning)
+        mask[among] = prunable_mask(self.gaussians.rows[among], self.config.pruning)
         self._remove(mask)
 
     def _prune_unconfirmed(self, newest: int) -> None:
@@ -274,23 +278,23 @@ class MapBuilder:
 
     def _contributions(self, keyframe: int) -> Contributions:
         camera, pose = self.views.cameras[keyframe], self.views.poses[keyframe]
-        shown = self.seen_from(camera, pose, contributions=True).contributions
+        shown = self.render_from(camera, pose, contributions=True).contributions
         assert shown is not None
         return shown
 
     def _remove(self, mask: np.ndarray) -> None:
-        self._log.removing(self.gaussians, mask)
+        self._log.mark_removed(self.gaussians, mask)
         self._pruned += self.gaussians.remove(mask)
 
     # --- labels -----------------------------------------------------------------------------------
-    def made_by(self, keyframe: int) -> Contributions:
+    def visible_contributions(self, keyframe: int) -> Contributions:
         """The Gaussians that make its image, woken if they slept."""
         self._wake(self.views.placed(keyframe))
-        shown = self.shown(keyframe, contributions=True).contributions
+        shown = self.render_keyframe(keyframe, contributions=True).contributions
         assert shown is not None
         return shown
 
-    def relabelled(self, indices: np.ndarray) -> None:
+    def mark_relabeled(self, indices: np.ndarray) -> None:
         """These rows have other labels than followers know."""
         mask = np.zeros(len(self.gaussians), bool)
         mask[indices] = True
@@ -302,13 +306,13 @@ class MapBuilder:
         return self.config.sleep.reach_m
 
     def _wake(self, camera: PlacedCamera) -> None:
-        seen = self.sleeping.seen_from(camera, self._reach_m)
-        ids = self.sleeping.return_to(self.gaussians, seen)
+        seen = self.sleeping.visible_chunks(camera, self._reach_m)
+        ids = self.sleeping.load_into(self.gaussians, seen)
         if len(ids):
             self._shown = None
-        self._log.woken(self.gaussians, ids)
+        self._log.mark_loaded(self.gaussians, ids)
 
-    def rest(self) -> None:
+    def offload_excess(self) -> None:
         """Let Gaussians sleep where there are too many. To be called when followers know all that
         changed: to them sleeping Gaussians are as before."""
         if len(self.gaussians) <= self.config.sleep.max_active:
@@ -316,32 +320,32 @@ class MapBuilder:
         keyframes = list(self.views.cameras)[-self.config.recent_cameras :]
         recent = [self.views.placed(keyframe) for keyframe in keyframes]
         rows, anchors = self.gaussians.rows, self.gaussians.anchors
-        clumps = clumps_of(self.gaussians.means, anchors, self.config.sleep.clump_m)
-        awake = AnchorSpheres.around(rows, anchors, clumps)
-        choice = choose_sleepers(awake, recent, self.config.sleep)
+        clumps = chunk_numbers(self.gaussians.means, anchors, self.config.sleep.clump_m)
+        awake = BoundingSpheres.around(rows, anchors, clumps)
+        choice = plan_offload(awake, recent, self.config.sleep)
         self._excess = choice.excess
-        self.sleeping.take_from(self.gaussians, clumps, choice.clumps)
+        self.sleeping.offload_from(self.gaussians, clumps, choice.clumps)
         self._shown = None
-        self._log.all_told(self.gaussians)
+        self._log.mark_all_published(self.gaussians)
 
     def size(self) -> int:
         """Gaussians, awake and asleep."""
         return len(self.gaussians) + len(self.sleeping)
 
-    def pieces(self) -> Iterator[Piece]:
+    def batches(self) -> Iterator[GaussianBatch]:
         """The whole map, in pieces; ids ascend throughout."""
-        yield from whole_map(self.gaussians, self.sleeping)
+        yield from iter_all_gaussians(self.gaussians, self.sleeping)
 
     # --- telling others ---------------------------------------------------------------------------
     def changes(self, *, with_changed: bool) -> Changes:
-        """What followers of the map do not know yet; see `ChangeLog.take`."""
-        self._log.lost(self.sleeping.take_lost(self.gaussians))
-        return self._log.take(self.gaussians, with_changed=with_changed)
+        """What followers of the map do not know yet; see `ChangeLog.drain`."""
+        self._log.lost(self.sleeping.pop_lost_ids(self.gaussians))
+        return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
         """T_map_keyframe of keyframes that the optimiser moved since others were told."""
         poses = self.views.poses
-        is_news = se3.differ(
+        is_news = se3.transforms_differ(
             poses.of(self._told),
             self._told.of(self._told),
             self.config.refined_m,
@@ -385,7 +389,7 @@ class MapBuilder:
         self.sleeping.restore(state["sleeping"])
         self._told.become(self.views.cameras, state["told"])
         self._newest, self._shown = state["newest"], None
-        self._log.all_told(self.gaussians)
+        self._log.mark_all_published(self.gaussians)
 
     def statistics(self) -> dict[str, float]:
         return {

@@ -8,14 +8,14 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry.se3 import quaternions
-from ldo_service.kernels._rasterise import Bounds
+from ldo_service.kernels._rasterize import Bounds
 
 ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused
 LABEL_BYTES = 32  # per Gaussian; what they mean: `semantics.labels`. Zeros: nobody has seen it
 _CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache
 
 
-class Piece(NamedTuple):
+class GaussianBatch(NamedTuple):
     """Some Gaussians of a map, in order.
 
     ids     [M] int64
@@ -29,8 +29,8 @@ class Piece(NamedTuple):
     anchors: np.ndarray
     labels: np.ndarray
 
-    def at(self, where: np.ndarray | slice) -> "Piece":
-        return Piece(*(array[where] for array in self))
+    def at(self, where: np.ndarray | slice) -> "GaussianBatch":
+        return GaussianBatch(*(array[where] for array in self))
 
 
 def new_labels(n: int) -> np.ndarray:
@@ -108,9 +108,9 @@ class GaussianMap:
         return self._labels[: self._size]
 
     @property
-    def _arrays(self) -> Piece:
+    def _arrays(self) -> GaussianBatch:
         """With the room behind the last Gaussian."""
-        return Piece(self._ids, self._rows, self._anchors, self._labels)
+        return GaussianBatch(self._ids, self._rows, self._anchors, self._labels)
 
     def touch(self, rows: np.ndarray | slice | None = None) -> None:
         """Say what was written through a view: the rows with these numbers (uint32, or a slice
@@ -176,11 +176,11 @@ class GaussianMap:
         self.membership += 1
         return removed
 
-    def all(self) -> Piece:
+    def all(self) -> GaussianBatch:
         """All of them, without a copy."""
-        return Piece(self.ids, self.rows, self.anchors, self.labels)
+        return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 
-    def take_out(self, mask: np.ndarray) -> Piece:
+    def extract(self, mask: np.ndarray) -> GaussianBatch:
         """Remove the Gaussians where mask [N] is true, to keep them elsewhere for a while.
 
         Returns copies. Raises ValueError as `remove`.
@@ -190,7 +190,7 @@ class GaussianMap:
         self.remove(mask)
         return taken
 
-    def bring_back(
+    def reinsert(
         self,
         ids: np.ndarray,
         rows: np.ndarray,
@@ -299,7 +299,7 @@ def aligned_rows(capacity: int) -> np.ndarray:
     return memory[skip : skip + capacity * ROW].reshape(capacity, ROW)
 
 
-def moved_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
+def transform_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
     """Copies of rows [M, 16] moved by T_new_old [4, 4], as `move_anchors` moves them."""
     out = aligned_rows(len(rows))
     out[:] = rows
@@ -311,7 +311,7 @@ def moved_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
 
 def _piece(
     ids: np.ndarray, rows: np.ndarray, anchors: np.ndarray, labels: np.ndarray | None
-) -> Piece:
+) -> GaussianBatch:
     if rows.ndim != 2 or rows.shape[1] != ROW or not len(ids) == len(anchors) == len(rows):
         raise ValueError(f"rows have shape {rows.shape}, must be [M, {ROW}], with M ids.")
     if not np.all(np.isfinite(rows)):
@@ -319,7 +319,7 @@ def _piece(
     labels = new_labels(len(ids)) if labels is None else labels
     if labels.shape != (len(ids), LABEL_BYTES) or labels.dtype != np.uint8:
         raise ValueError(f"labels are {labels.dtype}{labels.shape}, must be uint8[M, 32].")
-    return Piece(ids, rows, anchors, labels)
+    return GaussianBatch(ids, rows, anchors, labels)
 
 
 def _move(

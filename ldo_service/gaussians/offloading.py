@@ -10,16 +10,16 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import se3
-from ldo_service.storage.checksummed_folder import SealedFolder
+from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
-from .chunk import Chunk, packed, unpacked
-from .model import ROW, GaussianMap, Piece, new_labels
-from .visibility import AnchorSpheres, PlacedCamera
+from .chunk import Chunk, pack, unpack
+from .model import ROW, GaussianBatch, GaussianMap, new_labels
+from .visibility import BoundingSpheres, PlacedCamera
 
 log = logging.getLogger(__name__)
 
 _DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
-MOST_MOTIONS = 32  # of a chunk that are remembered; then
+MAX_MOTIONS = 32  # of a chunk that are remembered; then
 SETTLED_AT_ONCE = 16  # chunks with more are written anew, so many at a motion: 2 ms each
 
 
@@ -42,14 +42,14 @@ class _Entry:
 
 
 @dataclass(frozen=True, slots=True)
-class Lost:
+class LostIdRange:
     """The ids from the first to the last that are nowhere else are lost."""
 
     first_id: int
     last_id: int
 
 
-class SleepingGaussians:
+class OffloadedGaussians:
     """Chunks of Gaussians in `folder`, as if they had never left the map: bit for bit what they
     would be had they moved with their anchors while awake.
 
@@ -62,13 +62,13 @@ class SleepingGaussians:
     """
 
     def __init__(self, folder: Path | None) -> None:
-        self._files = SealedFolder(folder, "gaussians", _DISK_FULL)
+        self._files = ChecksummedFolder(folder, "gaussians", _DISK_FULL)
         self._entries: dict[int, _Entry] = {}  # by number, ascending
         self._next_number = 0
         self._retired: list[int] = []  # since the last snapshot
         self._retired_before: list[int] = []  # and before it
-        self._spheres: AnchorSpheres | None = None  # None when the entries changed
-        self._lost: list[Lost] = []  # that nobody was told of
+        self._spheres: BoundingSpheres | None = None  # None when the entries changed
+        self._lost: list[LostIdRange] = []  # that nobody was told of
         self._slept = self._awoken = self._damaged = 0
 
     def __len__(self) -> int:
@@ -91,12 +91,12 @@ class SleepingGaussians:
             raise ValueError(f"anchor {chunk.anchor}: {len(ids)} ids, must ascend, one per row.")
         if self._next_number == 0:
             self._remove_unknown()
-        sphere = AnchorSpheres.around(rows, chunk.anchors)
+        sphere = BoundingSpheres.around(rows, chunk.anchors)
         place = sphere.centers[0], float(sphere.radii_m[0])
         entry = _Entry(chunk.anchor, int(ids[0]), int(ids[-1]), len(ids), *place)
         return self._write(chunk, entry)
 
-    def wake(self, number: int) -> Chunk:
+    def load(self, number: int) -> Chunk:
         """Take a chunk out, as its anchor stands now.
 
         It is empty when its file is damaged, which is counted and logged: those Gaussians are lost.
@@ -109,7 +109,7 @@ class SleepingGaussians:
         return chunk
 
     # --- many, between here and the map -----------------------------------------------------------
-    def take_from(
+    def offload_from(
         self, gaussians: GaussianMap, clumps: np.ndarray, chosen: Iterable[int]
     ) -> list[int]:
         """Let the Gaussians of the chosen clumps fall asleep; the numbers of their chunks.
@@ -119,7 +119,7 @@ class SleepingGaussians:
         """
         mask = np.isin(clumps, np.array(sorted(chosen), np.int64))
         of_clump = clumps[mask]
-        taken = gaussians.take_out(mask)
+        taken = gaussians.extract(mask)
         numbers, refused = [], np.zeros(len(of_clump), bool)
         for members in _members(of_clump):
             ids, rows, anchors, labels = taken.at(members)
@@ -127,21 +127,21 @@ class SleepingGaussians:
             refused[members] = number is None
             numbers += [] if number is None else [number]
         if np.any(refused):
-            gaussians.bring_back(*taken.at(refused))
+            gaussians.reinsert(*taken.at(refused))
         return numbers
 
-    def return_to(self, gaussians: GaussianMap, numbers: Iterable[int]) -> np.ndarray:
+    def load_into(self, gaussians: GaussianMap, numbers: Iterable[int]) -> np.ndarray:
         """Wake chunks into the map they came from; their ids [M] ascending. Linear in the size of
         the map."""
-        chunks = [self.wake(number) for number in sorted(numbers)]
+        chunks = [self.load(number) for number in sorted(numbers)]
         if not chunks:
             return np.zeros(0, np.int64)
         woken = _joined([chunk.piece() for chunk in chunks])
-        gaussians.bring_back(*woken)
+        gaussians.reinsert(*woken)
         return np.sort(woken.ids)
 
     # --- without waking ---------------------------------------------------------------------------
-    def seen_from(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
+    def visible_chunks(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
         """Numbers, ascending, of the chunks that the camera may see up to `reach_m` away. No file
         is read."""
         if self._spheres is None:
@@ -156,9 +156,9 @@ class SleepingGaussians:
             if entry.anchor in T_new_old:
                 self._entries[number] = entry.moved(T_new_old[entry.anchor])
                 self._spheres = None
-        moved_often = [n for n, entry in self._entries.items() if len(entry.motions) > MOST_MOTIONS]
+        moved_often = [n for n, entry in self._entries.items() if len(entry.motions) > MAX_MOTIONS]
         for number in moved_often[:SETTLED_AT_ONCE]:
-            self._settle(number)
+            self._rewrite_chunk(number)
 
     def chunks(self) -> Iterator[Chunk]:
         """All that sleep, by anchor, in order of their ids; those of one anchor in memory at a
@@ -172,9 +172,9 @@ class SleepingGaussians:
                 ids, rows, _, labels = _in_order(parts)
                 yield Chunk(anchor, ids, rows, labels)
 
-    def _all_spheres(self) -> AnchorSpheres:
+    def _all_spheres(self) -> BoundingSpheres:
         entries = self._entries.values()
-        return AnchorSpheres(
+        return BoundingSpheres(
             np.array([entry.anchor for entry in entries], np.int32),
             np.array([entry.count for entry in entries], np.int64),
             np.array([entry.center_map for entry in entries]).reshape(-1, 3),
@@ -182,7 +182,7 @@ class SleepingGaussians:
         )
 
     # --- damage -----------------------------------------------------------------------------------
-    def take_lost(self, gaussians: GaussianMap) -> np.ndarray:
+    def pop_lost_ids(self, gaussians: GaussianMap) -> np.ndarray:
         """Ids [L], ascending, of which some were lost since the last call, and none is there now:
         neither awake in the map they came from, nor asleep."""
         if not self._lost:
@@ -252,7 +252,7 @@ class SleepingGaussians:
     # --- files ------------------------------------------------------------------------------------
     def _write(self, chunk: Chunk, entry: _Entry) -> int | None:
         number = self._next_number
-        if not self._files.write(number, packed(chunk)):
+        if not self._files.write(number, pack(chunk)):
             return None
         self._entries[number] = entry
         self._next_number += 1
@@ -264,7 +264,7 @@ class SleepingGaussians:
         """The chunk as it is now; an empty one, and the entry is gone, if damaged."""
         entry = self._entries[number]
         try:
-            chunk = unpacked(self._files.read(number))
+            chunk = unpack(self._files.read(number))
             if (chunk.anchor, len(chunk.ids)) != (entry.anchor, entry.count):
                 raise DataError(f"the file holds {len(chunk.ids)} of anchor {chunk.anchor}")
         except DataError as error:
@@ -273,7 +273,7 @@ class SleepingGaussians:
             return Chunk(entry.anchor, np.zeros(0, np.int64), rows, new_labels(0))
         return chunk.moved(entry.motions)
 
-    def _settle(self, number: int) -> None:
+    def _rewrite_chunk(self, number: int) -> None:
         """Write a chunk anew, as it is now, and forget how it came there."""
         chunk, entry = self._read(number), self._entries.get(number)
         if entry is not None and self._write(chunk, replace(entry, motions=())) is not None:
@@ -286,7 +286,7 @@ class SleepingGaussians:
         log.error("anchor %d: %d of its sleeping Gaussians are lost: %s", anchor, count, reason)
         self._damaged += count
         self._spheres = None
-        self._lost.append(Lost(entry.first_id, entry.last_id))
+        self._lost.append(LostIdRange(entry.first_id, entry.last_id))
         self._files.remove(number)
 
     def _retire(self, number: int) -> None:
@@ -308,15 +308,17 @@ def _members(labels: np.ndarray) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 
 
-def _joined(pieces: list[Piece]) -> Piece:
-    return Piece(*map(np.concatenate, zip(*pieces, strict=True)))
+def _joined(pieces: list[GaussianBatch]) -> GaussianBatch:
+    return GaussianBatch(*map(np.concatenate, zip(*pieces, strict=True)))
 
 
-def _in_order(piece: Piece) -> Piece:
+def _in_order(piece: GaussianBatch) -> GaussianBatch:
     return piece.at(np.argsort(piece.ids, kind="stable"))
 
 
-def whole_map(gaussians: GaussianMap, sleeping: SleepingGaussians) -> Iterator[Piece]:
+def iter_all_gaussians(
+    gaussians: GaussianMap, sleeping: OffloadedGaussians
+) -> Iterator[GaussianBatch]:
     """All Gaussians, awake or asleep, in pieces; ids ascend throughout, as those of one anchor
     follow each other. Of those asleep, one anchor's are in memory at a time."""
     awake, start = gaussians.all(), 0

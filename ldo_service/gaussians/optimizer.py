@@ -11,17 +11,17 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
 from .adam import Adam, AdamConfig
-from .exposure import Exposure, estimated_exposure
+from .exposure import Exposure, estimate_exposure
 from .loss import ImageLoss, LossWeights, image_loss
 from .model import GaussianMap
-from .renderer import Rasteriser
-from .training_views import View
+from .renderer import Rasterizer
+from .training_views import TrainingView
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # a view is taken seldom: remember longer than the map
 WIDTH = 6  # of a twist
 
 
-class PoseMoments:
+class PoseAdam:
     """First and second moments of the gradients of each keyframe's pose."""
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class PoseMoments:
 
 
 @dataclass(frozen=True, slots=True)
-class OptimiserConfig:
+class GaussianOptimizerConfig:
     adam: AdamConfig = field(default_factory=AdamConfig)
     loss: LossWeights = field(default_factory=LossWeights)
     needle_weight: float = 0.01  # of mean log(longest / middle axis) beyond max_needle_ratio
@@ -106,34 +106,34 @@ class Step:
     """What one iteration found, before it changed the map; `view` is as it left it."""
 
     loss: ImageLoss
-    view: View
+    view: TrainingView
     reached: int  # Gaussians that may touch the image
 
 
 class Views(Protocol):
     """Where the optimiser finds a keyframe's view, and puts it with a new exposure and pose."""
 
-    def __getitem__(self, keyframe: int) -> View: ...
+    def __getitem__(self, keyframe: int) -> TrainingView: ...
 
-    def __setitem__(self, keyframe: int, view: View) -> None: ...
+    def __setitem__(self, keyframe: int, view: TrainingView) -> None: ...
 
 
-class Optimiser:
+class GaussianOptimizer:
     """Moments of everything that is optimised, from one keyframe to the next.
 
     Deterministic: the same map, views and generator give the same bits for any number of
     threads. Not for two threads at once.
     """
 
-    def __init__(self, config: OptimiserConfig | None = None, *, threads: int = 1) -> None:
-        self.config = config or OptimiserConfig()
+    def __init__(self, config: GaussianOptimizerConfig | None = None, *, threads: int = 1) -> None:
+        self.config = config or GaussianOptimizerConfig()
         self.threads = threads
         self._adam = Adam(self.config.adam)
-        self._poses = PoseMoments()
-        self._rasteriser = Rasteriser(threads=threads)
+        self._poses = PoseAdam()
+        self._rasterizer = Rasterizer(threads=threads)
         self._by_planes = np.empty((5, 0, 0), np.float32)
 
-    def optimise(
+    def optimize(
         self,
         gaussians: GaussianMap,
         views: Views,
@@ -166,7 +166,12 @@ class Optimiser:
         return losses
 
     def step(
-        self, gaussians: GaussianMap, view: View, *, rate: float = 1.0, is_fixed: bool = False
+        self,
+        gaussians: GaussianMap,
+        view: TrainingView,
+        *,
+        rate: float = 1.0,
+        is_fixed: bool = False,
     ) -> Step:
         """One iteration against one view.
 
@@ -176,7 +181,7 @@ class Optimiser:
         config = self.config
         # how it looks, and what is wrong
         T_camera_map = se3.inverse(view.T_map_camera)
-        planes = self._rasteriser.render(
+        planes = self._rasterizer.render(
             gaussians.rows, view.camera, T_camera_map, bounds=gaussians.bounds
         )
         if not is_fixed:
@@ -193,9 +198,9 @@ class Optimiser:
             threads=self.threads,
         )
         # who is to blame, and a step of each
-        reached = self._adam.descend(
+        reached = self._adam.step_fused(
             gaussians,
-            self._rasteriser,
+            self._rasterizer,
             by_planes,
             rate=rate,
             needle_weight=config.needle_weight,
@@ -211,23 +216,23 @@ class Optimiser:
             self._by_planes = np.empty_like(planes)
         return self._by_planes
 
-    def _exposed(self, view: View, planes: np.ndarray) -> View:
+    def _exposed(self, view: TrainingView, planes: np.ndarray) -> TrainingView:
         share = self.config.exposure_share
         if share == 0:
             return view
-        found = estimated_exposure(planes[:3], planes[4], view.color, view.mask)
+        found = estimate_exposure(planes[:3], planes[4], view.color, view.mask)
         if found is None:
             return view
         before = view.exposure.matrix
         return replace(view, exposure=Exposure.of(before + share * (found.matrix - before)))
 
-    def _placed(self, view: View, by_xi: np.ndarray, rate: float) -> View:
+    def _placed(self, view: TrainingView, by_xi: np.ndarray, rate: float) -> TrainingView:
         config = self.config
         if not config.refines_poses:
             return view
         rates = np.repeat([config.rotation_rate_rad, config.translation_rate_m], 3)
         step = -rate * rates * self._poses.direction(view.keyframe, by_xi)
-        T_map_camera = se3.orthonormalised(view.T_map_camera @ se3.exp(step))
+        T_map_camera = se3.orthonormalize(view.T_map_camera @ se3.exp(step))
         return replace(view, T_map_camera=T_map_camera)
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:

@@ -38,7 +38,7 @@ class PruningConfig:
             )
 
 
-def superfluous(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
+def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
     """Mask [N] bool of rows [N, 16] that are nearly transparent, far larger than those around
     them, or not finite."""
     config = config or PruningConfig()
@@ -81,7 +81,7 @@ def _opacities(rows: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
-class MergingConfig:
+class DeduplicationConfig:
     keyframes_apart: int = 30  # nearer ones see the map that the others made, and add to it
     off_m: float = 0.03  # along the normal: a closure is good to a centimetre or two, and the two
     # sides of a door are 4 cm apart
@@ -103,8 +103,8 @@ class MergingConfig:
             )
 
 
-def doubled(
-    rows: np.ndarray, anchors: np.ndarray, keyframe: int, config: MergingConfig | None = None
+def find_duplicates(
+    rows: np.ndarray, anchors: np.ndarray, keyframe: int, config: DeduplicationConfig | None = None
 ) -> np.ndarray:
     """Mask [N] bool of the Gaussians of `keyframe` that much older ones stand for.
 
@@ -115,7 +115,7 @@ def doubled(
     rows [N, 16], anchors [N]: see `GaussianMap`. Of the others only those around the keyframe's own
     are looked at, so that it costs the same in a larger map but for one pass over the means.
     """
-    config = config or MergingConfig()
+    config = config or DeduplicationConfig()
     mask = np.zeros(len(rows), bool)
     own = np.flatnonzero(anchors == keyframe)
     reach_m = config.off_m + config.reach_sigmas * _longest_m(rows[own]).max(initial=0)
@@ -126,7 +126,7 @@ def doubled(
     tree = KDTree(rows[older, :3])
     _, found = tree.query(rows[own, :3], k=count)
     for near in np.reshape(found, (len(own), count)).T:
-        mask[own] |= _stands_for(rows[older[near]], rows[own], config)
+        mask[own] |= _is_duplicate(rows[older[near]], rows[own], config)
     return mask
 
 
@@ -140,7 +140,7 @@ def _within(rows: np.ndarray, among: np.ndarray, points: np.ndarray, reach_m: fl
     return candidates[np.all((means >= low) & (means <= high), axis=1)]
 
 
-def _stands_for(older: np.ndarray, newer: np.ndarray, config: MergingConfig) -> np.ndarray:
+def _is_duplicate(older: np.ndarray, newer: np.ndarray, config: DeduplicationConfig) -> np.ndarray:
     """Mask [M] of pairs of rows [M, 16]."""
     normals, others = _normals(older), _normals(newer)
     apart = newer[:, :3] - older[:, :3]

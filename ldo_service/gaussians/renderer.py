@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.geometry import Camera
-from ldo_service.kernels import _rasterise
+from ldo_service.kernels import _rasterize
 
 from .model import ROW, aligned_rows
 
@@ -52,7 +52,7 @@ class RowGradients:
 
 
 @dataclass(frozen=True, slots=True)
-class Reached:
+class VisibleGaussians:
     """What a step of the optimiser reached. Views: valid until the next rendering.
 
     indices  [V] uint32, ascending: the rows that may touch the image
@@ -65,7 +65,7 @@ class Reached:
     xi: np.ndarray
 
 
-class Rasteriser:
+class Rasterizer:
     """Renders one view after the other for the optimiser, and keeps the memory for the next.
 
     Not for two threads at once. Its images have no median depth; otherwise they are `render`'s.
@@ -73,7 +73,7 @@ class Rasteriser:
 
     def __init__(self, *, threads: int = 1) -> None:
         self.threads = threads
-        self._pass = _rasterise.Pass()
+        self._pass = _rasterize.Pass()
         self._planes = np.empty((PLANES, 0, 0), np.float32)
         self._rows = aligned_rows(0)
         self._visible = 0
@@ -87,7 +87,7 @@ class Rasteriser:
         camera: Camera,
         T_camera_map: np.ndarray,
         *,
-        bounds: _rasterise.Bounds | None = None,
+        bounds: _rasterize.Bounds | None = None,
         tiles: np.ndarray | None = None,
     ) -> np.ndarray:
         """Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity.
@@ -103,7 +103,7 @@ class Rasteriser:
             self._planes = _new_planes(camera.height, camera.width)
         T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
-        self._visible = _rasterise.rasterise_planes(
+        self._visible = _rasterize.rasterize_planes(
             self._pass, rows, T, *intrinsics, self._planes, self.threads, bounds, tiles
         )
         self._rows = rows
@@ -122,7 +122,7 @@ class Rasteriser:
         if len(self._gradients) < self._visible:
             self._gradients = aligned_rows(self._visible * 5 // 4)
         gradients = self._gradients[: self._visible]
-        xi = _rasterise.backpropagate(
+        xi = _rasterize.backpropagate(
             self._pass,
             self._rows,
             self._planes,
@@ -143,7 +143,7 @@ class Rasteriser:
         needle_weight: float = 0.0,
         needle_ratio: float = 1.0,
         max_sigma_px: float = inf,
-    ) -> Reached:
+    ) -> VisibleGaussians:
         """The step of `step` against what `gradients` would give, to the same bits.
 
         Changes the rows that were rendered, in place, and the moments. Their gradients stay in
@@ -155,7 +155,7 @@ class Rasteriser:
         if len(self._weights) < self._visible:
             self._weights = np.empty(self._visible * 5 // 4, np.float32)
         weights = self._weights[: self._visible]
-        xi = _rasterise.descend(
+        xi = _rasterize.descend(
             self._pass,
             step.rows,
             step.mean,
@@ -174,7 +174,7 @@ class Rasteriser:
             max_sigma_px,
             self.threads,
         )
-        return Reached(indices, weights, xi)
+        return VisibleGaussians(indices, weights, xi)
 
     def _room_for_indices(self) -> np.ndarray:
         if len(self._indices) < self._visible:
@@ -188,7 +188,7 @@ def _new_planes(height: int, width: int) -> np.ndarray:
     return aligned_rows(-(-size // ROW)).reshape(-1)[:size].reshape(PLANES, height, width)
 
 
-RenderMemory = _rasterise.Pass  # scratch that one rendering leaves to the next
+RenderMemory = _rasterize.Pass  # scratch that one rendering leaves to the next
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +237,7 @@ def render(
     T_camera_map: np.ndarray,
     *,
     threads: int = 1,
-    bounds: _rasterise.Bounds | None = None,
+    bounds: _rasterize.Bounds | None = None,
     memory: RenderMemory | None = None,
     contributions: bool = False,
 ) -> Rendering:
@@ -266,7 +266,7 @@ def render(
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     size = camera.width, camera.height
     memory = memory or RenderMemory()
-    images = _rasterise.rasterise(rows, T, *intrinsics, *size, threads, memory, bounds)
+    images = _rasterize.rasterize(rows, T, *intrinsics, *size, threads, memory, bounds)
     made_by = _contributions(memory, camera, threads) if contributions else None
     return Rendering(*images, made_by)
 
@@ -274,6 +274,6 @@ def render(
 def _contributions(memory: RenderMemory, camera: Camera, threads: int) -> Contributions:
     indices, weights = np.empty(memory.visible, np.uint32), np.empty(memory.visible, np.float32)
     top = np.empty((camera.height, camera.width), np.int32)
-    _rasterise.contributions(memory, indices, weights, top, threads)
+    _rasterize.contributions(memory, indices, weights, top, threads)
     seen = weights > 0
     return Contributions(indices[seen], weights[seen], top)

@@ -16,11 +16,11 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 from .exposure import Exposure
 
 _LEVEL = 1  # of zstd
-_QUANTISED = 0.25  # depth that shrinks to less is: sensors count in steps, so bytes repeat
+_QUANTIZED = 0.25  # depth that shrinks to less is: sensors count in steps, so bytes repeat
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class View:
+class TrainingView:
     """A keyframe as the loss reads it.
 
     keyframe      its id
@@ -40,12 +40,12 @@ class View:
     mask: np.ndarray | None = None
 
     @classmethod
-    def of(cls, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int) -> "View":
+    def of(cls, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int) -> "TrainingView":
         planes = np.ascontiguousarray(frame.color.transpose(2, 0, 1))
         return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
 
 
-def sampled_surface(view: View, *, step_px: int = 32) -> np.ndarray:
+def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
     """Points [M, 3] in the map that a view measured, of every `step_px`-th pixel."""
     coarse = slice(step_px // 2, None, step_px)
     z = view.depth_m[coarse, coarse]
@@ -53,7 +53,7 @@ def sampled_surface(view: View, *, step_px: int = 32) -> np.ndarray:
     return se3.transform(view.T_map_camera, points)
 
 
-def shared_surface(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) -> float:
+def covisibility_ratio(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) -> float:
     """Share of points [M, 3] that lie in the image of a camera, in front of it; 0 of none.
     Occlusion is not looked at."""
     points = se3.transform(se3.inverse(T_map_camera), p_map)
@@ -63,7 +63,7 @@ def shared_surface(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) 
     return float(np.count_nonzero(inside)) / max(len(p_map), 1)
 
 
-def shown_within(
+def visible_in_mask(
     pixels: np.ndarray, p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray
 ) -> np.ndarray:
     """Mask [M] of the points [M, 3] that a camera shows in `pixels`, [H, W] bool, or that something
@@ -77,7 +77,7 @@ def shown_within(
     return out
 
 
-def schedule(
+def sample_training_views(
     newest: int,
     covisible: Sequence[int],
     others: Sequence[int],
@@ -140,12 +140,12 @@ class KeyframeImages:
             )
 
     @classmethod
-    def of(cls, view: View) -> "KeyframeImages":
+    def of(cls, view: TrainingView) -> "KeyframeImages":
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
 
-    def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> View:
+    def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
         """The keyframe as the loss reads it, at a pose [4, 4] and with an exposure."""
-        return View(
+        return TrainingView(
             self.keyframe,
             self.camera,
             self.color,
@@ -182,7 +182,7 @@ class _Stored(msgspec.Struct, frozen=True):
     mask: bytes | None
 
 
-def packed(images: KeyframeImages) -> bytes:
+def pack(images: KeyframeImages) -> bytes:
     """The images without loss, about a quarter of their size (tests/bench/RESULTS.md)."""
     depth, is_differences = _packed_depth(images.depth_m)
     stored = _Stored(
@@ -196,7 +196,7 @@ def packed(images: KeyframeImages) -> bytes:
     return msgspec.msgpack.encode(stored)
 
 
-def unpacked(body: bytes | memoryview) -> KeyframeImages:
+def unpack(body: bytes | memoryview) -> KeyframeImages:
     """The images of which `body` is the packed form. Raises DataError for other bytes."""
     try:
         stored = msgspec.msgpack.decode(body, type=_Stored)
@@ -233,7 +233,7 @@ def _packed_depth(depth_m: np.ndarray) -> tuple[bytes, bool]:
     """Quantised depth as it is; other depth as differences of rows, byte by byte, which halves
     it. Whether it is differences."""
     plain = _compressed(depth_m)
-    if len(plain) < _QUANTISED * depth_m.nbytes:
+    if len(plain) < _QUANTIZED * depth_m.nbytes:
         return plain, False
     bits = depth_m.view(np.uint32)
     differences = bits.copy()

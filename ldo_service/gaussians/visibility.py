@@ -26,14 +26,14 @@ _ROUNDING = 1.000_01  # of what the renderer adds up in float32
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Horizon:
+class MaxDepthGrid:
     """farthest_m [12, 16] float32: the farthest depth in each block of an image; infinite where
     not all of the block was measured."""
 
     farthest_m: np.ndarray
 
     @classmethod
-    def of(cls, depth_m: np.ndarray) -> "Horizon":
+    def of(cls, depth_m: np.ndarray) -> "MaxDepthGrid":
         """depth_m [H, W] float32, 0 where not measured."""
         filled_m = with_small_holes_filled(depth_m, _HOLE_PX)
         known_m = np.where(filled_m > 0, filled_m, np.float32(inf))
@@ -41,7 +41,9 @@ class Horizon:
             known_m = np.maximum.reduceat(known_m, edges[:-1], axis=axis)
         return cls(known_m)
 
-    def hides(self, camera: Camera, centers_camera: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
+    def occludes(
+        self, camera: Camera, centers_camera: np.ndarray, radii_m: np.ndarray
+    ) -> np.ndarray:
         """Which spheres [K] bool lie wholly behind what `camera` saw in every block that they may
         show in.
 
@@ -85,7 +87,7 @@ class PlacedCamera:
 
     camera: Camera
     T_map_camera: np.ndarray
-    horizon: Horizon | None = None
+    horizon: MaxDepthGrid | None = None
 
     def distances_m(self, centers_map: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
         """To the nearest point of each sphere [K]; negative inside."""
@@ -105,7 +107,7 @@ class PlacedCamera:
         beyond = self.distances_m(centers_map, radii_m) > reach_m
         seen = ~(beside | behind | beyond)
         if self.horizon is not None:
-            seen[seen] = ~self.horizon.hides(self.camera, centers[seen], radii_m[seen])
+            seen[seen] = ~self.horizon.occludes(self.camera, centers[seen], radii_m[seen])
         return seen
 
     def _sides(self) -> np.ndarray:
@@ -125,7 +127,7 @@ class PlacedCamera:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class AnchorSpheres:
+class BoundingSpheres:
     """Spheres around all that is drawn of some Gaussians, each around Gaussians of one anchor.
 
     anchors  [K], of which one may have several
@@ -142,9 +144,9 @@ class AnchorSpheres:
     @classmethod
     def around(
         cls, rows: np.ndarray, anchors: np.ndarray, clumps: np.ndarray | None = None
-    ) -> "AnchorSpheres":
+    ) -> "BoundingSpheres":
         """Of Gaussians rows [N, 16] that hang on anchors [N], a sphere for each of the clumps [N],
-        in the order of their numbers (see `clumps_of`); without, one for each anchor."""
+        in the order of their numbers (see `chunk_numbers`); without, one for each anchor."""
         clumps = anchors if clumps is None else clumps
         order = np.argsort(clumps, kind="stable")
         rows, anchors, clumps = rows[order, :6], anchors[order], clumps[order]
@@ -156,7 +158,7 @@ class AnchorSpheres:
         return len(self.anchors)
 
 
-def clumps_of(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.ndarray:
+def chunk_numbers(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.ndarray:
     """Number [N] of the clump of each Gaussian: of those of one anchor in one cube of the map.
 
     means [N, 3]; numbers ascend with the anchors. Cubes 1024 edges apart count as one.
@@ -183,7 +185,7 @@ def _spheres(
 
 
 @dataclass(frozen=True, slots=True)
-class SleepConfig:
+class OffloadConfig:
     max_active: int = 1_500_000  # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments.
     # Between two looks at it, every mapper.publish.update_interval_keyframes, new and woken ones
     # come on top
@@ -208,7 +210,7 @@ class SleepConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class SleepChoice:
+class OffloadPlan:
     """clumps   numbers of the spheres whose Gaussians go to sleep, the farthest first
     excess   Gaussians over max_active that stay, because they may be looked at
     """
@@ -217,11 +219,11 @@ class SleepChoice:
     excess: int
 
 
-def choose_sleepers(
-    awake: AnchorSpheres,
+def plan_offload(
+    awake: BoundingSpheres,
     recent: Sequence[PlacedCamera],
-    config: SleepConfig,
-) -> SleepChoice:
+    config: OffloadConfig,
+) -> OffloadPlan:
     """Nobody up to `max_active` Gaussians; over it, clumps until `low_water` of that is left.
 
     awake   of all Gaussians in memory, by clump
@@ -232,7 +234,7 @@ def choose_sleepers(
     """
     active = int(awake.counts.sum())
     if active <= config.max_active:
-        return SleepChoice([], 0)
+        return OffloadPlan([], 0)
     looked_at = awake.anchors == awake.anchors[-1]
     for camera in recent:
         looked_at |= camera.may_see(awake.centers, awake.radii_m, config.reach_m)
@@ -244,4 +246,4 @@ def choose_sleepers(
             break
         chosen.append(int(k))
         active -= int(awake.counts[k])
-    return SleepChoice(chosen, max(0, active - config.max_active))
+    return OffloadPlan(chosen, max(0, active - config.max_active))

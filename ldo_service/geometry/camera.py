@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 
-WIDEST, NARROWEST = 0.02, 100.0  # focal lengths over the side: 175 and 0.6 degrees of view
+MIN_FOCAL_RATIO, NARROWEST = 0.02, 100.0  # focal lengths over the side: 175 and 0.6 degrees of view
 
 FARTHEST_RADIUS = 4.0  # normalised, 76 degrees from the axis: no pinhole model reaches there
 
@@ -39,7 +39,7 @@ class Camera:
         if not all(isfinite(n) for n in numbers):
             raise DataError(f"camera intrinsics {numbers} hold NaN or infinity: recalibrate.")
         for name, focal, side in (("fx", self.fx, self.width), ("fy", self.fy, self.height)):
-            if not NARROWEST * side >= focal >= WIDEST * side:
+            if not NARROWEST * side >= focal >= MIN_FOCAL_RATIO * side:
                 raise DataError(
                     f"focal length {name}={focal:g} px does not go with an image of {side} px: no "
                     "camera sees that little or that much. Is it in pixels, and of this image?"

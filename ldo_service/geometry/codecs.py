@@ -21,7 +21,7 @@ START_OF_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # ITU T.81, 
 ZSTD_LEVEL = 1  # 0.8 ms for a VGA depth image; 16-bit PNG takes 17 times that (measured)
 
 
-def announced_size(data: memoryview) -> tuple[int, int] | None:
+def read_image_size(data: memoryview) -> tuple[int, int] | None:
     """Width and height in pixels; None for what is neither PNG nor JPEG, or breaks off before, or
     is a PNG with a chunk that is longer than the file."""
     if bytes(data[:8]) == PNG and len(data) >= 24:
@@ -113,7 +113,7 @@ def _expand(data: memoryview, size: int) -> bytes:
 
 def _decompress(data: memoryview, flags: int, encoding: str, width: int, height: int) -> np.ndarray:
     """A header of another size is refused before memory is taken for it."""
-    announced = announced_size(data)
+    announced = read_image_size(data)
     if announced is None:
         raise FrameError(f"{len(data)} bytes are no readable {encoding} image.")
     if announced != (width, height):

@@ -104,10 +104,10 @@ class RawFrame:
 
     def depth_m(self) -> np.ndarray:
         """Depth [H, W] float32 in metres, 0 where not measured."""
-        return in_metres(self.depth, self.depth_scale)
+        return in_meters(self.depth, self.depth_scale)
 
 
-def in_metres(depth: np.ndarray, depth_scale: float) -> np.ndarray:
+def in_meters(depth: np.ndarray, depth_scale: float) -> np.ndarray:
     """Depth [H, W] float32 in metres, 0 where `depth`, in 1/depth_scale metres, is no distance."""
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         depth_m = depth.astype(np.float32) / np.float32(depth_scale)

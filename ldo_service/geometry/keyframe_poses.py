@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from . import se3
-from .point_records import Records
+from .point_records import RecordTable
 
 APART_M = 100.0  # between segments that are not joined: farther than depth cameras see
 NO_REFERENCE = -1
@@ -47,7 +47,7 @@ class KeyframePoses:
 
     def __init__(self) -> None:
         self.version = 0  # of the last correction
-        self._known = Records(KEYFRAME)
+        self._known = RecordTable(KEYFRAME)
 
     def __len__(self) -> int:
         return len(self._known)
@@ -71,7 +71,7 @@ class KeyframePoses:
         """[n] bool of n keyframes."""
         return self._known.are_known(keyframes)
 
-    def chain(
+    def add(
         self,
         keyframe: int,
         reference: int | None,
@@ -141,7 +141,7 @@ class KeyframePoses:
             T_map = self.T_map_odom(newest) @ record["T_odom"]
         else:
             T_map = T_map_segment(int(record["segment"])) @ record["T_odom"]
-        return se3.orthonormalised(T_map)
+        return se3.orthonormalize(T_map)
 
     def _newest(self, segment: int, before: float = math.inf) -> int | None:
         """The newest keyframe of a segment among those older than `before`."""

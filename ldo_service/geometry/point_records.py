@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-LEAST_ROOM = 64  # records
+MIN_ROOM = 64  # records
 GROWTH = 1.25  # at most a fifth of the room is empty
 
 
-class Records:
+class RecordTable:
     """Records with a field `id`, ascending; so compact as a dict of arrays is not, by four."""
 
     def __init__(self, dtype: DTypeLike) -> None:
-        self._room = np.zeros(LEAST_ROOM, dtype)
+        self._room = np.zeros(MIN_ROOM, dtype)
         self._count = 0
 
     def __len__(self) -> int:
@@ -62,7 +62,7 @@ class Records:
 
     def _make_room(self, row: int) -> None:
         if self._count == len(self._room):
-            more = np.zeros(max(LEAST_ROOM, int((GROWTH - 1) * self._count)), self._room.dtype)
+            more = np.zeros(max(MIN_ROOM, int((GROWTH - 1) * self._count)), self._room.dtype)
             self._room = np.concatenate([self._room, more])
         self._room[row + 1 : self._count + 1] = self._room[row : self._count]
         self._count += 1
@@ -76,11 +76,11 @@ class Records:
         self._count -= 1
 
     def keep_only(self, ids: Iterable[int]) -> None:
-        self.become(self.all[np.sort(np.unique(self.rows(ids)))])
+        self.replace_all(self.all[np.sort(np.unique(self.rows(ids)))])
 
-    def become(self, records: np.ndarray) -> None:
+    def replace_all(self, records: np.ndarray) -> None:
         """Exactly these [N], ids ascending."""
-        room = np.zeros(max(LEAST_ROOM, len(records)), self._room.dtype)
+        room = np.zeros(max(MIN_ROOM, len(records)), self._room.dtype)
         room[: len(records)] = records
         self._room, self._count = room, len(records)
 
@@ -93,14 +93,14 @@ class Records:
         records: np.ndarray = np.zeros(len(columns["id"]), self._room.dtype)
         for name in records.dtype.names or ():
             records[name] = columns[name]
-        self.become(records)
+        self.replace_all(records)
 
 
 class PoseTable(MutableMapping[int, np.ndarray]):
     """Transforms [4, 4] by id, ascending, in 136 bytes each."""
 
     def __init__(self) -> None:
-        self._records = Records([("id", np.int64), ("T", float, (4, 4))])
+        self._records = RecordTable([("id", np.int64), ("T", float, (4, 4))])
 
     def __getitem__(self, id_: int) -> np.ndarray:
         """A copy. Raises KeyError."""

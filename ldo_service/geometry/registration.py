@@ -69,11 +69,11 @@ def _points(
 
 def _same_surface(z: np.ndarray, is_seen: np.ndarray, axis: int) -> np.ndarray:
     """Whether a pixel and the next one along `axis` are seen and on one surface."""
-    (first, second), (a, b) = _neighbours(z, axis), _neighbours(is_seen, axis)
+    (first, second), (a, b) = _neighbors(z, axis), _neighbors(is_seen, axis)
     return a & b & (np.abs(second - first) < SAME_SURFACE * first)
 
 
-def _neighbours(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
+def _neighbors(image: np.ndarray, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Views of each pixel with a next one along `axis`, and of that next one."""
     return (image[:, :-1], image[:, 1:]) if axis == 1 else (image[:-1], image[1:])
 
@@ -92,11 +92,11 @@ def _covered(
     """
     before, after = half.copy(), half.copy()
     along = _half_gap(center, is_joined[axis], axis)
-    for reach in (_neighbours(after, axis)[0], _neighbours(before, axis)[1]):
+    for reach in (_neighbors(after, axis)[0], _neighbors(before, axis)[1]):
         np.maximum(reach, along, out=reach)
     sheared = np.zeros_like(half)
     across = _half_gap(center, is_joined[1 - axis], 1 - axis)
-    for reach in _neighbours(sheared, 1 - axis):
+    for reach in _neighbors(sheared, 1 - axis):
         np.maximum(reach, across, out=reach)
     most = MAX_STRETCH * half
     first = np.ceil(center - np.minimum(before + sheared, most) - TIE_PX)
@@ -109,7 +109,7 @@ def _covered(
 
 def _half_gap(center: np.ndarray, is_joined: np.ndarray, axis: int) -> np.ndarray:
     """Half of how far neighbours along `axis` lie apart; 0 where a surface ends between them."""
-    here, there = _neighbours(center, axis)
+    here, there = _neighbors(center, axis)
     return 0.5 * np.abs(there - here) * is_joined
 
 

@@ -57,7 +57,7 @@ def inverse(T: Array) -> Array:
     return out
 
 
-def orthonormalised(T: Array) -> Array:
+def orthonormalize(T: Array) -> Array:
     """T [4, 4] with the nearest rotation; chains of products leave the group without it."""
     U, _, Vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
@@ -151,7 +151,9 @@ def from_quaternion(translation: Array, q: Array) -> Array:
     return T
 
 
-def differ(T_a: np.ndarray, T_b: np.ndarray, distance_m: float, angle_rad: float) -> np.ndarray:
+def transforms_differ(
+    T_a: np.ndarray, T_b: np.ndarray, distance_m: float, angle_rad: float
+) -> np.ndarray:
     """Mask [K] of the pairs of transforms [K, 4, 4] that are further apart, or turned by more."""
     T_a, T_b = np.reshape(T_a, (-1, 4, 4)), np.reshape(T_b, (-1, 4, 4))
     apart_m = np.linalg.norm(T_a[:, :3, 3] - T_b[:, :3, 3], axis=1)
@@ -161,7 +163,7 @@ def differ(T_a: np.ndarray, T_b: np.ndarray, distance_m: float, angle_rad: float
     return (apart_m > distance_m) | (turned_rad > angle_rad)
 
 
-def blended(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarray:
+def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarray:
     """T [N, 4, 4] that lie `share` [N] of the way from T_a to T_b [N, 4, 4]: 0 is T_a, 1 is T_b.
 
         T = T_a (exp(s omega), s t),   (exp(omega), t) = T_a^-1 T_b
@@ -200,7 +202,7 @@ def _powers(q: np.ndarray, share: np.ndarray) -> np.ndarray:
     return np.column_stack([np.cos(half), scale[:, None] * q[:, 1:]])
 
 
-def align(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+def fit_rigid_transform(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     """T_target_points [4, 4] minimising sum |T p_k - q_k|^2 over p, q [M, 3], without scale.
 
     Umeyama, PAMI 1991, eq. 40-42, with the reflection guarded. Points on one line leave the

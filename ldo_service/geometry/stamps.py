@@ -54,7 +54,7 @@ B = TypeVar("B", bound=Stamped)
 
 
 @dataclass
-class Half:
+class StreamBuffer:
     """One stream: what waits for its other half, the oldest first."""
 
     waiting: deque[Stamped] = field(default_factory=deque)
@@ -82,7 +82,7 @@ class Half:
         return min((b - a for a, b in pairwise(self.stamps_ns)), default=None)
 
 
-class Pairing(Generic[A, B]):
+class StreamPairer(Generic[A, B]):
     """Pairs each half with the nearest of the other stream, at most `max_skew_ns` away.
 
     Pairs keep the order of both streams, and each half is used once. A pair is given out as soon
@@ -98,7 +98,7 @@ class Pairing(Generic[A, B]):
                 f"pairing within {max_skew_ns} ns, {buffer} waiting: must be at least 0 and 1."
             )
         self._max_skew_ns, self._buffer = max_skew_ns, buffer
-        self._a, self._b = Half(), Half()
+        self._a, self._b = StreamBuffer(), StreamBuffer()
         self._skews_ns: deque[int] = deque(maxlen=RECENT_PAIRS)
         self.pairs = 0
 
@@ -143,13 +143,13 @@ class Pairing(Generic[A, B]):
                 half.lose()
 
     @staticmethod
-    def _has_nearer(earlier: Half, later: Half, skew: int) -> bool:
+    def _has_nearer(earlier: StreamBuffer, later: StreamBuffer, skew: int) -> bool:
         """Whether the half after the earlier one is nearer to the later one."""
         target = later.waiting[0].stamp_ns
         return len(earlier.waiting) > 1 and abs(earlier.waiting[1].stamp_ns - target) < skew
 
     @staticmethod
-    def _may_get_nearer(earlier: Half, skew: int) -> bool:
+    def _may_get_nearer(earlier: StreamBuffer, skew: int) -> bool:
         """Whether a half that is still to come may be nearer than the earlier one."""
         period = earlier.period_ns()
         return len(earlier.waiting) == 1 and period is not None and 2 * skew > period

@@ -8,7 +8,7 @@ and differ in the last bits between instruction sets.
 from ldo_service.errors import ConfigError
 
 try:
-    from ._rasterise import isa
+    from ._rasterize import isa
 except ImportError as error:
     if "LDO_ISA" in str(error):
         raise ConfigError(f"{error}.") from error

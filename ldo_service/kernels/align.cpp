@@ -66,8 +66,8 @@ void pack(const float* image, const float* depth, int width, int height, float m
 // The neighbours of a pixel lie on its surface when their depth differs by less than this.
 float surface_step(float depth, int radius) { return 0.015f * radius * depth + 0.01f; }
 
-bool on_surface(float depth, float neighbour, float step) {
-  return neighbour > 0 && std::fabs(neighbour - depth) <= step;
+bool on_surface(float depth, float neighbor, float step) {
+  return neighbor > 0 && std::fabs(neighbor - depth) <= step;
 }
 
 void normals(const float* depth, int width, int height, const Pinhole& camera, int radius,
@@ -201,7 +201,7 @@ void weigh_photometric(const Problem& p, Block& b) {
     const float shade = b.point[kShade][i];
     const float compared = (shade > 0) & (b.intensity[i] > 0) ? used : 0.0f;
     const float r = b.intensity[i] - p.gain * shade - p.bias;
-    const float normalised = r * inverse_sigma, square = normalised * normalised;
+    const float normalized = r * inverse_sigma, square = normalized * normalized;
     const float weight = robust_weight(square);
     const float s = compared * std::sqrt(weight) * inverse_sigma;
     b.rows[0][i] = s * (gy * z - gz * y);
@@ -238,7 +238,7 @@ void weigh_geometric(const Problem& p, Block& b) {
     const float beyond = b.z[i] - p.noise.nearest;
     const float sigma = p.depth_noise_scale * (p.noise.floor + p.noise.growth * beyond * beyond);
     const float inverse_sigma = 1.0f / sigma;
-    const float normalised = r * inverse_sigma, square = normalised * normalised;
+    const float normalized = r * inverse_sigma, square = normalized * normalized;
     const float weight = robust_weight(square);
     const float s = used * std::sqrt(weight) * inverse_sigma;
     const int j = kBlock + i;

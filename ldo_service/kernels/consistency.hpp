@@ -3,7 +3,7 @@
 #include <limits>
 
 #include "label_update.hpp"
-#include "neighbourhood.hpp"
+#include "neighborhood.hpp"
 #include "projection.hpp"
 
 namespace ldo::LDO_ISA {
@@ -19,9 +19,9 @@ inline uint8_t top_label(const LabelRow& row) {
 }
 
 // Sixteen Gaussians or fewer, as columns.
-class Neighbours16 {
+class Neighbors16 {
  public:
-  Neighbours16(const float* rows, const uint32_t* indices, const LabelRow* labels,
+  Neighbors16(const float* rows, const uint32_t* indices, const LabelRow* labels,
                const uint32_t* places, int count) {
     for (auto& column : mean_) std::fill_n(column, kLanes, std::numeric_limits<float>::infinity());
     label_[0] = kBackground;
@@ -83,7 +83,7 @@ class ConsistencyStep {
   explicit ConsistencyStep(const ConsistencyRule& rule) : rule_(rule) {}
 
   // Writes `row`, which was `before`.
-  void operator()(const Neighbours16& around, Floats weights, const LabelRow& before, LabelRow& row,
+  void operator()(const Neighbors16& around, Floats weights, const LabelRow& before, LabelRow& row,
                   Disagreement& sums) const {
     const float mass = sum(weights);
     if (!(mass > 0.0f)) return;

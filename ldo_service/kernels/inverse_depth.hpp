@@ -72,7 +72,7 @@ class InverseDepth {
     });
     mirror_ends(inverse, width_, 1);
     each_vector(width_, [&](int i) {
-      const Neighbours at(inverse + i);
+      const Neighbors at(inverse + i);
       min(min(at.at<-1>(), at.at<0>()), at.at<1>()).store(low + i);
       max(max(at.at<-1>(), at.at<0>()), at.at<1>()).store(high + i);
     });

@@ -57,7 +57,7 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
     for (int64_t a = job * kJobVoxels; a < std::min(n, (job + 1) * kJobVoxels); ++a) {
       uint32_t places[kLanes];
       const int count = voxels.around(active[a], places);
-      const Neighbours16 around(rows, indices, before.data(), places, count);
+      const Neighbors16 around(rows, indices, before.data(), places, count);
       const bool is_bare = around.labels() == 1;
       const uint32_t* members = voxels.begin(active[a]);
       const int64_t last = voxels.count(active[a]) - 1;

@@ -3,7 +3,7 @@
 #pragma once
 #include <cstdint>
 
-#include "rasterise.hpp"
+#include "rasterize.hpp"
 
 namespace ldo {
 

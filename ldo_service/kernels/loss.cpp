@@ -127,7 +127,7 @@ class PartLoss {
 
   static void across(const float* from, float* to, int begin, int end) {
     each_vector(begin, end, [&](int i) __attribute__((always_inline)) {
-      const Neighbours around(from + i);
+      const Neighbors around(from + i);
       window([&](auto k) __attribute__((always_inline)) {
         return around.at<decltype(k)::value>();
       }).store(to + i);

@@ -3,7 +3,7 @@
 #pragma once
 #include <algorithm>
 
-#include "rasterise.hpp"
+#include "rasterize.hpp"
 #include "transpose.hpp"
 
 namespace ldo::LDO_ISA {

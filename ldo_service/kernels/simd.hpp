@@ -288,10 +288,10 @@ inline Floats reciprocal(Floats x) {
 
 // The sixteen values at `p`, on a cache line, and those about them. Shifted in registers where the
 // machine can: loads that straddle cache lines cost twice.
-class Neighbours {
+class Neighbors {
  public:
 #if defined(__AVX512F__)
-  explicit Neighbours(const float* p)
+  explicit Neighbors(const float* p)
       : left_(_mm512_load_si512(p - kLanes)),
         middle_(_mm512_load_si512(p)),
         right_(_mm512_load_si512(p + kLanes)) {}
@@ -309,7 +309,7 @@ class Neighbours {
  private:
   __m512i left_, middle_, right_;
 #else
-  explicit Neighbours(const float* p) : middle_(p) {}
+  explicit Neighbors(const float* p) : middle_(p) {}
 
   template <int Right>
   [[gnu::always_inline]] inline Floats at() const {

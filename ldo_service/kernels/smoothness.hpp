@@ -81,7 +81,7 @@ class Smoothness {
     });
     mirror_ends(down, image_.width, 2);
     each_vector(image_.width, [&](int i) {
-      const Neighbours at(down + i);
+      const Neighbors at(down + i);
       (at.at<0>() * kBlur[0] + (at.at<-1>() + at.at<1>()) * kBlur[1] +
        (at.at<-2>() + at.at<2>()) * kBlur[2])
           .store(blurred + i);
@@ -89,7 +89,7 @@ class Smoothness {
     mirror_ends(blurred, image_.width, 2);
     float *along = rows_.row(kAlong, y), *mean = rows_.row(kMean, y);
     each_vector(image_.width, [&](int i) {
-      const Neighbours at(blurred + i);
+      const Neighbors at(blurred + i);
       (at.at<2>() - at.at<-2>() + (at.at<1>() - at.at<-1>()) * 2.0f).store(along + i);
       (at.at<2>() + at.at<-2>() + (at.at<1>() + at.at<-1>()) * 4.0f + at.at<0>() * 6.0f)
           .store(mean + i);

@@ -5,6 +5,6 @@ Fine: `verification` finds the pose between two keyframes and refuses it whereve
 against it. Paper, III.C; a false closure costs more than a missed one.
 """
 
-from .loop_detector import Finding, LoopsConfig, Recogniser
+from .loop_detector import LoopCandidateResult, LoopDetector, LoopsConfig
 
-__all__ = ["Finding", "LoopsConfig", "Recogniser"]
+__all__ = ["LoopCandidateResult", "LoopDetector", "LoopsConfig"]

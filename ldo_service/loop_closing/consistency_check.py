@@ -12,14 +12,14 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.tracking.motion import extent
+from ldo_service.tracking.motion import image_motion_rad
 
-from .subgraph import View
-from .verification import Proposal
+from .subgraph import SubgraphKeyframe
+from .verification import LoopHypothesis
 
 
 @dataclass(frozen=True, slots=True)
-class PlausibilityConfig:
+class ConsistencyCheckConfig:
     drift_m: float = 0.5  # that a loop may close in any case, and
     drift: float = 0.1  # m for each m of the way since: ten times what depth cameras drift
     turn_rad: float = 0.35  # likewise of the heading, and
@@ -36,16 +36,18 @@ class PlausibilityConfig:
             )
 
 
-class Plausibility:
+class ConsistencyChecker:
     """Judges by poses of the keyframes that are known; `joined` are segments, each with the older
     one whose frame it is in. Of two segments that are apart nothing is known."""
 
     def __init__(
-        self, poses: KeyframePoses, joined: Mapping[int, int], config: PlausibilityConfig
+        self, poses: KeyframePoses, joined: Mapping[int, int], config: ConsistencyCheckConfig
     ) -> None:
         self._poses, self._joined, self._config = poses, joined, config
 
-    def may_meet(self, old: Sequence[View], new: View) -> np.ndarray:
+    def possible_matches(
+        self, old: Sequence[SubgraphKeyframe], new: SubgraphKeyframe
+    ) -> np.ndarray:
         """[S] bool: which of S views a keyframe may show again, wherever it looks: all but those
         that are farther or turned more than drift and the width of a view explain."""
         if new.keyframe not in self._poses:
@@ -68,53 +70,54 @@ class Plausibility:
         )
         return may
 
-    def judged(self, proposal: Proposal) -> Proposal:
+    def check_drift(self, proposal: LoopHypothesis) -> LoopHypothesis:
         """Refused where no drift since then explains it."""
         old, new = proposal.old, proposal.new
-        if proposal.refused or not self._is_known(old, new):
+        if proposal.rejected_reason or not self._is_known(old, new):
             return proposal
         gap_m, turn_rad = self._drift(old, new, proposal.T_old_new)
         limit_m, limit_rad = self._limits(old, new)
         way_m = abs(new.path_m - old.path_m)
         if gap_m > limit_m:
-            return replace(proposal, refused=f"{gap_m:.1f} m of drift after {way_m:.0f} m")
+            return replace(proposal, rejected_reason=f"{gap_m:.1f} m of drift after {way_m:.0f} m")
         if turn_rad > limit_rad:
             reason = f"{np.degrees(turn_rad):.0f} degrees of drift after {way_m:.0f} m"
-            return replace(proposal, refused=reason)
+            return replace(proposal, rejected_reason=reason)
         return proposal
 
-    def without_twins(self, proposals: Sequence[Proposal]) -> list[Proposal]:
+    def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
         """Those refused whose view another place far elsewhere explains nearly as well."""
         return [
-            replace(proposal, refused="a twin elsewhere fits as well")
-            if not proposal.refused and any(self._is_twin(proposal, o) for o in proposals)
+            replace(proposal, rejected_reason="a twin elsewhere fits as well")
+            if not proposal.rejected_reason
+            and any(self._is_aliased(proposal, o) for o in proposals)
             else proposal
             for proposal in proposals
         ]
 
-    def _is_twin(self, proposal: Proposal, other: Proposal) -> bool:
+    def _is_aliased(self, proposal: LoopHypothesis, other: LoopHypothesis) -> bool:
         enough = self._config.rival_inliers * proposal.inliers
-        if other.refused or other.evidence != proposal.evidence or other.inliers < enough:
+        if other.rejected_reason or other.evidence != proposal.evidence or other.inliers < enough:
             return False
         if not self._is_known(proposal.old, other.old):
             return False
         T, T_other = (self._T_map(p, proposal.new) for p in (proposal, other))
-        apart_rad = extent(se3.inverse(T) @ T_other, proposal.new.place.median_depth_m)
+        apart_rad = image_motion_rad(se3.inverse(T) @ T_other, proposal.new.place.median_depth_m)
         return apart_rad > self._config.rival_rad
 
-    def _T_map(self, proposal: Proposal, new: View) -> np.ndarray:
+    def _T_map(self, proposal: LoopHypothesis, new: SubgraphKeyframe) -> np.ndarray:
         """Where a keyframe of the new subgraph is [4, 4], as a proposal says."""
         T_new_odom = se3.inverse(proposal.new.place.T_odom_keyframe)
         T_map_newodom = self._poses[proposal.old.keyframe] @ proposal.T_old_new @ T_new_odom
         return T_map_newodom @ new.place.T_odom_keyframe
 
-    def T_old_new(self, old: View, new: View) -> np.ndarray | None:
+    def T_old_new(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> np.ndarray | None:
         """[4, 4] as the map has them; None where it does not say."""
         if not self._is_known(old, new):
             return None
         return se3.inverse(self._poses[old.keyframe]) @ self._poses[new.keyframe]
 
-    def _is_known(self, old: View, new: View) -> bool:
+    def _is_known(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> bool:
         """Whether the map says where both are to each other."""
         if old.keyframe not in self._poses or new.keyframe not in self._poses:
             return False
@@ -123,13 +126,15 @@ class Plausibility:
     def _root(self, segment: int) -> int:
         return self._joined.get(segment, segment)
 
-    def _drift(self, old: View, new: View, T_old_new: np.ndarray) -> tuple[float, float]:
+    def _drift(
+        self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray
+    ) -> tuple[float, float]:
         """m and rad between where a pose and the map have the new keyframe."""
         T_map_new = self._poses[old.keyframe] @ T_old_new
         T_gap = se3.inverse(T_map_new) @ self._poses[new.keyframe]
         return float(np.linalg.norm(T_gap[:3, 3])), se3.rotation_angle(T_gap)
 
-    def _limits(self, old: View, new: View) -> tuple[float, float]:
+    def _limits(self, old: SubgraphKeyframe, new: SubgraphKeyframe) -> tuple[float, float]:
         """m and rad of drift between them."""
         way_m, config = abs(new.path_m - old.path_m), self._config
         return (

@@ -15,14 +15,21 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.tracking.alignment import AlignConfig
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import Place, PlacesConfig
+from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig, KeyframeRecord
 from ldo_service.tracking.pyramid import PyramidConfig
 
-from .consistency_check import Plausibility, PlausibilityConfig
-from .object_points import Sightings, landmarks_of, layout_of
-from .place_database import Likeness, Memory, RetrievalConfig, Stages
-from .subgraph import Subgraph, SubgraphConfig, View, follows, is_whole, spread
-from .verification import Check, Proposal, VerificationConfig, Verifier
+from .consistency_check import ConsistencyCheckConfig, ConsistencyChecker
+from .object_points import DetectionPoints, cluster_landmarks, layout_histogram
+from .place_database import PlaceDatabase, RetrievalConfig, RetrievalMatch, Stages
+from .subgraph import (
+    Subgraph,
+    SubgraphConfig,
+    SubgraphKeyframe,
+    evenly_spaced,
+    follows,
+    is_complete,
+)
+from .verification import LoopHypothesis, VerificationConfig, VerificationResult, Verifier
 
 BYTES = 32  # of an ORB descriptor
 LOOP_MIN_INLIERS = 12  # The tracker needs 15: a closure is verified by surfaces and by the graph.
@@ -95,8 +102,8 @@ class LoopsConfig:
     words: VisualWordsConfig = field(default_factory=VisualWordsConfig)
     retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
     verification: VerificationConfig = field(default_factory=VerificationConfig)
-    plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
-    places: PlacesConfig = field(default_factory=PlacesConfig)
+    plausibility: ConsistencyCheckConfig = field(default_factory=ConsistencyCheckConfig)
+    places: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     features: FeatureConfig = field(
         default_factory=lambda: FeatureConfig(min_inliers=LOOP_MIN_INLIERS)
@@ -111,26 +118,26 @@ class LoopsConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Finding:
+class LoopCandidateResult:
     """A candidate, with all its scores; a closure unless it was refused."""
 
     new: Subgraph
-    likeness: Likeness
-    check: Check
+    likeness: RetrievalMatch
+    check: VerificationResult
 
     @property
     def closure(self) -> RelativePose | None:
         return self.check.closure
 
 
-class Recogniser:
+class LoopDetector:
     """Cuts keyframes into subgraphs and looks for each new one among the old."""
 
     def __init__(self, config: LoopsConfig) -> None:
         self._config = config
         self._words = VisualWords(config.words)
-        self._memory = Memory(config.words.count, config.stages, config.retrieval)
-        self._open: list[View] = []  # of the subgraph that is not whole yet
+        self._memory = PlaceDatabase(config.words.count, config.stages, config.retrieval)
+        self._open: list[SubgraphKeyframe] = []  # of the subgraph that is not whole yet
         self._path_m = 0.0
         self._last: tuple[int, np.ndarray] | None = None  # segment and T_odom_keyframe
         self._verifier = Verifier(
@@ -148,63 +155,67 @@ class Recogniser:
 
     def add(
         self,
-        place: Place,
+        place: KeyframeRecord,
         frame: int,
         stamp_ns: int,
-        sightings: Sightings | None,
+        sightings: DetectionPoints | None,
         poses: KeyframePoses,
         joined: Mapping[int, int],
-    ) -> list[Finding]:
+    ) -> list[LoopCandidateResult]:
         """Take a keyframe, and with it perhaps the last of a subgraph: then what it was like.
 
         sightings   None where no detector looked
         poses       T_map_keyframe of the keyframes kept; those that are not known are not judged by
         joined      segments, each with the older one whose frame it is in
         """
-        findings: list[Finding] = []
+        findings: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
-            findings = self.rest(poses, joined)
+            findings = self.flush(poses, joined)
             self._open = []
         self._open.append(self._view(place, frame, stamp_ns, sightings))
-        if is_whole(self._open, self._config.subgraphs):
+        if is_complete(self._open, self._config.subgraphs):
             findings += self._completed(poses, joined)
         return findings
 
-    def rest(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
+    def flush(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[LoopCandidateResult]:
         """As `add`, when no keyframe follows: what was begun is whole, if it is long enough. A walk
         often ends where it began, and what was seen last is where a lost camera is."""
         if len(self._open) < self._config.subgraphs.least:
             return []
         return self._completed(poses, joined)
 
-    def _completed(self, poses: KeyframePoses, joined: Mapping[int, int]) -> list[Finding]:
+    def _completed(
+        self, poses: KeyframePoses, joined: Mapping[int, int]
+    ) -> list[LoopCandidateResult]:
         new, self._open = self._subgraph(self._open), []
         findings = self._findings(new, poses, joined)
-        kept = spread(new.views, self._config.subgraphs.kept_views)
+        kept = evenly_spaced(new.views, self._config.subgraphs.kept_views)
         self._memory.add(replace(new, views=kept))
         return findings
 
     # --- subgraphs --------------------------------------------------------------------------------
-    def _view(self, place: Place, frame: int, stamp_ns: int, sightings: Sightings | None) -> View:
+    def _view(
+        self, place: KeyframeRecord, frame: int, stamp_ns: int, sightings: DetectionPoints | None
+    ) -> SubgraphKeyframe:
         self._path_m += self._step_m(place)
         self._last = place.segment, place.T_odom_keyframe
         self._words.learn(place.descriptors)
         words = self._words.histogram(place.descriptors)
         looked = sightings is not None
         sightings = sightings if looked and self._config.stages != "geometric" else None
-        sightings = sightings or Sightings.none()
-        return View(place, frame, stamp_ns, self._path_m, looked, sightings, words)
+        sightings = sightings or DetectionPoints.none()
+        return SubgraphKeyframe(place, frame, stamp_ns, self._path_m, looked, sightings, words)
 
-    def _step_m(self, place: Place) -> float:
+    def _step_m(self, place: KeyframeRecord) -> float:
         """From the keyframe before; how far a lost camera went, nobody knows."""
         if self._last is None or self._last[0] != place.segment:
             return 0.0
         return float(np.linalg.norm(place.T_odom_keyframe[:3, 3] - self._last[1][:3, 3]))
 
-    def _subgraph(self, views: list[View]) -> Subgraph:
+    def _subgraph(self, views: list[SubgraphKeyframe]) -> Subgraph:
         seen = [view.sightings for view in views]
         T_odom = [view.place.T_odom_keyframe for view in views]
-        landmarks = landmarks_of(seen, T_odom, self._config.verification.landmarks)
+        landmarks = cluster_landmarks(seen, T_odom, self._config.verification.landmarks)
         return Subgraph(
             views=tuple(views),
             keyframes=tuple(view.keyframe for view in views),
@@ -215,51 +226,57 @@ class Recogniser:
             was_looked_at=any(view.was_looked_at for view in views),
             landmarks=landmarks,
             names=np.sum([sightings.histogram() for sightings in seen], axis=0),
-            layout=layout_of(landmarks),
+            layout=layout_histogram(landmarks),
             words=np.sum([view.words for view in views], axis=0),
         )
 
     # --- loops ------------------------------------------------------------------------------------
     def _findings(
         self, new: Subgraph, poses: KeyframePoses, joined: Mapping[int, int]
-    ) -> list[Finding]:
+    ) -> list[LoopCandidateResult]:
         """Coarse, then fine: the surest candidate that nothing speaks against closes the loop."""
-        known = Plausibility(poses, joined, self._config.plausibility)
-        is_possible = known.may_meet([old.views[0] for old in self.subgraphs], new.views[-1])
-        likely = self._memory.alike(new, is_possible)
-        proposals = [known.judged(self._proposal(like.subgraph, new, known)) for like in likely]
-        proposals = known.without_twins(proposals)
-        checks: dict[int, Check] = {}
+        known = ConsistencyChecker(poses, joined, self._config.plausibility)
+        is_possible = known.possible_matches(
+            [old.views[0] for old in self.subgraphs], new.views[-1]
+        )
+        likely = self._memory.query(new, is_possible)
+        proposals = [
+            known.check_drift(self._proposal(like.subgraph, new, known)) for like in likely
+        ]
+        proposals = known.reject_aliased(proposals)
+        checks: dict[int, VerificationResult] = {}
         is_closed = False
         for index in sorted(range(len(likely)), key=lambda i: -proposals[i].inliers):
             checks[index] = self._check(proposals[index], is_closed)
             is_closed = is_closed or checks[index].closure is not None
-        return [Finding(new, like, checks[index]) for index, like in enumerate(likely)]
+        return [LoopCandidateResult(new, like, checks[index]) for index, like in enumerate(likely)]
 
-    def _proposal(self, old: Subgraph, new: Subgraph, known: Plausibility) -> Proposal:
+    def _proposal(self, old: Subgraph, new: Subgraph, known: ConsistencyChecker) -> LoopHypothesis:
         """Features first: they place a camera to centimetres, landmarks to decimetres. The map
         last: what it says is judged by itself."""
         verifier, stages = self._verifier, self._config.stages
         if stages == "semantic":
-            return verifier.by_landmarks(old, new)
-        proposal = verifier.by_features(old, new)
-        if proposal.refused and stages == "two_stage":
-            proposal = _unless_refused(verifier.by_landmarks(old, new), proposal)
-        if proposal.refused:
-            proposal = _unless_refused(verifier.by_map(old, new, known.T_old_new), proposal)
+            return verifier.hypothesis_from_landmarks(old, new)
+        proposal = verifier.hypothesis_from_features(old, new)
+        if proposal.rejected_reason and stages == "two_stage":
+            proposal = _unless_refused(verifier.hypothesis_from_landmarks(old, new), proposal)
+        if proposal.rejected_reason:
+            proposal = _unless_refused(
+                verifier.hypothesis_from_map(old, new, known.T_old_new), proposal
+            )
         return proposal
 
-    def _check(self, proposal: Proposal, is_closed: bool) -> Check:
-        if proposal.refused:
-            return Check(proposal, refused=proposal.refused)
+    def _check(self, proposal: LoopHypothesis, is_closed: bool) -> VerificationResult:
+        if proposal.rejected_reason:
+            return VerificationResult(proposal, rejected_reason=proposal.rejected_reason)
         if is_closed:
-            return Check(proposal, refused="another candidate closed the loop")
+            return VerificationResult(proposal, rejected_reason="another candidate closed the loop")
         if self._config.stages == "semantic":
-            return self._verifier.believed(proposal)
-        return self._verifier.confirm(proposal)
+            return self._verifier.accept_unverified(proposal)
+        return self._verifier.verify(proposal)
 
     # --- state ------------------------------------------------------------------------------------
-    def state(self) -> dict[str, Any]:
+    def snapshot(self) -> dict[str, Any]:
         """`subgraphs` and `views` are lists of parts that never change; the rest is small."""
         return {
             "subgraphs": [subgraph.packed for subgraph in self._memory.subgraphs],
@@ -271,12 +288,12 @@ class Recogniser:
     def restore(self, state: Mapping[str, Any]) -> None:
         self.__init__(self._config)
         for packed in state["subgraphs"]:
-            self._memory.add(Subgraph.unpacked(packed))
-        self._open = [View.unpacked(packed) for packed in state["views"]]
+            self._memory.add(Subgraph.unpack(packed))
+        self._open = [SubgraphKeyframe.unpack(packed) for packed in state["views"]]
         self._words = VisualWords(self._config.words, state["words"])
         self._path_m, last = state["path"]
         self._last = None if last is None else (last[0], last[1])
 
 
-def _unless_refused(proposal: Proposal, other: Proposal) -> Proposal:
-    return other if proposal.refused else proposal
+def _unless_refused(proposal: LoopHypothesis, other: LoopHypothesis) -> LoopHypothesis:
+    return other if proposal.rejected_reason else proposal

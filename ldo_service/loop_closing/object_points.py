@@ -10,7 +10,7 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import ForegroundConfig, foreground, surfaces
 from ldo_service.semantics.distributions import dense, divergence, entropy, sparse
-from ldo_service.semantics.gaussian_labels import MOST_LABELS, OTHER
+from ldo_service.semantics.gaussian_labels import MAX_LABELS, OTHER
 
 LAYOUT_WORDS = 512  # pairs of names and their distances are spread over so many
 DISTANCE_BIN_M = 0.5  # of the distances; each counts in the two bins that it lies between
@@ -40,7 +40,7 @@ class LandmarkConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sightings:
+class DetectionPoints:
     """What was detected in one keyframe: labels [K] uint8, scores [K] float32, 0..1, and p_camera
     [K, 3] float32 m, NaN where no depth was measured."""
 
@@ -49,29 +49,29 @@ class Sightings:
     p_camera: np.ndarray
 
     @staticmethod
-    def none() -> "Sightings":
+    def none() -> "DetectionPoints":
         nowhere = np.zeros((0, 3), np.float32)
-        return Sightings(np.zeros(0, np.uint8), np.zeros(0, np.float32), nowhere)
+        return DetectionPoints(np.zeros(0, np.uint8), np.zeros(0, np.float32), nowhere)
 
     def histogram(self) -> np.ndarray:
         """[C] float32: the scores of each name, added up."""
-        counts = np.bincount(self.labels, self.scores, MOST_LABELS).astype(np.float32)
+        counts = np.bincount(self.labels, self.scores, MAX_LABELS).astype(np.float32)
         counts[:HIDDEN_NAMES] = 0
         return counts
 
 
-def sightings_of(
+def locate_detections(
     labels: np.ndarray,
     scores: np.ndarray,
     boxes: np.ndarray,
     depth_m: np.ndarray,
     camera: Camera,
     config: LandmarkConfig,
-) -> Sightings:
+) -> DetectionPoints:
     """Boxes [K, 4] (x0 y0 x1 y1, px) in a depth image [H, W]: where their foreground is, in the
     median."""
     if not len(labels):
-        return Sightings.none()
+        return DetectionPoints.none()
     pieces = surfaces(depth_m, camera, config.foreground)
     p_camera = np.full((len(labels), 3), np.nan, np.float32)
     for k, box in enumerate(boxes):
@@ -81,11 +81,11 @@ def sightings_of(
             z = float(np.median(depth_m[mask]))
             rays = (np.median(u) - camera.cx) / camera.fx, (np.median(v) - camera.cy) / camera.fy
             p_camera[k] = z * rays[0], z * rays[1], z
-    return Sightings(labels.astype(np.uint8), scores.astype(np.float32), p_camera)
+    return DetectionPoints(labels.astype(np.uint8), scores.astype(np.float32), p_camera)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Landmarks:
+class SubgraphLandmarks:
     """Points [K, 3] m in the odometry frame of a segment, with what they are: sparse distributions,
     labels [K, 8] uint8 and weights [K, 8] float32."""
 
@@ -112,9 +112,9 @@ class Landmarks:
         return {"p_odom": self.p_odom, "labels": self.labels, "weights": self.weights}
 
 
-def landmarks_of(
-    seen: Sequence[Sightings], T_odom_camera: Sequence[np.ndarray], config: LandmarkConfig
-) -> Landmarks:
+def cluster_landmarks(
+    seen: Sequence[DetectionPoints], T_odom_camera: Sequence[np.ndarray], config: LandmarkConfig
+) -> SubgraphLandmarks:
     """The sightings of a few keyframes, those of one thing taken together.
 
     A landmark's distribution is the mean over its sightings, each the score on its name and the
@@ -133,15 +133,15 @@ def landmarks_of(
             k = _same(p_odom, int(label), places, counts, names, config.same_m)
             if k == len(names):
                 places.append(np.zeros(3))
-                masses.append(np.zeros(MOST_LABELS))
+                masses.append(np.zeros(MAX_LABELS))
                 counts.append(0)
                 names.append(int(label))
             places[k] = places[k] + p_odom
             masses[k][[int(label), OTHER]] += float(score), 1.0 - float(score)
             counts[k] += 1
     total = np.array(counts, float).reshape(-1, 1)
-    labels, weights = sparse(np.array(masses).reshape(-1, MOST_LABELS) / total)
-    return Landmarks(np.array(places).reshape(-1, 3) / total, labels, weights)
+    labels, weights = sparse(np.array(masses).reshape(-1, MAX_LABELS) / total)
+    return SubgraphLandmarks(np.array(places).reshape(-1, 3) / total, labels, weights)
 
 
 def _same(
@@ -161,7 +161,7 @@ def _same(
     return nearest if gaps_m and gaps_m[nearest] < limit_m else len(names)
 
 
-def layout_of(landmarks: Landmarks) -> np.ndarray:
+def layout_histogram(landmarks: SubgraphLandmarks) -> np.ndarray:
     """[512] float32: which two names are how far apart, for each pair of landmarks.
 
     Unlike the names alone it tells a row of chairs from chairs about a table; it knows no
@@ -177,13 +177,13 @@ def layout_of(landmarks: Landmarks) -> np.ndarray:
     bins = bins / DISTANCE_BIN_M
     lower = np.floor(bins).astype(np.int64)
     for step, share in ((lower, 1 - (bins - lower)), (lower + 1, bins - lower)):
-        words = ((low * MOST_LABELS + high) * 31 + step) * 0x9E3779B1 % 2**32 % LAYOUT_WORDS
+        words = ((low * MAX_LABELS + high) * 31 + step) * 0x9E3779B1 % 2**32 % LAYOUT_WORDS
         np.add.at(out, words, share.astype(np.float32))
     return out
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Matched:
+class LandmarkAgreement:
     """How well landmarks of two subgraphs go together that lie in one place."""
 
     count: int  # that are of one kind
@@ -192,27 +192,31 @@ class Matched:
     entropy: float  # nats, likewise, of both
 
 
-def possible_pairs(old: Landmarks, new: Landmarks, config: LandmarkConfig) -> np.ndarray:
+def possible_pairs(
+    old: SubgraphLandmarks, new: SubgraphLandmarks, config: LandmarkConfig
+) -> np.ndarray:
     """Indices [M, 2] of landmarks that may be one: KL below 0.3 nats both ways (III.C)."""
     return np.argwhere(_divergences(old, new) < config.max_divergence)
 
 
-def matched(old: Landmarks, new: Landmarks, pairs: np.ndarray, contradicted: int = 0) -> Matched:
+def compare_landmarks(
+    old: SubgraphLandmarks, new: SubgraphLandmarks, pairs: np.ndarray, contradicted: int = 0
+) -> LandmarkAgreement:
     """What is recorded of pairs [M, 2]."""
     if not len(pairs):
-        return Matched(0, contradicted, 0.0, 0.0)
+        return LandmarkAgreement(0, contradicted, 0.0, 0.0)
     gaps = _divergences(old, new)[pairs[:, 0], pairs[:, 1]]
     certain = entropy(old.distributions)[pairs[:, 0]], entropy(new.distributions)[pairs[:, 1]]
     means = (max(float(np.mean(values)), 0.0) for values in (gaps, certain))
-    return Matched(len(pairs), contradicted, *means)
+    return LandmarkAgreement(len(pairs), contradicted, *means)
 
 
-def matched_at(
-    old: Landmarks, new: Landmarks, T_old_new: np.ndarray, config: LandmarkConfig
-) -> Matched:
+def compare_landmarks_at(
+    old: SubgraphLandmarks, new: SubgraphLandmarks, T_old_new: np.ndarray, config: LandmarkConfig
+) -> LandmarkAgreement:
     """The landmarks that a motion between the two odometry frames [4, 4] brings together."""
     if not len(old) or not len(new):
-        return Matched(0, 0, 0.0, 0.0)
+        return LandmarkAgreement(0, 0, 0.0, 0.0)
     gaps_m = np.linalg.norm(old.p_odom[:, None] - se3.transform(T_old_new, new.p_odom), axis=2)
     near = gaps_m < config.reach_m
     alike = near & (_divergences(old, new) < config.max_divergence)
@@ -221,10 +225,10 @@ def matched_at(
     # one name, said with less confidence, is no other thing
     agrees = alike | (near & (old.names[:, None] == new.names))
     contradicted = int(np.count_nonzero(near.any(axis=0) & ~agrees.any(axis=0)))
-    return matched(old, new, np.column_stack([nearest, both]), contradicted)
+    return compare_landmarks(old, new, np.column_stack([nearest, both]), contradicted)
 
 
-def _divergences(a: Landmarks, b: Landmarks) -> np.ndarray:
+def _divergences(a: SubgraphLandmarks, b: SubgraphLandmarks) -> np.ndarray:
     """[K, L] nats, the larger of both ways."""
     p, q = a.distributions[:, None], b.distributions[None]
     return np.maximum(divergence(p, q), divergence(q, p))

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from ldo_service.errors import ConfigError, named
-from ldo_service.semantics.gaussian_labels import MOST_LABELS
-from ldo_service.tracking.keyframe_database import gaps
+from ldo_service.semantics.gaussian_labels import MAX_LABELS
+from ldo_service.tracking.keyframe_database import neighbor_distances
 
 from .object_points import LAYOUT_WORDS
 from .subgraph import Subgraph
@@ -97,7 +97,7 @@ class RetrievalConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Likeness:
+class RetrievalMatch:
     """An old subgraph that a new one is like."""
 
     subgraph: Subgraph
@@ -107,7 +107,7 @@ class Likeness:
     score: float  # what candidates are ranked by
 
 
-class Memory:
+class PlaceDatabase:
     """Subgraphs in the order they came, with tables of their histograms.
 
     Beyond `count` the one goes whose neighbours along the path are nearest to each other: a month
@@ -117,7 +117,7 @@ class Memory:
     def __init__(self, words: int, stages: Stages, config: RetrievalConfig) -> None:
         self._stages, self._config = stages, config
         self.subgraphs: list[Subgraph] = []
-        self._names = Histograms(MOST_LABELS)
+        self._names = Histograms(MAX_LABELS)
         self._layout = Histograms(LAYOUT_WORDS)
         self._words = Histograms(words)
 
@@ -130,14 +130,16 @@ class Memory:
         self._layout.add(subgraph.layout)
         self._words.add(subgraph.words)
         if len(self) > self._config.count:
-            self._remove(int(np.argmin(gaps([s.views[0].place for s in self.subgraphs]))) + 1)
+            self._remove(
+                int(np.argmin(neighbor_distances([s.views[0].place for s in self.subgraphs]))) + 1
+            )
 
     def _remove(self, index: int) -> None:
         del self.subgraphs[index]
         for table in (self._names, self._layout, self._words):
             table.remove(index)
 
-    def alike(self, new: Subgraph, is_possible: np.ndarray) -> list[Likeness]:
+    def query(self, new: Subgraph, is_possible: np.ndarray) -> list[RetrievalMatch]:
         """At most K old subgraphs that may show the same place, the likeliest first, of those that
         are possible [S] bool."""
         if not self.subgraphs:
@@ -149,7 +151,7 @@ class Memory:
         score[~(self._are_far(new) & is_possible)] = 0
         ranked = np.argsort(-score, kind="stable")[: self._config.candidates]
         return [
-            Likeness(
+            RetrievalMatch(
                 self.subgraphs[i],
                 float(similarity[i]),
                 float(layout[i]),

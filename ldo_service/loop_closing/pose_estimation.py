@@ -9,47 +9,47 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
-from ldo_service.geometry.se3 import align
+from ldo_service.geometry.se3 import fit_rigid_transform
 
 SPREAD = 0.1  # m, of three points about their line: below, nothing fixes the turn about it
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Motion:
+class RansacResult:
     """T_a_b [4, 4], and which correspondences [M] agree with it."""
 
     T_a_b: np.ndarray
     inliers: np.ndarray
 
 
-def rigid_among(
+def ransac_rigid(
     p_a: np.ndarray,
     p_b: np.ndarray,
     pairs: np.ndarray,
     limit_m: float,
     iterations: int,
     rng: np.random.Generator,
-) -> Motion | None:
+) -> RansacResult | None:
     """The motion that most correspondences agree on, by RANSAC over triples of them.
 
     p_a [K, 3] and p_b [L, 3] m; pairs [M, 2] of indices (a, b) that may belong together: one point
     may be in many, and counts in the nearest alone. None where no triple is a triangle of the same
     shape in both. The winner is fitted again to its inliers.
     """
-    best: Motion | None = None
+    best: RansacResult | None = None
     if len(pairs) < 3:
         return None
     for _ in range(iterations):
         a, b = pairs[rng.choice(len(pairs), 3, replace=False)].T
         if len({*a}) < 3 or len({*b}) < 3 or not _are_alike(p_a[a], p_b[b], limit_m):
             continue
-        motion = _supported(p_a, p_b, pairs, align(p_b[b], p_a[a]), limit_m)
+        motion = _supported(p_a, p_b, pairs, fit_rigid_transform(p_b[b], p_a[a]), limit_m)
         if best is None or motion.inliers.sum() > best.inliers.sum():
             best = motion
     if best is None or best.inliers.sum() < 3:
         return None
     a, b = pairs[best.inliers].T
-    return _supported(p_a, p_b, pairs, align(p_b[b], p_a[a]), limit_m)
+    return _supported(p_a, p_b, pairs, fit_rigid_transform(p_b[b], p_a[a]), limit_m)
 
 
 def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
@@ -63,7 +63,7 @@ def _are_alike(p_a: np.ndarray, p_b: np.ndarray, limit_m: float) -> bool:
 
 def _supported(
     p_a: np.ndarray, p_b: np.ndarray, pairs: np.ndarray, T_a_b: np.ndarray, limit_m: float
-) -> Motion:
+) -> RansacResult:
     gaps_m = np.linalg.norm(p_a[pairs[:, 0]] - se3.transform(T_a_b, p_b[pairs[:, 1]]), axis=1)
     inliers = np.zeros(len(pairs), bool)
     used: tuple[set[int], set[int]] = set(), set()
@@ -73,11 +73,11 @@ def _supported(
             inliers[m] = True
             used[0].add(a)
             used[1].add(b)
-    return Motion(T_a_b, inliers)
+    return RansacResult(T_a_b, inliers)
 
 
 @dataclass(frozen=True, slots=True)
-class SurfaceFitConfig:
+class DepthConsistencyConfig:
     gate_m: float = 0.1  # along the ray, beyond which two depths are of different surfaces
     gate_share: float = 0.02  # of the depth, on top: the noise of structured light at 5 m
     min_overlap: float = 0.2  # share of the new surface that the old keyframe sees too
@@ -100,19 +100,19 @@ class SurfaceFitConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class SurfaceFit:
+class DepthConsistency:
     overlap: float  # of the new surface's points, those that the old keyframe measured too
     rmse_m: float  # of these along their normals
     conflict: float  # of the points within the old view, those in its free space
 
 
-def surface_fit(
+def check_depth_consistency(
     points: np.ndarray,
     T_old_new: np.ndarray,
     old_depth_m: np.ndarray,
     camera: Camera,
-    config: SurfaceFitConfig,
-) -> SurfaceFit:
+    config: DepthConsistencyConfig,
+) -> DepthConsistency:
     """Points [7, N] of the new keyframe (see `Reference`) against the old depth [H, W].
 
     A point p with normal n falls on a pixel whose depth makes the point q on the same ray:
@@ -130,14 +130,14 @@ def surface_fit(
     old_m = old_depth_m[v, u].astype(float)
     seen, old_m = seen[old_m > 0], old_m[old_m > 0]
     if not len(seen):
-        return SurfaceFit(0.0, 0.0, 0.0)
+        return DepthConsistency(0.0, 0.0, 0.0)
     z = p[seen, 2]
     gate_m = config.gate_m + config.gate_share * old_m
     is_one = np.abs(z - old_m) <= gate_m
     along = np.einsum("ij,ij->i", normals[seen], p[seen] * (1 - old_m / z)[:, None])
     has_normal = is_one & np.any(normals[seen] != 0, axis=1)
     squares = along[has_normal] ** 2
-    return SurfaceFit(
+    return DepthConsistency(
         overlap=float(is_one.sum() / points.shape[1]),
         rmse_m=float(np.sqrt(squares.mean())) if len(squares) else 0.0,
         conflict=float((z < old_m - gate_m).mean()),

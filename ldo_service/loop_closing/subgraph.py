@@ -9,10 +9,10 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
-from ldo_service.tracking.keyframe_database import Place
-from ldo_service.tracking.motion import extent
+from ldo_service.tracking.keyframe_database import KeyframeRecord
+from ldo_service.tracking.motion import image_motion_rad
 
-from .object_points import Landmarks, Sightings
+from .object_points import DetectionPoints, SubgraphLandmarks
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,18 +40,18 @@ class SubgraphConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class SubgraphKeyframe:
     """A keyframe as places are recognised by.
 
     words [W] float32 counts of visual words; path_m how far the camera had come by then
     """
 
-    place: Place
+    place: KeyframeRecord
     frame: int  # of the camera
     stamp_ns: int
     path_m: float
     was_looked_at: bool  # by a detector
-    sightings: Sightings
+    sightings: DetectionPoints
     words: np.ndarray
 
     @property
@@ -65,10 +65,13 @@ class View:
         return {**kept, "place": self.place.packed, "sightings": asdict(self.sightings)}
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "View":
+    def unpack(kept: dict[str, Any]) -> "SubgraphKeyframe":
         """The inverse of `packed`."""
-        place, sightings = Place.unpacked(kept["place"]), Sightings(**kept["sightings"])
-        return View(**{**kept, "place": place, "sightings": sightings})
+        place, sightings = (
+            KeyframeRecord.unpack(kept["place"]),
+            DetectionPoints(**kept["sightings"]),
+        )
+        return SubgraphKeyframe(**{**kept, "place": place, "sightings": sightings})
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +81,14 @@ class Subgraph:
     names [C], layout [512] and words [W] float32 are its histograms
     """
 
-    views: tuple[View, ...]
+    views: tuple[SubgraphKeyframe, ...]
     keyframes: tuple[int, ...]
     first_frame: int
     last_frame: int
     stamp_ns: int  # of its newest keyframe
     path_m: float  # likewise
     was_looked_at: bool
-    landmarks: Landmarks
+    landmarks: SubgraphLandmarks
     names: np.ndarray
     layout: np.ndarray
     words: np.ndarray
@@ -102,34 +105,37 @@ class Subgraph:
         return {**kept, "views": views, "landmarks": self.landmarks.packed}
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Subgraph":
+    def unpack(kept: dict[str, Any]) -> "Subgraph":
         """The inverse of `packed`."""
         changed = {
-            "views": tuple(map(View.unpacked, kept["views"])),
+            "views": tuple(map(SubgraphKeyframe.unpack, kept["views"])),
             "keyframes": tuple(kept["keyframes"]),
-            "landmarks": Landmarks(**kept["landmarks"]),
+            "landmarks": SubgraphLandmarks(**kept["landmarks"]),
         }
         return Subgraph(**{**kept, **changed})
 
 
-def follows(before: Place, place: Place, config: SubgraphConfig) -> bool:
+def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfig) -> bool:
     """Whether a keyframe goes on where the one before was made: others may lie between that were
     made long ago."""
     moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
-    is_near = extent(moved, before.median_depth_m) <= config.gap_rad
+    is_near = image_motion_rad(moved, before.median_depth_m) <= config.gap_rad
     return is_near and before.segment == place.segment
 
 
-def is_whole(views: Sequence[View], config: SubgraphConfig) -> bool:
+def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
     """Whether keyframes of one segment make a subgraph: enough of them, or far enough apart."""
     if len(views) < config.least:
         return False
     first, last = views[0].place, views[-1].place
     moved = se3.inverse(first.T_odom_keyframe) @ last.T_odom_keyframe
-    return len(views) >= config.most or extent(moved, first.median_depth_m) > config.turned_rad
+    return (
+        len(views) >= config.most
+        or image_motion_rad(moved, first.median_depth_m) > config.turned_rad
+    )
 
 
-def spread(views: Sequence[View], count: int) -> tuple[View, ...]:
+def evenly_spaced(views: Sequence[SubgraphKeyframe], count: int) -> tuple[SubgraphKeyframe, ...]:
     """So many of them, at equal steps, the first and the last included; the middle one of one."""
     if count == 1:
         return (views[len(views) // 2],)

@@ -19,16 +19,29 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.tracking.alignment import AlignConfig, Alignment, align
 from ldo_service.tracking.features import FeatureConfig, estimate_pose
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.motion import extent
+from ldo_service.tracking.motion import image_motion_rad
 from ldo_service.tracking.pyramid import PyramidConfig
 
-from .object_points import LandmarkConfig, Matched, matched, matched_at, possible_pairs
-from .pose_estimation import SurfaceFit, SurfaceFitConfig, rigid_among, surface_fit
-from .subgraph import Subgraph, View
+from .object_points import (
+    LandmarkAgreement,
+    LandmarkConfig,
+    compare_landmarks,
+    compare_landmarks_at,
+    possible_pairs,
+)
+from .pose_estimation import (
+    DepthConsistency,
+    DepthConsistencyConfig,
+    check_depth_consistency,
+    ransac_rigid,
+)
+from .subgraph import Subgraph, SubgraphKeyframe
 
-NOTHING = Matched(0, 0, 0.0, 0.0)
+NOTHING = LandmarkAgreement(0, 0, 0.0, 0.0)
 Evidence = Literal["", "landmarks", "features", "map"]
-KnownPose = Callable[[View, View], np.ndarray | None]  # T_old_new [4, 4]; None: not known
+KnownPose = Callable[
+    [SubgraphKeyframe, SubgraphKeyframe], np.ndarray | None
+]  # T_old_new [4, 4]; None: not known
 OPENED = 12  # keyframes kept ready for alignment, 3 MB each: a query and some candidates
 FIT_LEVEL = 1  # of the pyramid, 160 pixels wide: 19,200 points say what overlaps
 
@@ -36,7 +49,7 @@ FIT_LEVEL = 1  # of the pyramid, 160 pixels wide: 19,200 points say what overlap
 @dataclass(frozen=True, slots=True)
 class VerificationConfig:
     landmarks: LandmarkConfig = field(default_factory=LandmarkConfig)
-    fit: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
+    fit: DepthConsistencyConfig = field(default_factory=DepthConsistencyConfig)
     min_inliers: int = 20  # features that agree on the pose, of the best pair of keyframes; another
     # keyframe of the new subgraph that says the same needs `features.min_inliers` alone
     witness_landmarks: int = 3  # or landmarks of one kind that it brings together
@@ -75,26 +88,26 @@ class VerificationConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Proposal:
+class LoopHypothesis:
     """A pose between two keyframes, T_old_new [4, 4]; `refused` says why it goes no further."""
 
-    old: View
-    new: View
+    old: SubgraphKeyframe
+    new: SubgraphKeyframe
     T_old_new: np.ndarray
     evidence: Evidence = ""  # "": there is no pose
     inliers: int = 0
-    semantics: Matched = NOTHING
-    refused: str = ""
+    semantics: LandmarkAgreement = NOTHING
+    rejected_reason: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Check:
+class VerificationResult:
     """What came of a proposal; the closure if nothing speaks against it."""
 
-    proposal: Proposal
+    proposal: LoopHypothesis
     overlap: float = 0.0
     rmse_m: float = 0.0
-    refused: str = ""
+    rejected_reason: str = ""
     closure: RelativePose | None = None
 
 
@@ -112,83 +125,91 @@ class Verifier:
         self._opened = lru_cache(OPENED)(lambda view: view.place.keyframe(pyramid))
 
     # --- a pose -----------------------------------------------------------------------------------
-    def by_features(self, old: Subgraph, new: Subgraph) -> Proposal:
+    def hypothesis_from_features(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """The pose that features of two new keyframes agree on."""
-        found: list[Proposal] = []
+        found: list[LoopHypothesis] = []
         for a, b in islice(_likely_pairs(old, new), self._config.pairs):
             pose = estimate_pose(a.place.features, b.place.features, b.place.camera, self._features)
             if pose is not None:
                 T_old_new = se3.inverse(pose.T_camera_reference)
-                found.append(Proposal(a, b, T_old_new, "features", pose.inliers))
+                found.append(LoopHypothesis(a, b, T_old_new, "features", pose.inliers))
                 best = max(found, key=lambda proposal: proposal.inliers)
                 is_enough = best.inliers >= self._config.min_inliers
-                if is_enough and self._has_witness(best, found, self._config.witness_rad):
+                if is_enough and self._is_confirmed_by_any(best, found, self._config.witness_rad):
                     return self._with_semantics(best, old, new)
-        return self._alone(found, old, new)
+        return self._from_single_keyframe(found, old, new)
 
-    def _alone(self, found: list[Proposal], old: Subgraph, new: Subgraph) -> Proposal:
+    def _from_single_keyframe(
+        self, found: list[LoopHypothesis], old: Subgraph, new: Subgraph
+    ) -> LoopHypothesis:
         """What a single keyframe says; images of another, or three landmarks, may vouch for it."""
         best = max(found, key=lambda proposal: proposal.inliers, default=None)
         if best is None:
-            return Proposal(old.views[0], new.views[0], np.eye(4), refused="no pose fits features")
+            return LoopHypothesis(
+                old.views[0], new.views[0], np.eye(4), rejected_reason="no pose fits features"
+            )
         best = self._with_semantics(best, old, new)
         if best.inliers < self._config.min_inliers:
-            return replace(best, refused=f"{best.inliers} features agree")
+            return replace(best, rejected_reason=f"{best.inliers} features agree")
         if best.semantics.count >= self._config.witness_landmarks:
             return best
-        if any(self._vouches(best, view) for view in new.views if view is not best.new):
+        if any(self._is_confirmed_by(best, view) for view in new.views if view is not best.new):
             return best
-        return replace(best, refused="one keyframe alone says so")
+        return replace(best, rejected_reason="one keyframe alone says so")
 
-    def _vouches(self, best: Proposal, view: View) -> bool:
+    def _is_confirmed_by(self, best: LoopHypothesis, view: SubgraphKeyframe) -> bool:
         """Whether the image and surface of another new keyframe are as a pose predicts."""
         T_old_view = _between(best.old, view, _odometry_frames(best))
-        check = self.confirm(replace(best, new=view, T_old_new=T_old_view))
+        check = self.verify(replace(best, new=view, T_old_new=T_old_view))
         return check.closure is not None
 
-    def _has_witness(self, best: Proposal, found: list[Proposal], within_rad: float) -> bool:
+    def _is_confirmed_by_any(
+        self, best: LoopHypothesis, found: list[LoopHypothesis], within_rad: float
+    ) -> bool:
         """Whether another new keyframe says the same."""
         return any(
-            extent(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
+            image_motion_rad(se3.inverse(best.T_old_new) @ _as_seen_by(best, other), _depth(best))
             < within_rad
             for other in found
             if other.new is not best.new
         )
 
-    def by_landmarks(self, old: Subgraph, new: Subgraph) -> Proposal:
+    def hypothesis_from_landmarks(self, old: Subgraph, new: Subgraph) -> LoopHypothesis:
         """The pose that most landmarks agree on, between the keyframes that then see most alike."""
         config = self._config.landmarks
         pairs = possible_pairs(old.landmarks, new.landmarks, config)
         points = old.landmarks.p_odom, new.landmarks.p_odom
         rng = np.random.default_rng(0)
-        motion = rigid_among(*points, pairs, config.reach_m, config.iterations, rng)
+        motion = ransac_rigid(*points, pairs, config.reach_m, config.iterations, rng)
         count = 0 if motion is None else int(motion.inliers.sum())
         if motion is None or count < config.min_inliers:
             reason = f"{count} landmarks agree"
-            return Proposal(old.views[0], new.views[0], np.eye(4), refused=reason)
-        semantics = matched(old.landmarks, new.landmarks, pairs[motion.inliers])
+            return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=reason)
+        semantics = compare_landmarks(old.landmarks, new.landmarks, pairs[motion.inliers])
         nearest = _nearest_pairs(old, new, lambda a, b: _between(a, b, motion.T_a_b))
         a, b, T_old_new = next(nearest)
-        return Proposal(a, b, T_old_new, "landmarks", count, semantics)
+        return LoopHypothesis(a, b, T_old_new, "landmarks", count, semantics)
 
-    def by_map(self, old: Subgraph, new: Subgraph, T_old_new: KnownPose) -> Proposal:
+    def hypothesis_from_map(
+        self, old: Subgraph, new: Subgraph, T_old_new: KnownPose
+    ) -> LoopHypothesis:
         """Where the map has them, if that brings them together, and the images of two new keyframes
         refine it to one and the same pose: what sees a place from elsewhere shares few features.
 
         It finds no loop that drift tore open; it ties what was seen twice before it drifts apart.
         """
-        found: list[Proposal] = []
+        found: list[LoopHypothesis] = []
         for a, b, T in islice(_nearest_pairs(old, new, T_old_new), self._config.map_pairs):
-            check = self._met(Proposal(a, b, T, "map"))
+            check = self._check_overlap(LoopHypothesis(a, b, T, "map"))
             if check is not None and check.closure is not None:
                 met = replace(check.proposal, T_old_new=check.closure.T_a_b)
-                if self._has_witness(met, found, self._config.map_witness_rad):
+                if self._is_confirmed_by_any(met, found, self._config.map_witness_rad):
                     return self._with_semantics(met, old, new)
                 found.append(met)
         refused = "the map alone says so" if found else "the map does not bring them together"
-        return Proposal(old.views[0], new.views[0], np.eye(4), refused=refused)
+        return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
-    def _met(self, proposal: Proposal) -> Check | None:
+    def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
         """None, without an alignment, where either sees too little of what the other does."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         T_old_new, least = proposal.T_old_new, self._config.blind_overlap
@@ -196,22 +217,24 @@ class Verifier:
             return None
         if self._fit(new, old, se3.inverse(T_old_new)).overlap < least:
             return None
-        return self.confirm(proposal)
+        return self.verify(proposal)
 
-    def _with_semantics(self, proposal: Proposal, old: Subgraph, new: Subgraph) -> Proposal:
+    def _with_semantics(
+        self, proposal: LoopHypothesis, old: Subgraph, new: Subgraph
+    ) -> LoopHypothesis:
         """What the landmarks say of a pose: those in one place should be of one kind."""
         T, config = _odometry_frames(proposal), self._config.landmarks
-        semantics = matched_at(old.landmarks, new.landmarks, T, config)
+        semantics = compare_landmarks_at(old.landmarks, new.landmarks, T, config)
         return replace(proposal, semantics=semantics)
 
     # --- its proof --------------------------------------------------------------------------------
-    def confirm(self, proposal: Proposal) -> Check:
+    def verify(self, proposal: LoopHypothesis) -> VerificationResult:
         """Refine a pose on the images, and see whether the surfaces meet."""
         old, new = self._opened(proposal.old), self._opened(proposal.new)
         alignment = align(old.reference, new.view, se3.inverse(proposal.T_old_new), self._align)
         fit = self._fit(old, new, alignment.T_reference_camera)
         back = self._fit(new, old, se3.inverse(alignment.T_reference_camera))
-        refused = self._objection(proposal, alignment, fit, min(fit.overlap, back.overlap))
+        refused = self._rejection_reason(proposal, alignment, fit, min(fit.overlap, back.overlap))
         measured = RelativePose(
             proposal.old.keyframe,
             proposal.new.keyframe,
@@ -219,29 +242,31 @@ class Verifier:
             alignment.information,
         )
         closure = None if refused else measured
-        return Check(proposal, min(fit.overlap, 1.0), fit.rmse_m, refused, closure)
+        return VerificationResult(proposal, min(fit.overlap, 1.0), fit.rmse_m, refused, closure)
 
-    def believed(self, proposal: Proposal) -> Check:
+    def accept_unverified(self, proposal: LoopHypothesis) -> VerificationResult:
         """A pose of landmarks as it is: what the paper's fine stage alone would close."""
         sigma_m = self._config.landmarks.reach_m / np.sqrt(proposal.inliers)
         sigmas = np.repeat([sigma_m / _depth(proposal), sigma_m], 3)
         a, b = proposal.old.keyframe, proposal.new.keyframe
         closure = RelativePose(a, b, proposal.T_old_new, np.diag(sigmas**-2))
-        return Check(proposal, closure=closure)
+        return VerificationResult(proposal, closure=closure)
 
-    def _fit(self, old: Keyframe, new: Keyframe, T_old_new: np.ndarray) -> SurfaceFit:
+    def _fit(self, old: Keyframe, new: Keyframe, T_old_new: np.ndarray) -> DepthConsistency:
         level = min(FIT_LEVEL, len(old.view.levels) - 1, len(new.view.levels) - 1)
         points, there = new.reference.points[level], old.view.levels[level]
-        return surface_fit(points, T_old_new, there.depth_m, there.camera, self._config.fit)
+        return check_depth_consistency(
+            points, T_old_new, there.depth_m, there.camera, self._config.fit
+        )
 
-    def _objection(
-        self, proposal: Proposal, alignment: Alignment, fit: SurfaceFit, shared: float
+    def _rejection_reason(
+        self, proposal: LoopHypothesis, alignment: Alignment, fit: DepthConsistency, shared: float
     ) -> str:
         """What speaks against a pose; nothing: "". `shared`: of either's surface, at least."""
         config, by_landmarks = self._config, proposal.evidence == "landmarks"
         moved = se3.inverse(proposal.T_old_new) @ alignment.T_reference_camera
         limit = config.refined_landmarks_rad if by_landmarks else config.refined_rad
-        if extent(moved, _depth(proposal)) > limit:
+        if image_motion_rad(moved, _depth(proposal)) > limit:
             return "images and " + proposal.evidence + " disagree"
         if alignment.condition > config.max_condition:
             return "the images do not fix the pose"
@@ -260,7 +285,9 @@ class Verifier:
         return ""
 
 
-def _likely_pairs(old: Subgraph, new: Subgraph) -> Iterator[tuple[View, View]]:
+def _likely_pairs(
+    old: Subgraph, new: Subgraph
+) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe]]:
     """All pairs of keyframes, those with most visual words in common first."""
     pairs = list(product(old.views, new.views))
     shared = [float(np.minimum(a.words, b.words).sum()) for a, b in pairs]
@@ -269,13 +296,13 @@ def _likely_pairs(old: Subgraph, new: Subgraph) -> Iterator[tuple[View, View]]:
 
 def _nearest_pairs(
     old: Subgraph, new: Subgraph, T_old_new: KnownPose
-) -> Iterator[tuple[View, View, np.ndarray]]:
+) -> Iterator[tuple[SubgraphKeyframe, SubgraphKeyframe, np.ndarray]]:
     """Each new keyframe with the old one that a pose brings nearest to it, the nearest first; with
     T_old_new [4, 4]."""
     nearest = []
     for b in new.views:
         known = [(a, b, T) for a in old.views if (T := T_old_new(a, b)) is not None]
-        apart = [extent(T, a.place.median_depth_m) for a, _, T in known]
+        apart = [image_motion_rad(T, a.place.median_depth_m) for a, _, T in known]
         if known:
             index = int(np.argmin(apart))
             nearest.append((apart[index], known[index]))
@@ -283,22 +310,24 @@ def _nearest_pairs(
         yield nearest[index][1]
 
 
-def _between(old: View, new: View, T_oldodom_newodom: np.ndarray) -> np.ndarray:
+def _between(
+    old: SubgraphKeyframe, new: SubgraphKeyframe, T_oldodom_newodom: np.ndarray
+) -> np.ndarray:
     """T_old_new [4, 4]."""
     T_odom_old, T_odom_new = old.place.T_odom_keyframe, new.place.T_odom_keyframe
-    return se3.orthonormalised(se3.inverse(T_odom_old) @ T_oldodom_newodom @ T_odom_new)
+    return se3.orthonormalize(se3.inverse(T_odom_old) @ T_oldodom_newodom @ T_odom_new)
 
 
-def _odometry_frames(proposal: Proposal) -> np.ndarray:
+def _odometry_frames(proposal: LoopHypothesis) -> np.ndarray:
     """T_oldodom_newodom [4, 4] that a proposal says."""
     T_odom_old = proposal.old.place.T_odom_keyframe
     return T_odom_old @ proposal.T_old_new @ se3.inverse(proposal.new.place.T_odom_keyframe)
 
 
-def _as_seen_by(best: Proposal, other: Proposal) -> np.ndarray:
+def _as_seen_by(best: LoopHypothesis, other: LoopHypothesis) -> np.ndarray:
     """T_old_new [4, 4] of the keyframes of `best`, as the other says it."""
     return _between(best.old, best.new, _odometry_frames(other))
 
 
-def _depth(proposal: Proposal) -> float:
+def _depth(proposal: LoopHypothesis) -> float:
     return proposal.new.place.median_depth_m

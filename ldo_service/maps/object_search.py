@@ -6,11 +6,11 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.schemas import MapObjects, Pose
-from ldo_service.semantics.text_search import Encode, NotCompared, nearest_names, search
+from ldo_service.semantics.text_search import Encode, TextComparisonError, nearest_names, search
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class ObjectMatch:
     """An object, in the map frame; lengths in metres."""
 
     id: int
@@ -22,9 +22,9 @@ class Answer:
     distance: float | None  # from where the camera is, or was at the end of the run
 
 
-def answer(
+def find_objects(
     text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
-) -> list[Answer]:
+) -> list[ObjectMatch]:
     """Objects that answer to `text`, the best and of equals the nearest to `eye` [3] first. Only
     where none does by its name or another word for it, `encode` is asked which mean nearly the
     same.
@@ -37,7 +37,7 @@ def answer(
     if not hits and objects and encode is not None:
         try:
             hits = search(text, named, encode)
-        except NotCompared as error:
+        except TextComparisonError as error:
             why_not = f" Words were not compared by what they mean: {error}"
     if not hits:
         raise DataError(_nothing(text, [one.name for one in objects]) + why_not)
@@ -47,7 +47,7 @@ def answer(
         center = one.T_map_object.translation
         distance = None if eye is None else float(np.linalg.norm(eye - center))
         about = (one.id, one.name, hit.score, center, one.size, one.T_map_object)
-        answers.append(Answer(*about, distance))
+        answers.append(ObjectMatch(*about, distance))
     return sorted(answers, key=lambda one: (-one.score, one.distance or 0, one.id))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ldo_service.conversions.objects import map_objects
 from ldo_service.gaussians.map_builder import MapBuilder
-from ldo_service.runtime.process import give_back_free_memory
+from ldo_service.runtime.process import trim_memory
 from ldo_service.schemas import (
     AnchorMotion,
     Array,
@@ -22,7 +22,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.semantics.objects import Objects
 
-from .messages import NO_GAUSSIANS, NO_IDS, gaussians_message, parts_of, regrouped
+from .messages import NO_GAUSSIANS, NO_IDS, gaussians_message, rechunk, split_changes
 
 # A successor starts from a checkpoint and must not use a version again that followers may hold:
 # more than a mapper could use up between two checkpoints.
@@ -30,7 +30,7 @@ VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class PublishConfig:
     """How much at once, and how often; see `MapperConfig`."""
 
     part_gaussians: int
@@ -41,7 +41,7 @@ class Pace:
 
 
 @dataclass(frozen=True, slots=True)
-class Occasion:
+class MessageContext:
     """stamp_ns of the newest keyframe, version of the graph, all names of labels."""
 
     stamp_ns: int
@@ -49,11 +49,11 @@ class Occasion:
     label_names: tuple[str, ...]
 
 
-class MapTeller:
+class MapPublisher:
     """Counts the versions of a MapBuilder's map: one per delta. New Gaussians are told at once, how
     old ones changed now and then, and the whole of it seldom."""
 
-    def __init__(self, map_: MapBuilder, pace: Pace) -> None:
+    def __init__(self, map_: MapBuilder, pace: PublishConfig) -> None:
         self.version = 0
         self._map, self._pace = map_, pace
         self._names_told = 0
@@ -61,16 +61,16 @@ class MapTeller:
         self._since_changed = 0
         self._in_snapshot = 0  # Gaussians in the last one
 
-    def keyframe(self, now: Occasion) -> Iterator[MapDelta]:
+    def on_keyframe(self, now: MessageContext) -> Iterator[MapDelta]:
         """There is one more."""
         self._since_changed += 1
         is_time = self._since_changed >= self._pace.changed_keyframes
         yield from self.deltas(now, with_changed=is_time)
 
-    def deltas(self, now: Occasion, *, with_changed: bool) -> Iterator[MapDelta]:
+    def deltas(self, now: MessageContext, *, with_changed: bool) -> Iterator[MapDelta]:
         """What followers do not know."""
         changes = self._map.changes(with_changed=with_changed)
-        for part in parts_of(changes, self._pace.part_gaussians):
+        for part in split_changes(changes, self._pace.part_gaussians):
             yield self.delta(
                 now,
                 removed=part.removed,
@@ -79,12 +79,12 @@ class MapTeller:
             )
         if with_changed:
             self._since_changed = 0
-            self._map.rest()
-            give_back_free_memory()  # copies as large as the map were made
+            self._map.offload_excess()
+            trim_memory()  # copies as large as the map were made
 
     def delta(
         self,
-        now: Occasion,
+        now: MessageContext,
         motions: tuple[AnchorMotion, ...] = (),
         removed: np.ndarray = NO_IDS,
         changed: Gaussians = NO_GAUSSIANS,
@@ -112,7 +112,7 @@ class MapTeller:
         return gaussians_message(self._map.gaussians.all().at(chosen))
 
     # --- the whole --------------------------------------------------------------------------------
-    def snapshot_when_due(self, now: Occasion) -> Iterator[MapDelta | MapSnapshot]:
+    def snapshot_if_due(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """To be asked once per keyframe."""
         self._since_snapshot += 1
         pace, grown = self._pace, self._map.size() - self._in_snapshot
@@ -122,12 +122,12 @@ class MapTeller:
         ):
             yield from self.snapshot(now)
 
-    def snapshot(self, now: Occasion) -> Iterator[MapDelta | MapSnapshot]:
+    def snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """First all that is new, so that followers and late joiners hold the same."""
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
         parts = max(1, -(-self._map.size() // self._pace.part_gaussians))
-        pieces = regrouped(self._map.pieces(), parts, self._pace.part_gaussians)
+        pieces = rechunk(self._map.batches(), parts, self._pace.part_gaussians)
         exposures = self._map.views.exposures
         for part, gaussians in enumerate(pieces):
             named = list(exposures) if part == 0 else []
@@ -161,7 +161,7 @@ class MapTeller:
         self._names_told = state["names_told"]
 
 
-class ObjectsTeller:
+class ObjectPublisher:
     """Makes map/objects: a thousand objects take 50 ms to make, and few change at a time. `names`
     of the vocabulary may get more."""
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.conversions.poses import pose_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.geometry.point_records import Records
+from ldo_service.geometry.point_records import RecordTable
 from ldo_service.schemas import Keyframe, KeyframeRefinement, MeasuredPose
 from ldo_service.schemas.pose import Matrix6
 
@@ -16,7 +16,7 @@ UPPER = np.triu_indices(6)
 LINK = np.dtype([("id", np.int64), ("reference", np.int64), ("information", np.float32, (21,))])
 
 
-class KeyframeLinks:
+class RelativeMeasurements:
     """Beside the poses of keyframes: which of them were measured against which.
 
     Of the newest `recent` all; of older ones that against the reference, in 100 bytes: what else
@@ -26,7 +26,7 @@ class KeyframeLinks:
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
         self._poses, self._most_recent = poses, recent
         self._recent: dict[int, dict[int, Matrix6]] = {}  # by keyframe, then by what it is against
-        self._older = Records(LINK)
+        self._older = RecordTable(LINK)
         self._refinements = 0  # sent
         self._unacknowledged: dict[int, int] = {}  # the refinement that no correction knows yet
 
@@ -76,7 +76,7 @@ class KeyframeLinks:
         return MeasuredPose(
             reference=reference,
             keyframe=keyframe,
-            T_reference_keyframe=pose_message(T_reference_keyframe),
+            T_reference_keyframe=pose_to_message(T_reference_keyframe),
             information=information,
         )
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from ldo_service.conversions.poses import transform
-from ldo_service.gaussians.model import GaussianMap, Piece
+from ldo_service.conversions.poses import pose_from_message
+from ldo_service.gaussians.model import GaussianBatch, GaussianMap
 from ldo_service.gaussians.pruning import weightiest
 from ldo_service.schemas import MapDelta, MapSnapshot
 
@@ -74,7 +74,9 @@ class MapReplica:
             if self._max_gaussians is None:
                 return False
         if delta.motions:
-            self.map.move_anchors({m.keyframe: transform(m.T_new_old) for m in delta.motions})
+            self.map.move_anchors(
+                {m.keyframe: pose_from_message(m.T_new_old) for m in delta.motions}
+            )
         if delta.removed.shape[0]:
             self.map.remove(np.isin(self.map.ids, delta.removed.numpy()))
         self._change(piece_of(delta.changed))
@@ -83,7 +85,7 @@ class MapReplica:
         self.version = delta.version
         return True
 
-    def _change(self, changed: Piece) -> None:
+    def _change(self, changed: GaussianBatch) -> None:
         """Overwrite the Gaussians that are here: a bounded replica may lack some."""
         if not (len(self.map) and len(changed.ids)):
             return
@@ -95,7 +97,7 @@ class MapReplica:
         self.map.labels[where] = changed.labels[is_here]
         self.map.touch(where.astype(np.uint32))
 
-    def _add(self, added: Piece) -> None:
+    def _add(self, added: GaussianBatch) -> None:
         """Append the Gaussians that no snapshot brought already."""
         new = added.at(added.ids >= self._next_id)
         self.map.append(*new)
@@ -137,7 +139,7 @@ class MapReplica:
         piece = piece_of(part.gaussians)
         first, last = self._span(part, piece.ids)
         self.map.remove((self.map.ids >= first) & (self.map.ids <= last))
-        self.map.bring_back(*piece.at(piece.ids < self._next_id))
+        self.map.reinsert(*piece.at(piece.ids < self._next_id))
         self._add(piece)
         self.label_names = part.label_names or self.label_names
         self._last_ids[part.part] = int(piece.ids[-1]) if len(piece.ids) else -1

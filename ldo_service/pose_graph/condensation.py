@@ -12,20 +12,20 @@ import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
-from ldo_service.geometry.se3 import blended
+from ldo_service.geometry.se3 import interpolate
 
 from .factors import (
     NoiseConfig,
+    between_factor,
     closure_information,
-    first_factor,
     odometry_information,
-    relative_factor,
+    prior_factor,
 )
 from .solver import graph_of, values_of, variables_of
 
 
 @dataclass(frozen=True, slots=True)
-class Followers:
+class CondensedKeyframes:
     """F keyframes, each between the variables `heads` and `tails`, ids [F].
 
     T_head [F, 4, 4] is T_head_keyframe and T_tail T_tail_keyframe, as measured; `shares` [F] how
@@ -40,34 +40,34 @@ class Followers:
     shares: np.ndarray
 
     @staticmethod
-    def none() -> "Followers":
+    def none() -> "CondensedKeyframes":
         ids, transforms = np.zeros(0, np.int64), np.zeros((0, 4, 4))
-        return Followers(ids, ids, ids, transforms, transforms, np.zeros(0))
+        return CondensedKeyframes(ids, ids, ids, transforms, transforms, np.zeros(0))
 
-    def joined_by(self, more: "Followers") -> "Followers":
+    def joined_by(self, more: "CondensedKeyframes") -> "CondensedKeyframes":
         columns = (getattr(self, name) for name in self.__slots__)
         others = (getattr(more, name) for name in self.__slots__)
-        return Followers(*map(np.concatenate, zip(columns, others, strict=True)))
+        return CondensedKeyframes(*map(np.concatenate, zip(columns, others, strict=True)))
 
-    def only(self, row: int) -> "Followers":
-        return Followers(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
+    def only(self, row: int) -> "CondensedKeyframes":
+        return CondensedKeyframes(*(getattr(self, name)[row : row + 1] for name in self.__slots__))
 
     def index(self) -> dict[int, int]:
         """Row of each keyframe."""
         return {int(k): row for row, k in enumerate(self.keyframes)}
 
-    def placed(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
+    def interpolated_poses(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
         """T_map_keyframe [F, 4, 4], from where heads and tails [F, 4, 4] are in the map."""
-        return blended(T_heads @ self.T_head, T_tails @ self.T_tail, self.shares)
+        return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.shares)
 
-    def moved(self, row: int, T_head_keyframe: np.ndarray) -> "Followers":
+    def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
         """One measured anew."""
         T_tail_head = self.T_tail[row] @ np.linalg.inv(self.T_head[row])
         T_head, T_tail = self.T_head.copy(), self.T_tail.copy()
         T_head[row], T_tail[row] = T_head_keyframe, T_tail_head @ T_head_keyframe
         return replace(self, T_head=T_head, T_tail=T_tail)
 
-    def parted(self, row: int) -> "Followers":
+    def without_split(self, row: int) -> "CondensedKeyframes":
         """Without one, which is a variable again: those of its group lie before or behind it."""
         of_group = (self.heads == self.heads[row]) & (self.tails == self.tails[row])
         share = self.shares[row]
@@ -88,23 +88,25 @@ class Followers:
         )
         return parted.without(row)
 
-    def without(self, row: int) -> "Followers":
-        return Followers(*(np.delete(getattr(self, name), row, 0) for name in self.__slots__))
+    def without(self, row: int) -> "CondensedKeyframes":
+        return CondensedKeyframes(
+            *(np.delete(getattr(self, name), row, 0) for name in self.__slots__)
+        )
 
-    def packed(self) -> dict[str, np.ndarray]:
+    def pack(self) -> dict[str, np.ndarray]:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
-def between(
+def condense_between(
     head: int,
     tail: int,
     keyframes: Sequence[int],
     T_head: np.ndarray,
     T_head_tail: np.ndarray,
-) -> Followers:
+) -> CondensedKeyframes:
     """Those that were made between two, one after another, T_head [n, 4, 4]."""
     n = len(keyframes)
-    return Followers(
+    return CondensedKeyframes(
         np.array(keyframes, np.int64),
         np.full(n, head),
         np.full(n, tail),
@@ -119,7 +121,7 @@ class Condensed:
     """The first of a group in the first of the next, and where the others follow."""
 
     edge: RelativePose
-    followers: Followers
+    followers: CondensedKeyframes
 
 
 def group_to_condense(
@@ -154,7 +156,7 @@ def group_to_condense(
     return []
 
 
-def condensed(
+def condense(
     group: Sequence[int],
     measured: Mapping[tuple[int, int], RelativePose],
     closures: Iterable[RelativePose],
@@ -170,15 +172,15 @@ def condensed(
     head, *others, tail = group
     inside = set(group)
     factors = [
-        relative_factor(m.a, m.b, m.T_a_b, odometry_information(m, noise))
+        between_factor(m.a, m.b, m.T_a_b, odometry_information(m, noise))
         for pair, m in measured.items()
         if inside.issuperset(pair)
     ]
     factors += [
-        relative_factor(c.a, c.b, c.T_a_b, closure_information(c, noise, np.zeros((6, 6))))
+        between_factor(c.a, c.b, c.T_a_b, closure_information(c, noise, np.zeros((6, 6))))
         for c in closures
     ]
-    factors.append(first_factor(head, T_map[head], noise.first_sigma))
+    factors.append(prior_factor(head, T_map[head], noise.first_sigma))
     graph, start = graph_of(factors), values_of({k: T_map[k] for k in group})
     values = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     covariance = gtsam.Marginals(graph, values).marginalCovariance(tail)
@@ -186,10 +188,12 @@ def condensed(
     T_head_map = se3.inverse(solved[head])
     edge = RelativePose(head, tail, T_head_map @ solved[tail], np.linalg.inv(covariance))
     T_head = np.array([T_head_map @ solved[k] for k in others])
-    return Condensed(edge, between(head, tail, others, T_head, edge.T_a_b))
+    return Condensed(edge, condense_between(head, tail, others, T_head, edge.T_a_b))
 
 
-def bridges(gone: Iterable[RelativePose], stays: Iterable[tuple[int, int]]) -> list[RelativePose]:
+def connecting_measurements(
+    gone: Iterable[RelativePose], stays: Iterable[tuple[int, int]]
+) -> list[RelativePose]:
     """The first measurements among `gone` without which variables would be held by nothing, when
     the pairs `stays` are connected."""
     root: dict[int, int] = {}
@@ -209,7 +213,7 @@ def bridges(gone: Iterable[RelativePose], stays: Iterable[tuple[int, int]]) -> l
     return needed
 
 
-def carried(
+def transfer_measurement(
     measured: RelativePose, T_a_new: np.ndarray, T_b_new: np.ndarray, new: tuple[int, int]
 ) -> RelativePose:
     """The same measurement between the keyframes `new`, which hang rigidly on its own: T_a_new and

@@ -9,44 +9,49 @@ import numpy as np
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .condensation import Followers, bridges, carried, condensed
+from .condensation import (
+    CondensedKeyframes,
+    condense,
+    connecting_measurements,
+    transfer_measurement,
+)
 from .factors import (
+    BoxObservation,
     NoiseConfig,
-    Sight,
+    between_factor,
+    box_factor,
     closure_information,
     closure_residual,
-    first_factor,
     odometry_information,
     pack_relative,
     pack_sights,
-    relative_factor,
-    sight_factor,
+    prior_factor,
     unpack_relative,
     unpack_sights,
 )
-from .loop_closures import Closures, ClosuresConfig, Pair, pair_of
+from .loop_closures import LoopClosureConfig, LoopClosureSet, Pair, pair_of
 from .solver import Name, Variables, point_key
 
 
-class Measurements:
+class FactorStore:
     """Between keyframes that are variables, and others that follow two of them: what is measured of
     a follower is measured of the nearer one."""
 
-    def __init__(self, noise: NoiseConfig, closures: ClosuresConfig) -> None:
+    def __init__(self, noise: NoiseConfig, closures: LoopClosureConfig) -> None:
         self._noise = noise
         self.first_of: dict[int, int] = {}  # the first keyframe of each one's component
         self.active: list[int] = []  # variables that are not condensed, ascending
         self.odometry: dict[Pair, RelativePose] = {}  # between variables
         self.condensed: dict[Pair, RelativePose] = {}  # heads, each in the one before
         self.joins: dict[Pair, RelativePose] = {}  # between what were components
-        self.closures = Closures(closures)
+        self.closures = LoopClosureSet(closures)
         self.doubts: dict[Pair, RelativePose] = {}  # closures that contradict a join, the newest
-        self.sights: dict[Pair, Sight] = {}  # by keyframe and landmark
-        self.followers = Followers.none()
+        self.sights: dict[Pair, BoxObservation] = {}  # by keyframe and landmark
+        self.followers = CondensedKeyframes.none()
         self.rows: dict[int, int] = {}  # of followers
 
     # --- what changes -----------------------------------------------------------------------------
-    def measure(self, m: RelativePose) -> Name:
+    def add_measurement(self, m: RelativePose) -> Name:
         """The factor's name; in place of what was measured between the same variables, but what is
         measured of followers in place of nothing that is."""
         between = self.between_variables(m)
@@ -55,7 +60,9 @@ class Measurements:
             self.odometry[pair] = between
         return ("odometry", *pair)
 
-    def measure_anew(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> Name | None:
+    def replace_measurement(
+        self, m: RelativePose, pose: Callable[[int], np.ndarray]
+    ) -> Name | None:
         """The name of the factor that is another one now; of a follower, which is placed where it
         was measured, there is none. `pose` tells T_map_keyframe [4, 4]."""
         row = self.rows.get(m.b)
@@ -68,13 +75,13 @@ class Measurements:
         between = self.between_variables(m)
         pair = between.a, between.b
         if pair not in self.condensed:
-            return self.measure(between)
+            return self.add_measurement(between)
         own = self.condensed[pair].information
         self.condensed[pair] = RelativePose(*pair, between.T_a_b, own)
         return ("condensed", *pair)
 
     def _in_head_of_b(self, m: RelativePose, pose: Callable[[int], np.ndarray]) -> np.ndarray:
-        (head_a, T_a), (head_b, _) = self.in_head(m.a), self.in_head(m.b)
+        (head_a, T_a), (head_b, _) = self.relative_to_start(m.a), self.relative_to_start(m.b)
         if head_a == head_b:
             return T_a @ m.T_a_b
         return se3.inverse(pose(head_b)) @ pose(m.a) @ m.T_a_b
@@ -92,7 +99,7 @@ class Measurements:
             for pair, closure in self.closures.accepted.items()
             if set(pair) <= set(group) and followers.intersection(pair)
         }
-        one = condensed(group, self.odometry, closed.values(), T_map, self._noise)
+        one = condense(group, self.odometry, closed.values(), T_map, self._noise)
         self.closures = self.closures.without(closed)
         gone = [self.odometry.pop(p) for p in list(self.odometry) if followers.intersection(p)]
         self.odometry.pop((group[0], group[-1]), None)
@@ -101,10 +108,10 @@ class Measurements:
         self.rows = self.followers.index()
         self.active = [k for k in self.active if k not in group[:-1]]
         outside = [self.between_variables(m) for m in gone if not {m.a, m.b} <= set(group)]
-        for m in bridges(outside, [(m.a, m.b) for m in self.relative()]):
-            self.measure(m)
+        for m in connecting_measurements(outside, [(m.a, m.b) for m in self.relative()]):
+            self.add_measurement(m)
 
-    def part(self, keyframe: int) -> None:
+    def restore_variable(self, keyframe: int) -> None:
         """Make a follower a variable again, between the two that it lies between: what is known
         from one to the other is spread over both parts, each by its share."""
         row = self.rows[keyframe]
@@ -117,10 +124,10 @@ class Measurements:
         behind = edge.information / (1 - share)
         self.condensed[head, keyframe] = RelativePose(head, keyframe, T_head, before)
         self.condensed[keyframe, tail] = RelativePose(keyframe, tail, T_tail, behind)
-        self.followers = self.followers.parted(row)
+        self.followers = self.followers.without_split(row)
         self.rows = self.followers.index()
 
-    def bent(self, keyframe: int, variables: Variables) -> float:
+    def interpolation_error_sigmas(self, keyframe: int, variables: Variables) -> float:
         """How far apart the two ends say that a follower is, in sigmas of a closure; 0 of a
         variable."""
         row = self.rows.get(keyframe)
@@ -141,31 +148,33 @@ class Measurements:
         yield from map(self.between_variables, joins)
 
     # --- followers --------------------------------------------------------------------------------
-    def in_head(self, keyframe: int) -> tuple[int, np.ndarray]:
+    def relative_to_start(self, keyframe: int) -> tuple[int, np.ndarray]:
         """The first of its group, or itself, and T_head_keyframe [4, 4]."""
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
         return int(self.followers.heads[row]), self.followers.T_head[row]
 
-    def in_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
+    def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
         """The variable that stands for a keyframe, the nearer of the two that it lies between, and
         T_variable_keyframe [4, 4]."""
         row = self.rows.get(keyframe)
         if row is None or self.followers.shares[row] <= 0.5:
-            return self.in_head(keyframe)
+            return self.relative_to_start(keyframe)
         return int(self.followers.tails[row]), self.followers.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
         """The variables that stand for both: another one where that would be the same."""
-        a, b = self.in_variable(m.a), self.in_variable(m.b)
-        return (a, b) if a[0] != b[0] else (self.in_head(m.a), self.in_head(m.b))
+        a, b = self.relative_to_variable(m.a), self.relative_to_variable(m.b)
+        return (
+            (a, b) if a[0] != b[0] else (self.relative_to_start(m.a), self.relative_to_start(m.b))
+        )
 
     def between_variables(self, m: RelativePose) -> RelativePose:
         (a, T_a), (b, T_b) = self.ends(m)
         if (a, b) == (m.a, m.b):
             return m
-        return carried(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
+        return transfer_measurement(m, se3.inverse(T_a), se3.inverse(T_b), (a, b))
 
     def _ends_covariance(self, m: RelativePose) -> np.ndarray:
         """[6, 6] at b, of followers among its ends: their share of what their group is known by,
@@ -196,18 +205,18 @@ class Measurements:
         kind, pair = name[0], name[1:]
         match kind:
             case "first":
-                return first_factor(name[1], initial[name[1]], self._noise.first_sigma)
+                return prior_factor(name[1], initial[name[1]], self._noise.first_sigma)
             case "odometry":
                 return self._odometry_factor(self.odometry[pair])
             case "condensed":
                 m = self.condensed[pair]
-                return relative_factor(m.a, m.b, m.T_a_b, m.information)
+                return between_factor(m.a, m.b, m.T_a_b, m.information)
             case "join":
                 return self._odometry_factor(self.between_variables(self.joins[pair]))
             case "closure":
                 return self._closure_factor(self.closures.accepted[pair], self._noise.robust_sigmas)
         sight = self.sights[pair]
-        return sight_factor(sight, *self.in_variable(sight.keyframe), self._noise)
+        return box_factor(sight, *self.relative_to_variable(sight.keyframe), self._noise)
 
     def with_closures(
         self, closures: Iterable[RelativePose], initial: Variables
@@ -224,11 +233,11 @@ class Measurements:
         return float(np.abs(np.linalg.cholesky(m.information).T @ residual).max())
 
     def _odometry_factor(self, m: RelativePose) -> gtsam.NonlinearFactor:
-        return relative_factor(m.a, m.b, m.T_a_b, odometry_information(m, self._noise))
+        return between_factor(m.a, m.b, m.T_a_b, odometry_information(m, self._noise))
 
     def _closure_factor(self, closure: RelativePose, robust_sigmas: float) -> gtsam.NonlinearFactor:
         m = self._closure(closure)
-        return relative_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
+        return between_factor(m.a, m.b, m.T_a_b, m.information, robust_sigmas)
 
     def _closure(self, m: RelativePose) -> RelativePose:
         """Between variables, as much as it is believed."""
@@ -251,13 +260,13 @@ class Measurements:
         moved |= {k: se3.transform(T_new_old, variables[k]) for k in variables.keys() & points}
         return {k: moved.get(k, value) for k, value in variables.items()}
 
-    def doubt(self, closure: RelativePose) -> None:
+    def keep_rejected(self, closure: RelativePose) -> None:
         """Keep what contradicts a join."""
         doubts = {**self.doubts, pair_of(closure): closure}
         self.doubts = dict(list(doubts.items())[-self.closures.config.doubts :])
 
     # --- state ------------------------------------------------------------------------------------
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         return {
             "keyframes": np.array(list(self.first_of), np.int64),
             "first_of": np.array(list(self.first_of.values()), np.int64),
@@ -266,9 +275,9 @@ class Measurements:
             "condensed": pack_relative(self.condensed.values()),
             "joins": pack_relative(self.joins.values()),
             "doubts": pack_relative(self.doubts.values()),
-            "closures": self.closures.packed(),
+            "closures": self.closures.pack(),
             "sights": pack_sights(self.sights.values()),
-            "followers": self.followers.packed(),
+            "followers": self.followers.pack(),
         }
 
     def unpack(self, packed: Mapping[str, Any]) -> None:
@@ -277,7 +286,7 @@ class Measurements:
         self.active = packed["active"].tolist()
         for name in ("odometry", "condensed", "joins", "doubts"):
             setattr(self, name, {(m.a, m.b): m for m in unpack_relative(packed[name])})
-        self.closures = Closures.unpacked(self.closures.config, packed["closures"])
+        self.closures = LoopClosureSet.unpack(self.closures.config, packed["closures"])
         self.sights = {(s.keyframe, s.landmark): s for s in unpack_sights(packed["sights"])}
-        self.followers = Followers(**packed["followers"])
+        self.followers = CondensedKeyframes(**packed["followers"])
         self.rows = self.followers.index()

@@ -67,7 +67,7 @@ class NoiseConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class BoxObservation:
     """A landmark in the image of a keyframe."""
 
     keyframe: int
@@ -99,12 +99,12 @@ def closure_information(
     return np.linalg.inv(np.linalg.inv(own) + least + covariance)
 
 
-def first_factor(keyframe: int, T_map: np.ndarray, sigma: float) -> gtsam.NonlinearFactor:
+def prior_factor(keyframe: int, T_map: np.ndarray, sigma: float) -> gtsam.NonlinearFactor:
     noise = gtsam.noiseModel.Isotropic.Sigma(6, sigma)
     return gtsam.PriorFactorPose3(keyframe, gtsam.Pose3(T_map), noise)
 
 
-def relative_factor(
+def between_factor(
     a: int, b: int, T_a_b: np.ndarray, information: np.ndarray, robust_sigmas: float = 0.0
 ) -> gtsam.NonlinearFactor:
     """`robust_sigmas` of Cauchy's kernel; 0: none."""
@@ -112,8 +112,8 @@ def relative_factor(
     return gtsam.BetweenFactorPose3(a, b, gtsam.Pose3(T_a_b), _robust(noise, robust_sigmas))
 
 
-def sight_factor(
-    sight: Sight, variable: int, T_variable_keyframe: np.ndarray, noise: NoiseConfig
+def box_factor(
+    sight: BoxObservation, variable: int, T_variable_keyframe: np.ndarray, noise: NoiseConfig
 ) -> gtsam.NonlinearFactor:
     """s rho(w |pi(T_k^-1 mu) - z|^2 / sigma^2) with s = `independent_sights`; `variable` is the
     keyframe, or what it follows.
@@ -166,7 +166,7 @@ def unpack_relative(packed: Mapping[str, np.ndarray]) -> list[RelativePose]:
     ]
 
 
-def pack_sights(sights: Iterable[Sight]) -> Packed:
+def pack_sights(sights: Iterable[BoxObservation]) -> Packed:
     sights = list(sights)
     return {
         "pairs": np.array([(s.keyframe, s.landmark) for s in sights], np.int64).reshape(-1, 2),
@@ -177,10 +177,12 @@ def pack_sights(sights: Iterable[Sight]) -> Packed:
     }
 
 
-def unpack_sights(packed: Mapping[str, np.ndarray]) -> list[Sight]:
+def unpack_sights(packed: Mapping[str, np.ndarray]) -> list[BoxObservation]:
     columns = (packed[name] for name in ("centers_px", "sigmas_px", "intrinsics", "weights"))
     return [
-        Sight(int(keyframe), int(landmark), center_px, float(sigma_px), intrinsics, float(weight))
+        BoxObservation(
+            int(keyframe), int(landmark), center_px, float(sigma_px), intrinsics, float(weight)
+        )
         for (keyframe, landmark), center_px, sigma_px, intrinsics, weight in zip(
             packed["pairs"], *columns, strict=True
         )

@@ -31,7 +31,7 @@ class Evidence:
         return Evidence(self.weight + weight, self.log_sum + weight * log_q)
 
 
-def fused(
+def fuse_labels(
     evidence: Mapping[int, Evidence],
     covisible: Iterable[tuple[int, int]] = (),
     *,
@@ -54,12 +54,12 @@ def fused(
     """
     p = {k: geometric_mean(evidence[k]) for k in sorted(evidence)}
     p |= {k: v for k, v in (start or {}).items() if k in p}
-    neighbours = _neighbours(covisible, p)
+    neighbors = _neighbors(covisible, p)
     if only is not None:
-        neighbours = {k: others for k, others in neighbours.items() if k in only}
+        neighbors = {k: others for k, others in neighbors.items() if k in only}
     for _ in range(sweeps):
         largest = 0.0
-        for k, others in neighbours.items():
+        for k, others in neighbors.items():
             alike = [p[j] for j in others if p[j].argmax() == p[k].argmax()]
             new = _minimum(evidence[k], alike, lambda_sem, w_sem)
             largest = max(largest, float(np.abs(new - p[k]).max()))
@@ -92,15 +92,15 @@ def objective(
     return float(lambda_sem * observed + 0.5 * w_sem * alike)
 
 
-def _neighbours(
+def _neighbors(
     covisible: Iterable[tuple[int, int]], known: Mapping[int, object]
 ) -> dict[int, list[int]]:
-    neighbours: dict[int, list[int]] = {}
+    neighbors: dict[int, list[int]] = {}
     for i, j in sorted({(min(pair), max(pair)) for pair in covisible}):
         if i != j and i in known and j in known:
-            neighbours.setdefault(i, []).append(j)
-            neighbours.setdefault(j, []).append(i)
-    return dict(sorted(neighbours.items()))
+            neighbors.setdefault(i, []).append(j)
+            neighbors.setdefault(j, []).append(i)
+    return dict(sorted(neighbors.items()))
 
 
 def _minimum(

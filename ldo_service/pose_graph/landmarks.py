@@ -10,16 +10,16 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-from .factors import NoiseConfig, Sight, pack_sights, unpack_sights
-from .label_fusion import Evidence, fused
+from .factors import BoxObservation, NoiseConfig, pack_sights, unpack_sights
+from .label_fusion import Evidence, fuse_labels
 from .loop_closures import Pair
-from .pose_graph import KeyframeGraph
+from .pose_graph import PoseGraph
 
-CLASSES = 256  # C_max of the paper, III.B
+MAX_CLASSES = 256  # C_max of the paper, III.B
 BORDER_PX = 2.0  # a box so near to the border of the image is cut by it
 
 
-def meeting_point(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float]:
+def triangulate(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, float]:
     """The point [3] nearest to all rays, and the widest angle in rad between two of them.
 
         min_x sum_i |(I - d_i d_i^T) (x - o_i)|^2
@@ -34,7 +34,7 @@ def meeting_point(origins: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, fl
 
 
 @dataclass(frozen=True, slots=True)
-class LandmarksConfig:
+class ObjectLandmarkConfig:
     lambda_sem: float = 0.5  # III.C
     w_sem: float = 0.1  # III.C
     vague_nats: float = 0.5  # III.C: above, what is observed weighs exp(-2 H), and leaves earlier
@@ -101,9 +101,9 @@ class Observation:
         return values | {"distribution": (labels, self.distribution[labels])}
 
     @staticmethod
-    def unpacked(packed: Mapping[str, Any]) -> "Observation":
+    def unpack(packed: Mapping[str, Any]) -> "Observation":
         labels, weights = packed["distribution"]
-        distribution = np.zeros(CLASSES)
+        distribution = np.zeros(MAX_CLASSES)
         distribution[labels] = weights
         return Observation(**{**packed, "distribution": distribution})
 
@@ -114,7 +114,7 @@ class Landmark:
 
     evidence: Evidence
     distribution: np.ndarray  # [C]
-    sights: tuple[Sight, ...] = ()
+    sights: tuple[BoxObservation, ...] = ()
     misses: int = 0  # in a row
     last: int = -1  # keyframe that saw it
 
@@ -127,11 +127,11 @@ class Landmark:
         return float(-np.sum(p * np.log(np.where(p > 0, p, 1))))
 
 
-class Landmarks:
+class ObjectLandmarks:
     """Deterministic; bounded by `most` landmarks, each 4 kB and its sights, and the pairs of them
     that a keyframe showed together."""
 
-    def __init__(self, config: LandmarksConfig, noise: NoiseConfig) -> None:
+    def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
         self._config, self._noise = config, noise
         self.known: dict[int, Landmark] = {}
         self._waiting: list[Observation] = []
@@ -140,7 +140,7 @@ class Landmarks:
         self.skipped = 0  # keyframes at which the graph was left alone
 
     def observe(self, seen: Observation) -> None:
-        """To be taken in at the next `settle`."""
+        """To be taken in at the next `update_graph`."""
         self._waiting.append(seen)
 
     def weight(self, entropy: float) -> float:
@@ -148,7 +148,7 @@ class Landmarks:
         return float(np.exp(-2 * entropy)) if entropy > self._config.vague_nats else 1.0
 
     # --- into the graph ---------------------------------------------------------------------------
-    def is_due(self) -> bool:
+    def needs_update(self) -> bool:
         """Whether the graph is to take in what waits; to be asked once a keyframe."""
         config = self._config
         if not self._waiting:
@@ -160,7 +160,7 @@ class Landmarks:
         self.skipped += 1
         return False
 
-    def settle(self, graph: KeyframeGraph) -> None:
+    def update_graph(self, graph: PoseGraph) -> None:
         """What waits goes into the graph, what is gone leaves it, and distributions are fused."""
         waiting, self._waiting, self._saved = self._waiting, [], {}
         for seen in waiting:
@@ -168,7 +168,7 @@ class Landmarks:
         self._pair(waiting)
         self._see(graph, {(seen.keyframe, seen.landmark) for seen in waiting if not seen.is_miss})
         self._fuse({seen.landmark for seen in waiting if not seen.is_miss})
-        self._leave(graph)
+        self._remove_lost(graph)
 
     def _take(self, seen: Observation) -> None:
         old = self.known.get(seen.landmark)
@@ -178,17 +178,17 @@ class Landmarks:
             return
         if old is not None and old.knows(seen.keyframe):
             return  # sent again after a restart
-        old = old or Landmark(Evidence.none(CLASSES), np.full(CLASSES, 1 / CLASSES))
+        old = old or Landmark(Evidence.none(MAX_CLASSES), np.full(MAX_CLASSES, 1 / MAX_CLASSES))
         evidence = old.evidence.with_observed(seen.distribution, self.weight(seen.entropy))
         sights = (*old.sights, self._sight(seen)) if seen.is_whole else old.sights
         self.known[seen.landmark] = replace(
             old, evidence=evidence, sights=sights, misses=0, last=seen.keyframe
         )
 
-    def _sight(self, seen: Observation) -> Sight:
+    def _sight(self, seen: Observation) -> BoxObservation:
         x0, y0, x1, y1 = seen.box_px
         share_px = self._noise.sigma_box_share * max(x1 - x0, y1 - y0)
-        return Sight(
+        return BoxObservation(
             seen.keyframe,
             seen.landmark,
             np.array([x0 + x1, y0 + y1]) / 2,
@@ -206,7 +206,7 @@ class Landmarks:
         for together in shown.values():
             self._pairs |= set(itertools.combinations(sorted(together), 2))
 
-    def _see(self, graph: KeyframeGraph, waiting: set[Pair]) -> None:
+    def _see(self, graph: PoseGraph, waiting: set[Pair]) -> None:
         """Sights of landmarks in the graph, and all of those that can be placed by now."""
         new, placed, gone = [], {}, []
         for k in sorted({landmark for _, landmark in waiting}):
@@ -221,16 +221,18 @@ class Landmarks:
                 placed[k] = point
                 new += kept
         if new:
-            graph.see(new, placed)
-        graph.unsee(gone)
+            graph.add_observations(new, placed)
+        graph.remove_observations(gone)
 
-    def _thinned(self, sights: list[Sight]) -> tuple[Sight, ...]:
+    def _thinned(self, sights: list[BoxObservation]) -> tuple[BoxObservation, ...]:
         """The first ones, which tie it to where it was, and the newest."""
         half = self._config.most_sights // 2
         excess = len(sights) - self._config.most_sights
         return tuple(sights if excess <= 0 else sights[:half] + sights[half + excess :])
 
-    def _triangulated(self, sights: Iterable[Sight], graph: KeyframeGraph) -> np.ndarray | None:
+    def _triangulated(
+        self, sights: Iterable[BoxObservation], graph: PoseGraph
+    ) -> np.ndarray | None:
         """Where the rays through the centres of boxes meet [3]; None where that says nothing: too
         few, too small an angle, behind a camera, or not in the boxes."""
         sights = list(sights)
@@ -241,7 +243,7 @@ class Landmarks:
         u, v = np.array([s.center_px for s in sights]).T
         rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(sights))], axis=1)
         try:
-            point, parallax_rad = meeting_point(
+            point, parallax_rad = triangulate(
                 T_map[:, :3, 3], (T_map[:, :3, :3] @ rays[..., None])[..., 0]
             )
         except np.linalg.LinAlgError:
@@ -258,7 +260,7 @@ class Landmarks:
         """Of those observed anew; the others are as they were."""
         pairs = [pair for pair in self._pairs if touched & set(pair)]
         near = touched | {k for pair in pairs for k in pair if k in self.known}
-        p = fused(
+        p = fuse_labels(
             {k: self.known[k].evidence for k in near},
             pairs,
             lambda_sem=self._config.lambda_sem,
@@ -269,7 +271,7 @@ class Landmarks:
         self.known |= {k: replace(self.known[k], distribution=p[k]) for k in touched}
 
     # --- out again --------------------------------------------------------------------------------
-    def _leave(self, graph: KeyframeGraph) -> None:
+    def _remove_lost(self, graph: PoseGraph) -> None:
         """With their observations: a dense factor among all keyframes that saw one would cost more
         than it says, and hold them where they are today."""
         newest = graph.newest or 0
@@ -277,7 +279,7 @@ class Landmarks:
         by_age = sorted(self.known.keys() - set(gone), key=lambda k: (self.known[k].last, k))
         gone += by_age[: max(0, len(by_age) - self._config.most)]
         for k in gone:
-            graph.unsee((s.keyframe, k) for s in self.known.pop(k).sights)
+            graph.remove_observations((s.keyframe, k) for s in self.known.pop(k).sights)
         self._pairs = {pair for pair in self._pairs if set(pair) <= self.known.keys()}
 
     def _is_gone(self, landmark: Landmark, newest: int) -> bool:
@@ -290,7 +292,7 @@ class Landmarks:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """`known` is the same object until the next `settle`."""
+        """`known` is the same object until the next `update_graph`."""
         self._saved = self._saved or self._packed()
         waiting = [seen.packed for seen in self._waiting]
         return {"known": self._saved, "waiting": waiting, "skipped": self.skipped}
@@ -300,8 +302,8 @@ class Landmarks:
         return {
             "ids": list(self.known),
             "weights": [float(one.evidence.weight) for one in known],
-            "log_sums": np.array([one.evidence.log_sum for one in known]).reshape(-1, CLASSES),
-            "distributions": np.array([one.distribution for one in known]).reshape(-1, CLASSES),
+            "log_sums": np.array([one.evidence.log_sum for one in known]).reshape(-1, MAX_CLASSES),
+            "distributions": np.array([one.distribution for one in known]).reshape(-1, MAX_CLASSES),
             "misses": [(one.misses, one.last) for one in known],
             "sights": pack_sights(s for one in known for s in one.sights),
             "pairs": sorted(self._pairs),
@@ -309,7 +311,7 @@ class Landmarks:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         packed = state["known"]
-        sights: dict[int, list[Sight]] = {}
+        sights: dict[int, list[BoxObservation]] = {}
         for sight in unpack_sights(packed["sights"]):
             sights.setdefault(sight.landmark, []).append(sight)
         columns = (packed[n] for n in ("ids", "weights", "log_sums", "distributions", "misses"))
@@ -318,5 +320,5 @@ class Landmarks:
             for k, weight, log_sum, p, misses in zip(*columns, strict=True)
         }
         self._pairs = {(i, j) for i, j in packed["pairs"]}
-        self._waiting = [Observation.unpacked(values) for values in state["waiting"]]
+        self._waiting = [Observation.unpack(values) for values in state["waiting"]]
         self.skipped = state["skipped"]

@@ -18,7 +18,7 @@ Sigmas = Callable[[Variables, RelativePose], float]
 
 
 @dataclass(frozen=True, slots=True)
-class ClosuresConfig:
+class LoopClosureConfig:
     # What a closure may add to the sum of squares: chi^2 of six numbers at 3 sigma (99.73 %). Its
     # own residual would not do: a chain of a hundred links bends by a metre and leaves it 2 sigma.
     most_cost: float = 20.06
@@ -44,7 +44,7 @@ class ClosuresConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class ClosureDecision:
     is_accepted: bool
     dropped: tuple[Pair, ...] = ()  # accepted earlier, and refuted by now
 
@@ -54,17 +54,17 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
-class Closures:
+class LoopClosureSet:
     """Those in the graph, and those that were refused or left it."""
 
-    config: ClosuresConfig = field(default_factory=ClosuresConfig)
+    config: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     accepted: Mapping[Pair, RelativePose] = field(default_factory=dict)
-    refused: tuple[Pair, ...] = ()
-    left: tuple[Pair, ...] = ()
+    rejected: tuple[Pair, ...] = ()
+    removed: tuple[Pair, ...] = ()
 
-    def judged(
+    def check(
         self, closure: RelativePose, solve: Solve, sigmas: Sigmas
-    ) -> tuple[Verdict, Variables]:
+    ) -> tuple[ClosureDecision, Variables]:
         """Is it to be believed, and where is everything then.
 
         `solve` gives the solution with some closures and its sum of squares; `sigmas` the largest
@@ -77,9 +77,9 @@ class Closures:
         chosen = [*before, closure]
         variables, cost = solve(chosen)
         if cost - cost_before > self.config.most_cost:
-            rival = self._rival(closure, before, cost_before, solve, variables, sigmas)
+            rival = self._find_conflicting(closure, before, cost_before, solve, variables, sigmas)
             if rival is None:
-                return Verdict(False), variables
+                return ClosureDecision(False), variables
             chosen = [c for c in chosen if c is not rival]
             variables, cost = solve(chosen)
         while chosen and (worst := max(chosen, key=lambda c: sigmas(variables, c))):
@@ -89,11 +89,11 @@ class Closures:
             variables, cost = solve(chosen)
         kept = {pair_of(c) for c in chosen}
         if pair_of(closure) not in kept and pair_of(closure) in self.accepted:
-            return Verdict(False), variables  # what it would have replaced stays
+            return ClosureDecision(False), variables  # what it would have replaced stays
         dropped = tuple(pair for pair in self.accepted if pair not in kept)
-        return Verdict(pair_of(closure) in kept, dropped), variables
+        return ClosureDecision(pair_of(closure) in kept, dropped), variables
 
-    def _rival(
+    def _find_conflicting(
         self,
         closure: RelativePose,
         before: list[RelativePose],
@@ -113,20 +113,20 @@ class Closures:
                 best, best_cost = rival, cost
         return best
 
-    def after(self, closure: RelativePose, verdict: Verdict) -> "Closures":
+    def with_decision(self, closure: RelativePose, verdict: ClosureDecision) -> "LoopClosureSet":
         """A pair is in one of the three, where it was put last."""
         pair = pair_of(closure)
         accepted = {p: c for p, c in self.accepted.items() if p not in verdict.dropped}
         if verdict.is_accepted:
             accepted |= {pair: closure}
         now_refused = {pair} - accepted.keys()
-        refused = (p for p in (*self.refused, *now_refused) if p not in accepted)
-        left = (p for p in (*self.left, *verdict.dropped) if p not in accepted)
+        refused = (p for p in (*self.rejected, *now_refused) if p not in accepted)
+        left = (p for p in (*self.removed, *verdict.dropped) if p not in accepted)
         return replace(
             self,
             accepted=self._thinned(accepted),
-            refused=self._remembered(p for p in refused if p not in verdict.dropped),
-            left=self._remembered(p for p in left if p not in now_refused),
+            rejected=self._remembered(p for p in refused if p not in verdict.dropped),
+            removed=self._remembered(p for p in left if p not in now_refused),
         )
 
     def _thinned(self, accepted: Mapping[Pair, RelativePose]) -> Mapping[Pair, RelativePose]:
@@ -139,32 +139,32 @@ class Closures:
         older = int(np.argmin(apart)) // len(pairs)
         return {p: c for place, (p, c) in enumerate(accepted.items()) if place != older}
 
-    def without(self, pairs: Collection[Pair]) -> "Closures":
+    def without(self, pairs: Collection[Pair]) -> "LoopClosureSet":
         """When other measurements hold what these say."""
         return replace(self, accepted={p: c for p, c in self.accepted.items() if p not in pairs})
 
-    def exchanged(self, join: Pair, closure: Pair) -> "Closures":
+    def with_replaced_bridge(self, join: Pair, closure: Pair) -> "LoopClosureSet":
         """When a closure joins two components in place of another, which leaves."""
-        refused = tuple(pair for pair in self.refused if pair != closure)
-        left = self._remembered((*(pair for pair in self.left if pair != closure), join))
-        return replace(self, refused=refused, left=left)
+        refused = tuple(pair for pair in self.rejected if pair != closure)
+        left = self._remembered((*(pair for pair in self.removed if pair != closure), join))
+        return replace(self, rejected=refused, removed=left)
 
     def _remembered(self, pairs: Iterable[Pair]) -> tuple[Pair, ...]:
         """The newest of them."""
         return tuple(dict.fromkeys(pairs))[-self.config.remembered :]
 
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         return {
             "accepted": pack_relative(self.accepted.values()),
-            "refused": self.refused,
-            "left": self.left,
+            "refused": self.rejected,
+            "left": self.removed,
         }
 
     @staticmethod
-    def unpacked(config: ClosuresConfig, packed: Mapping[str, Any]) -> "Closures":
+    def unpack(config: LoopClosureConfig, packed: Mapping[str, Any]) -> "LoopClosureSet":
         accepted = {pair_of(c): c for c in unpack_relative(packed["accepted"])}
         refused, left = (tuple((a, b) for a, b in packed[name]) for name in ("refused", "left"))
-        return Closures(config, accepted, refused, left)
+        return LoopClosureSet(config, accepted, refused, left)
 
 
 def pair_of(measured: RelativePose) -> Pair:

@@ -9,26 +9,31 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .component_merging import T_new_old, best_without, contradicted, judged
+from .component_merging import (
+    T_new_old,
+    best_bridge_removal,
+    check_against_bridge,
+    conflicting_bridges,
+)
 from .condensation import group_to_condense
-from .factor_store import Measurements
+from .factor_store import FactorStore
 from .factors import (
+    BoxObservation,
     NoiseConfig,
-    Sight,
     information,
     pack_relative,
     pack_sights,
     unpack_relative,
     unpack_sights,
 )
-from .loop_closures import Closures, ClosuresConfig, Pair, Verdict, pair_of
+from .loop_closures import ClosureDecision, LoopClosureConfig, LoopClosureSet, Pair, pair_of
 from .solver import Name, Solver, Variables, point_key
 
 
 @dataclass(frozen=True, slots=True)
-class KeyframeGraphConfig:
+class PoseGraphConfig:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
-    closures: ClosuresConfig = field(default_factory=ClosuresConfig)
+    closures: LoopClosureConfig = field(default_factory=LoopClosureConfig)
     condense_keyframes: int = 10  # of which one stays a variable (paper, III.C: every 10)
     window_keyframes: int = 20  # the newest stay as they are: they are still measured anew
     # An end of a closure that follows, and is bent by more sigmas of it, is a variable again, while
@@ -50,7 +55,7 @@ class KeyframeGraphConfig:
             raise ConfigError(f"most_bent={self.most_bent:g} must not be negative.")
 
 
-class KeyframeGraph:
+class PoseGraph:
     """min F(T, mu) of `ldo_service.pose_graph`, over the keyframes that are variables.
 
     Keyframes that measurements connect are a component, whose frame its first keyframe fixes; a
@@ -63,9 +68,9 @@ class KeyframeGraph:
     changed the object. Deterministic: the same measurements in the same order give the same bits.
     """
 
-    def __init__(self, config: KeyframeGraphConfig = KeyframeGraphConfig()) -> None:
+    def __init__(self, config: PoseGraphConfig = PoseGraphConfig()) -> None:
         self._config = config
-        self._known = Measurements(config.noise, config.closures)
+        self._known = FactorStore(config.noise, config.closures)
         self._initial: Variables = {}  # the value each variable was inserted with
         self._solver = Solver()
         self._base = self._packed()
@@ -92,19 +97,19 @@ class KeyframeGraph:
         return len(self) - len(self._known.rows)
 
     @property
-    def closures(self) -> Closures:
+    def closures(self) -> LoopClosureSet:
         return self._known.closures
 
     # --- keyframes --------------------------------------------------------------------------------
     def add_first(self, keyframe: int, T_map_keyframe: np.ndarray) -> None:
         """The keyframe that fixes the frame of a new component."""
-        self._note("first", keyframe=keyframe, T_map=T_map_keyframe)
+        self._log_change("first", keyframe=keyframe, T_map=T_map_keyframe)
         self._initial[keyframe] = np.array(T_map_keyframe, float)
         self._known.first_of[keyframe] = keyframe
         self._known.active.append(keyframe)
         self._update([("first", keyframe)], [keyframe])
 
-    def first_of(self, keyframe: int) -> int:
+    def component_root(self, keyframe: int) -> int:
         """The first keyframe of its component. Raises KeyError when it is not known."""
         return self._known.first_of[keyframe]
 
@@ -117,11 +122,11 @@ class KeyframeGraph:
         if any(m.b != measured.b for m in every):
             raise ValueError(f"keyframes {sorted({m.b for m in every})} cannot be added at once.")
         self._require(m.a for m in every)
-        self._note("add", measured=pack_relative(every))
+        self._log_change("add", measured=pack_relative(every))
         self._initial[measured.b] = self.pose(measured.a) @ measured.T_a_b
-        self._known.first_of[measured.b] = self.first_of(measured.a)
+        self._known.first_of[measured.b] = self.component_root(measured.a)
         self._known.active.append(measured.b)
-        self._update([self._known.measure(m) for m in every], [measured.b])
+        self._update([self._known.add_measurement(m) for m in every], [measured.b])
         self._condense()
 
     def replace(self, measured: Sequence[RelativePose]) -> None:
@@ -131,11 +136,11 @@ class KeyframeGraph:
         Raises KeyError for a keyframe that is not known.
         """
         self._require(k for m in measured for k in (m.a, m.b))
-        self._note("replace", measured=pack_relative(measured))
-        names = [self._known.measure_anew(m, self.pose) for m in measured]
+        self._log_change("replace", measured=pack_relative(measured))
+        names = [self._known.replace_measurement(m, self.pose) for m in measured]
         self._update([name for name in names if name], [])
 
-    def missed_odometry(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
+    def odometry_fallback(self, a: int, b: int, T_a_b: np.ndarray) -> RelativePose:
         """Odometry between keyframes of which those between were missed: believed less."""
         noise = self._config.noise
         own = information(noise.sigma_odometry_rad, noise.sigma_odometry_m)
@@ -147,7 +152,7 @@ class KeyframeGraph:
                 raise KeyError(keyframe)
 
     # --- components and loops ---------------------------------------------------------------------
-    def close(self, closure: RelativePose) -> Verdict:
+    def add_loop_closure(self, closure: RelativePose) -> ClosureDecision:
         """What somebody recognised, between known keyframes: is it believed, and what left for it.
 
         See `loop_closures`; a refused one leaves no trace in any pose. Between two components there
@@ -155,20 +160,20 @@ class KeyframeGraph:
         agree with each other than with it, one of them joins instead. Raises KeyError when a
         keyframe is not known.
         """
-        if self.first_of(closure.a) != self.first_of(closure.b):
-            self._join(closure)
-            return Verdict(True)
+        if self.component_root(closure.a) != self.component_root(closure.b):
+            self._merge_components(closure)
+            return ClosureDecision(True)
         if pair_of(closure) in self._known.joins:
-            return Verdict(True)  # the same two images: told again they would count twice
+            return ClosureDecision(True)  # the same two images: told again they would count twice
         start, known = self._solver.variables(), self._known
-        if known.in_head(closure.a)[0] == known.in_head(closure.b)[0]:
-            return self._refuse(closure)  # too late: both hang on one variable by now
-        verdict, variables = judged(known, closure, start, self._initial)
+        if known.relative_to_start(closure.a)[0] == known.relative_to_start(closure.b)[0]:
+            return self._reject(closure)  # too late: both hang on one variable by now
+        verdict, variables = check_against_bridge(known, closure, start, self._initial)
         self.solved_times += 1
         if not verdict.changes:
-            return self._refuse(closure)
-        known.closures = known.closures.after(closure, verdict)
-        self._rebase(self._with_ends(closure, variables))
+            return self._reject(closure)
+        known.closures = known.closures.with_decision(closure, verdict)
+        self._restart_solver(self._with_ends(closure, variables))
         return verdict
 
     def _with_ends(self, closure: RelativePose, variables: Variables) -> Variables:
@@ -176,48 +181,50 @@ class KeyframeGraph:
         known, config = self._known, self._config
         for keyframe in (closure.a, closure.b):
             is_room = len(known.condensed) * config.keyframes_each < len(self)
-            if is_room and known.bent(keyframe, variables) > config.most_bent:
+            if is_room and known.interpolation_error_sigmas(keyframe, variables) > config.most_bent:
                 follower = known.followers.only(known.rows[keyframe])
                 ends = int(follower.heads[0]), int(follower.tails[0])
                 T_head, T_tail = (variables[k][None] for k in ends)
-                known.part(keyframe)
-                variables = {**variables, keyframe: follower.placed(T_head, T_tail)[0]}
+                known.restore_variable(keyframe)
+                variables = {**variables, keyframe: follower.interpolated_poses(T_head, T_tail)[0]}
         return variables
 
-    def _join(self, measured: RelativePose) -> None:
+    def _merge_components(self, measured: RelativePose) -> None:
         """Two components become one: the younger moves as a whole into the older one's frame,
         before everything is solved again."""
-        first_a, first_b = self.first_of(measured.a), self.first_of(measured.b)
+        first_a, first_b = self.component_root(measured.a), self.component_root(measured.b)
         moves = T_new_old(measured, self.pose, moves_b=first_a < first_b)
         younger, older = max(first_a, first_b), min(first_a, first_b)
         moved = self._known.move_component(younger, older, moves, self._solver.variables())
         self._known.joins[measured.a, measured.b] = measured
-        self._rebase(moved)
+        self._restart_solver(moved)
 
-    def _refuse(self, closure: RelativePose) -> Verdict:
+    def _reject(self, closure: RelativePose) -> ClosureDecision:
         """Unless more closures agree with it than with a join that it contradicts. Of several joins
         the one falls that takes the fewest closures with it; where that is not one, all stay."""
         known, variables = self._known, self._solver.variables()
-        known.closures = known.closures.after(closure, Verdict(False))
-        joins = contradicted(known, closure)
-        self._note("refuse", measured=pack_relative([closure]), is_doubt=bool(joins))
+        known.closures = known.closures.with_decision(closure, ClosureDecision(False))
+        joins = conflicting_bridges(known, closure)
+        self._log_change("refuse", measured=pack_relative([closure]), is_doubt=bool(joins))
         if not joins:
-            return Verdict(False)
-        known.doubt(closure)
-        better = best_without(known, joins, closure, self.pose, variables, self._initial)
+            return ClosureDecision(False)
+        known.keep_rejected(closure)
+        better = best_bridge_removal(known, joins, closure, self.pose, variables, self._initial)
         if better is None:
-            return Verdict(False)
+            return ClosureDecision(False)
         joined, self._known, variables = better
-        self._rebase(variables)
+        self._restart_solver(variables)
         gone = (p for p in known.closures.accepted if p not in self.closures.accepted)
-        return Verdict(True, (joined.pair, *gone))
+        return ClosureDecision(True, (joined.pair, *gone))
 
     # --- landmarks --------------------------------------------------------------------------------
-    def see(self, sights: Sequence[Sight], placed: Mapping[int, np.ndarray]) -> None:
+    def add_observations(
+        self, sights: Sequence[BoxObservation], placed: Mapping[int, np.ndarray]
+    ) -> None:
         """Landmarks in the images of known keyframes; `placed` [3], in the map, are those that are
         new. Raises KeyError for a keyframe that is not known."""
         self._require(s.keyframe for s in sights)
-        self._note(
+        self._log_change(
             "see", sights=pack_sights(sights), ids=list(placed), points=list(placed.values())
         )
         self._initial |= {point_key(k): np.array(p, float) for k, p in placed.items()}
@@ -225,12 +232,12 @@ class KeyframeGraph:
         names = [("sight", s.keyframe, s.landmark) for s in sights]
         self._update(names, [point_key(k) for k in placed])
 
-    def unsee(self, pairs: Iterable[Pair]) -> None:
+    def remove_observations(self, pairs: Iterable[Pair]) -> None:
         """Forget sights, by keyframe and landmark; with its last sight a landmark is forgotten."""
         known = [pair for pair in pairs if pair in self._known.sights]
         if not known:
             return
-        self._note("unsee", pairs=[list(pair) for pair in known])
+        self._log_change("unsee", pairs=[list(pair) for pair in known])
         for pair in known:
             del self._known.sights[pair]
         left = {landmark for _, landmark in self._known.sights}
@@ -255,14 +262,14 @@ class KeyframeGraph:
         follower = self._known.followers.only(row)
         ends = int(follower.heads[0]), int(follower.tails[0])
         T_head, T_tail = (self._solver.pose(k)[None] for k in ends)
-        return follower.placed(T_head, T_tail)[0]
+        return follower.interpolated_poses(T_head, T_tail)[0]
 
     def poses(self) -> dict[int, np.ndarray]:
         """T_map_keyframe of every keyframe, ascending by id."""
-        keyframes, T_map = self.placed()
+        keyframes, T_map = self.all_poses()
         return dict(zip(keyframes.tolist(), T_map, strict=True))
 
-    def placed(self) -> tuple[np.ndarray, np.ndarray]:
+    def all_poses(self) -> tuple[np.ndarray, np.ndarray]:
         """All keyframes [K], ascending, and T_map_keyframe [K, 4, 4]."""
         variables, followers = self._solver.variables(), self._known.followers
         keys = np.array([k for k in variables if k in self], np.int64)
@@ -270,7 +277,7 @@ class KeyframeGraph:
         heads, tails = (np.searchsorted(keys, ids) for ids in (followers.heads, followers.tails))
         keyframes = np.concatenate([keys, followers.keyframes])
         order = np.argsort(keyframes)
-        every = np.concatenate([T_map, followers.placed(T_map[heads], T_map[tails])])
+        every = np.concatenate([T_map, followers.interpolated_poses(T_map[heads], T_map[tails])])
         return keyframes[order], every[order]
 
     # --- iSAM2 ------------------------------------------------------------------------------------
@@ -314,21 +321,21 @@ class KeyframeGraph:
         if group or len(self._changes) > config.most_changes:
             followers = known.rows.keys()
             variables = self._solver.variables()
-            self._rebase({k: v for k, v in variables.items() if k not in followers})
+            self._restart_solver({k: v for k, v in variables.items() if k not in followers})
 
-    def _rebase(self, variables: Variables) -> None:
+    def _restart_solver(self, variables: Variables) -> None:
         """Start anew from here."""
         self._initial, self._changes = variables, []
         self._base = self._packed()
         self._rebuild_or_forget_landmarks()
 
     # --- state ------------------------------------------------------------------------------------
-    def _note(self, change: str, **what: Any) -> None:
+    def _log_change(self, change: str, **what: Any) -> None:
         self._changes.append((change, what))
 
     def _packed(self) -> dict[str, Any]:
         initial = list(self._initial), [v.ravel() for v in self._initial.values()]
-        return {"keys": initial[0], "values": initial[1], "known": self._known.packed()}
+        return {"keys": initial[0], "values": initial[1], "known": self._known.pack()}
 
     def snapshot(self) -> dict[str, Any]:
         """`base` is the same object until the next rebuild."""
@@ -342,9 +349,9 @@ class KeyframeGraph:
         self._known.unpack(self._base["known"])
         self._rebuild_or_forget_landmarks()
         for change, what in state["changes"]:
-            self._repeat(change, what)
+            self._replay_change(change, what)
 
-    def _repeat(self, change: str, what: Mapping[str, Any]) -> None:
+    def _replay_change(self, change: str, what: Mapping[str, Any]) -> None:
         match change:
             case "first":
                 self.add_first(what["keyframe"], what["T_map"])
@@ -354,12 +361,16 @@ class KeyframeGraph:
                 self.replace(unpack_relative(what["measured"]))
             case "see":
                 points = dict(zip(what["ids"], what["points"], strict=True))
-                self.see(unpack_sights(what["sights"]), points)
+                self.add_observations(unpack_sights(what["sights"]), points)
             case "unsee":
-                self.unsee([(keyframe, landmark) for keyframe, landmark in what["pairs"]])
+                self.remove_observations(
+                    [(keyframe, landmark) for keyframe, landmark in what["pairs"]]
+                )
             case "refuse":
                 (closure,) = unpack_relative(what["measured"])
-                self._note(change, **what)
-                self._known.closures = self._known.closures.after(closure, Verdict(False))
+                self._log_change(change, **what)
+                self._known.closures = self._known.closures.with_decision(
+                    closure, ClosureDecision(False)
+                )
                 if what["is_doubt"]:
-                    self._known.doubt(closure)
+                    self._known.keep_rejected(closure)

@@ -50,7 +50,9 @@ class Solver:
         return variables_of(self._isam.calculateEstimate())
 
 
-def solved(factors: Iterable[gtsam.NonlinearFactor], start: Variables) -> tuple[Variables, float]:
+def solve_batch(
+    factors: Iterable[gtsam.NonlinearFactor], start: Variables
+) -> tuple[Variables, float]:
     """From scratch, by Levenberg-Marquardt from `start`: the variables, and sum |error / sigma|^2
     there. Raises RuntimeError as `update`."""
     graph = graph_of(factors)

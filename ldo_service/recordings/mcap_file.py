@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the body
 
-LARGEST_CHUNK_BYTES = 1 << 28  # ours have none; other tools fill them to 1 or 4 MB
+MAX_CHUNK_BYTES = 1 << 28  # ours have none; other tools fill them to 1 or 4 MB
 UNREADABLE = (
     *(OSError, struct.error, McapError, ZstdError, ValueError, LookupError),
     *(MemoryError, OverflowError),  # a damaged length asks for too much
@@ -45,7 +45,7 @@ CHECK_EVERY_BYTES = 64_000_000  # limits are looked at so often: 10 ms of a fast
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class MessageLocation:
     """A message: the file's bytes [start, start + size), or those of a chunk in it."""
 
     topic: str
@@ -62,7 +62,7 @@ class McapIndex:
 
     path: Path
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    places: list[Place] = field(default_factory=list)  # in the order of the file
+    places: list[MessageLocation] = field(default_factory=list)  # in the order of the file
     is_whole: bool = False  # it was finished: neither killed nor cut off
 
     def __post_init__(self) -> None:
@@ -74,7 +74,7 @@ class McapIndex:
         except UNREADABLE as error:
             raise DataError(f"{self.path} cannot be read as a recording: {error}.") from error
 
-    def body(self, place: Place) -> bytes:
+    def body(self, place: MessageLocation) -> bytes:
         with self.path.open("rb") as file:
             if place.chunk is None:
                 file.seek(place.start)
@@ -105,7 +105,7 @@ class McapIndex:
         if opcode == Opcode.MESSAGE:
             channel, number, _, stamp_ns = MESSAGE.unpack(record.read(MESSAGE.size))
             start, length = start + MESSAGE.size, length - MESSAGE.size
-            place = Place(self._topics[channel], number, stamp_ns, start, length, chunk)
+            place = MessageLocation(self._topics[channel], number, stamp_ns, start, length, chunk)
             self.places.append(place)
         elif opcode == Opcode.CHANNEL:
             channel = Channel.read(ReadDataStream(record))
@@ -130,8 +130,8 @@ def _read_chunk(file: BinaryIO) -> bytes:
     """The uncompressed data of the chunk whose content begins here."""
     chunk = Chunk.read(ReadDataStream(file))
     announced = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0
-    if max(announced, chunk.uncompressed_size) > LARGEST_CHUNK_BYTES:
-        raise ValueError(f"a chunk says that it unpacks to over {LARGEST_CHUNK_BYTES} bytes")
+    if max(announced, chunk.uncompressed_size) > MAX_CHUNK_BYTES:
+        raise ValueError(f"a chunk says that it unpacks to over {MAX_CHUNK_BYTES} bytes")
     data, length = get_chunk_data_stream(chunk)
     return data.read(length)
 

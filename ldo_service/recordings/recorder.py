@@ -9,7 +9,7 @@ from threading import Lock
 
 from msgspec.structs import replace
 
-from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.actor import FlowStatus
 from ldo_service.runtime.inlet import Delivery
 from ldo_service.runtime.journal import (
     Gap,
@@ -62,7 +62,7 @@ class Recorder(Journal):
         self._closed: Future[None] | None = None
 
     # --- told by the stage ------------------------------------------------------------------------
-    def started(self, state: State | None) -> None:
+    def record_start(self, state: State | None) -> None:
         try:
             parts = None if state is None else {k: encode_state(v) for k, v in state.items()}
         except (NotImplementedError, TypeError) as error:
@@ -72,7 +72,7 @@ class Recorder(Journal):
         size = sum(map(len, (parts or {}).values()))
         self._submit(size, self._file.add_entry, Started(step=self._steps, state=parts))
 
-    def took(self, delivery: Delivery, stamp_ns: int) -> None:
+    def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
         size = len(delivery.body)
         with self._lock:
             has_place = self._waiting + size <= self._max_waiting
@@ -84,10 +84,10 @@ class Recorder(Journal):
         self._numbers += 1
         self._submit(size, self._write_message, self._taken)
 
-    def stepped(
+    def record_step(
         self,
         kind: Kind,
-        situation: Situation,
+        situation: FlowStatus,
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
@@ -100,8 +100,8 @@ class Recorder(Journal):
             step=self._steps,
             kind=kind,
             taken=-1 if taken is None else taken.number,
-            room=_by_name(situation.room),
-            waiting=_by_name(situation.waiting),
+            room=_by_name(situation.credits),
+            waiting=_by_name(situation.backlog),
             error=error,
         )
         self._steps += 1

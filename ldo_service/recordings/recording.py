@@ -11,7 +11,7 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.runtime.journal import CHANNELS, Entry, Step
 from ldo_service.schemas import decode
 
-from .mcap_file import ABOUT, McapIndex, Place
+from .mcap_file import ABOUT, McapIndex, MessageLocation
 
 NAME = re.compile(r"(?P<actor>\w+?)(\.(?P<number>\d+))?\.mcap")
 ENTRIES: Mapping[str, Any] = {channel: kind for kind, channel in CHANNELS.items()}
@@ -48,7 +48,7 @@ class JournalFile:
             except msgspec.DecodeError as error:
                 raise DataError(f"{self.path}, {place.topic} {place.number}: {error}.") from error
 
-    def body(self, message: Place) -> bytes:
+    def body(self, message: MessageLocation) -> bytes:
         return self._index.body(message)
 
     def taken(self, step: Step) -> bytes:

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 import msgspec
 
 from ldo_service.errors import DataError, ReplayDiverged
-from ldo_service.runtime.actor import Actor, Situation
-from ldo_service.runtime.delivery_state import Past, counts_by_topic, successor
+from ldo_service.runtime.actor import Actor, FlowStatus
+from ldo_service.runtime.delivery_state import RestoredState, counts_by_topic, restore_actor
 from ldo_service.runtime.journal import Gap, Output, Started, Step, checksum, digest_of, outputs_of
 from ldo_service.runtime.step import Produced, produce
 from ldo_service.schemas import Message, decode
@@ -24,7 +24,7 @@ Make = Callable[[Mapping[str, str]], Actor]  # from what a file says about itsel
 
 
 @dataclass
-class Replayed:
+class ReplayReport:
     """What came of a replay; it ends at the first difference."""
 
     actor: str
@@ -56,27 +56,27 @@ def replay(
     files: Iterable[JournalFile],
     make: Make,
     advance: Callable[[], None] = lambda: None,
-) -> Replayed:
+) -> ReplayReport:
     """Replay every life of an actor; `advance` is called after each step."""
-    replayed = Replayed(actor)
+    replayed = ReplayReport(actor)
     try:
         for file in files:
-            for _ in Life(file, make, replayed).live():
+            for _ in ReplaySession(file, make, replayed).steps():
                 advance()
     except ReplayDiverged as difference:
         replayed.difference = difference
     return replayed
 
 
-class Life:
+class ReplaySession:
     """One file, step by step."""
 
-    def __init__(self, file: JournalFile, make: Make, replayed: Replayed) -> None:
+    def __init__(self, file: JournalFile, make: Make, replayed: ReplayReport) -> None:
         self._file, self._make, self._replayed = file, make, replayed
         self._actor: Actor | None = None  # None: nothing is known until the next start
         self._last: Step | None = None
 
-    def live(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[Step]:
         for entry in self._file.entries():
             match entry:
                 case Started():
@@ -108,9 +108,9 @@ class Life:
 
     def _successor(self, start: Started, state: Mapping[str, bytes]) -> Actor:
         try:
-            past = Past.of({part: decode_state(body) for part, body in state.items()})
+            past = RestoredState.of({part: decode_state(body) for part, body in state.items()})
             about = self._file.about
-            return successor(self._make(about), past, lambda: self._make(about))
+            return restore_actor(self._make(about), past, lambda: self._make(about))
         except Exception as error:
             where = f"the start before step {start.step} ({self._file.path.name})"
             what = "the state it began from"
@@ -136,26 +136,26 @@ class Life:
     def _step(self, actor: Actor, step: Step) -> None:
         if actor.talks_outside:
             return
-        actor.situation = Situation(
-            room=counts_by_topic(step.room, (out.topic for out in actor.outputs)),
-            waiting=counts_by_topic(step.waiting, (port.topic for port in actor.inputs)),
+        actor.situation = FlowStatus(
+            credits=counts_by_topic(step.room, (out.topic for out in actor.outputs)),
+            backlog=counts_by_topic(step.waiting, (port.topic for port in actor.inputs)),
         )
         match step.kind:
             case "done":
                 message = self._message(actor, step)
                 self._compare(step, self._produce(step, actor, actor.handle(message)))
                 actor.snapshot()  # as the stage does: it may keep what it gave away
-                actor.saved()
+                actor.on_saved()
             case "failed":
                 self._fail(step, actor, self._message(actor, step))
             case "set_aside":
                 self._replayed.set_aside += 1
             case "resumed":
-                self._compare(step, self._produce(step, actor, actor.resumed()))
+                self._compare(step, self._produce(step, actor, actor.on_restored()))
                 actor.checkpoint()
-                actor.saved()
+                actor.on_saved()
             case "finished":
-                self._compare(step, self._produce(step, actor, actor.finish()))
+                self._compare(step, self._produce(step, actor, actor.on_stop()))
 
     def _message(self, actor: Actor, step: Step) -> Message:
         self._replayed.taken[step.topic] += 1

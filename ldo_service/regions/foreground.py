@@ -87,7 +87,7 @@ class Foreground:
         return (self.row, self.column, *self.mask.shape), np.packbits(self.mask)
 
     @staticmethod
-    def unpacked(place: Sequence[int], bits: np.ndarray) -> "Foreground":
+    def unpack(place: Sequence[int], bits: np.ndarray) -> "Foreground":
         row, column, height, width = place
         mask = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
         return Foreground(row, column, mask)
@@ -227,7 +227,7 @@ def _shared(a: Foreground, b: Foreground) -> tuple[Window, Window] | None:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Claims:
+class RegionDetections:
     """What is said to be in M boxes of a keyframe.
 
     boxes                  [M, 4], x0 y0 x1 y1, px, pixel centres at integers
@@ -243,29 +243,29 @@ class Claims:
     open_labels: np.ndarray
     open_confidences: np.ndarray
     parts: tuple[Foreground | None, ...] = ()
-    anew: bool = False
+    replaces_labels: bool = False
 
     @classmethod
     def of_detector(
         cls, boxes: np.ndarray, labels: np.ndarray, confidences: np.ndarray
-    ) -> "Claims":
+    ) -> "RegionDetections":
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
     @classmethod
-    def none(cls) -> "Claims":
+    def none(cls) -> "RegionDetections":
         return cls.of_detector(np.zeros((0, 4), np.float32), *np.zeros((2, 0), np.float32))
 
-    def where(self, mask: np.ndarray) -> "Claims":
+    def where(self, mask: np.ndarray) -> "RegionDetections":
         """Those of a mask [M]."""
         parts = tuple(part for part, is_in in zip(self.parts, mask, strict=False) if is_in)
-        return Claims(
+        return RegionDetections(
             self.boxes[mask],
             self.labels[mask],
             self.confidences[mask],
             self.open_labels[mask],
             self.open_confidences[mask],
             parts,
-            self.anew,
+            self.replaces_labels,
         )
 
     def scores(self) -> np.ndarray:

@@ -21,14 +21,23 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .foreground import Foreground
-from .planes import PlaneConfig, Planes, Relief, disc, planes, relief, shrink_factor, structure
+from .planes import (
+    DepthFeatures,
+    PlaneConfig,
+    Planes,
+    compute_depth_features,
+    disc,
+    planes,
+    shrink_factor,
+    structural_planes,
+)
 
 Kind = Literal["apart", "standing", "convex", "flat", "room"]
 _3X3 = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True, slots=True)
-class SegmentConfig:
+class GeometricSegmentationConfig:
     """Chosen as those of `PlaneConfig`; pixels are those of its small image."""
 
     planes: PlaneConfig = field(default_factory=PlaneConfig)
@@ -57,17 +66,17 @@ class Segment:
     part: Foreground
 
 
-def segments(
-    color: np.ndarray, depth_m: np.ndarray, camera: Camera, config: SegmentConfig
+def segment_geometry(
+    color: np.ndarray, depth_m: np.ndarray, camera: Camera, config: GeometricSegmentationConfig
 ) -> list[Segment]:
     """Of a keyframe: color [H, W, 3] uint8 RGB, depth [H, W] m, 0 where it is missing.
 
     The same images give the same segments.
     """
     # what is measured, made small
-    seen = relief(depth_m, camera, config.planes)
+    seen = compute_depth_features(depth_m, camera, config.planes)
     found = planes(seen, config.planes)
-    of_room = structure(seen, found, config.planes)
+    of_room = structural_planes(seen, found, config.planes)
     # what is no part of the room
     joined = _joined(seen, config)
     apart = (seen.inverse > 0) & (of_room == 0)
@@ -104,7 +113,7 @@ def components(mask: np.ndarray, least_px: int = 1) -> Iterator[Foreground]:
             yield Foreground(row, column, window == part)
 
 
-def _joined(seen: Relief, config: SegmentConfig) -> np.ndarray:
+def _joined(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
     """Measured, and without a step of depth to a neighbour."""
     low = cv2.erode(seen.inverse, _3X3)
     return (low > 0) & (cv2.dilate(seen.inverse, _3X3) < (1 + config.max_gap) * low)
@@ -115,7 +124,7 @@ def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
     return cv2.dilate(((found.number > 0) & apart).astype(np.uint8), _3X3) > 0
 
 
-def _concave(seen: Relief, config: SegmentConfig) -> np.ndarray:
+def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
     """Where normals of neighbours turn towards each other: (p_b - p_a) . (n_b - n_a) < 0, for
     normals towards the camera, and by more than noise."""
     rays = np.stack(np.broadcast_arrays(seen.x, seen.y, np.float32(1)), axis=-1)
@@ -128,7 +137,9 @@ def _concave(seen: Relief, config: SegmentConfig) -> np.ndarray:
     return concave
 
 
-def _divided(apart: np.ndarray, concave: np.ndarray, config: SegmentConfig) -> Iterator[np.ndarray]:
+def _divided(
+    apart: np.ndarray, concave: np.ndarray, config: GeometricSegmentationConfig
+) -> Iterator[np.ndarray]:
     """[h, w] bool: the pieces of each thing between its creases, with what of these is theirs. What
     has most of a thing is the thing, and no piece."""
     of_thing = np.asarray(cv2.connectedComponents(apart.astype(np.uint8), connectivity=4)[1])
@@ -148,7 +159,7 @@ def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
 
 
 def _colored(
-    color: np.ndarray, of_room: np.ndarray, config: SegmentConfig, camera: Camera
+    color: np.ndarray, of_room: np.ndarray, config: GeometricSegmentationConfig, camera: Camera
 ) -> Iterator[np.ndarray]:
     """[h, w] bool for each plane of the room: what on it is of another colour than most of it."""
     k, (height, width) = shrink_factor(camera.width, config.planes), of_room.shape
@@ -171,7 +182,7 @@ def _steps(lab: np.ndarray) -> np.ndarray:
     return np.sqrt((across * across + down * down).sum(axis=-1))
 
 
-def _of_plane(even: np.ndarray, lab: np.ndarray, config: SegmentConfig) -> np.ndarray:
+def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationConfig) -> np.ndarray:
     """Of the even pieces of a plane [h, w] bool: the largest, and those of its colour; grown over
     their edges."""
     count, parts = cv2.connectedComponents(even.astype(np.uint8), connectivity=4)

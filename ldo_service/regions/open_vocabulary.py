@@ -11,21 +11,27 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.detection.vocabulary import Vocabulary, normalised
+from ldo_service.detection.vocabulary import Vocabulary, normalized
 from ldo_service.errors import ConfigError, named
-from ldo_service.gaussians.training_views import View
+from ldo_service.gaussians.training_views import TrainingView
 
-from .foreground import Claims, Foreground
-from .geometric_segmentation import segments
-from .region import Answer
-from .region_proposals import Candidate, TriggerConfig, candidates, named_objects, regions_of_image
-from .region_tracker import Opinion, Question, RegionConfig, RegionsToName
+from .foreground import Foreground, RegionDetections
+from .geometric_segmentation import segment_geometry
+from .region import RegionLabelResult
+from .region_proposals import (
+    RegionProposal,
+    RegionProposalConfig,
+    labeled_regions,
+    propose_regions,
+    regions_of_image,
+)
+from .region_tracker import RegionLabel, RegionRequest, RegionTracker, RegionTrackerConfig
 
 
 @dataclass(frozen=True, slots=True)
-class NamingConfig:
-    trigger: TriggerConfig = field(default_factory=TriggerConfig)
-    regions: RegionConfig = field(default_factory=RegionConfig)
+class OpenVocabularyConfig:
+    trigger: RegionProposalConfig = field(default_factory=RegionProposalConfig)
+    regions: RegionTrackerConfig = field(default_factory=RegionTrackerConfig)
     reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
     least_sure: float = 0.3  # of an answer: with 0.5 the flat's recall is 7 points less, and of
     # labellers that tell what is no thing little else is below
@@ -43,7 +49,7 @@ class NamingConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Asked:
+class PendingRequest:
     """What a question was about: a part of a box in a keyframe, the detector's word on it, and the
     kind of the region."""
 
@@ -54,27 +60,31 @@ class Asked:
     kind: str = ""
 
 
-class Naming:
+class OpenVocabularyLabeling:
     """Chooses what to ask, and knows what was asked. Bounded; the same calls give the same bits,
-    also after `unpacked`."""
+    also after `unpack`."""
 
-    def __init__(self, config: NamingConfig | None = None, *, is_heard: bool = True) -> None:
+    def __init__(
+        self, config: OpenVocabularyConfig | None = None, *, is_heard: bool = True
+    ) -> None:
         """`is_heard`: names are claimed; else they are learnt, and boxes stay as they are."""
-        self.config, self._is_heard = config or NamingConfig(), is_heard
-        self._regions = RegionsToName(self.config.regions)
-        self._open: dict[tuple[int, int], Asked] = {}  # by region and keyframe, the oldest first
+        self.config, self._is_heard = config or OpenVocabularyConfig(), is_heard
+        self._regions = RegionTracker(self.config.regions)
+        self._open: dict[
+            tuple[int, int], PendingRequest
+        ] = {}  # by region and keyframe, the oldest first
         self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
         self._outvoted = 0
 
     # --- questions --------------------------------------------------------------------------------
-    def see(
+    def observe_keyframe(
         self,
-        view: View,
-        claims: Claims,
+        view: TrainingView,
+        claims: RegionDetections,
         vocabulary: Vocabulary,
         is_labelled: np.ndarray,
         T_map_keyframe: Mapping[int, np.ndarray],
-    ) -> tuple[Claims, list[Question]]:
+    ) -> tuple[RegionDetections, list[RegionRequest]]:
         """The detector's claims of a keyframe with what is known of its regions, and what is to be
         asked about them now.
 
@@ -84,45 +94,45 @@ class Naming:
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
         labels = [vocabulary.name(int(label)) for label in claims.labels]
         color = np.ascontiguousarray(view.color.transpose(1, 2, 0))
-        shown = segments(color, depth_m, camera, config.segments)
+        shown = segment_geometry(color, depth_m, camera, config.segments)
         found = regions_of_image(shown, depth_m.shape, config)
         room = [one.part for one in shown if one.kind == "room"]
-        doubtful = candidates(
+        doubtful = propose_regions(
             *(claims.boxes, labels, claims.confidences),
             *(depth_m, camera, is_labelled, found, room, config),
         )
-        named = named_objects(claims.boxes, is_labelled, found, config)
-        sightings = self._regions.see(
+        named = labeled_regions(claims.boxes, is_labelled, found, config)
+        sightings = self._regions.observe_keyframe(
             view.keyframe, doubtful, color, depth_m, camera, T_map_keyframe, named
         )
         for question in sightings.questions:
             self._remember(question)
-        claims = replace(claims, parts=fitting_parts(len(claims.boxes), doubtful))
+        claims = replace(claims, parts=match_boxes_to_regions(len(claims.boxes), doubtful))
         opinions = sightings.opinions if self._is_heard else []
-        told = with_opinions(claims, opinions, vocabulary, self._boxes_vote)
+        told = add_region_labels(claims, opinions, vocabulary, self._boxes_vote)
         return told, sightings.questions
 
-    def _remember(self, question: Question) -> None:
+    def _remember(self, question: RegionRequest) -> None:
         region, of = question.region, question.candidate
         self._questions += 1
-        asked = Asked(of.box_px, of.part, of.label, of.score, of.kind)
+        asked = PendingRequest(of.box_px, of.part, of.label, of.score, of.kind)
         self._open[region.id, region.keyframe] = asked
         while len(self._open) > self.config.most_open:
             del self._open[next(iter(self._open))]
             self._overdue += 1
 
     # --- answers ----------------------------------------------------------------------------------
-    def answered(
-        self, region: int, keyframe: int, answer: Answer, vocabulary: Vocabulary
-    ) -> Claims | None:
+    def apply_label_result(
+        self, region: int, keyframe: int, answer: RegionLabelResult, vocabulary: Vocabulary
+    ) -> RegionDetections | None:
         """What the labeller claims of that keyframe, with what the detector said of the same part.
         None where it names nothing, or nobody asked."""
         asked = self._open.pop((region, keyframe), None)
         if asked is None:
             self._unknown += 1
             return None
-        answer = self._believed(answer, asked)
-        name, confidence = answer.label, answer.sure
+        answer = self._filter_answer(answer, asked)
+        name, confidence = answer.label, answer.confidence
         before = self._regions.get(region)
         known_as = self._regions.answered(region, answer)
         is_name = bool(name) and confidence > 0
@@ -134,7 +144,7 @@ class Naming:
             self._outvoted += 1
             return None
         said = vocabulary.index(name)
-        return Claims(
+        return RegionDetections(
             np.reshape(asked.box_px, (1, 4)).astype(np.float32),
             np.array([vocabulary.index(asked.label) if asked.label else said]),
             np.array([asked.score], np.float32),
@@ -142,7 +152,7 @@ class Naming:
             np.array([confidence], np.float32),
             (asked.part,),
             # until now it was a part of what it stands on, for all that was said
-            anew=asked.kind == "standing"
+            replaces_labels=asked.kind == "standing"
             and confidence >= self.config.regions.settled
             and before is not None
             and not before.votes
@@ -150,36 +160,38 @@ class Naming:
         )
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """The keyframes whose views of a region the labeller was shown; see `RegionsToName`."""
+        """The keyframes whose views of a region the labeller was shown; see `RegionTracker`."""
         return self._regions.shown_in(region)
 
     def carried(
         self,
         region: int,
-        view: View,
+        view: TrainingView,
         vocabulary: Vocabulary,
         T_map_keyframe: Mapping[int, np.ndarray],
-    ) -> Claims | None:
+    ) -> RegionDetections | None:
         """What a region is, as an earlier keyframe shows it; None where it has no name, or is not
         seen."""
         place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
         opinion = self._regions.carried(region, *place)
-        return opinion and with_opinions(Claims.none(), [opinion], vocabulary, self._boxes_vote)
+        return opinion and add_region_labels(
+            RegionDetections.none(), [opinion], vocabulary, self._boxes_vote
+        )
 
-    def _believed(self, answer: Answer, asked: Asked) -> Answer:
+    def _filter_answer(self, answer: RegionLabelResult, asked: PendingRequest) -> RegionLabelResult:
         """Without a label that is no object's, or is told too unsurely of what no box is about."""
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
-            return Answer("", answer.sure)
-        is_sure = answer.sure >= self.config.least_sure or bool(asked.label)
-        return replace(answer, others=others) if is_sure else Answer("", 0.0)
+            return RegionLabelResult("", answer.confidence)
+        is_sure = answer.confidence >= self.config.least_sure or bool(asked.label)
+        return replace(answer, others=others) if is_sure else RegionLabelResult("", 0.0)
 
     @property
     def _boxes_vote(self) -> bool:
         return self.config.regions.boxes_vote
 
     def _is_object(self, name: str) -> bool:
-        return normalised(name) not in self.config.structure
+        return normalized(name) not in self.config.structure
 
     # --- state ------------------------------------------------------------------------------------
     @property
@@ -191,12 +203,15 @@ class Naming:
         }
 
     @staticmethod
-    def unpacked(
-        packed: Mapping[str, Any], config: NamingConfig | None = None, *, is_heard: bool = True
-    ) -> "Naming":
+    def unpack(
+        packed: Mapping[str, Any],
+        config: OpenVocabularyConfig | None = None,
+        *,
+        is_heard: bool = True,
+    ) -> "OpenVocabularyLabeling":
         """As it was."""
-        out = Naming(config, is_heard=is_heard)
-        out._regions = RegionsToName.unpacked(packed["regions"], out.config.regions)
+        out = OpenVocabularyLabeling(config, is_heard=is_heard)
+        out._regions = RegionTracker.unpack(packed["regions"], out.config.regions)
         out._open = {
             (region, keyframe): _unpacked(*row) for region, keyframe, *row in packed["open"]
         }
@@ -215,7 +230,9 @@ class Naming:
         }
 
 
-def fitting_parts(boxes: int, found: Sequence[Candidate]) -> tuple[Foreground | None, ...]:
+def match_boxes_to_regions(
+    boxes: int, found: Sequence[RegionProposal]
+) -> tuple[Foreground | None, ...]:
     """Of each box of the detector the thing that depth and creases set apart there, or what of it
     is no room, or None where nobody looked. What colour sets apart has the rim of what it lies
     on."""
@@ -226,9 +243,12 @@ def fitting_parts(boxes: int, found: Sequence[Candidate]) -> tuple[Foreground | 
     return tuple(parts)
 
 
-def with_opinions(
-    claims: Claims, opinions: Sequence[Opinion], vocabulary: Vocabulary, boxes_vote: bool
-) -> Claims:
+def add_region_labels(
+    claims: RegionDetections,
+    opinions: Sequence[RegionLabel],
+    vocabulary: Vocabulary,
+    boxes_vote: bool,
+) -> RegionDetections:
     """Claims of a detector with the names of the same regions: of other regions alone, of a box of
     the detector beside its label, or in place of it where it has a vote in the name."""
     labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
@@ -245,7 +265,7 @@ def with_opinions(
     ]
     said = np.array([vocabulary.index(opinion.label) for opinion in alone], np.int64)
     boxes = np.array([opinion.of.box_px for opinion in alone], np.float32).reshape(-1, 4)
-    return Claims(
+    return RegionDetections(
         np.concatenate([claims.boxes, boxes]),
         np.concatenate([claims.labels, said]),
         np.concatenate([by_detector, np.zeros(len(alone), np.float32)]),
@@ -255,7 +275,7 @@ def with_opinions(
     )
 
 
-def _is_part_of_one(opinion: Opinion, opinions: Sequence[Opinion]) -> bool:
+def _is_part_of_one(opinion: RegionLabel, opinions: Sequence[RegionLabel]) -> bool:
     """Most of its box lies in that of a larger region of the same name: one thing, not two."""
     box_px = opinion.of.box_px
     for other in opinions:
@@ -272,9 +292,11 @@ def _area_px(box_px: np.ndarray) -> float:
     return float(np.prod(box_px[2:] - box_px[:2]))
 
 
-def _packed(asked: Asked) -> list[Any]:
+def _packed(asked: PendingRequest) -> list[Any]:
     return [asked.box_px, *asked.part.packed, asked.label, asked.score, asked.kind]
 
 
-def _unpacked(box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any) -> Asked:
-    return Asked(box_px, Foreground.unpacked(place, bits), *seen)
+def _unpacked(
+    box_px: np.ndarray, place: Sequence[int], bits: np.ndarray, *seen: Any
+) -> PendingRequest:
+    return PendingRequest(box_px, Foreground.unpack(place, bits), *seen)

@@ -55,7 +55,7 @@ class PlaneConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Relief:
+class DepthFeatures:
     """A depth image made small: [h, w] each.
 
     inverse  float32, 1 / m, as measured, 0 where nothing is
@@ -90,7 +90,9 @@ def shrink_factor(width: int, config: PlaneConfig) -> int:
     return max(1, round(width / config.width_px))
 
 
-def relief(depth_m: np.ndarray, camera: Camera, config: PlaneConfig) -> Relief:
+def compute_depth_features(
+    depth_m: np.ndarray, camera: Camera, config: PlaneConfig
+) -> DepthFeatures:
     """Of depth [H, W], 0 where it is missing."""
     k = shrink_factor(camera.width, config)
     inverse = _shrunk_inverse(depth_m, k)
@@ -107,10 +109,10 @@ def relief(depth_m: np.ndarray, camera: Camera, config: PlaneConfig) -> Relief:
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
     is_step = (low <= 0) | (high >= (1 + config.max_step) * low + config.step_floor)
     surfaces, sizes = _pieces(~is_step, normals, config)
-    return Relief(inverse, smooth, normals, x, y, is_step, surfaces, sizes)
+    return DepthFeatures(inverse, smooth, normals, x, y, is_step, surfaces, sizes)
 
 
-def planes(seen: Relief, config: PlaneConfig) -> Planes:
+def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
     """Fitted to the largest surfaces. A wall that a thing cuts in two is one plane."""
     number, inverses = np.zeros(seen.inverse.shape, np.int32), []
     for piece in np.argsort(-seen.sizes, kind="stable")[: config.most]:
@@ -131,7 +133,7 @@ def planes(seen: Relief, config: PlaneConfig) -> Planes:
     return Planes(number, tuple(inverses))
 
 
-def structure(seen: Relief, found: Planes, config: PlaneConfig) -> np.ndarray:
+def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
     """[h, w] int32, the number of the plane where a pixel lies on one that is structure, or next to
     such a plane and no farther from it than noise; 0 elsewhere."""
     out = np.zeros(found.number.shape, np.int32)
@@ -183,7 +185,7 @@ def _pieces(
     return np.asarray(labels), sizes
 
 
-def _fitted(seen: Relief, part: np.ndarray, config: PlaneConfig) -> np.ndarray | None:
+def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.ndarray | None:
     """a, b, c of 1 / z = a x + b y + c; None where it is no plane. Twice without what is off."""
     v, u = np.nonzero(part)
     v, u = v[::4], u[::4]
@@ -199,7 +201,7 @@ def _fitted(seen: Relief, part: np.ndarray, config: PlaneConfig) -> np.ndarray |
 
 
 def _share_behind(
-    seen: Relief, part: np.ndarray, inverse: np.ndarray, config: PlaneConfig
+    seen: DepthFeatures, part: np.ndarray, inverse: np.ndarray, config: PlaneConfig
 ) -> float:
     """Of the outline of a plane's part: where what is seen beyond is farther than the plane would
     be there. What lies about on the plane does not count."""

@@ -9,10 +9,10 @@ import numpy as np
 from ldo_service.geometry import Camera
 
 from .foreground import Foreground
-from .region_proposals import Candidate
+from .region_proposals import RegionProposal
 from .region_views import RegionView
 
-MOST_POINTS = 96  # of a sighting, 12 bytes each
+MAX_POINTS = 96  # of a sighting, 12 bytes each
 
 
 Votes = tuple[tuple[str, float, float], ...]  # name, sum of its votes, the surest of them
@@ -50,11 +50,11 @@ def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
     return _added(votes, tuple((name, share * total, share * most) for name, total, most in others))
 
 
-def favourite(votes: Votes, least: float) -> tuple[str, float]:
+def winning_label(votes: Votes, least: float) -> tuple[str, float]:
     """What most speaks for, and how sure: as the surest was, by the share of all votes that are for
     it; nothing where the sum is less than `least`.
 
-    >>> favourite((("tv", 0.6, 0.5), ("oven", 0.4, 0.6)), 0.35)
+    >>> winning_label((("tv", 0.6, 0.5), ("oven", 0.4, 0.6)), 0.35)
     ('tv', 0.3)
     """
     name, total, most = max(votes, key=lambda vote: vote[1], default=("", 0.0, 0.0))
@@ -75,22 +75,22 @@ Box = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Answer:
+class RegionLabelResult:
     """What a labeller takes a region for, 0..1 `sure`; no label: it is no object, or who knows.
     `others`: what else it may be, and how sure."""
 
     label: str
-    sure: float
+    confidence: float
     others: tuple[tuple[str, float], ...] = ()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sighting:
+class RegionObservation:
     """What a keyframe showed of a region, and points [P, 3] float32 of its surface in the camera's
     frame."""
 
     keyframe: int
-    candidate: Candidate
+    candidate: RegionProposal
     p_camera: np.ndarray
 
     @property
@@ -123,26 +123,26 @@ class Region:
     id: int
     keyframe: int
     box_px: Box
-    shape: Sighting
+    shape: RegionObservation
     seen: int = 0
-    best: Sighting | None = None
+    best: RegionObservation | None = None
     views: tuple[RegionView, ...] = ()
     label: str = ""
     score: float = 0.0
     votes: Votes = ()
     questions: int = 0
     quality: float = 0.0
-    answer: Answer | None = None
+    answer: RegionLabelResult | None = None
     is_standing: bool = False
 
-    def gained(self) -> float:
+    def view_quality_gain(self) -> float:
         """How much better its views are than when it was asked about."""
         return sum(view.quality for view in self.views) - self.quality
 
 
-def sighting_of(
-    keyframe: int, candidate: Candidate, depth_m: np.ndarray, camera: Camera
-) -> Sighting | None:
+def observe_region(
+    keyframe: int, candidate: RegionProposal, depth_m: np.ndarray, camera: Camera
+) -> RegionObservation | None:
     """None where depth is missing."""
     part = candidate.part
     rows, columns = np.nonzero(part.mask)
@@ -152,19 +152,19 @@ def sighting_of(
     if len(rows) == 0:
         return None
     few = _spread(rows, columns)
-    return Sighting(keyframe, candidate, _points(rows[few], columns[few], depth_m, camera))
+    return RegionObservation(keyframe, candidate, _points(rows[few], columns[few], depth_m, camera))
 
 
 def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Which of these pixels [N] to keep, MOST_POINTS at most: those on a grid, or every so many of
     what is too thin for it. Every so many of a rectangle would lie on a few lines."""
-    step = max(1, int(np.sqrt(len(rows) / MOST_POINTS)))
+    step = max(1, int(np.sqrt(len(rows) / MAX_POINTS)))
     while True:
         on_grid = (rows % step == step // 2) & (columns % step == step // 2)
-        if np.count_nonzero(on_grid) <= MOST_POINTS:
+        if np.count_nonzero(on_grid) <= MAX_POINTS:
             break
         step += 1
-    most = min(len(rows), MOST_POINTS)
+    most = min(len(rows), MAX_POINTS)
     if 2 * np.count_nonzero(on_grid) >= most:
         return np.flatnonzero(on_grid)
     return np.linspace(0, len(rows) - 1, most).astype(int)
@@ -178,7 +178,7 @@ def _points(
     return np.stack([x, y, z], axis=1).astype(np.float32)
 
 
-def seen_again(region: Region, seen: Sighting, most_boxes: float) -> Region:
+def merge_observation(region: Region, seen: RegionObservation, most_boxes: float) -> Region:
     """With what is new of it, and the surer of two opinions; `most_boxes` is what all boxes of a
     name may speak for it."""
     said = seen.candidate
@@ -197,27 +197,29 @@ def seen_again(region: Region, seen: Sighting, most_boxes: float) -> Region:
     )
 
 
-def packed(region: Region) -> dict[str, Any]:
+def pack(region: Region) -> dict[str, Any]:
     views = [{name: getattr(view, name) for name in RegionView.__slots__} for view in region.views]
     plain = {name: getattr(region, name) for name in Region.__slots__}
-    answer = region.answer and [getattr(region.answer, name) for name in Answer.__slots__]
+    answer = region.answer and [
+        getattr(region.answer, name) for name in RegionLabelResult.__slots__
+    ]
     best, shape = region.best and _packed_sighting(region.best), _packed_sighting(region.shape)
     return {**plain, "shape": shape, "best": best, "views": views, "answer": answer}
 
 
-def unpacked(row: Mapping[str, Any]) -> Region:
+def unpack(row: Mapping[str, Any]) -> Region:
     views = tuple(RegionView(**{**view, "box_px": tuple(view["box_px"])}) for view in row["views"])
     changed = {
         "box_px": tuple(row["box_px"]),
         "votes": tuple(tuple(vote) for vote in row["votes"]),
         "shape": _unpacked_sighting(*row["shape"]),
         "best": row["best"] and _unpacked_sighting(*row["best"]),
-        "answer": row["answer"] and Answer(*row["answer"]),
+        "answer": row["answer"] and RegionLabelResult(*row["answer"]),
     }
     return Region(**{**row, **changed, "views": views})
 
 
-def _packed_sighting(seen: Sighting) -> list[Any]:
+def _packed_sighting(seen: RegionObservation) -> list[Any]:
     """Without the number that its box had in its keyframe: nobody asks for it any more."""
     of = seen.candidate
     said = of.label, of.score, of.kind
@@ -226,7 +228,7 @@ def _packed_sighting(seen: Sighting) -> list[Any]:
 
 def _unpacked_sighting(
     keyframe: int, p_camera: np.ndarray, box_px: np.ndarray, *said: Any
-) -> Sighting:
+) -> RegionObservation:
     label, score, kind, *part = said
-    of = Candidate(box_px, Foreground.unpacked(*part), label, score, None, kind)
-    return Sighting(keyframe, of, p_camera)
+    of = RegionProposal(box_px, Foreground.unpack(*part), label, score, None, kind)
+    return RegionObservation(keyframe, of, p_camera)

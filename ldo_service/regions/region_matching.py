@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 from ldo_service.geometry import Camera, se3
 
 from .foreground import Foreground
-from .region import Region, Sighting
+from .region import Region, RegionObservation
 
 STRIDE_PX = 4  # of the pixels that are looked at, and the edge of what each stands for
 MARGIN_PX = 24  # around the points seen: they are few, and end within their region
@@ -18,7 +18,7 @@ SPACING = 1.5  # of its points, as they would lie on a square: what is farther f
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Projected:
+class ProjectedPoints:
     """Those points of R regions that a keyframe sees: rows, columns and of [P] which region."""
 
     rows: np.ndarray
@@ -26,14 +26,14 @@ class Projected:
     of: np.ndarray
     counts: np.ndarray
 
-    def only(self, regions: Sequence[int]) -> "Projected":
+    def only(self, regions: Sequence[int]) -> "ProjectedPoints":
         """Those of some of the R regions, each once, numbered as they come."""
         places = np.full(len(self.counts), -1)
         places[regions] = np.arange(len(regions))
         of = places[self.of]
         is_theirs = of >= 0
         points = self.rows[is_theirs], self.columns[is_theirs], of[is_theirs]
-        return Projected(*points, self.counts[regions])
+        return ProjectedPoints(*points, self.counts[regions])
 
     def shares_in(self, part: Foreground) -> np.ndarray:
         """[R] of the points of each region that it sees."""
@@ -49,7 +49,7 @@ def projected(
     T_camera_map: np.ndarray,
     T_map_keyframe: Mapping[int, np.ndarray],
     max_gap_m: float,
-) -> Projected:
+) -> ProjectedPoints:
     """What a keyframe, depth [H, W], sees of the regions' points."""
     points, of = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for i, region in enumerate(regions):
@@ -61,11 +61,11 @@ def projected(
     measured = depth_m[rows, columns]
     is_seen = is_inside & (measured > 0) & (np.abs(measured - p_camera[:, 2]) < max_gap_m)
     counts = np.bincount(numbers[is_seen], minlength=len(regions))
-    return Projected(rows[is_seen], columns[is_seen], numbers[is_seen], counts)
+    return ProjectedPoints(rows[is_seen], columns[is_seen], numbers[is_seen], counts)
 
 
-def share_back(
-    seen: Sighting,
+def reverse_overlap(
+    seen: RegionObservation,
     region: Region,
     shape: tuple[int, ...],
     camera: Camera,
@@ -106,8 +106,8 @@ def is_in(part: Foreground, rows: np.ndarray, columns: np.ndarray) -> np.ndarray
     return inside
 
 
-def carried(
-    seen: Sighting,
+def propagate_mask(
+    seen: RegionObservation,
     rows: np.ndarray,
     columns: np.ndarray,
     depth_m: np.ndarray,
@@ -155,7 +155,7 @@ def _points(
     return row, column, np.stack([x, y, z], axis=1)
 
 
-def _spacing_m(seen: Sighting, camera: Camera) -> float:
+def _spacing_m(seen: RegionObservation, camera: Camera) -> float:
     """Of a sighting's points, were its area a square full of them."""
     m_per_px = float(np.median(seen.p_camera[:, 2])) / camera.fx
     return float(np.sqrt(seen.size_px / len(seen.p_camera))) * m_per_px
@@ -173,7 +173,7 @@ def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> 
     return Foreground(top, left, mask[: shape[0] - top, : shape[1] - left])
 
 
-class KnownRegions:
+class RegionMatcher:
     """Those whose keyframe is known, as they were before this one: depth [H, W], T_map_keyframe
     [4, 4] by keyframe, this one's too. Points of a region are seen within max_gap_m of their depth,
     and fewer than `least_points` tell nothing."""
@@ -195,7 +195,9 @@ class KnownRegions:
         args = depth_m, camera, T_camera_map, T_map_keyframe, max_gap_m
         self._seen = projected(self._regions, *args)
 
-    def same(self, sighting: Sighting, overlap: float, taken: Collection[int]) -> int | None:
+    def same(
+        self, sighting: RegionObservation, overlap: float, taken: Collection[int]
+    ) -> int | None:
         """The id of the region that it is most of, and that is most of it; but for those taken."""
         shares = self._seen.shares_in(sighting.candidate.part)
         shares[self._seen.counts < self._least] = 0
@@ -205,7 +207,7 @@ class KnownRegions:
             region = self._regions[int(i)]
             if region.id in taken:
                 continue
-            back = share_back(sighting, region, *place, self._least)
+            back = reverse_overlap(sighting, region, *place, self._least)
             if min(back, shares[i]) >= most:
                 best, most = region.id, min(back, float(shares[i]))
         return best
@@ -238,7 +240,7 @@ class KnownRegions:
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i
         T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))
-        return carried(
+        return propagate_mask(
             shape,
             self._seen.rows[is_its],
             self._seen.columns[is_its],

@@ -16,13 +16,13 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
-from .geometric_segmentation import Segment, SegmentConfig
+from .geometric_segmentation import GeometricSegmentationConfig, Segment
 
 _ORDER = ("flat", "apart", "standing", "convex")  # of regions alike, the first is kept
 
 
 @dataclass(frozen=True, slots=True)
-class TriggerConfig:
+class RegionProposalConfig:
     sure: float = 0.6  # of a detector that nobody needs to help (III.B)
     same_iou: float = 0.5  # with a sure box: the hesitant one is of the same thing
     fits_iou: float = 0.6  # of a hesitant box and a region: the box's thing is the region
@@ -33,7 +33,7 @@ class TriggerConfig:
     min_fill: float = 0.25  # of its box: what fills less is a frame around something
     most: int = 32  # candidates of a keyframe, the largest first
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
-    segments: SegmentConfig = field(default_factory=SegmentConfig)
+    segments: GeometricSegmentationConfig = field(default_factory=GeometricSegmentationConfig)
 
     def __post_init__(self) -> None:
         shares = self.sure, self.same_iou, self.fits_iou, self.alike_iou, self.explained
@@ -59,7 +59,7 @@ class TriggerConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Candidate:
+class RegionProposal:
     """A region that nobody has a reliable name for, or that the detector is sure of.
 
     box_px [4], x0 y0 x1 y1; part, what of the box it is; number, label and score of the detector's
@@ -74,17 +74,17 @@ class Candidate:
     kind: str = ""
 
 
-def candidates(
+def propose_regions(
     boxes_px: np.ndarray,
     labels: Sequence[str],
     scores: np.ndarray,
     depth_m: np.ndarray,
     camera: Camera,
     is_labelled: np.ndarray,
-    found: Sequence[Candidate],
+    found: Sequence[RegionProposal],
     room: Sequence[Foreground],
-    config: TriggerConfig,
-) -> list[Candidate]:
+    config: RegionProposalConfig,
+) -> list[RegionProposal]:
     """Regions of a keyframe that a labeller should see, and those that the detector is sure of, to
     be followed; the largest first.
 
@@ -122,10 +122,10 @@ def _boxed(
     scores: np.ndarray,
     depth_m: np.ndarray,
     camera: Camera,
-    found: Sequence[Candidate],
+    found: Sequence[RegionProposal],
     room: Sequence[Foreground],
-    config: TriggerConfig,
-) -> tuple[list[Candidate], list[bool]]:
+    config: RegionProposalConfig,
+) -> tuple[list[RegionProposal], list[bool]]:
     """Boxes of a detector: each is the region that fits it best, else its foreground without the
     room, if that leaves enough to show. And which regions these are."""
     asked, is_taken, pieces = [], [False] * len(found), None
@@ -140,20 +140,20 @@ def _boxed(
             continue
         pieces = pieces or surfaces(depth_m, camera, config.foreground)
         part = foreground(boxes_px[i], depth_m, pieces, camera, config.foreground)
-        whole = Candidate(boxes_px[i], part, label, score, i)
-        cut = replace(whole, part=without_room(part, room, config.foreground.min_inside))
+        whole = RegionProposal(boxes_px[i], part, label, score, i)
+        cut = replace(whole, part=remove_structure(part, room, config.foreground.min_inside))
         asked.append(cut if _is_worth_a_look(cut, depth_m.shape, config) else whole)
     return asked, is_taken
 
 
-def without_room(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
+def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
     """Without those planes of the room that mostly go on outside of it: a wall between the leaves
     of a plant, a floor between the legs of a table. Where that is most of it, as of a clock on its
     wall, it stays whole. `inside`: share of a plane within the box, to be a part of the thing.
 
     >>> plant, wall = np.ones((2, 4), bool), np.zeros((6, 8), bool)
     >>> wall[:, 3:] = True
-    >>> without_room(Foreground(2, 1, plant), [Foreground(0, 0, wall)], 0.5).mask[0].tolist()
+    >>> remove_structure(Foreground(2, 1, plant), [Foreground(0, 0, wall)], 0.5).mask[0].tolist()
     [True, True, False, False]
     """
     mask = part.mask.copy()
@@ -166,12 +166,12 @@ def without_room(part: Foreground, room: Sequence[Foreground], inside: float) ->
     return Foreground(part.row, part.column, mask) if is_most_left else part
 
 
-def named_objects(
+def labeled_regions(
     boxes_px: np.ndarray,
     is_labelled: np.ndarray,
-    found: Sequence[Candidate],
-    config: TriggerConfig,
-) -> list[Candidate]:
+    found: Sequence[RegionProposal],
+    config: RegionProposalConfig,
+) -> list[RegionProposal]:
     """Those of the regions `found` that the map has a reliable name for, is_labelled [H, W] bool,
     and no box [M, 4] is drawn about; but for what stands on a thing, which is a candidate."""
     return [
@@ -184,14 +184,14 @@ def named_objects(
 
 
 def regions_of_image(
-    found: Sequence[Segment], shape: tuple[int, ...], config: TriggerConfig
-) -> list[Candidate]:
+    found: Sequence[Segment], shape: tuple[int, ...], config: RegionProposalConfig
+) -> list[RegionProposal]:
     """The segments that a labeller could tell from an image [H, W], each once. What stands on a
     thing is no part of it."""
-    out: list[Candidate] = []
+    out: list[RegionProposal] = []
     for kind in _ORDER:
         for segment in found:
-            one = Candidate(segment.part.box_px, segment.part, kind=segment.kind)
+            one = RegionProposal(segment.part.box_px, segment.part, kind=segment.kind)
             if segment.kind != kind or not _is_worth_a_look(one, shape, config):
                 continue
             if np.all(_ious(_boxes(out), one.box_px) < config.alike_iou):
@@ -200,18 +200,20 @@ def regions_of_image(
     return [_without(one, stands) if one.kind == "apart" and stands.any() else one for one in out]
 
 
-def _without(one: Candidate, others: np.ndarray) -> Candidate:
+def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
     """Its part but for the pixels of others [H, W] bool."""
     part, (height, width) = one.part, one.part.mask.shape
     here = others[part.row : part.row + height, part.column : part.column + width]
     return replace(one, part=Foreground(part.row, part.column, part.mask & ~here))
 
 
-def distinct_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConfig) -> list[int]:
+def distinct_boxes(
+    boxes_px: np.ndarray, scores: np.ndarray, config: RegionProposalConfig
+) -> list[int]:
     """Of the same thing the best of them.
 
     >>> boxes = np.array([[0, 0, 10, 10], [1, 0, 10, 10], [20, 0, 30, 10.0]])
-    >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), TriggerConfig())
+    >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), RegionProposalConfig())
     [0, 2]
     """
     kept: list[int] = []
@@ -221,7 +223,9 @@ def distinct_boxes(boxes_px: np.ndarray, scores: np.ndarray, config: TriggerConf
     return kept
 
 
-def _is_worth_a_look(candidate: Candidate, shape: tuple[int, ...], config: TriggerConfig) -> bool:
+def _is_worth_a_look(
+    candidate: RegionProposal, shape: tuple[int, ...], config: RegionProposalConfig
+) -> bool:
     width, height = candidate.box_px[2:] - candidate.box_px[:2]
     size_px = np.count_nonzero(candidate.part.mask)
     is_object = size_px <= config.max_share * shape[0] * shape[1]
@@ -254,6 +258,6 @@ def _areas(boxes_px: np.ndarray) -> np.ndarray:
     return (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
 
 
-def _boxes(found: Sequence[Candidate]) -> np.ndarray:
+def _boxes(found: Sequence[RegionProposal]) -> np.ndarray:
     """[M, 4]"""
     return np.array([one.box_px for one in found], float).reshape(-1, 4)

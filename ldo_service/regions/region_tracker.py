@@ -21,27 +21,27 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
 from .region import (
-    Answer,
     Region,
-    Sighting,
+    RegionLabelResult,
+    RegionObservation,
     Votes,
-    favourite,
-    packed,
-    seen_again,
-    sighting_of,
-    unpacked,
+    merge_observation,
+    observe_region,
+    pack,
+    unpack,
+    winning_label,
     with_vote,
     with_votes_of,
 )
-from .region_matching import KnownRegions
-from .region_proposals import Candidate
+from .region_matching import RegionMatcher
+from .region_proposals import RegionProposal
 from .region_views import RegionView, ViewConfig, region_view
 
-MOST_VIEWS = 8  # of a region, that a request has room for
+MAX_VIEWS = 8  # of a region, that a request has room for
 
 
 @dataclass(frozen=True, slots=True)
-class RegionConfig:
+class RegionTrackerConfig:
     views: int = 5  # the best, shown to the labeller
     views_first: int = 2  # before it is asked at all: a single glimpse may be a flaw of depth
     patience: int = 3  # keyframes without a better view, before it is asked: one may yet come
@@ -96,8 +96,8 @@ class RegionConfig:
                 named(self, "views", "views_first", "gain")
                 + ": views_first at most views, gain over 1."
             )
-        if self.views > MOST_VIEWS:
-            raise ConfigError(f"views={self.views}: a labeller is shown up to {MOST_VIEWS}.")
+        if self.views > MAX_VIEWS:
+            raise ConfigError(f"views={self.views}: a labeller is shown up to {MAX_VIEWS}.")
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
             raise ConfigError(
                 named(self, "overlap", "max_gap_m", "least_points")
@@ -116,33 +116,33 @@ class RegionConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Question:
+class RegionRequest:
     """A region to be asked about now, as it was at its best."""
 
     region: Region
-    candidate: Candidate
+    candidate: RegionProposal
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Opinion:
+class RegionLabel:
     """What is known of a region that is seen again, after a labeller has spoken, 0..1 `sure`."""
 
-    of: Candidate
+    of: RegionProposal
     label: str
     sure: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sightings:
-    questions: list[Question]
-    opinions: list[Opinion]
+class RegionUpdate:
+    questions: list[RegionRequest]
+    opinions: list[RegionLabel]
 
 
-class RegionsToName:
+class RegionTracker:
     """Bounded; the same keyframes give the same questions."""
 
-    def __init__(self, config: RegionConfig | None = None) -> None:
-        self.config = config or RegionConfig()
+    def __init__(self, config: RegionTrackerConfig | None = None) -> None:
+        self.config = config or RegionTrackerConfig()
         self._regions: dict[int, Region] = {}  # the one seen last comes last
         self._next_id = 0
         self._allowed = 0.0  # questions
@@ -154,16 +154,16 @@ class RegionsToName:
         """None when it was forgotten."""
         return self._regions.get(region)
 
-    def see(
+    def observe_keyframe(
         self,
         keyframe: int,
-        found: Sequence[Candidate],
+        found: Sequence[RegionProposal],
         color: np.ndarray,
         depth_m: np.ndarray,
         camera: Camera,
         T_map_keyframe: Mapping[int, np.ndarray],
-        named: Sequence[Candidate] = (),
-    ) -> Sightings:
+        named: Sequence[RegionProposal] = (),
+    ) -> RegionUpdate:
         """Take note of a keyframe's candidates: those regions that are to be asked about now, and
         what was said before of those that have an answer.
 
@@ -171,46 +171,48 @@ class RegionsToName:
         those of earlier sightings, as they are now; `named`: objects that the map has a name for,
         of which nobody is asked.
         """
-        config, told, taken = self.config, list[tuple[int, Candidate]](), set[int]()
+        config, told, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
-        known = KnownRegions(regions, *place, config.max_gap_m, config.least_points)
+        known = RegionMatcher(regions, *place, config.max_gap_m, config.least_points)
         for candidate in found:
-            sighting = sighting_of(keyframe, candidate, depth_m, camera)
+            sighting = observe_region(keyframe, candidate, depth_m, camera)
             if sighting is None:
                 continue
             region = self._same(sighting, known, taken) or self._new(sighting)
             taken.add(region.id)
-            region = seen_again(region, sighting, config.most_boxes)
+            region = merge_observation(region, sighting, config.most_boxes)
             if candidate.score < config.settled:
                 args = keyframe, color, depth_m, camera, candidate.box_px, candidate.part
                 region = self._with_view(region, sighting, region_view(*args, config.view))
             self._keep(region)
             told.append((region.id, candidate))
         for candidate in named:
-            sighting = sighting_of(keyframe, candidate, depth_m, camera)
+            sighting = observe_region(keyframe, candidate, depth_m, camera)
             region = sighting and self._same(sighting, known, taken)
-            if sighting and region and self._told(region)[0]:
+            if sighting and region and self._label_of(region)[0]:
                 taken.add(region.id)
-                self._keep(seen_again(region, sighting, config.most_boxes))
+                self._keep(merge_observation(region, sighting, config.most_boxes))
                 told.append((region.id, candidate))
-        told += self._carried(known, taken)
+        told += self._propagated(known, taken)
         opinions = self._opinions(told, known)
         questions = self._questions(keyframe, T_map_keyframe)
         self._forget()
-        return Sightings(questions, opinions)
+        return RegionUpdate(questions, opinions)
 
     def _same(
-        self, sighting: Sighting, known: KnownRegions, taken: Collection[int]
+        self, sighting: RegionObservation, known: RegionMatcher, taken: Collection[int]
     ) -> Region | None:
         same = known.same(sighting, self.config.overlap, taken)
         return None if same is None else self._regions[same]
 
-    def _carried(self, known: KnownRegions, taken: Collection[int]) -> list[tuple[int, Candidate]]:
+    def _propagated(
+        self, known: RegionMatcher, taken: Collection[int]
+    ) -> list[tuple[int, RegionProposal]]:
         """Regions that have a name and are seen, and were not set apart."""
-        found: list[tuple[int, Candidate]] = []
+        found: list[tuple[int, RegionProposal]] = []
         for number in known.seen():
             region = self._regions[number]
-            label, sure = self._told(region)
+            label, sure = self._label_of(region)
             if number in taken or not label or sure < self.config.least_carried:
                 continue
             if len(found) == self.config.most_carried:
@@ -218,16 +220,16 @@ class RegionsToName:
             part = known.carried(number)
             if part is not None:
                 self._keep(region)
-                found.append((number, Candidate(part.box_px, part)))
+                found.append((number, RegionProposal(part.box_px, part)))
         return found
 
     def _opinions(
-        self, shown: Sequence[tuple[int, Candidate]], known: KnownRegions
-    ) -> list[Opinion]:
+        self, shown: Sequence[tuple[int, RegionProposal]], known: RegionMatcher
+    ) -> list[RegionLabel]:
         """What is to be said of those that a labeller has given a name: boxes alone are told
         anyway, where they are."""
         regions = [(self._regions[number], of) for number, of in shown]
-        named = [(region, of) for region, of in regions if self._told(region)[0]]
+        named = [(region, of) for region, of in regions if self._label_of(region)[0]]
         overlaps = known.overlaps([(region.id, of.part) for region, of in named])
         opinions = []
         for (region, of), row in zip(named, overlaps, strict=True):
@@ -235,8 +237,8 @@ class RegionsToName:
             for (other, _), share in zip(named, row.tolist(), strict=True):
                 if share > 0 and other.is_standing == region.is_standing:
                     votes = with_votes_of(votes, other.votes, share)
-            label, sure = favourite(votes, self.config.least_votes)
-            opinions.append(Opinion(of, label, sure))
+            label, sure = winning_label(votes, self.config.least_votes)
+            opinions.append(RegionLabel(of, label, sure))
         return opinions
 
     def shown_in(self, region: int) -> tuple[int, ...]:
@@ -251,69 +253,71 @@ class RegionsToName:
         depth_m: np.ndarray,
         camera: Camera,
         T_map_keyframe: Mapping[int, np.ndarray],
-    ) -> Opinion | None:
+    ) -> RegionLabel | None:
         """The name of a region, and what an earlier keyframe shows of it; None where it has none,
-        or is not seen. Arguments as for `see`."""
+        or is not seen. Arguments as for `observe_keyframe`."""
         known, config = self._regions.get(region), self.config
-        label, sure = self._told(known) if known else ("", 0.0)
+        label, sure = self._label_of(known) if known else ("", 0.0)
         if known is None or not label:
             return None
         place = keyframe, depth_m, camera, T_map_keyframe
-        seen = KnownRegions([known], *place, config.max_gap_m, config.least_points)
+        seen = RegionMatcher([known], *place, config.max_gap_m, config.least_points)
         part = seen.carried(region) if [*seen.seen()] else None
-        return part and Opinion(Candidate(part.box_px, part), label, sure)
+        return part and RegionLabel(RegionProposal(part.box_px, part), label, sure)
 
-    def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[Question]:
+    def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[RegionRequest]:
         """About the regions that are due, those with most to show first, as many as are allowed."""
         config = self.config
         self._allowed = min(self._allowed + config.per_keyframe, float(config.at_once))
         due = [r for r in self._regions.values() if self._is_due(r, now, T_map_keyframe)]
-        due.sort(key=lambda region: -region.gained() * _worth(region))
+        due.sort(key=lambda region: -region.view_quality_gain() * _worth(region))
         asked = [self._asked(region) for region in due[: int(self._allowed)]]
         self._allowed -= len(asked)
         return asked
 
-    def _asked(self, region: Region) -> Question:
+    def _asked(self, region: Region) -> RegionRequest:
         quality = sum(view.quality for view in region.views)
         shape = region.best if region.best and region.questions == 0 else region.shape
         region = replace(region, questions=region.questions + 1, quality=quality, shape=shape)
         self._regions[region.id] = region
         best = region.best
         assert best is not None
-        return Question(replace(region, keyframe=best.keyframe, box_px=best.box_px), best.candidate)
+        return RegionRequest(
+            replace(region, keyframe=best.keyframe, box_px=best.box_px), best.candidate
+        )
 
     def _keep(self, region: Region) -> None:
         """As the one seen last."""
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
 
-    def _told(self, region: Region) -> tuple[str, float]:
+    def _label_of(self, region: Region) -> tuple[str, float]:
         """Its name, where a labeller has given it one."""
         return self.name(region) if region.answer and region.answer.label else ("", 0.0)
 
     def name(self, region: Region) -> tuple[str, float]:
         """By its own votes, and how sure; nothing where little speaks for it."""
-        return favourite(region.votes, self.config.least_votes)
+        return winning_label(region.votes, self.config.least_votes)
 
-    def answered(self, region: int, answer: Answer) -> str:
+    def answered(self, region: int, answer: RegionLabelResult) -> str:
         """The labeller has spoken of it; its name now. A confident answer needs no second one."""
         known = self._regions.get(region)
         if known is None:
             return answer.label
         votes = known.votes
-        for label, sure in ((answer.label, answer.sure), *answer.others):
+        for label, sure in ((answer.label, answer.confidence), *answer.others):
             votes = with_vote(votes, label, sure, self.config.answer_weight)
-        is_surer = answer.sure > (known.answer.sure if known.answer else 0)
+        is_surer = answer.confidence > (known.answer.confidence if known.answer else 0)
         surest = replace(answer, others=()) if is_surer else known.answer
         known = replace(known, votes=votes, answer=surest)
         self._regions[region] = known
         return self.name(known)[0]
 
-    def _new(self, seen: Sighting) -> Region:
+    def _new(self, seen: RegionObservation) -> Region:
         self._next_id += 1
         return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen)
 
-    def _with_view(self, region: Region, sighting: Sighting, view: RegionView) -> Region:
+    def _with_view(self, region: Region, sighting: RegionObservation, view: RegionView) -> Region:
         if view.quality < self.config.least_quality:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
@@ -329,12 +333,15 @@ class RegionsToName:
         if len(region.views) < self.config.views_first:
             return False
         is_still = now - best.keyframe >= self.config.patience
-        is_better = region.gained() >= (self.config.gain - 1) * region.quality
+        is_better = region.view_quality_gain() >= (self.config.gain - 1) * region.quality
         return is_still and (region.questions == 0 or is_better)
 
     def _is_settled(self, region: Region) -> bool:
         """Somebody was sure of it."""
-        return max(region.score, region.answer.sure if region.answer else 0) >= self.config.settled
+        return (
+            max(region.score, region.answer.confidence if region.answer else 0)
+            >= self.config.settled
+        )
 
     def _forget(self) -> None:
         while len(self._regions) > self.config.most:
@@ -343,15 +350,15 @@ class RegionsToName:
     @property
     def packed(self) -> dict[str, Any]:
         """Plain values, bytes and lists, for a state."""
-        regions = [packed(region) for region in self._regions.values()]
+        regions = [pack(region) for region in self._regions.values()]
         return {"next_id": self._next_id, "allowed": self._allowed, "regions": regions}
 
     @staticmethod
-    def unpacked(packed: dict[str, Any], config: RegionConfig) -> "RegionsToName":
+    def unpack(packed: dict[str, Any], config: RegionTrackerConfig) -> "RegionTracker":
         """As it was."""
-        out = RegionsToName(config)
+        out = RegionTracker(config)
         out._next_id, out._allowed = packed["next_id"], packed["allowed"]
-        out._regions = {row["id"]: unpacked(row) for row in packed["regions"]}
+        out._regions = {row["id"]: unpack(row) for row in packed["regions"]}
         return out
 
 

@@ -88,8 +88,8 @@ def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig
 
 def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
     """v / (v + sharp), v the variance of the Laplacian (Pech-Pacheco et al., ICPR 2000)."""
-    grey = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
-    variance = float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    gray = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
+    variance = float(cv2.Laplacian(gray, cv2.CV_64F).var())
     return variance / (variance + config.sharp)
 
 

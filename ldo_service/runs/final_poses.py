@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.se3 import blended
+from ldo_service.geometry.se3 import interpolate
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class FinalPoses:
             after.append(self._seen_from(b, frame, T_map))
             shares.append(share)
         T_a, T_b = (np.array(T).reshape(-1, 4, 4) for T in (before, after))
-        return blended(T_a, T_b, np.array(shares, float))
+        return interpolate(T_a, T_b, np.array(shares, float))
 
     def _around(
         self, frame: TrackedFrame

@@ -26,10 +26,10 @@ from .records import read_loops
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
     """All that is judged of a run; one that localised has no map of its own."""
-    frames = _frames(written(folder, "frames.csv"))
+    frames = _frames(require_file(folder, "frames.csv"))
     estimates = {
-        "online": Trajectory.load(written(folder, "trajectory_online.txt")),
-        "final": Trajectory.load(written(folder, "trajectory.txt")),
+        "online": Trajectory.load(require_file(folder, "trajectory_online.txt")),
+        "final": Trajectory.load(require_file(folder, "trajectory.txt")),
     }
     if not has_map:
         return FinishedRun(folder, frames, estimates, ())
@@ -62,7 +62,7 @@ def has_refined(folder: Path) -> bool:
     return (folder / REFINED / "map.ply").is_file()
 
 
-def written(folder: Path, name: str) -> Path:
+def require_file(folder: Path, name: str) -> Path:
     """A file that every run writes."""
     if not (folder / name).is_file():
         raise DataError(f"{folder} has no {name}: is it what `ldo run` wrote?")
@@ -99,7 +99,7 @@ class MapFolder:
 
     def trajectory(self) -> Trajectory:
         """T_map_camera of every frame that has a pose, after the last correction."""
-        return Trajectory.load(written(self.folder, "trajectory.txt"))
+        return Trajectory.load(require_file(self.folder, "trajectory.txt"))
 
     def viewpoints(self) -> list[Viewpoint]:
         """Where the keyframes were taken that are in the map's frame."""
@@ -135,7 +135,7 @@ def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
 @contextmanager
 def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     """Where keyframes.json is and what it holds; what makes no sense is the file's fault."""
-    path = written(folder, "keyframes.json")
+    path = require_file(folder, "keyframes.json")
     try:
         yield path, json.loads(path.read_text())
     except OSError as error:

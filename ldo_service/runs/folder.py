@@ -31,8 +31,8 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.tracker import TrackerConfig
-from ldo_service.conversions.frames import keyframe_of
-from ldo_service.conversions.poses import keyframe_poses_of, transform
+from ldo_service.conversions.frames import keyframe_from_message
+from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.file_formats import write_ply
 from ldo_service.geometry import Trajectory
@@ -56,7 +56,11 @@ from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
 from ldo_service.storage.state_codec import encode_state
 from ldo_service.tracking import OdometryConfig
-from ldo_service.tracking.keyframe_database import PLACES, Places, place_of
+from ldo_service.tracking.keyframe_database import (
+    DATABASE_FILE,
+    KeyframeDatabase,
+    make_keyframe_record,
+)
 
 from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
 from .front_end import FRONT_END
@@ -78,7 +82,7 @@ WRITTEN = frozenset(
     {
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
         *(
-            PLACES,
+            DATABASE_FILE,
             OBJECTS,
             LOOPS,
             FRONT_END,
@@ -100,17 +104,19 @@ COLUMNS = (
 )
 
 
-class PlaceRecord:
+class DatabaseWriter:
     """Places of the keyframes that it is shown: no more than `places.count`, 0.13 MB each."""
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
-        self._places = Places()
+        self._places = KeyframeDatabase()
 
     def add(self, message: Keyframe) -> None:
         config = self._config
-        place = place_of(keyframe_of(message, config.pyramid), config.features, config.places)
-        self._places = self._places.added(place, config.places)
+        place = make_keyframe_record(
+            keyframe_from_message(message, config.pyramid), config.features, config.places
+        )
+        self._places = self._places.with_record(place, config.places)
 
     def save(self, path: Path, poses: KeyframePoses, joined: dict[int, int]) -> None:
         """Those that are in the map's frame, with T_map_keyframe for T_odom_keyframe."""
@@ -145,13 +151,13 @@ def prepare(folder: Path, overwrite: bool) -> None:
         raise ConfigError(f"{folder} cannot be written: {error.strerror}.") from error
 
 
-class RunFolder:
+class RunWriter:
     """Observes what the actors make; `close` writes what is only known at the end."""
 
     def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
         self.folder, self._hold_out = folder, tracker.hold_out
         self._makes_map = not tracker.localise
-        self._places = PlaceRecord(tracker.odometry)
+        self._places = DatabaseWriter(tracker.odometry)
         (folder / "config.yaml").write_text(config_text)
         self._csv_file = (folder / "frames.csv").open("w", newline="")
         self._csv = csv.writer(self._csv_file)
@@ -182,7 +188,7 @@ class RunFolder:
                 self._observe_keyframe(message)
             case Correction():
                 self.loops.observe(message, step_ms)
-                self._poses.correct(message.graph_version, keyframe_poses_of(message))
+                self._poses.correct(message.graph_version, keyframe_poses_from_correction(message))
                 self._joined = dict(message.joined)
             case DetectionBoxes():
                 self.boxes += len(message.detections)
@@ -209,26 +215,26 @@ class RunFolder:
             )
         )
         if pose.status != "LOST":
-            online = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+            online = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
             self._tracked.append(
                 TrackedFrame(
                     pose.stamp_ns,
                     pose.reference,
-                    transform(pose.T_reference_camera),
+                    pose_from_message(pose.T_reference_camera),
                     online,
                     pose.segment,
                 )
             )
 
     def _observe_keyframe(self, keyframe: Keyframe) -> None:
-        self._poses.chain(
+        self._poses.add(
             keyframe.keyframe,
             keyframe.reference,
-            transform(keyframe.T_reference_keyframe),
-            transform(keyframe.T_odom_keyframe),
+            pose_from_message(keyframe.T_reference_keyframe),
+            pose_from_message(keyframe.T_odom_keyframe),
             keyframe.segment,
         )
-        T_reference_keyframe = transform(keyframe.T_reference_keyframe)
+        T_reference_keyframe = pose_from_message(keyframe.T_reference_keyframe)
         measured = MeasuredKeyframe(keyframe.stamp_ns, keyframe.keyframe, T_reference_keyframe)
         self._final_poses.add(measured, keyframe.reference)
         self._places.add(keyframe)
@@ -283,7 +289,7 @@ class RunFolder:
             write_semantics(folder / SEMANTICS, gaussians.labels[in_map], names)
         if self._objects is not None:
             write_objects(folder, self._placed_objects(self._objects))
-        self._places.save(self.folder / PLACES, self._poses, self._joined)
+        self._places.save(self.folder / DATABASE_FILE, self._poses, self._joined)
 
     def online(self) -> Trajectory:
         """T_map_camera as published at the time."""

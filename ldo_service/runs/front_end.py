@@ -25,7 +25,7 @@ from ldo_service.actors.tracker import Tracker
 from ldo_service.config import Config, recording_parameters
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.recordings.mcap_file import ABOUT, McapIndex, Place, RecordingFile
+from ldo_service.recordings.mcap_file import ABOUT, McapIndex, MessageLocation, RecordingFile
 from ldo_service.schemas import Message, decode
 from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW, POSE_TRACKED
 
@@ -130,7 +130,7 @@ class FrontEnd:
             yield self._messages(list(places))
             tick += 1
 
-    def _messages(self, places: list[Place]) -> tuple[Message, ...]:
+    def _messages(self, places: list[MessageLocation]) -> tuple[Message, ...]:
         try:
             return tuple(decode(self._index.body(p), MESSAGES[p.topic]) for p in places)
         except (msgspec.DecodeError, LookupError, OSError) as error:

@@ -23,7 +23,7 @@ class Advance(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Job:
+class RunOptions:
     """A sequence and which of its frames, the configuration, where the results go, who is warned,
     how many iterations refine the map after the last frame, and where another odometry had the
     robot's base; a front end that another run kept, in place of one over the frames, or whether to

@@ -13,16 +13,16 @@ from ldo_service.errors import DataError
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import MapRefine, Message
 
-from .folder import RunFolder
+from .folder import RunWriter
 from .front_end import ACTORS, FrontEnd, FrontEndRecord
-from .job import REFINE_ITERATIONS, Advance, Job, requests
-from .source import Reader, with_prior
-from .summary import Percentiles, Usage, percentiles, summarise
+from .job import REFINE_ITERATIONS, Advance, RunOptions, requests
+from .source import FrameReader, interleave_prior
+from .summary import Percentiles, Usage, percentiles, summarize
 
 LAST_RATE = 0.05  # of the steps when the map is refined: they shrink so far, to settle
 
 
-def run_over_file(job: Job, advance: Advance) -> RunFolder:
+def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
     """Run every actor over the chosen frames, fit the map again where corrections have torn it, and
     write the folder; then refine the map, if asked.
 
@@ -30,7 +30,7 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
     fails leaves what it has done, and its summary says so. Raises DataError when nothing or too
     little can be read, and StageError when an actor fails.
     """
-    with FileRun(job, advance) as run:
+    with OfflineRun(job, advance) as run:
         try:
             run.stream()
             run.repair()
@@ -42,10 +42,10 @@ def run_over_file(job: Job, advance: Advance) -> RunFolder:
     return run.record
 
 
-class FileRun:
+class OfflineRun:
     """The parts of a run, for a context: `stream`, `repair`, `close`, `refine`."""
 
-    def __init__(self, job: Job, advance: Advance) -> None:
+    def __init__(self, job: RunOptions, advance: Advance) -> None:
         self._job, self._advance, self._work = job, advance, job.work
         self._frames = job.selection.indices(job.sequence)
         config = with_all_cores(job.config)
@@ -56,15 +56,15 @@ class FileRun:
             if not (job.front_end and actor.name in ACTORS)
         ]
         self._actors = {actor.name: actor for actor in actors}
-        self._reader = Reader(job.sequence, self._frames, job.warn)
-        self.record = RunFolder(job.folder, config_yaml(job.config), parameters.tracker)
+        self._reader = FrameReader(job.sequence, self._frames, job.warn)
+        self.record = RunWriter(job.folder, config_yaml(job.config), parameters.tracker)
         self._kept: FrontEndRecord | None = None
         self._clock = LogicalClock(actors, latency_frames(config), self._observe)
         self._started = Usage.now()
         self._stage_ms: dict[str, Percentiles] = {}
         self._is_finished = False
 
-    def __enter__(self) -> "FileRun":
+    def __enter__(self) -> "OfflineRun":
         self._clock.__enter__()
         return self
 
@@ -74,7 +74,7 @@ class FileRun:
     def stream(self) -> None:
         """Take every frame."""
         job = self._job
-        frames = with_prior(self._reader, job.prior)
+        frames = interleave_prior(self._reader, job.prior)
         with ExitStack() as kept:
             if job.keep_front_end:
                 record = FrontEndRecord(job.folder, job.config, job.sequence, job.selection)
@@ -85,7 +85,7 @@ class FileRun:
 
     def repair(self) -> None:
         """Fit the map again where corrections have torn it."""
-        if due := int(self._actors["mapper"].facts()["iterations_due"]):
+        if due := int(self._actors["mapper"].metrics()["iterations_due"]):
             self._work += requests(due)
             self._run(refinements(due, self.record.newest_stamp_ns))
         self._is_finished = True
@@ -93,10 +93,10 @@ class FileRun:
     def close(self) -> None:
         """Write what there is."""
         used = Usage.now().since(self._started)
-        facts = self._actors["optimizer"].facts() | self._actors["mapper"].facts()
+        facts = self._actors["optimizer"].metrics() | self._actors["mapper"].metrics()
         stage_ms = self._stage_ms or self._step_percentiles()
         frames, rejected = len(self._frames), self._rejected()
-        summary = summarise(self.record, used, frames, rejected, stage_ms, {}, facts)
+        summary = summarize(self.record, used, frames, rejected, stage_ms, {}, facts)
         self.record.close({**summary, "interrupted": not self._is_finished})
 
     def refine(self) -> None:
@@ -124,7 +124,7 @@ class FileRun:
     def _rejected(self) -> int:
         if self._job.front_end:
             return self._job.front_end.rejected
-        by_source = int(self._actors["frame_source"].facts()["frames_rejected"])
+        by_source = int(self._actors["frame_source"].metrics()["frames_rejected"])
         return self._reader.rejected + by_source
 
     def _step_percentiles(self) -> dict[str, Percentiles]:
@@ -153,7 +153,7 @@ def refinements(iterations: int, stamp_ns: int) -> Iterator[MapRefine]:
         )
 
 
-def require_usable(record: RunFolder, max_rejected: float) -> None:
+def require_usable(record: RunWriter, max_rejected: float) -> None:
     """Raise DataError when more than this share of the frames could not be used."""
     frames, rejected = record.summary["frames"], record.summary["frames_rejected"]
     if rejected > max_rejected * frames:

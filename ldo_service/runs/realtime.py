@@ -6,25 +6,25 @@ from collections.abc import Sequence as Ordered
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ldo_service.actors.topology import GRAPH, Box
+from ldo_service.actors.topology import GRAPH, ActorSpec
 from ldo_service.config import actor_parameters, config_yaml, stage_parameters
 from ldo_service.errors import ConfigError
 from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.schemas import Health, decode, encode
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR, Topic
 from ldo_service.transport.flow_control import Header, data_key, encode_link
 from ldo_service.transport.interface import MemoryTransport
 
-from .folder import RunFolder
-from .job import Advance, Job
+from .folder import RunWriter
+from .job import Advance, RunOptions
 from .offline import require_usable
-from .source import Reader, with_prior
-from .summary import Usage, summarise
+from .source import FrameReader, interleave_prior
+from .summary import Usage, summarize
 
 
-def run_in_real_time(job: Job, advance: Advance) -> RunFolder:
+def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
     """Like `run_over_file`, with the stages and policies of the service, all in this process.
 
     A frame that comes before the tracker is done with the last one is dropped and counted, so the
@@ -38,22 +38,22 @@ def run_in_real_time(job: Job, advance: Advance) -> RunFolder:
 
 
 class _RealTimeRun:
-    def __init__(self, job: Job, folder: Path, advance: Advance) -> None:
+    def __init__(self, job: RunOptions, folder: Path, advance: Advance) -> None:
         self._sequence, self._advance = job.sequence, advance
         self._prior = job.prior
         self._config = job.config.with_map_folder(folder)
         self._indices = job.selection.indices(job.sequence)
-        self._reader = Reader(job.sequence, self._indices, job.warn)
+        self._reader = FrameReader(job.sequence, self._indices, job.warn)
         tracker = actor_parameters(job.config).tracker
-        self._record = RunFolder(job.folder, config_yaml(job.config), tracker)
+        self._record = RunWriter(job.folder, config_yaml(job.config), tracker)
         self._step_ms: dict[str, float] = {}
 
-    async def go(self) -> RunFolder:
+    async def go(self) -> RunWriter:
         transport = MemoryTransport()
         stages = [self._stage(box, transport) for box in GRAPH]
         for topic in _made_topics():
             self._observe(topic, transport)
-        stop = Stop()
+        stop = StopRequest()
         started = Usage.now()
         async with asyncio.TaskGroup() as group:
             service = supervise(stages, stop, self._config.service.shutdown_timeout_s)
@@ -61,11 +61,11 @@ class _RealTimeRun:
             feeding = group.create_task(self._feed(transport))
             await asyncio.wait({running, feeding}, return_when=asyncio.FIRST_COMPLETED)
             feeding.cancel()
-            stop.ask()
+            stop.request()
         used = Usage.now().since(started)
         return self._close(used, [stage.health() for stage in stages])
 
-    def _stage(self, box: Box, transport: MemoryTransport) -> Stage:
+    def _stage(self, box: ActorSpec, transport: MemoryTransport) -> Stage:
         make = box.make
         assert make is not None
         parameters = actor_parameters(self._config)
@@ -91,7 +91,7 @@ class _RealTimeRun:
         odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])
         started_s = time.monotonic()
-        batches = with_prior(self._reader, self._prior)
+        batches = interleave_prior(self._reader, self._prior)
         number = poses = 0
         while (batch := await asyncio.to_thread(next, batches, None)) is not None:
             *prior, frame = batch
@@ -106,7 +106,7 @@ class _RealTimeRun:
             number += 1
             self._advance(number + self._reader.rejected)
 
-    def _close(self, used: Usage, healths: Ordered[Health]) -> RunFolder:
+    def _close(self, used: Usage, healths: Ordered[Health]) -> RunWriter:
         rejected = self._reader.rejected + sum(
             int(health.facts.get("frames_rejected", 0)) for health in healths
         )
@@ -119,7 +119,7 @@ class _RealTimeRun:
             if health.actor in ("optimizer", "mapper")
             for name, value in health.facts.items()
         }
-        self._record.close(summarise(self._record, used, frames, rejected, stage_ms, drops, facts))
+        self._record.close(summarize(self._record, used, frames, rejected, stage_ms, drops, facts))
         require_usable(self._record, self._config.offline.max_rejected_ratio)
         return self._record
 

@@ -31,9 +31,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import DataError
-from ldo_service.evaluation.loops import FoundLoops, LoopClosed, PairCompared
+from ldo_service.evaluation.loops import ComparedPair, FoundLoops, LoopClosed
 from ldo_service.schemas import Correction, LoopCandidate, LoopClosure, MapObjects
 
 LOOPS = "loops.json"
@@ -102,7 +102,7 @@ def _closure(message: LoopClosure) -> dict[str, Any]:
     return {
         "keyframe": message.pose.keyframe,
         "reference": message.pose.reference,
-        "T_reference_keyframe": transform(message.pose.T_reference_keyframe).tolist(),
+        "T_reference_keyframe": pose_from_message(message.pose.T_reference_keyframe).tolist(),
         "information": np.reshape(message.pose.information, (6, 6)).tolist(),
         "overlap": message.overlap,
         "rmse_m": message.rmse_m,
@@ -126,9 +126,9 @@ def read_loops(folder: Path) -> FoundLoops | None:
         raise DataError(f"{path} is not what `ldo run` writes: {error!r}.") from error
 
 
-def _compared(row: dict[str, Any]) -> PairCompared:
+def _compared(row: dict[str, Any]) -> ComparedPair:
     subgraphs = tuple(map(int, row["keyframes"])), tuple(map(int, row["references"]))
-    return PairCompared(*subgraphs, is_closure=not row["refused"], ms=row["ms"])
+    return ComparedPair(*subgraphs, is_closure=not row["refused"], ms=row["ms"])
 
 
 def _closed(row: dict[str, Any]) -> LoopClosed:

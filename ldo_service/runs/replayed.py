@@ -10,13 +10,13 @@ import msgspec
 import yaml
 
 from ldo_service import kernels, versions
-from ldo_service.actors.topology import box_named
+from ldo_service.actors.topology import actor_spec
 from ldo_service.config import Config, actor_parameters, config_of
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.recordings.recording import JournalFile, recorded_actors
-from ldo_service.recordings.replay import Replayed, replay
+from ldo_service.recordings.replay import ReplayReport, replay
 from ldo_service.runtime import Actor
-from ldo_service.storage.yaml_io import plain_values
+from ldo_service.storage.yaml_io import load_yaml
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,12 +30,12 @@ class RecordedActor:
     def steps(self) -> int:
         return sum(file.steps for file in self.files)
 
-    def replay(self, advance: Callable[[], None] = lambda: None) -> Replayed:
+    def replay(self, advance: Callable[[], None] = lambda: None) -> ReplayReport:
         """Feed it to a fresh actor; `advance` is called after each step."""
         with TemporaryDirectory(prefix="ldo-replay-") as folder:
             return replay(self.name, self.files, partial(self._make, Path(folder)), advance)
 
-    def verify(self) -> Replayed:
+    def verify(self) -> ReplayReport:
         """Replay. Raises ReplayDiverged, or DataError when something was not recorded."""
         replayed = self.replay()
         replayed.verify()
@@ -43,7 +43,7 @@ class RecordedActor:
 
     def _make(self, folder: Path, about: Mapping[str, str]) -> Actor:
         """One that keeps on disk what outlives it, as it did then, and not where it did."""
-        make = box_named(self.name).make
+        make = actor_spec(self.name).make
         assert make is not None
         config = _config_of(about)
         mapper = replace(config.mapper, image_folder=str(folder))
@@ -57,7 +57,7 @@ class RecordedActor:
 def _config_of(about: Mapping[str, str]) -> Config:
     """What the actor was configured with. Raises DataError."""
     try:
-        return config_of(plain_values(about.get("config", "")) or {})
+        return config_of(load_yaml(about.get("config", "")) or {})
     except yaml.YAMLError as error:
         raise DataError(f"the configuration in the recording cannot be read: {error}.") from error
 

@@ -12,11 +12,11 @@ from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Message, encode
 
 from .job import Advance
-from .source import Reader, Selection, Warn
+from .source import FrameReader, Selection, Warn
 
 
 @dataclass(frozen=True, slots=True)
-class Made:
+class ActorDigest:
     messages: int
     digest: str  # BLAKE2b of 16 bytes over the digests of all messages, in hexadecimal
 
@@ -32,22 +32,22 @@ class Digests:
         self._counts[actor] += 1
         self._states[actor].update(digest(encode(message)).encode())
 
-    def made(self) -> dict[str, Made]:
+    def made(self) -> dict[str, ActorDigest]:
         return {
-            actor: Made(count, self._states[actor].hexdigest())
+            actor: ActorDigest(count, self._states[actor].hexdigest())
             for actor, count in self._counts.items()
         }
 
 
 def simulate_graph(
     sequence: Sequence, config: Config, selection: Selection, warn: Warn, advance: Advance
-) -> dict[str, Made]:
+) -> dict[str, ActorDigest]:
     """By actor: what it made of the chosen frames.
 
     Independent of the machine's load and of the number of threads, see `runtime.logical_clock`.
     Raises DataError when no frame can be read, StageError when an actor fails.
     """
-    reader = Reader(sequence, selection.indices(sequence), warn)
+    reader = FrameReader(sequence, selection.indices(sequence), warn)
     actors = make_actors(actor_parameters(config))
     digests = Digests([actor.name for actor in actors])
     with LogicalClock(

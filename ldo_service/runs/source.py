@@ -10,15 +10,19 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig, joined
-from ldo_service.conversions.frames import camera_of, camera_rgbd_message, raw_frame_of
-from ldo_service.conversions.poses import pose_message
+from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig, join_halves
+from ldo_service.conversions.frames import (
+    camera_from_message,
+    raw_frame_from_message,
+    raw_frame_to_message,
+)
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import SequenceOptions, open_sequence
 from ldo_service.errors import ConfigError, DataError, FrameError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.geometry.stamps import Pairing
-from ldo_service.recordings.mcap_file import Place
+from ldo_service.geometry.stamps import StreamPairer
+from ldo_service.recordings.mcap_file import MessageLocation
 from ldo_service.recordings.recording import JournalFile, recorded_actors
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, Message, OdometryPrior, decode
 from ldo_service.schemas.message import LAST_INTEGER
@@ -54,7 +58,7 @@ class Selection:
         return chosen
 
 
-class Reader:
+class FrameReader:
     """Frames as camera messages, read ahead in a thread; bad ones are counted and left out."""
 
     def __init__(self, sequence: Sequence, indices: range, warn: Warn) -> None:
@@ -74,7 +78,7 @@ class Reader:
 
     def _read(self, index: int) -> CameraRgbd | None:
         try:
-            return camera_rgbd_message(self._sequence.read(index), compress_depth=False)
+            return raw_frame_to_message(self._sequence.read(index), compress_depth=False)
         except FrameError as error:
             if self.rejected == 0:
                 self._warn(f"{error} It is left out; further bad frames are only counted.")
@@ -82,7 +86,7 @@ class Reader:
             return None
 
 
-def with_prior(
+def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
     """Each frame behind the poses up to the first that is not before it, as they come live."""
@@ -97,7 +101,7 @@ def with_prior(
 
 
 def _prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
-    return OdometryPrior(stamp_ns=round(1e9 * stamp_s), T_odom_base=pose_message(T_odom_base))
+    return OdometryPrior(stamp_ns=round(1e9 * stamp_s), T_odom_base=pose_to_message(T_odom_base))
 
 
 def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> None:
@@ -117,11 +121,11 @@ def open_source(source: str, options: SequenceOptions | None = None) -> Sequence
 
 
 @dataclass(frozen=True, slots=True)
-class Stored:
+class RecordedMessage:
     """A message on the disk."""
 
     file: JournalFile
-    place: Place
+    place: MessageLocation
 
     @property
     def stamp_ns(self) -> int:
@@ -138,8 +142,8 @@ class Stored:
 class StoredFrame:
     """depth: None where colour is a whole frame."""
 
-    color: Stored
-    depth: Stored | None = None
+    color: RecordedMessage
+    depth: RecordedMessage | None = None
 
     def message(self, index: int) -> CameraRgbd | CameraColor:
         return self.color.message(CameraColor if self.depth else CameraRgbd, index)
@@ -147,9 +151,9 @@ class StoredFrame:
     def read(self, index: int) -> RawFrame:
         message = self.message(index)
         if isinstance(message, CameraRgbd):
-            return raw_frame_of(message, index)
+            return raw_frame_from_message(message, index)
         assert self.depth is not None
-        return replace(joined(message, self.depth.message(CameraDepth, index)), index=index)
+        return replace(join_halves(message, self.depth.message(CameraDepth, index)), index=index)
 
 
 class RecordingSequence(Sequence):
@@ -163,7 +167,9 @@ class RecordingSequence(Sequence):
         paths = recorded_actors(folder).get(FrameSource.name, [])
         self._frames: list[StoredFrame] = []
         files = map(JournalFile, paths)
-        for frame in _frames(Stored(file, place) for file in files for place in file.messages):
+        for frame in _frames(
+            RecordedMessage(file, place) for file in files for place in file.messages
+        ):
             last_ns = self._frames[-1].color.stamp_ns if self._frames else -1
             if last_ns < frame.color.stamp_ns <= LAST_INTEGER:
                 self._frames.append(frame)
@@ -179,7 +185,7 @@ class RecordingSequence(Sequence):
         """That of the first frame that can be read."""
         for index, frame in enumerate(self._frames):
             with suppress(FrameError):
-                return camera_of(frame.message(index).camera)
+                return camera_from_message(frame.message(index).camera)
         raise DataError(f"{folder}: none of its {len(self._frames)} frames can be read.")
 
     def read(self, index: int) -> RawFrame:
@@ -189,10 +195,12 @@ class RecordingSequence(Sequence):
         return None  # nobody told the robot
 
 
-def _frames(messages: Iterator[Stored]) -> Iterator[StoredFrame]:
+def _frames(messages: Iterator[RecordedMessage]) -> Iterator[StoredFrame]:
     config = FrameSourceConfig()
     skew_ns = round(config.max_skew_s * 1e9)
-    pairing: Pairing[Stored, Stored] = Pairing(skew_ns, config.pair_buffer)
+    pairing: StreamPairer[RecordedMessage, RecordedMessage] = StreamPairer(
+        skew_ns, config.pair_buffer
+    )
     for stored in messages:
         try:
             match stored.place.topic:

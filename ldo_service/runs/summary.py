@@ -11,7 +11,7 @@ import numpy as np
 
 from ldo_service import kernels, versions
 
-from .folder import RunFolder
+from .folder import RunWriter
 
 Percentiles = dict[str, float]  # p50, p95
 
@@ -31,8 +31,8 @@ class Usage:
         return replace(self, wall_s=self.wall_s - earlier.wall_s, cpu_s=self.cpu_s - earlier.cpu_s)
 
 
-def summarise(
-    record: RunFolder,
+def summarize(
+    record: RunWriter,
     used: Usage,
     frames: int,
     rejected: int,

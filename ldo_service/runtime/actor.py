@@ -33,24 +33,24 @@ class Lossless:
 
 @dataclass(frozen=True, slots=True)
 class Latest:
-    """The newest `keep` messages wait; older ones are dropped and counted.
+    """The newest `depth` messages wait; older ones are dropped and counted.
 
-    With `per_key`, the newest `keep` for each value of the topic's key, at most `max_keys` values:
+    With `per_key`, the newest `depth` for each value of the topic's key, at most `max_keys` values:
     the oldest value makes room for a new one.
     """
 
-    keep: int = 1
+    depth: int = 1
     per_key: bool = False
     max_keys: int = 32
 
     def __post_init__(self) -> None:
-        if self.keep < 1 or self.max_keys < 1:
+        if self.depth < 1 or self.max_keys < 1:
             raise ConfigError(
-                f"Latest(keep={self.keep}, max_keys={self.max_keys}): both must be at least 1."
+                f"Latest(keep={self.depth}, max_keys={self.max_keys}): both must be at least 1."
             )
 
     def __str__(self) -> str:
-        return f"Latest({self.keep} per key)" if self.per_key else f"Latest({self.keep})"
+        return f"Latest({self.depth} per key)" if self.per_key else f"Latest({self.depth})"
 
 
 Policy = Lossless | Latest
@@ -58,11 +58,11 @@ Policy = Lossless | Latest
 
 @dataclass(frozen=True, slots=True)
 class In:
-    """`goes_first`: what comes here is taken before all that waits at other inputs."""
+    """`has_priority`: what comes here is taken before all that waits at other inputs."""
 
     topic: Topic
     policy: Policy
-    goes_first: bool = False
+    has_priority: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.policy, Latest) and self.policy.per_key and self.topic.key is None:
@@ -71,22 +71,23 @@ class In:
 
 @dataclass(frozen=True, slots=True)
 class Out:
-    """`never_wait`: the actor looks at `room` before it makes a message, and never waits for it."""
+    """`is_nonblocking`: the actor looks at `credits` before it makes a message, and never waits for
+    it."""
 
     topic: Topic
-    never_wait: bool = False
+    is_nonblocking: bool = False
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
+class FlowStatus:
     """What an actor sees of the traffic around it; with the message, all that a step depends on.
 
     room     for each output that never waits: how many messages may be sent now
     waiting  for each lossless input: how many messages wait behind the one that is handled
     """
 
-    room: Mapping[Topic, int] = field(default_factory=dict)
-    waiting: Mapping[Topic, int] = field(default_factory=dict)
+    credits: Mapping[Topic, int] = field(default_factory=dict)
+    backlog: Mapping[Topic, int] = field(default_factory=dict)
 
 
 class Actor:
@@ -103,20 +104,20 @@ class Actor:
     is_prompt = False  # a robot waits for what it makes: its thread comes before those of others
 
     def __init__(self) -> None:
-        self.situation = Situation()
+        self.situation = FlowStatus()
 
-    def has_room(self, topic: Topic) -> bool:
-        return self.situation.room.get(topic, UNLIMITED) > 0
+    def has_credit(self, topic: Topic) -> bool:
+        return self.situation.credits.get(topic, UNLIMITED) > 0
 
     def handle(self, message: Any) -> Iterator[Message]:
         """What the actor makes of one message of its inputs."""
         raise NotImplementedError
 
-    def resumed(self) -> Iterator[Message]:
+    def on_restored(self) -> Iterator[Message]:
         """First words of a successor: what a predecessor may have left unsaid to those outside."""
         return iter(())
 
-    def finish(self) -> Iterator[Message]:
+    def on_stop(self) -> Iterator[Message]:
         """Last words before a soft stop. `finishes_last`: after all others have said theirs."""
         return iter(())
 
@@ -128,12 +129,12 @@ class Actor:
         """The same with nothing left for later, however long it takes; on request."""
         return self.snapshot()
 
-    def saved(self) -> None:
+    def on_saved(self) -> None:
         """The last snapshot or checkpoint is where a successor will find it."""
 
     def restore(self, state: State) -> None:
         """Go on from a predecessor's snapshot."""
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """What the actor counts itself, for its health message."""
         return {}

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from ldo_service.transport.flow_control import Grant
+from ldo_service.transport.flow_control import Credit
 
 from .actor import UNLIMITED
 
@@ -46,11 +46,11 @@ class Consumers:
         """Every message before has been handled by all."""
         return min((c.handled for c in self._known.values()), default=seq)
 
-    def have_all(self, seq: int) -> bool:
+    def all_received(self, seq: int) -> bool:
         """Whether everything sent has arrived everywhere."""
         return all(c.arrived >= seq for c in self._known.values())
 
-    def starts(self) -> dict[str, int]:
+    def next_seq_by_consumer(self) -> dict[str, int]:
         """By name: the first message that each is to get."""
         return {name: consumer.handled for name, consumer in self._known.items()}
 
@@ -61,7 +61,7 @@ class Consumers:
         consumer.alive, consumer.shut_since_s, consumer.repeated_from = True, None, -1
         consumer.arrived = consumer.limit = consumer.handled
 
-    def grant(self, grant: Grant) -> Consumer:
+    def grant(self, grant: Credit) -> Consumer:
         self._evicted.pop(grant.consumer, None)
         consumer = self._known[grant.consumer]
         consumer.alive = True
@@ -78,7 +78,7 @@ class Consumers:
         if name not in self.expected:
             del self._known[name]
 
-    def overdue(self, now_s: float, patience_s: float, seq: int) -> list[str]:
+    def stalled(self, now_s: float, patience_s: float, seq: int) -> list[str]:
         """Those that live, and whose window has been shut for longer than that."""
         names: list[str] = []
         for name, consumer in self._known.items():
@@ -93,6 +93,6 @@ class Consumers:
         self._evicted[name] = self._known[name].handled
         self.leave(name)
 
-    def is_still_stuck(self, grant: Grant) -> bool:
+    def is_still_stuck(self, grant: Credit) -> bool:
         """Whether it was evicted and has handled nothing since: its heartbeats alone count not."""
         return grant.handled <= self._evicted.get(grant.consumer, -1)

@@ -16,18 +16,19 @@ from typing import Any, NamedTuple
 from ldo_service.schemas import decode
 from ldo_service.schemas.topics import Topic
 from ldo_service.storage.state_store import State
-from ldo_service.transport.flow_control import InletPast, OutletPast, Sent
+from ldo_service.transport.flow_control import InletPosition, OutletPosition, UnackedMessage
 
-from .actor import Actor, Situation
+from .actor import Actor, FlowStatus
 from .step import produce
 
 log = logging.getLogger(__name__)
 
 LINKS, SENT, TAKEN = "stage.links", "stage.sent", "stage.taken"
-MOST_TAKEN = 64  # messages that a lagging actor's successor handles again, some seconds of work
+# messages that a lagging actor's successor handles again, some seconds of work
+MAX_WAL_ENTRIES = 64
 
 
-class Taken(NamedTuple):
+class LoggedInput(NamedTuple):
     """A message that was handled, and the situation it was handled in; counts by topic."""
 
     topic: str
@@ -36,41 +37,41 @@ class Taken(NamedTuple):
     waiting: Mapping[str, int]
 
     @classmethod
-    def of(cls, topic: str, body: bytes | memoryview, situation: Situation) -> "Taken":
-        room = {topic.name: count for topic, count in situation.room.items()}
-        waiting = {topic.name: count for topic, count in situation.waiting.items()}
+    def of(cls, topic: str, body: bytes | memoryview, situation: FlowStatus) -> "LoggedInput":
+        room = {topic.name: count for topic, count in situation.credits.items()}
+        waiting = {topic.name: count for topic, count in situation.backlog.items()}
         return cls(topic, bytes(body), room, waiting)
 
-    def situation(self, actor: Actor) -> Situation:
-        return Situation(
-            room=counts_by_topic(self.room, (out.topic for out in actor.outputs)),
-            waiting=counts_by_topic(self.waiting, (port.topic for port in actor.inputs)),
+    def situation(self, actor: Actor) -> FlowStatus:
+        return FlowStatus(
+            credits=counts_by_topic(self.room, (out.topic for out in actor.outputs)),
+            backlog=counts_by_topic(self.waiting, (port.topic for port in actor.inputs)),
         )
 
 
 @dataclass(frozen=True)
-class Past:
+class RestoredState:
     """A saved state, taken apart."""
 
     own: State = field(default_factory=dict)  # the actor's
-    inputs: Mapping[str, InletPast] = field(default_factory=dict)
-    outputs: Mapping[str, OutletPast] = field(default_factory=dict)
-    taken: tuple[Taken, ...] = ()
+    inputs: Mapping[str, InletPosition] = field(default_factory=dict)
+    outputs: Mapping[str, OutletPosition] = field(default_factory=dict)
+    taken: tuple[LoggedInput, ...] = ()
     is_none: bool = False  # nothing was saved
 
     @classmethod
-    def of(cls, state: State | None) -> "Past":
+    def of(cls, state: State | None) -> "RestoredState":
         if not state:
             return cls(is_none=True)
         links = state.get(LINKS, {"in": {}, "out": {}})  # none: no lossless neighbours
         return cls(
             own={part: value for part, value in state.items() if not part.startswith("stage.")},
-            inputs={topic: InletPast(*past) for topic, past in links["in"].items()},
+            inputs={topic: InletPosition(*past) for topic, past in links["in"].items()},
             outputs={
-                topic: OutletPast(epoch, seq, tuple(_sent(state, topic)))
+                topic: OutletPosition(epoch, seq, tuple(_sent(state, topic)))
                 for topic, (epoch, seq) in links["out"].items()
             },
-            taken=tuple(Taken(*state[part]) for part in _numbered(state, TAKEN)),
+            taken=tuple(LoggedInput(*state[part]) for part in _numbered(state, TAKEN)),
         )
 
     @property
@@ -85,20 +86,20 @@ class Past:
         return handled or any(past.seq for past in self.outputs.values())
 
 
-class Ledger:
+class DeliveryState:
     """Makes the parts; those that did not change are the same objects as before."""
 
     def __init__(self) -> None:
         self._links: dict[str, Any] = {}
         self._own: State = {}
-        self._taken: dict[str, Taken] = {}
+        self._taken: dict[str, LoggedInput] = {}
         self._number = 0
 
     @property
     def is_long(self) -> bool:
-        return len(self._taken) >= MOST_TAKEN
+        return len(self._taken) >= MAX_WAL_ENTRIES
 
-    def own(self, own: State, taken: Taken | None, whole: bool) -> dict[str, Any]:
+    def own(self, own: State, taken: LoggedInput | None, whole: bool) -> dict[str, Any]:
         """The actor's state; with what it took since, if that is not `whole`, nor another one than
         before."""
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
@@ -110,7 +111,7 @@ class Ledger:
         return {**own, **self._taken}
 
     def links(
-        self, inputs: Mapping[str, InletPast], outputs: Mapping[str, OutletPast]
+        self, inputs: Mapping[str, InletPosition], outputs: Mapping[str, OutletPosition]
     ) -> dict[str, Any]:
         """Nothing for an actor without lossless neighbours."""
         if not inputs and not outputs:
@@ -129,7 +130,7 @@ class Ledger:
         return {LINKS: self._links, **sent}
 
 
-def successor(actor: Actor, past: Past, make: Callable[[], Actor]) -> Actor:
+def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) -> Actor:
     """An actor as its predecessor was after its last saved step, from one that was just made.
 
     What it took since its state it handles again, for the state alone: what it made then was kept.
@@ -146,7 +147,7 @@ def successor(actor: Actor, past: Past, make: Callable[[], Actor]) -> Actor:
         actor = make()
 
 
-def _handled_again(actor: Actor, taken: Iterable[Taken]) -> int | None:
+def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
     """Which of them fails first."""
     kinds = {port.topic.name: port.topic.message for port in actor.inputs}
     for number, one in enumerate(taken):
@@ -169,9 +170,9 @@ def _sent_part(topic: str) -> str:
     return f"{SENT} {topic.replace('/', '.')}"
 
 
-def _sent(state: State, topic: str) -> Iterator[Sent]:
+def _sent(state: State, topic: str) -> Iterator[UnackedMessage]:
     for part in _numbered(state, _sent_part(topic)):
-        yield Sent(*state[part])
+        yield UnackedMessage(*state[part])
 
 
 def _numbered(state: State, kind: str) -> list[str]:

@@ -4,7 +4,14 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from ldo_service.schemas import InputCount
-from ldo_service.transport.flow_control import OUTSIDE, Grant, Header, InletPast, Join, Numbers
+from ldo_service.transport.flow_control import (
+    EXTERNAL_HEADER,
+    ConsumerHello,
+    Credit,
+    Header,
+    InletPosition,
+    SequenceTracker,
+)
 
 from .actor import In, Latest, Lossless
 
@@ -30,12 +37,12 @@ class Inlet:
     gaps: int = 0
     peak: int = 0
     paused: int = 0
-    numbers: Numbers = field(default_factory=Numbers)
+    numbers: SequenceTracker = field(default_factory=SequenceTracker)
 
     def number(self, header: Header) -> None:
         """Count those that never came."""
-        if header is not OUTSIDE:
-            self.numbers.came(header)
+        if header is not EXTERNAL_HEADER:
+            self.numbers.observe(header)
 
     def accept(self, header: Header) -> bool:  # noqa: ARG002
         """Whether to take the message in."""
@@ -55,12 +62,12 @@ class Inlet:
         policy = self.port.policy
         assert isinstance(policy, Latest)
         if not policy.per_key:
-            return [self.waiting[0]] if len(self.waiting) > policy.keep else []
+            return [self.waiting[0]] if len(self.waiting) > policy.depth else []
         by_key: dict[str, list[Delivery]] = {}  # the key that has waited longest comes first
         for delivery in self.waiting:
             by_key.setdefault(delivery.header.key, []).append(delivery)
         same = by_key[newest.header.key]
-        if len(same) > policy.keep:
+        if len(same) > policy.depth:
             return same[:1]
         return next(iter(by_key.values())) if len(by_key) > policy.max_keys else []
 
@@ -68,12 +75,12 @@ class Inlet:
         self.delivered += not rejected
         self.rejected += rejected
 
-    def leave_out(self) -> None:
+    def discard_backlog(self) -> None:
         """What waits is not taken any more: the stage is held."""
         self.paused += len(self.waiting)
         self.waiting.clear()
 
-    def renew(self) -> None:
+    def reset(self) -> None:
         """Forget what waits."""
         self.waiting.clear()
 
@@ -99,7 +106,7 @@ class LosslessInlet(Inlet):
     handled: int = 0
     arrived: int = 0
     gap: bool = False
-    is_welcome: bool = False  # by the producer that is there now
+    is_connected: bool = False  # by the producer that is there now
 
     @property
     def window(self) -> int:
@@ -108,8 +115,8 @@ class LosslessInlet(Inlet):
 
     def welcome(self, epoch: int, start: int) -> int:
         """Numbering begins here, unless we know already; how many messages are lost by it."""
-        known, joins = epoch == self.epoch, not self.is_welcome
-        self.is_welcome = True
+        known, joins = epoch == self.epoch, not self.is_connected
+        self.is_connected = True
         if known and start <= self.arrived:
             self.gap = self.gap or joins
             return 0
@@ -129,14 +136,14 @@ class LosslessInlet(Inlet):
         self.arrived += 1
         return True
 
-    def leave_out(self) -> None:
+    def discard_backlog(self) -> None:
         """Nothing: it waits in its window."""
 
-    def renew(self) -> None:
+    def reset(self) -> None:
         """Forget what waits and who sent it: whoever sends has to welcome us again."""
-        super().renew()
+        super().reset()
         self.epoch = self.handled = self.arrived = 0
-        self.gap = self.is_welcome = False
+        self.gap = self.is_connected = False
 
     def _overflow(self, newest: Delivery) -> list[Delivery]:  # noqa: ARG002
         return []  # `accept` keeps to the window
@@ -146,20 +153,20 @@ class LosslessInlet(Inlet):
         if delivery.header.epoch == self.epoch:
             self.handled = max(self.handled, delivery.header.seq + 1)
 
-    def go_on(self, past: InletPast) -> None:
+    def resume_from(self, past: InletPosition) -> None:
         """Where a predecessor stopped."""
         self.epoch, self.handled, self.arrived = past.epoch, past.handled, past.handled
 
-    def past(self, being_handled: Delivery | None) -> InletPast:
+    def position(self, being_handled: Delivery | None) -> InletPosition:
         """For a successor, as if that delivery had been handled."""
         handled = self.handled
         if being_handled is not None and being_handled.header.epoch == self.epoch:
             handled = max(handled, being_handled.header.seq + 1)
-        return InletPast(self.epoch, handled)
+        return InletPosition(self.epoch, handled)
 
-    def grant(self, consumer: str, *, waits_for_disk: bool = False) -> Join | Grant:
-        if not self.is_welcome:
-            return Join(consumer)
+    def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
+        if not self.is_connected:
+            return ConsumerHello(consumer)
         limit = self.handled + self.window
         where = self.epoch, self.handled, self.arrived, limit
-        return Grant(consumer, *where, self.gap, waits_for_disk)
+        return Credit(consumer, *where, self.gap, waits_for_disk)

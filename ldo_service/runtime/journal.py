@@ -18,7 +18,7 @@ import msgspec
 
 from ldo_service.storage.state_store import State
 
-from .actor import Situation
+from .actor import FlowStatus
 from .inlet import Delivery
 from .step import Produced
 
@@ -97,16 +97,16 @@ def digest_of(outputs: Iterable[Output]) -> str:
 class Journal:
     """What a stage tells about itself, in order. This one listens to nothing; `Recorder` writes."""
 
-    def started(self, state: State | None) -> None:
+    def record_start(self, state: State | None) -> None:
         """An actor is in place."""
 
-    def took(self, delivery: Delivery, stamp_ns: int) -> None:
+    def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
         """The message that the next steps speak of; the stamp is the message's own."""
 
-    def stepped(
+    def record_step(
         self,
         kind: Kind,
-        situation: Situation,
+        situation: FlowStatus,
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:

@@ -24,19 +24,19 @@ Observer = Callable[[str, Message, float], None]  # actor, what it made, millise
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
+class StepOutput:
     messages: list[Message]
     step_ms: float  # wall time
 
 
 @dataclass(order=True)
-class Due:
+class PendingOutput:
     """An answer under way; equal ticks are settled in the order of the graph, then of starting."""
 
     tick: int
     rank: int
     order: int
-    answer: Future[Answer] = field(compare=False)
+    answer: Future[StepOutput] = field(compare=False)
 
 
 @dataclass
@@ -49,23 +49,23 @@ class ActorThread:
         default_factory=list
     )  # of each step, but those that took note only
 
-    def start(self, message: Message) -> Future[Answer]:
+    def start(self, message: Message) -> Future[StepOutput]:
         return self.thread.submit(self._step, message)
 
-    def finish(self) -> Future[Answer]:
-        return self.thread.submit(lambda: _timed(self.actor.finish()))
+    def finish(self) -> Future[StepOutput]:
+        return self.thread.submit(lambda: _timed(self.actor.on_stop()))
 
-    def _step(self, message: Message) -> Answer:
+    def _step(self, message: Message) -> StepOutput:
         answer = _timed(self.actor.handle(message))
         if answer.messages or not self.actor.outputs:  # notes would hide what a frame costs
             self.step_ms.append(answer.step_ms)
         return answer
 
 
-def _timed(messages: Iterator[Message]) -> Answer:
+def _timed(messages: Iterator[Message]) -> StepOutput:
     started_s = time.perf_counter()
     produced = list(messages)
-    return Answer(produced, 1e3 * (time.perf_counter() - started_s))
+    return StepOutput(produced, 1e3 * (time.perf_counter() - started_s))
 
 
 class LogicalClock:
@@ -94,7 +94,7 @@ class LogicalClock:
             for port in thread.actor.inputs:
                 self._takers.setdefault(port.topic.message, []).append(thread)
         self._observe = observe
-        self._due: list[Due] = []
+        self._due: list[PendingOutput] = []
         self._started = 0
         self._tick = -1
         self.now = -1  # tick of what is being passed on, for an observer
@@ -135,9 +135,9 @@ class LogicalClock:
         for thread in self._takers.get(type(message), ()):
             self._expect(thread, tick + thread.latency_ticks, thread.start(message))
 
-    def _expect(self, thread: ActorThread, tick: int, answer: Future[Answer]) -> None:
+    def _expect(self, thread: ActorThread, tick: int, answer: Future[StepOutput]) -> None:
         self._started += 1
-        heapq.heappush(self._due, Due(tick, thread.rank, self._started, answer))
+        heapq.heappush(self._due, PendingOutput(tick, thread.rank, self._started, answer))
 
     def _settle(self, tick: int) -> None:
         """Wait for every answer that is due by now and pass it on."""
@@ -155,7 +155,7 @@ class LogicalClock:
             self._settle(self._due[0].tick)
 
 
-def _answer(due: Due, actor: str) -> Answer:
+def _answer(due: PendingOutput, actor: str) -> StepOutput:
     try:
         return due.answer.result()
     except Exception as error:

@@ -12,21 +12,21 @@ import msgspec
 from ldo_service.schemas import InputCount, decode
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.flow_control import (
-    OUTSIDE,
+    EXTERNAL_HEADER,
     Header,
-    InletPast,
-    Welcome,
-    again_key,
+    InletPosition,
+    ProducerHello,
+    credit_key,
     data_key,
     encode_link,
-    grant_key,
-    welcome_key,
+    producer_hello_key,
+    retransmit_key,
 )
 from ldo_service.transport.interface import Publisher, Transport, call_soon
 
 from .actor import In, Lossless
 from .inlet import Delivery, Inlet, LosslessInlet
-from .stage_commands import Order
+from .stage_commands import StageCommand
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,8 @@ class Mailbox:
         ports: tuple[In, ...],
         transport: Transport,
         max_bytes: int = 64_000_000,  # of a Latest input: lossless ones come from our own actors
-        past: Mapping[str, InletPast] | None = None,  # by lossless topic: where a predecessor was
+        past: Mapping[str, InletPosition]
+        | None = None,  # by lossless topic: where a predecessor was
     ) -> None:
         self._consumer, self._max_bytes = consumer, max_bytes
         self._loop = asyncio.get_running_loop()
@@ -53,14 +54,14 @@ class Mailbox:
         self._wake_pending = self._grant_pending = False
         self._closed = self._held = False
         self.waits_for_disk = False  # then it takes nothing, and that is no fault of this process
-        self._orders: deque[Order] = deque()
+        self._orders: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
         self._inlets: dict[str, Inlet] = {}
         for port in ports:
             self._connect(port, transport, (past or {}).get(port.topic.name))
-        self.send_grants()
+        self.send_credits()
 
-    def _connect(self, port: In, transport: Transport, past: InletPast | None) -> None:
+    def _connect(self, port: In, transport: Transport, past: InletPosition | None) -> None:
         topic = port.topic.name
         inlet = LosslessInlet(port) if isinstance(port.policy, Lossless) else Inlet(port)
         self._inlets[topic] = inlet
@@ -71,10 +72,12 @@ class Mailbox:
         if isinstance(inlet, LosslessInlet):
             link = inlet
             if past is not None:
-                link.go_on(past)
-            self._grants[topic] = transport.publisher(grant_key(topic))
-            transport.subscribe(welcome_key(topic), lambda _, body: self._welcomed(link, body))
-            transport.subscribe(again_key(topic), arrived)
+                link.resume_from(past)
+            self._grants[topic] = transport.publisher(credit_key(topic))
+            transport.subscribe(
+                producer_hello_key(topic), lambda _, body: self._welcomed(link, body)
+            )
+            transport.subscribe(retransmit_key(topic), arrived)
         transport.subscribe(data_key(topic), arrived)
 
     # --- arriving, on any thread --------------------------------------------------------------
@@ -114,7 +117,7 @@ class Mailbox:
 
     def _welcomed(self, inlet: LosslessInlet, body: memoryview) -> None:
         try:
-            welcome = decode(body, Welcome)
+            welcome = decode(body, ProducerHello)
         except msgspec.DecodeError as error:
             log.warning("%s: unreadable welcome: %s", inlet.port.topic.name, error)
             return
@@ -130,10 +133,10 @@ class Mailbox:
         """Under the lock."""
         if not self._grant_pending:
             self._grant_pending = True
-            call_soon(self._loop, self.send_grants)
+            call_soon(self._loop, self.send_credits)
 
     # --- taking, on the event loop --------------------------------------------------------------
-    async def take(self) -> Delivery | Order | None:
+    async def take(self) -> Delivery | StageCommand | None:
         """An order, else the oldest delivery, of an input that goes first if there is one; None
         when the mailbox was closed and is empty."""
         while True:
@@ -143,7 +146,7 @@ class Mailbox:
                 if self._orders:
                     return self._orders.popleft()
                 if self._order and not self._held:
-                    delivery = next((d for d in self._order if d.port.goes_first), self._order[0])
+                    delivery = next((d for d in self._order if d.port.has_priority), self._order[0])
                     self._order.remove(delivery)
                     self._inlets[delivery.port.topic.name].waiting.popleft()
                     return delivery
@@ -159,31 +162,31 @@ class Mailbox:
         if isinstance(inlet, LosslessInlet):
             self._send_grant(inlet)
 
-    def past(self, being_handled: Delivery | None = None) -> dict[str, InletPast]:
+    def past(self, being_handled: Delivery | None = None) -> dict[str, InletPosition]:
         """Where a successor goes on, by lossless topic, once that delivery was handled."""
         with self._lock:
             return {
-                topic: inlet.past(
+                topic: inlet.position(
                     being_handled if being_handled and being_handled.port is inlet.port else None
                 )
                 for topic, inlet in self._inlets.items()
                 if isinstance(inlet, LosslessInlet)
             }
 
-    def tell(self, order: Order) -> None:
+    def put_command(self, order: StageCommand) -> None:
         """It is taken before any delivery."""
         self._orders.append(order)
         self._ready.set()
 
-    def hold(self) -> None:
-        """Give out no deliveries until `release`; what has a policy of Latest is left out."""
+    def pause(self) -> None:
+        """Give out no deliveries until `resume`; what has a policy of Latest is left out."""
         with self._lock:
             self._held = True
             for inlet in self._inlets.values():
-                inlet.leave_out()
+                inlet.discard_backlog()
             self._keep_only_waiting()
 
-    def release(self) -> None:
+    def resume(self) -> None:
         with self._lock:
             self._held = False
         self._ready.set()
@@ -192,20 +195,20 @@ class Mailbox:
     def is_held(self) -> bool:
         return self._held
 
-    def renew(self) -> None:
+    def reset(self) -> None:
         """Forget what waits, and join the producers again."""
         with self._lock:
             for inlet in self._inlets.values():
-                inlet.renew()
+                inlet.reset()
             self._keep_only_waiting()
-        self.send_grants()
+        self.send_credits()
 
     def _keep_only_waiting(self) -> None:
         """Under the lock."""
         waiting = {id(d) for inlet in self._inlets.values() for d in inlet.waiting}
         self._order = deque(d for d in self._order if id(d) in waiting)
 
-    def send_grants(self) -> None:
+    def send_credits(self) -> None:
         """Repeat every grant: lost ones heal, new producers learn of us."""
         with self._lock:
             self._grant_pending = False
@@ -245,6 +248,6 @@ class Mailbox:
 def _read_header(raw: bytes) -> Header | None:
     """None when it cannot be read."""
     try:
-        return decode(raw, Header) if raw else OUTSIDE
+        return decode(raw, Header) if raw else EXTERNAL_HEADER
     except msgspec.DecodeError:
         return None

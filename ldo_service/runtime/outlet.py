@@ -10,18 +10,18 @@ import msgspec
 from ldo_service.schemas import Message, OutputCount
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.flow_control import (
-    Grant,
+    ConsumerHello,
+    Credit,
     Header,
-    Join,
-    OutletPast,
-    Sent,
-    Welcome,
-    again_key,
+    OutletPosition,
+    ProducerHello,
+    UnackedMessage,
+    credit_key,
     data_key,
     decode_request,
     encode_link,
-    grant_key,
-    welcome_key,
+    producer_hello_key,
+    retransmit_key,
 )
 from ldo_service.transport.interface import Transport, call_soon
 
@@ -54,10 +54,10 @@ class Outlet:
         expected: Iterable[str] = (),
         evict_after_s: float = 30.0,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
-        past: OutletPast | None = None,
+        past: OutletPosition | None = None,
     ) -> None:
         self.port, self.topic = port, port.topic
-        past = past or OutletPast(epoch, 0)
+        past = past or OutletPosition(epoch, 0)
         self._source, self._epoch = source, past.epoch
         self._evict_after_s, self._on_evicted = evict_after_s, on_evicted
         self._loop = asyncio.get_running_loop()
@@ -78,45 +78,45 @@ class Outlet:
     def _open(self, transport: Transport) -> None:
         topic = self.topic.name
         self._publisher = transport.publisher(data_key(topic))
-        self._again = transport.publisher(again_key(topic))
-        self._welcomes = transport.publisher(welcome_key(topic))
-        transport.subscribe(grant_key(topic), self._requested)
-        transport.watch(self._presence)
+        self._again = transport.publisher(retransmit_key(topic))
+        self._welcomes = transport.publisher(producer_hello_key(topic))
+        transport.subscribe(credit_key(topic), self._requested)
+        transport.watch_liveliness(self._presence)
         if self.topic.is_state:
-            transport.answer(data_key(topic), lambda: self._last_value)
+            transport.serve_queries(data_key(topic), lambda: self._last_value)
         self._post_welcomes()  # consumers that are there already join at once
 
     # --- sending ----------------------------------------------------------------------------
-    def room(self) -> int:
+    def credits(self) -> int:
         """How many messages may be sent now without waiting; none while one is held."""
         return 0 if self._unsent else self._consumers.room(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
-        self.hold(message, body)
-        await self.release()
+        self.stage_message(message, body)
+        await self.commit()
 
-    def hold(self, message: Message, body: bytes) -> None:
+    def stage_message(self, message: Message, body: bytes) -> None:
         """Number a message, to be sent with the next `release`."""
         key = str(getattr(message, self.topic.key)) if self.topic.key else ""
         header = encode_link(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
-        held = Sent(self._seq, header, body)
+        held = UnackedMessage(self._seq, header, body)
         self._unsent.append(held)
         if self._consumers:
             self._unhandled.append(held)
         self._note_state(message, header, body)
         self._seq += 1
 
-    async def release(self) -> None:
+    async def commit(self) -> None:
         """Send what is held."""
         while self._unsent:
-            if not self.port.never_wait:
+            if not self.port.is_nonblocking:
                 await self._wait_for_room()
             held = self._unsent.popleft()
             self.sent += 1
             self._sent_at_s = self._loop.time()
             await self._publisher.send(held.header, held.body)
 
-    def take_back(self) -> None:
+    def rollback(self) -> None:
         """What is held was never made: its numbers are given again."""
         self._seq = self._next
         self._unhandled = deque(sent for sent in self._unhandled if sent.seq < self._seq)
@@ -135,7 +135,7 @@ class Outlet:
     async def flush(self) -> None:
         """Wait until all that was sent has arrived at every lossless consumer."""
         self._post_welcomes()  # each answers with a grant at once
-        while not self._consumers.have_all(self._seq):
+        while not self._consumers.all_received(self._seq):
             await self._change()
 
     async def _change(self) -> None:
@@ -150,11 +150,11 @@ class Outlet:
             if len(self._parts) == getattr(message, "parts", 1):
                 self._last_value = tuple(self._parts)
 
-    def past(self) -> OutletPast | None:
+    def position(self) -> OutletPosition | None:
         """What a successor needs to go on; None where nobody is expected."""
         if not self._consumers.expected:
             return None
-        return OutletPast(self._epoch, self._seq, tuple(self._unhandled))
+        return OutletPosition(self._epoch, self._seq, tuple(self._unhandled))
 
     # --- consumers --------------------------------------------------------------------------
     def _requested(self, _header: bytes, body: memoryview) -> None:
@@ -166,11 +166,11 @@ class Outlet:
             return
         call_soon(self._loop, self._take_request, request)
 
-    def _take_request(self, request: Join | Grant) -> None:
+    def _take_request(self, request: ConsumerHello | Credit) -> None:
         name = request.consumer
         if self._closed:
             return
-        if isinstance(request, Grant) and request.epoch == self._epoch:
+        if isinstance(request, Credit) and request.epoch == self._epoch:
             if self._consumers.is_still_stuck(request):
                 return
             if name in self._consumers:
@@ -179,7 +179,7 @@ class Outlet:
         self._consumers.join(name, self._seq)
         self._post_welcomes()
 
-    def renew(self, epoch: int) -> None:
+    def reset(self, epoch: int) -> None:
         """Number from 0 again: what was sent is forgotten, and every consumer joins anew."""
         if self._repeating is not None:
             self._repeating.cancel()
@@ -191,19 +191,21 @@ class Outlet:
         self._post_welcomes()
 
     def _post_welcomes(self) -> None:
-        self._welcomes.post(b"", encode_link(Welcome(self._epoch, self._consumers.starts())))
+        self._welcomes.post(
+            b"", encode_link(ProducerHello(self._epoch, self._consumers.next_seq_by_consumer()))
+        )
 
-    def _granted(self, grant: Grant) -> None:
+    def _granted(self, grant: Credit) -> None:
         if grant.arrived > self._seq:
-            self._say_older_than(grant)
+            self._warn_stale_state(grant)
             return
         consumer = self._consumers.grant(grant)
         self._forget_handled()
         if consumer.arrived < self._next:
-            self._repeat(consumer, grant.gap)
+            self._retransmit(consumer, grant.gap)
         self._changed.set()
 
-    def _say_older_than(self, grant: Grant) -> None:
+    def _warn_stale_state(self, grant: Credit) -> None:
         """It has had messages that were never sent."""
         if grant.consumer not in self._ahead:
             log.error(
@@ -219,7 +221,7 @@ class Outlet:
         while self._unhandled and self._unhandled[0].seq < oldest:
             self._unhandled.popleft()
 
-    def _repeat(self, consumer: Consumer, gap: bool) -> None:
+    def _retransmit(self, consumer: Consumer, gap: bool) -> None:
         """Send again what did not arrive: after a gap at once, a lost tail after a while."""
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
@@ -234,7 +236,7 @@ class Outlet:
         self.repeated += len(lost)
         self._repeating = self._loop.create_task(self._send_again(lost))
 
-    async def _send_again(self, lost: list[Sent]) -> None:
+    async def _send_again(self, lost: list[UnackedMessage]) -> None:
         try:
             for sent in lost:
                 await self._again.send(sent.header, sent.body)
@@ -248,9 +250,9 @@ class Outlet:
             self._forget_handled()
             self._changed.set()
 
-    def check_windows(self) -> None:
+    def evict_stalled(self) -> None:
         """Evict consumers that live and yet take nothing; called with every heartbeat."""
-        overdue = self._consumers.overdue(self._loop.time(), self._evict_after_s, self._next)
+        overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
             log.error("%s: consumer %s took nothing for %.0f s and is evicted",
                       self.topic.name, name, self._evict_after_s)  # fmt: skip
@@ -288,37 +290,39 @@ class Outlets:
         return self._all[message]
 
     @property
-    def never_wait(self) -> bool:
+    def is_nonblocking(self) -> bool:
         """Whether one of them is of a port that never waits."""
-        return any(outlet.port.never_wait for outlet in self._all.values())
+        return any(outlet.port.is_nonblocking for outlet in self._all.values())
 
     @property
-    def have_expected(self) -> bool:
+    def has_required_consumers(self) -> bool:
         """Whether some consumer must not miss a message."""
-        return any(outlet.past() for outlet in self._all.values())
+        return any(outlet.position() for outlet in self._all.values())
 
     def room(self) -> dict[Topic, int]:
         """Of the ports that never wait, whose actor looks before it makes something."""
         return {
-            outlet.topic: outlet.room() for outlet in self._all.values() if outlet.port.never_wait
+            outlet.topic: outlet.credits()
+            for outlet in self._all.values()
+            if outlet.port.is_nonblocking
         }
 
-    def past(self) -> dict[str, OutletPast | None]:
-        return {outlet.topic.name: outlet.past() for outlet in self._all.values()}
+    def past(self) -> dict[str, OutletPosition | None]:
+        return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
     def hold(self, produced: Sequence[Produced]) -> None:
         for out in produced:
-            self._all[type(out.message)].hold(out.message, out.body)
+            self._all[type(out.message)].stage_message(out.message, out.body)
 
     async def release(self, *, is_saved: bool = True) -> None:
         """Send what is held; of a step that is not saved what nobody has to get."""
         for outlet in self._all.values():
-            if is_saved or outlet.past() is None:
-                await outlet.release()
+            if is_saved or outlet.position() is None:
+                await outlet.commit()
 
     def take_back(self) -> None:
         for outlet in self._all.values():
-            outlet.take_back()
+            outlet.rollback()
 
     async def flush(self) -> None:
         for outlet in self._all.values():
@@ -326,11 +330,11 @@ class Outlets:
 
     def renew(self, epoch: int) -> None:
         for outlet in self._all.values():
-            outlet.renew(epoch)
+            outlet.reset(epoch)
 
     def check_windows(self) -> None:
         for outlet in self._all.values():
-            outlet.check_windows()
+            outlet.evict_stalled()
 
     def statistics(self) -> tuple[OutputCount, ...]:
         return tuple(outlet.statistics() for outlet in self._all.values())

@@ -27,7 +27,7 @@ def resident_mb() -> float:
     return pages * resource.getpagesize() / 1e6
 
 
-def give_back_free_memory() -> None:
+def trim_memory() -> None:
     """Hand the system what this process let go of. Without it glibc keeps what lies between what is
     still used: 280 MB after three laps of a flat. Elsewhere than on Linux nothing is done."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
@@ -35,7 +35,7 @@ def give_back_free_memory() -> None:
         trim(0)
 
 
-async def leave_with_parent(period_s: float = 0.5) -> None:
+async def exit_with_parent(period_s: float = 0.5) -> None:
     """Return when the process that started this one is gone; never, if no ChildProcess did."""
     parent = int(os.environ.get(PARENT_VARIABLE, "0"))
     while parent == 0 or os.getppid() == parent:
@@ -131,7 +131,7 @@ class ChildProcess:
     async def _back_off(self, code: int) -> None:
         how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
         log.error("%s: its process %s", self.name, how)
-        await asyncio.sleep(self._budget.spend(self._loop.time()))
+        await asyncio.sleep(self._budget.record_failure(self._loop.time()))
         self.restarts += 1
 
 

@@ -12,22 +12,22 @@ from ldo_service.transport.flow_control import Header, encode_link, new_epoch
 from ldo_service.transport.interface import Transport
 from ldo_service.transport.worker import Worker
 
-from .actor import Actor, Lossless, Situation
-from .checkpointer import Keeper
-from .delivery_state import Taken
+from .actor import Actor, FlowStatus, Lossless
+from .checkpointer import Checkpointer
+from .delivery_state import LoggedInput
 from .inlet import Delivery
 from .journal import Journal, Kind
 from .mailbox import Mailbox
 from .outlet import Outlet, Outlets
-from .stage_commands import Order, OrderTaker
-from .stage_metrics import Vitals
-from .step import Produced, Reader, produce
-from .supervision_policy import RestartBudget, StageConfig
+from .stage_commands import CommandReceiver, StageCommand
+from .stage_metrics import StageMetrics
+from .step import MessageDecoder, Produced, produce
+from .supervision_policy import RestartBudget, SupervisionConfig
 
 log = logging.getLogger(__name__)
 
 
-class LeftUnsaved(Exception):
+class UnsavedStateError(Exception):
     """A stage is to end, and the disk takes nothing: what it did last will be done again."""
 
 
@@ -52,22 +52,22 @@ class Stage:
         make: Callable[[], Actor],
         transport: Transport,
         *,
-        config: StageConfig | None = None,
+        config: SupervisionConfig | None = None,
         store: StateStore | None = None,
         expected: Mapping[str, frozenset[str]] | None = None,
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         journal: Journal | None = None,
     ) -> None:
         self._make, self._transport = make, transport
-        self._config = config = config or StageConfig()
-        self._keeper = Keeper(store or MemoryStore())
+        self._config = config = config or SupervisionConfig()
+        self._keeper = Checkpointer(store or MemoryStore())
         self._expected = expected or {}
         self._on_evicted = on_evicted
         self._journal = journal or Journal()
-        self._actor = self._successor()
+        self._actor = self._restored_actor()
         self.name = self._actor.name
         self._epoch = new_epoch()
-        self._vitals = Vitals()
+        self._vitals = StageMetrics()
         self._budget = RestartBudget(
             self.name,
             config.max_restarts,
@@ -77,7 +77,7 @@ class Stage:
         )
         self._drain_requested = False
         self._mailbox: Mailbox | None = None
-        self._reader = Reader(self.name)
+        self._reader = MessageDecoder(self.name)
         self._outlets = Outlets()
 
     # --- life -----------------------------------------------------------------------------------
@@ -89,9 +89,9 @@ class Stage:
         if self._keeper.past.is_none:
             self._begin()
         self._mailbox = self._open_mailbox()
-        self._transport.announce(self.name)
+        self._transport.declare_liveliness(self.name)
         tasks = {
-            asyncio.create_task(self._beat(self._mailbox), name=f"{self.name} heartbeat"),
+            asyncio.create_task(self._heartbeat_loop(self._mailbox), name=f"{self.name} heartbeat"),
             asyncio.create_task(self._work(self._mailbox), name=f"{self.name} work"),
         }
         try:
@@ -137,7 +137,7 @@ class Stage:
             max_bytes=round(self._config.max_message_mb * 1e6),
             past=self._keeper.past.inputs,
         )
-        self._orders = OrderTaker(self.name, self._transport, mailbox.tell)
+        self._orders = CommandReceiver(self.name, self._transport, mailbox.put_command)
         if self._drain_requested:
             mailbox.close()
         else:
@@ -162,19 +162,19 @@ class Stage:
     async def _work(self, mailbox: Mailbox) -> None:
         try:
             if self._keeper.is_unsaved:
-                await self._keep()
+                await self._save()
             await self._outlets.release()  # what a predecessor made
-            await self._say_first_words()
+            await self._publish_restored()
             while delivery := await self._next(mailbox):
                 await self._take(delivery, mailbox)
-            await self._say_last_words()
+            await self._publish_final()
             if self._keeper.is_unsaved:
-                raise LeftUnsaved
+                raise UnsavedStateError
             await self._outlets.flush()
-        except LeftUnsaved:
+        except UnsavedStateError:
             log.error("%s ends and its last step is not saved: it will be done again", self.name)
 
-    async def _next(self, mailbox: Mailbox) -> Delivery | Order | None:
+    async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
         """While something is not saved, it is tried again meanwhile."""
         while self._keeper.is_unsaved:
             try:
@@ -183,13 +183,13 @@ class Stage:
                 await self._tell([])
         return await mailbox.take()
 
-    async def _take(self, delivery: Delivery | Order, mailbox: Mailbox) -> None:
-        if isinstance(delivery, Order):
-            await self._obey(delivery, mailbox)
+    async def _take(self, delivery: Delivery | StageCommand, mailbox: Mailbox) -> None:
+        if isinstance(delivery, StageCommand):
+            await self._execute(delivery, mailbox)
             return
         message = self._reader.message_of(delivery)
         if message is not None:
-            self._journal.took(delivery, message.stamp_ns)
+            self._journal.record_input(delivery, message.stamp_ns)
             await self._step(message, delivery)
         mailbox.done(delivery, rejected=message is None)
 
@@ -198,8 +198,8 @@ class Stage:
             if await self._try(message, delivery):
                 return
         self._vitals.set_aside += 1
-        self._journal.stepped("set_aside", Situation())
-        await self._keep(delivery)
+        self._journal.record_step("set_aside", FlowStatus())
+        await self._save(delivery)
         log.error(
             "%s: %s of stamp %d failed twice and is set aside",
             self.name, type(message).__name__, message.stamp_ns,
@@ -207,49 +207,49 @@ class Stage:
 
     async def _try(self, message: Message, delivery: Delivery) -> bool:
         """Handle, save, send; False when it failed and a successor is in place."""
-        self._look_around()
+        self._update_flow_status()
         try:
             with self._vitals.step():
                 produced = await self._worker.run(self._handle, message)
             self._outlets.hold(produced)
-            is_saved = await self._keep(delivery, self._taken(delivery))
-        except LeftUnsaved:
+            is_saved = await self._save(delivery, self._taken(delivery))
+        except UnsavedStateError:
             raise
         except Exception as error:
             log.exception("%s failed on %s", self.name, type(message).__name__)
-            self._journal.stepped("failed", self._actor.situation, error=repr(error))
+            self._journal.record_step("failed", self._actor.situation, error=repr(error))
             await self._restart()
             return False
-        self._journal.stepped("done", self._actor.situation, produced)
+        self._journal.record_step("done", self._actor.situation, produced)
         await self._outlets.release(is_saved=is_saved)
-        self._vitals.finished(message, is_timed=bool(produced) or not self._actor.outputs)
+        self._vitals.record_step(message, is_timed=bool(produced) or not self._actor.outputs)
         return True
 
-    def _taken(self, delivery: Delivery) -> Taken | None:
+    def _taken(self, delivery: Delivery) -> LoggedInput | None:
         """For an actor whose state lags."""
         if not self._actor.lags:
             return None
-        return Taken.of(delivery.port.topic.name, delivery.body, self._actor.situation)
+        return LoggedInput.of(delivery.port.topic.name, delivery.body, self._actor.situation)
 
     async def _tell(self, produced: list[Produced], *, whole: bool = False) -> None:
         self._outlets.hold(produced)
-        await self._outlets.release(is_saved=await self._keep(whole=whole))
+        await self._outlets.release(is_saved=await self._save(whole=whole))
 
-    def _look_around(self) -> None:
-        self._actor.situation = Situation(
-            room=self._outlets.room(),
-            waiting=self._mailbox.waiting() if self._mailbox else {},
+    def _update_flow_status(self) -> None:
+        self._actor.situation = FlowStatus(
+            credits=self._outlets.room(),
+            backlog=self._mailbox.waiting() if self._mailbox else {},
         )
 
-    async def _say_first_words(self) -> None:
+    async def _publish_restored(self) -> None:
         if self._keeper.past.of_actor:
-            await self._say("resumed", lambda: self._actor.resumed())
+            await self._say("resumed", lambda: self._actor.on_restored())
 
-    async def _say_last_words(self) -> None:
-        await self._say("finished", lambda: self._actor.finish())
+    async def _publish_final(self) -> None:
+        await self._say("finished", lambda: self._actor.on_stop())
 
     async def _say(self, kind: Kind, words: Callable[[], Iterator[Message]]) -> None:
-        self._look_around()
+        self._update_flow_status()
         try:
             produced = await self._worker.run(lambda: produce(self._actor, words()))
         except Exception:
@@ -257,12 +257,15 @@ class Stage:
             log.exception("%s: what it says when it has %s failed", self.name, kind)
             return
         if produced or kind == "finished":
-            self._journal.stepped(kind, self._actor.situation, produced)
+            self._journal.record_step(kind, self._actor.situation, produced)
         await self._tell(produced, whole=True)
 
     # --- keeping --------------------------------------------------------------------------------
-    async def _keep(
-        self, delivery: Delivery | None = None, taken: Taken | None = None, whole: bool = False
+    async def _save(
+        self,
+        delivery: Delivery | None = None,
+        taken: LoggedInput | None = None,
+        whole: bool = False,
     ) -> bool:
         """Save all as of now, that delivery handled. False: not yet, and nobody waits for it.
 
@@ -270,13 +273,13 @@ class Stage:
         is to end and the disk takes nothing.
         """
         state = await self._worker.run(
-            self._keeper.compose, self._actor, self._links(delivery), taken, whole
+            self._keeper.build_checkpoint, self._actor, self._links(delivery), taken, whole
         )
         while not await self._is_written(state):
             if not self._waits_for_disk:
                 return False
             if self._drain_requested:
-                raise LeftUnsaved
+                raise UnsavedStateError
             await asyncio.sleep(self.SAVE_AGAIN_S)
         return True
 
@@ -292,13 +295,13 @@ class Stage:
     @property
     def _waits_for_disk(self) -> bool:
         takes = any(isinstance(port.policy, Lossless) for port in self._actor.inputs)
-        return not self._outlets.never_wait and (takes or self._outlets.have_expected)
+        return not self._outlets.is_nonblocking and (takes or self._outlets.has_required_consumers)
 
     def _begin(self) -> None:
         """Save what there is before anyone counts on this stage: at once, as it is little. What the
         disk does not take is tried again before the first step."""
         try:
-            self._write(self._keeper.compose(self._actor, self._links(), None, False))
+            self._write(self._keeper.build_checkpoint(self._actor, self._links(), None, False))
         except OSError as error:
             self._note_unsaved(error)
 
@@ -307,17 +310,17 @@ class Stage:
         return self._keeper.links(inputs, self._outlets.past())
 
     def _note_unsaved(self, error: OSError) -> None:
-        self._vitals.failures += self._keeper.failed(self.name, error)
-        self._vitals.facts = {**self._vitals.facts, **self._keeper.facts()}
+        self._vitals.failures += self._keeper.record_failure(self.name, error)
+        self._vitals.facts = {**self._vitals.facts, **self._keeper.metrics()}
 
     # --- orders ---------------------------------------------------------------------------------
-    async def _obey(self, order: Order, mailbox: Mailbox) -> None:
+    async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
         try:
             match order.what:
                 case "hold":
-                    mailbox.hold()
+                    mailbox.pause()
                 case "release":
-                    mailbox.release()
+                    mailbox.resume()
                 case "renew":
                     await self._renew(mailbox)
                 case "save":
@@ -331,52 +334,52 @@ class Stage:
     async def _renew(self, mailbox: Mailbox) -> None:
         """Begin anew; to everyone else it looks like a process that was started again."""
         self._keeper.forget(self.name)
-        self._actor = await self._worker.run(self._successor)
+        self._actor = await self._worker.run(self._restored_actor)
         self._epoch = new_epoch()
         self._vitals.facts = {}
-        mailbox.renew()
+        mailbox.reset()
         self._outlets.renew(self._epoch)
-        await self._keep()
+        await self._save()
 
     # --- in the actor's thread ------------------------------------------------------------------
     def _handle(self, message: Message) -> list[Produced]:
         return produce(self._actor, self._actor.handle(message))
 
-    def _successor(self) -> Actor:
-        actor = self._keeper.successor(self._make)
-        self._journal.started(self._keeper.past.of_actor or None)
+    def _restored_actor(self) -> Actor:
+        actor = self._keeper.restore_actor(self._make)
+        self._journal.record_start(self._keeper.past.of_actor or None)
         return actor
 
     def _write(self, state: State) -> None:
         self._keeper.write(self._actor, state)
         self._vitals.facts = {
-            **self._actor.facts(),
+            **self._actor.metrics(),
             **self._journal.statistics(),
-            **self._keeper.facts(),
+            **self._keeper.metrics(),
         }
 
     def _save_whole(self, links: State) -> None:
-        self._write(self._keeper.compose(self._actor, links, None, True))
+        self._write(self._keeper.build_checkpoint(self._actor, links, None, True))
 
     async def _restart(self) -> None:
         """Wait, longer with each failure, and put a successor in place."""
         while True:
             self._vitals.failures += 1
-            await asyncio.sleep(self._budget.spend(asyncio.get_running_loop().time()))
+            await asyncio.sleep(self._budget.record_failure(asyncio.get_running_loop().time()))
             try:
-                self._actor = await self._worker.run(self._successor)
+                self._actor = await self._worker.run(self._restored_actor)
             except Exception:
                 log.exception("%s cannot go on from its last state", self.name)
                 continue
             self._vitals.restarts += 1
             self._outlets.take_back()
-            await self._say_first_words()
+            await self._publish_restored()
             return
 
     # --- health ---------------------------------------------------------------------------------
-    async def _beat(self, mailbox: Mailbox) -> None:
+    async def _heartbeat_loop(self, mailbox: Mailbox) -> None:
         while True:
-            mailbox.send_grants()
+            mailbox.send_credits()
             self._outlets.check_windows()
             header = Header(self.name, self._epoch, 0, self._vitals.last_stamp_ns)
             self._health.post(encode_link(header), encode(self.health()))

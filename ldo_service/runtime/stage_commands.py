@@ -34,37 +34,39 @@ log = logging.getLogger(__name__)
 ORDER_KEY, REPORT_KEY = "link/order", "link/report"
 REPEAT_AFTER_S = 0.25  # an order or its report got lost; a stage at work is asked again in vain
 
-LEAST_S = 2.0  # 3x the slowest step measured
+MIN_S = 2.0  # 3x the slowest step measured
 
 
 What = Literal["hold", "release", "renew", "save"]
 
 
-class Order(msgspec.Struct, frozen=True, array_like=True):
+class StageCommand(msgspec.Struct, frozen=True, array_like=True):
     number: int  # no other order has it
     what: What
     stage: str
 
 
-class Report(msgspec.Struct, frozen=True, array_like=True):
+class StageReply(msgspec.Struct, frozen=True, array_like=True):
     number: int
     stage: str
     error: str = ""  # empty: done
 
 
-class OrderTaker:
+class CommandReceiver:
     """The stage's end: hands over each order once, and repeats its report when asked again."""
 
-    def __init__(self, stage: str, transport: Transport, take: Callable[[Order], None]) -> None:
+    def __init__(
+        self, stage: str, transport: Transport, take: Callable[[StageCommand], None]
+    ) -> None:
         self._stage, self._take = stage, take
         self._loop = asyncio.get_running_loop()
         self._under_way = 0
-        self._done: Report | None = None
+        self._done: StageReply | None = None
         self._reports = transport.publisher(REPORT_KEY)
         transport.subscribe(ORDER_KEY, self._arrived)
 
-    def report(self, order: Order, error: str) -> None:
-        self._done = Report(order.number, self._stage, error)
+    def report(self, order: StageCommand, error: str) -> None:
+        self._done = StageReply(order.number, self._stage, error)
         self._reports.post(b"", encode_link(self._done))
 
     def close(self) -> None:
@@ -73,11 +75,11 @@ class OrderTaker:
     def _arrived(self, _header: bytes, body: memoryview) -> None:
         """On any thread."""
         with suppress(msgspec.DecodeError):
-            order = decode(body, Order)
+            order = decode(body, StageCommand)
             if order.stage == self._stage:
                 call_soon(self._loop, self._take_once, order)
 
-    def _take_once(self, order: Order) -> None:
+    def _take_once(self, order: StageCommand) -> None:
         if self._done is not None and order.number == self._done.number:
             self._reports.post(b"", encode_link(self._done))
         elif order.number != self._under_way:
@@ -85,7 +87,7 @@ class OrderTaker:
             self._take(order)
 
 
-class Commander:
+class CommandSender:
     """The service's end."""
 
     def __init__(self, transport: Transport) -> None:
@@ -96,7 +98,7 @@ class Commander:
 
     async def order(self, what: What, stage: str, timeout_s: float) -> str:
         """Empty when it is done, else why it is not; does not raise for what a stage does."""
-        order = Order(1 + secrets.randbits(62), what, stage)
+        order = StageCommand(1 + secrets.randbits(62), what, stage)
         report = self._reports[order.number] = self._loop.create_future()
         try:
             async with asyncio.timeout(timeout_s):
@@ -115,15 +117,15 @@ class Commander:
     def _arrived(self, _header: bytes, body: memoryview) -> None:
         """On any thread."""
         with suppress(msgspec.DecodeError):
-            call_soon(self._loop, self._reported, decode(body, Report))
+            call_soon(self._loop, self._reported, decode(body, StageReply))
 
-    def _reported(self, report: Report) -> None:
+    def _reported(self, report: StageReply) -> None:
         future = self._reports.get(report.number)
         if future is not None and not future.done():
             future.set_result(report.error)
 
 
-class ControlFailed(Exception):
+class ControlError(Exception):
     """Some actor did not obey; the text names it."""
 
 
@@ -138,7 +140,7 @@ class Control:
         saved_where: str,
         timeout_s: float,
     ) -> None:
-        self._commander = Commander(transport)
+        self._commander = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
         self._saved_where, self._timeout_s = saved_where, timeout_s
         self._is_paused = False
@@ -150,7 +152,7 @@ class Control:
             "save": self._save,
             "reset": self._reset,
         }
-        transport.watch(self._presence)
+        transport.watch_liveliness(self._presence)
 
     async def answer(self, body: bytes) -> bytes:
         """The reply to a query's payload, whatever the bytes are."""
@@ -166,7 +168,7 @@ class Control:
         async with self._one_at_a_time:
             try:
                 ok, text = True, await verb()
-            except ControlFailed as failed:
+            except ControlError as failed:
                 ok, text = False, str(failed)
         log.log(logging.INFO if ok else logging.ERROR, "%s: %s", request.verb, text)
         return encode(_answer(request.stamp_ns, ok, text))
@@ -207,12 +209,12 @@ class Control:
         """
         failures, until_s = [], time.monotonic() + self._timeout_s
         for actor in actors:
-            within_s = max(until_s - time.monotonic(), min(LEAST_S, self._timeout_s))
+            within_s = max(until_s - time.monotonic(), min(MIN_S, self._timeout_s))
             error = await self._commander.order(what, actor, within_s)
             failures += [f"{actor} {error}"] if error else []
         if failures:
             advice = "`ldo doctor` shows how the actors are; then ask again."
-            raise ControlFailed(f"could not {what} all actors: {'; '.join(failures)}. {advice}")
+            raise ControlError(f"could not {what} all actors: {'; '.join(failures)}. {advice}")
 
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:

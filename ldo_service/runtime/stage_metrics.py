@@ -16,7 +16,7 @@ from .process import resident_mb
 
 
 @dataclass
-class Vitals:
+class StageMetrics:
     """Times are of the monotonic clock."""
 
     state: Literal["starting", "ready", "draining"] = "starting"
@@ -24,7 +24,9 @@ class Vitals:
     failures: int = 0
     restarts: int = 0
     set_aside: int = 0
-    step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))  # as `finished` has it
+    step_ms: deque[float] = field(
+        default_factory=lambda: deque(maxlen=200)
+    )  # as `record_step` has it
     last_step_ms: float = 0.0
     last_stamp_ns: int = 0
     finished_at_s: float = field(default_factory=time.monotonic)
@@ -41,7 +43,7 @@ class Vitals:
         finally:
             self.started_at_s = None
 
-    def finished(self, message: Message, is_timed: bool) -> None:
+    def record_step(self, message: Message, is_timed: bool) -> None:
         """`is_timed`: not for a step that took note only, or such would hide what a frame costs."""
         self.steps += 1
         if is_timed:

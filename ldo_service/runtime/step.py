@@ -28,7 +28,7 @@ class Produced:
 def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
     """Raises when a message is none of the outputs, or has no room where none may wait."""
     topics = {out.topic.message: out.topic for out in actor.outputs}
-    room = dict(actor.situation.room)
+    room = dict(actor.situation.credits)
     produced: list[Produced] = []
     for message in messages:
         topic = topics.get(type(message))
@@ -42,7 +42,7 @@ def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
     return produced
 
 
-class Reader:
+class MessageDecoder:
     """Says once an episode that messages of a topic cannot be decoded."""
 
     def __init__(self, actor: str) -> None:

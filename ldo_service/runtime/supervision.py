@@ -28,13 +28,13 @@ class Runner(Protocol):
     def drain(self) -> None: ...
 
 
-class Stop:
+class StopRequest:
     """Asked once: soft, each stage finishes what it has. Asked twice: hard, at once."""
 
     def __init__(self) -> None:
         self._soft, self._hard = asyncio.Event(), asyncio.Event()
 
-    def ask(self) -> None:
+    def request(self) -> None:
         (self._hard if self._soft.is_set() else self._soft).set()
 
     @property
@@ -48,7 +48,7 @@ class Stop:
         await self._hard.wait()
 
 
-async def supervise(runners: Sequence[Runner], stop: Stop, drain_s: float = 10.0) -> None:
+async def supervise(runners: Sequence[Runner], stop: StopRequest, drain_s: float = 10.0) -> None:
     """Run until asked to stop; then end them in the given order, producers first.
 
     Raises what a runner gave up on (RestartsExhausted, StageStalled).
@@ -96,7 +96,7 @@ class Watchdog:
         period = environment.get("WATCHDOG_USEC", "") if watched else ""
         self.period_s = int(period) * 1e-6 if period.isdecimal() else 0.0  # 0: not watched
 
-    def tell(self, word: str) -> None:
+    def notify(self, word: str) -> None:
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
@@ -106,5 +106,5 @@ class Watchdog:
     async def ping(self) -> None:
         """For ever, on the event loop that is watched; returns at once when nobody does."""
         while self.period_s > 0:
-            self.tell("WATCHDOG=1")
+            self.notify("WATCHDOG=1")
             await asyncio.sleep(self.period_s / PINGS_PER_PERIOD)

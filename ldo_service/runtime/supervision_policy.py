@@ -16,7 +16,7 @@ class RestartBudget:
         self._delay_s, self._delay_max_s = delay_s, delay_max_s
         self._failed_at_s: deque[float] = deque()
 
-    def spend(self, now_s: float) -> float:
+    def record_failure(self, now_s: float) -> float:
         """Count a failure; the delay before the restart. Raises RestartsExhausted."""
         self._failed_at_s.append(now_s)
         while self._failed_at_s[0] < now_s - self._window_s:
@@ -28,7 +28,7 @@ class RestartBudget:
 
 
 @dataclass(frozen=True, slots=True)
-class StageConfig:
+class SupervisionConfig:
     max_restarts: int = 5  # within restart_window_s; more is a fault that a restart does not cure
     restart_window_s: float = 60.0
     restart_delay_s: float = 0.05  # doubled with each failure in the window

@@ -17,8 +17,8 @@ from scipy.optimize import linear_sum_assignment
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 
-from .distributions import pooled, shared
-from .object_landmarks import MEMBERS, NO_MEMBER, believed, rows_of, shuffled, trimmed
+from .distributions import common_mass, mean_distributions
+from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
 
 PROBES = 128  # members that are projected: the first when shuffled are a sample of the sample
 
@@ -89,7 +89,7 @@ class MapView:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Found:
+class RegionStatistics:
     """R regions of a keyframe with enough Gaussians.
 
     numbers       [R] among those of the keyframe, ascending
@@ -109,7 +109,9 @@ class Found:
     far_m: np.ndarray
 
 
-def found(view: MapView, T_camera_map: np.ndarray, config: AssociationConfig) -> Found:
+def compute_region_statistics(
+    view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
+) -> RegionStatistics:
     """What the regions of a keyframe are made of."""
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
@@ -121,24 +123,26 @@ def found(view: MapView, T_camera_map: np.ndarray, config: AssociationConfig) ->
     p_map = rows[..., :3].astype(float)
     z = p_map @ T_camera_map[2, :3] + T_camera_map[2, 3]
     near_m, far_m = trimmed(z[..., None], at >= 0)
-    return Found(
+    return RegionStatistics(
         numbers,
         np.asarray(view.boxes, float).reshape(-1, 4)[numbers],
         np.where(at >= 0, view.ids[np.maximum(at, 0)] if len(view.ids) else NO_MEMBER, NO_MEMBER),
         p_map,
-        pooled(view.labels[np.maximum(at, 0)], weights),
+        mean_distributions(view.labels[np.maximum(at, 0)], weights),
         near_m[:, 0],
         far_m[:, 0],
     )
 
 
-def with_whole_things(view: MapView, regions: Found, config: AssociationConfig) -> MapView:
+def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
     """A view in which regions that are parts of another belong to it. That one may have lost all
     of its Gaussians to them: then it is where its largest part is."""
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
     near_m[regions.numbers], far_m[regions.numbers] = regions.near_m, regions.far_m
-    whole = whole_of(np.asarray(view.boxes, float), view.classes, near_m, far_m, config)
+    whole = find_containing_regions(
+        np.asarray(view.boxes, float), view.classes, near_m, far_m, config
+    )
     if np.array_equal(whole, np.arange(len(whole))):
         return view
     is_hit = view.regions >= 0
@@ -146,7 +150,7 @@ def with_whole_things(view: MapView, regions: Found, config: AssociationConfig) 
     return replace(view, regions=numbers.astype(np.int32))
 
 
-def whole_of(
+def find_containing_regions(
     boxes: np.ndarray,
     classes: np.ndarray,
     near_m: np.ndarray,
@@ -159,7 +163,8 @@ def whole_of(
 
     >>> plant, crown, pot = [0, 0, 9, 20], [0, 0, 9, 12], [2, 12, 7, 20]
     >>> at_m = np.full(3, 2.0)
-    >>> whole_of(np.array([pot, plant, crown]), np.zeros((3, 2)), at_m, at_m, AssociationConfig())
+    >>> find_containing_regions(np.array([pot, plant, crown]), np.zeros((3, 2)), at_m, at_m,
+    ...     AssociationConfig())
     array([1, 1, 1])
     """
     area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
@@ -220,7 +225,7 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Looks:
+class PredictedBoxes:
     """K landmarks as a keyframe should show them.
 
     boxes         [K, 4] px, of what nothing hides, or of where that should be; empty ones
@@ -239,12 +244,12 @@ class Looks:
     rows: np.ndarray
 
 
-def look(
+def predict_boxes(
     table: np.ndarray, view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
-) -> Looks:
+) -> PredictedBoxes:
     """How landmarks [K] appear; of one none of whose members is awake, how its centroid does."""
     where = rows_of(table["members"], view.ids)
-    there = ((where >= 0) & believed(table))[:, :PROBES]
+    there = ((where >= 0) & reliable_members(table))[:, :PROBES]
     p_map = view.rows[np.maximum(where[:, :PROBES], 0), :3].astype(float)
     gone = ~there.any(axis=1)
     p_map[gone, 0] = table["centroid"][gone]
@@ -258,7 +263,7 @@ def look(
     shown = seen & ~through
     low, high = trimmed(px, np.where(shown.any(axis=1, keepdims=True), shown, seen))
     count = np.count_nonzero(there, axis=1)
-    return Looks(
+    return PredictedBoxes(
         np.concatenate([low, high], axis=1),
         np.count_nonzero(shown, axis=1) / count,
         np.count_nonzero(through, axis=1) / count,
@@ -307,7 +312,7 @@ def depth_gaps_m(
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Pairs:
+class AssociationCosts:
     """K landmarks and R regions: iou [K, R], and which may be the same, [K, R] bool: their boxes
     overlap, their depths meet, and they share a class."""
 
@@ -315,16 +320,19 @@ class Pairs:
     allowed: np.ndarray
 
 
-def paired(
-    distributions: np.ndarray, looks: Looks, regions: Found, config: AssociationConfig
-) -> Pairs:
+def association_costs(
+    distributions: np.ndarray,
+    looks: PredictedBoxes,
+    regions: RegionStatistics,
+    config: AssociationConfig,
+) -> AssociationCosts:
     """Of landmarks with distributions [K, C]."""
     iou = overlaps(looks.boxes, regions.boxes)
     gap_m = depth_gaps_m(looks.near_m, looks.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
     k, r = np.nonzero(allowed)
-    allowed[k, r] = shared(distributions[k], regions.distributions[r]) >= config.min_shared
-    return Pairs(iou, allowed)
+    allowed[k, r] = common_mass(distributions[k], regions.distributions[r]) >= config.min_shared
+    return AssociationCosts(iou, allowed)
 
 
 def associate(

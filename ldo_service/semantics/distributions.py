@@ -5,13 +5,13 @@ Kept and sent they are sparse: the eight heaviest labels; what the others had is
 
 import numpy as np
 
-from .gaussian_labels import BACKGROUND, MOST_LABELS, OTHER, background, fields
+from .gaussian_labels import BACKGROUND, MAX_LABELS, OTHER, background, fields
 
 KEPT = 8  # labels of a sparse distribution: the five of a Gaussian, and those of its neighbours
 FLOOR = 1e-6  # of what a distribution holds impossible, so that divergences are finite
 
 
-def pooled(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """[K, C] float64: means of the distributions of K groups of M Gaussians.
 
         p_k = sum_m w_km p_km / sum_m w_km
@@ -24,20 +24,20 @@ def pooled(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     >>> from ldo_service.semantics.gaussian_labels import new_labels
     >>> labels = new_labels(2)
     >>> fields(labels)["ids"][:, 0], fields(labels)["weights"][:, 0] = 2, (1, 0.5)
-    >>> pooled(labels[None], np.array([[3.0, 1.0]]))[0, :3].tolist()  # (3 + 0.5) / 4
+    >>> mean_distributions(labels[None], np.array([[3.0, 1.0]]))[0, :3].tolist()  # (3 + 0.5) / 4
     [0.125, 0.0, 0.875]
     """
     groups, each = weights.shape
     rows = labels.reshape(groups * each, labels.shape[-1])
     weight = weights.reshape(-1, 1)
-    group = np.repeat(np.arange(groups), each)[:, None] * MOST_LABELS
+    group = np.repeat(np.arange(groups), each)[:, None] * MAX_LABELS
     cells = np.concatenate([group + fields(rows)["ids"], group + BACKGROUND], axis=1)
     mass = np.concatenate([fields(rows)["weights"], background(rows)[:, None]], axis=1) * weight
-    sums = np.bincount(cells.ravel(), mass.ravel(), groups * MOST_LABELS)
-    return normalised(sums.reshape(groups, MOST_LABELS))
+    sums = np.bincount(cells.ravel(), mass.ravel(), groups * MAX_LABELS)
+    return normalized(sums.reshape(groups, MAX_LABELS))
 
 
-def normalised(p: np.ndarray) -> np.ndarray:
+def normalized(p: np.ndarray) -> np.ndarray:
     """Rows that sum to one; all on background where there is nothing."""
     total = p.sum(axis=-1, keepdims=True)
     nothing = np.zeros(p.shape[-1])
@@ -54,10 +54,10 @@ def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """[..., C] float64 of sparse ones, with what they miss on `other`."""
-    out = np.zeros((*labels.shape[:-1], MOST_LABELS))
+    out = np.zeros((*labels.shape[:-1], MAX_LABELS))
     np.put_along_axis(out, labels.astype(np.int64), weights.astype(float), axis=-1)
     out[..., OTHER] += np.maximum(1 - weights.sum(axis=-1, dtype=float), 0)
-    return normalised(out)
+    return normalized(out)
 
 
 def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ def entropy(p: np.ndarray) -> np.ndarray:
     return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=-1)
 
 
-def shared(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     """[...], how much two distributions have in common, 0..1, background apart:
     sum_c min(p_c, q_c) over the smaller mass that is not background."""
     p, q = p.copy(), q.copy()

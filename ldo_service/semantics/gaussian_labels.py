@@ -10,7 +10,7 @@ from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
 BACKGROUND, OTHER = 0, 1  # what every vocabulary begins with
-MOST_LABELS = 256  # C_max (III.B)
+MAX_LABELS = 256  # C_max (III.B)
 SLOTS = 5  # L (III.B)
 NOT_SEEN, MISS = -2, -1  # in place of a label that was observed
 ROW = np.dtype(
@@ -50,7 +50,7 @@ class Disagreement:
     expected: float
 
 
-def agree(
+def smooth_labels(
     rows: np.ndarray,
     labels: np.ndarray,
     indices: np.ndarray,
@@ -76,7 +76,7 @@ def agree(
     >>> rows, labels = np.zeros((2, 16), np.float32), new_labels(2)
     >>> rows[1, 0] = 0.05
     >>> fields(labels)["weights"][0, 0], fields(labels)["ids"][0, 0] = 1, 2
-    >>> loss = agree(rows, labels, np.arange(2, dtype=np.uint32), ConsistencyConfig())
+    >>> loss = smooth_labels(rows, labels, np.arange(2, dtype=np.uint32), ConsistencyConfig())
     >>> round(loss.literal, 3), round(loss.expected, 3)  # both see each other: 2 exp(-1)
     (0.736, 0.736)
     >>> distribution(labels, 3).astype(float).round(3).tolist()
@@ -193,14 +193,14 @@ def observe(
     )
 
 
-def without_misses(labels: np.ndarray, indices: np.ndarray) -> None:
+def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
     """Take background, and the evidence for it, out of rows `indices` [V] of labels [N, 32], in
     place: what else they were seen as stays, in proportion.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)
     >>> row["weights"][0, 0], row["evidence"] = 0.25, 2
-    >>> without_misses(labels, np.array([0]))
+    >>> clear_background(labels, np.array([0]))
     >>> row["weights"][0, 0].item(), row["evidence"].item()
     (1.0, 0.5)
     """
@@ -211,7 +211,7 @@ def without_misses(labels: np.ndarray, indices: np.ndarray) -> None:
     rows["evidence"][indices] *= named
 
 
-def forget(labels: np.ndarray, indices: np.ndarray) -> None:
+def reset_labels(labels: np.ndarray, indices: np.ndarray) -> None:
     """Make rows `indices` [V] of labels [N, 32] as never seen, in place."""
     labels[indices] = 0
 
@@ -227,7 +227,7 @@ def top_labels(labels: np.ndarray) -> np.ndarray:
     return np.where(rows["weights"][:, 0] > background(labels), rows["ids"][:, 0], BACKGROUND)
 
 
-def distribution(labels: np.ndarray, classes: int = MOST_LABELS) -> np.ndarray:
+def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
     """[N, classes] float32, dense: rows sum to one. Raises ValueError where a label is beyond."""
     rows = fields(labels)
     used = rows["weights"] > 0

@@ -68,7 +68,7 @@ class Regions:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Assigned:
+class Assignment:
     """regions  [V] int32: number of the region; UNMATCHED; or HIDDEN: out of the image, or not at
                 the depth that was measured there
     overlaps [V] float32, with that region, by the rule; 0 without one
@@ -80,7 +80,7 @@ class Assigned:
     depths_m: np.ndarray
 
 
-def assign(
+def assign_gaussians(
     rows: np.ndarray,
     indices: np.ndarray,
     camera: Camera,
@@ -90,7 +90,7 @@ def assign(
     config: AssignmentConfig,
     *,
     threads: int = 1,
-) -> Assigned:
+) -> Assignment:
     """Match Gaussians with regions.
 
     Each is projected, S = J R Sigma R' J' + 0.3 px^2 I as it is rendered, and has the axis-aligned
@@ -116,15 +116,15 @@ def assign(
     >>> row[0, 2], row[0, 3:6], row[0, 6] = 1, np.log(np.sqrt(0.7) / 10), 1
     >>> region = Regions.of_boxes(np.array([[2, 1, 10, 9]]), np.ones(1))
     >>> look = row, np.zeros(1, np.uint32), camera, np.eye(4), depth_m, region
-    >>> by_share = assign(*look, AssignmentConfig())
+    >>> by_share = assign_gaussians(*look, AssignmentConfig())
     >>> int(by_share.regions[0]), round(float(by_share.overlaps[0]), 4)
     (0, 0.5)
-    >>> by_iou = assign(*look, AssignmentConfig("iou", min_overlap=0.1))
+    >>> by_iou = assign_gaussians(*look, AssignmentConfig("iou", min_overlap=0.1))
     >>> round(float(by_iou.overlaps[0]), 4)  # 8 / (16 + 64 - 8)
     0.1111
     """
     v = len(indices)
-    out = Assigned(np.empty(v, np.int32), np.empty(v, np.float32), np.empty(v, np.float32))
+    out = Assignment(np.empty(v, np.int32), np.empty(v, np.float32), np.empty(v, np.float32))
     _labels.assign(
         rows,
         indices,

@@ -10,13 +10,13 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 
-from .distributions import KEPT, dense, entropy, pooled, sparse
+from .distributions import KEPT, dense, entropy, mean_distributions, sparse
 from .gaussian_labels import BACKGROUND
 
 MEMBERS = 256  # of each landmark: centroids of samples are within 1/16 of an object's spread
 VIEWS = 3  # best views that are remembered
 NO_MEMBER = -1
-MOST_VOTES = 8  # so that a member that is one no more is out after as many keyframes
+MAX_VOTES = 8  # so that a member that is one no more is out after as many keyframes
 TRIM = 0.02  # of the members at each end are strays: beyond the box
 
 LANDMARK = np.dtype(
@@ -97,7 +97,7 @@ def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.take_along_axis(ids, order, axis=1), np.take_along_axis(votes, order, axis=1)
 
 
-def believed(table: np.ndarray) -> np.ndarray:
+def reliable_members(table: np.ndarray) -> np.ndarray:
     """[K, 256] bool: members with a third of the votes of the one that has most, or more. Edges of
     regions lie beside objects now and then, and never in the same place for long."""
     return (table["votes"] > 0) & (3 * table["votes"] >= table["votes"].max(axis=1, keepdims=True))
@@ -125,7 +125,7 @@ def derive(
 ) -> None:
     """Where landmarks [K] are and what they are, from the map [N], in place. Those of which
     fewer than `least` members are awake, and believed, stay as they were."""
-    where = np.where(believed(table), rows_of(table["members"], ids), -1)
+    where = np.where(reliable_members(table), rows_of(table["members"], ids), -1)
     known = np.flatnonzero(np.count_nonzero(where >= 0, axis=1) >= max(least, 1))
     if len(known) == 0:
         return
@@ -134,7 +134,7 @@ def derive(
     p_map = rows[np.maximum(where, 0), :3].astype(float)
     spread = moments(p_map, weights)
     T_map_object, size = boxes(p_map, weights > 0, spread[1])
-    label_ids, label_weights = sparse(pooled(labels[np.maximum(where, 0)], weights))
+    label_ids, label_weights = sparse(mean_distributions(labels[np.maximum(where, 0)], weights))
     for name, values in {
         "centroid": spread[0],
         "covariance": spread[1],

@@ -11,15 +11,15 @@ from ldo_service.geometry import Camera, se3
 
 from .data_association import (
     AssociationConfig,
-    Found,
-    Looks,
+    AssociationCosts,
     MapView,
-    Pairs,
+    PredictedBoxes,
+    RegionStatistics,
     associate,
-    found,
-    look,
-    paired,
-    with_whole_things,
+    association_costs,
+    compute_region_statistics,
+    merge_parts,
+    predict_boxes,
 )
 from .distributions import divergence, entropy
 from .gaussian_labels import BACKGROUND
@@ -35,7 +35,15 @@ from .object_landmarks import (
     new_landmarks,
     within,
 )
-from .observations import absorb, coincide, inside, neighbours, one_each, remember, voted
+from .observations import (
+    add_views,
+    boxes_overlap,
+    inside,
+    merge_into,
+    neighbors,
+    one_each,
+    update_votes,
+)
 
 CANDIDATE = -1  # in place of an id
 _AT_A_TIME = 128  # landmarks that are derived together, to stay in cache
@@ -99,7 +107,7 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
-class Observed:
+class ObjectUpdate:
     """What a keyframe made of the objects: ids that came, that went, and that became another."""
 
     observations: tuple[Observation, ...] = ()
@@ -110,7 +118,7 @@ class Observed:
 
 class Objects:
     """All landmarks. Not for two threads at once; the same calls give the same bits, also after
-    `unpacked`. An id is given once, and is its object's until that is merged or retired."""
+    `unpack`. An id is given once, and is its object's until that is merged or retired."""
 
     def __init__(self, config: ObjectsConfig | None = None) -> None:
         self.config = config or ObjectsConfig()
@@ -126,7 +134,7 @@ class Objects:
         table = self._table[self._table["id"] != CANDIDATE]
         return table[np.argsort(table["id"])]
 
-    def observe(self, view: MapView, spared: np.ndarray | None = None) -> Observed:
+    def observe(self, view: MapView, spared: np.ndarray | None = None) -> ObjectUpdate:
         """Take in what a keyframe shows. `spared` [256] bool: labels that the detector does not
         know, and cannot miss unless their place is empty.
 
@@ -143,9 +151,9 @@ class Objects:
         # what is there, and what should be
         view, regions = _seen(view, T_camera_map, limits)
         near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
-        looks = look(self._table[near], view, T_camera_map, limits)
+        looks = predict_boxes(self._table[near], view, T_camera_map, limits)
         # which is which
-        pairs = paired(distributions(self._table[near]), looks, regions, limits)
+        pairs = association_costs(distributions(self._table[near]), looks, regions, limits)
         k, r = self._match(near, pairs)
         excused, left = self._pieces(near, k, pairs, regions, r)
         # what is learnt of those seen, and of those not
@@ -157,10 +165,10 @@ class Objects:
         merged, gone = self._merge(view, near, near[k])
         retired = self._retire(gone)
         self._begin(view, regions, left)
-        return Observed(tuple(observations), born, merged, retired)
+        return ObjectUpdate(tuple(observations), born, merged, retired)
 
     # --- association ------------------------------------------------------------------------------
-    def _match(self, near: np.ndarray, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+    def _match(self, near: np.ndarray, pairs: AssociationCosts) -> tuple[np.ndarray, np.ndarray]:
         """Landmarks, as numbers in `near`, and the regions that show them."""
         is_object = (self._table["id"][near] != CANDIDATE)[:, None]
         allowed, least = pairs.allowed.copy(), self.config.association.min_iou
@@ -170,7 +178,12 @@ class Objects:
         return np.concatenate([k, others]), np.concatenate([r, left])
 
     def _pieces(
-        self, near: np.ndarray, k: np.ndarray, pairs: Pairs, regions: Found, r: np.ndarray
+        self,
+        near: np.ndarray,
+        k: np.ndarray,
+        pairs: AssociationCosts,
+        regions: RegionStatistics,
+        r: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Which landmarks near are not missed, [K] bool, since they were matched or a region shows
         a piece of them, and the regions that are neither matched nor such pieces."""
@@ -191,19 +204,19 @@ class Objects:
         r: np.ndarray,
         rows: np.ndarray,
         shown: np.ndarray,
-        regions: Found,
+        regions: RegionStatistics,
     ) -> list[Observation]:
         seen, p_seen = self._table[which], regions.distributions[r]
         differs = divergence(distributions(seen), p_seen) >= self.config.max_divergence
         begins = differs & (seen["id"] == CANDIDATE)
-        seen["votes"] = voted(seen["votes"], rows, view, regions.numbers[r])
+        seen["votes"] = update_votes(seen["votes"], rows, view, regions.numbers[r])
         seen["members"], seen["votes"] = joined(
             seen["members"], seen["votes"], regions.members[r], one_each(regions.members[r])
         )
         seen["seen"] = np.where(begins, 1, seen["seen"] + 1)
         seen["first"] = np.where(begins, view.keyframe, seen["first"])
         seen["misses"], seen["last"] = 0, view.keyframe
-        remember(seen, view.keyframe, shown, regions.boxes[r])
+        add_views(seen, view.keyframe, shown, regions.boxes[r])
         self._derive(seen, view.rows, view.labels, view.ids, view.anchors)
         self._table[which] = seen
         entropies_seen = entropy(p_seen)
@@ -237,7 +250,11 @@ class Objects:
 
     # --- those not seen ---------------------------------------------------------------------------
     def _missed(
-        self, near: np.ndarray, looks: Looks, excused: np.ndarray, spared: np.ndarray | None
+        self,
+        near: np.ndarray,
+        looks: PredictedBoxes,
+        excused: np.ndarray,
+        spared: np.ndarray | None,
     ) -> np.ndarray:
         """Numbers of those near that a detector should have seen, or whose place is empty."""
         sides = np.clip(looks.boxes[:, 2:] - looks.boxes[:, :2], 0, None)
@@ -280,9 +297,9 @@ class Objects:
         """Objects that became another, and which landmarks [K] bool did: see `merging`."""
         merged: list[tuple[int, int]] = []
         gone = np.zeros(len(self._table), bool)
-        for a, b in neighbours(self._table, near, matched):
+        for a, b in neighbors(self._table, near, matched):
             one, other = self._table[[a]], self._table[[b]]
-            if gone[a] or gone[b] or not coincide(one, other, view, self.config.merge_overlap):
+            if gone[a] or gone[b] or not boxes_overlap(one, other, view, self.config.merge_overlap):
                 continue
             keep, goes = (a, b) if self._age(a) < self._age(b) else (b, a)
             self._join(keep, goes, view)
@@ -298,17 +315,17 @@ class Objects:
 
     def _join(self, keep: int, goes: int, view: MapView) -> None:
         one = self._table[[keep]]
-        absorb(one, self._table[[goes]])
+        merge_into(one, self._table[[goes]])
         self._derive(one, view.rows, view.labels, view.ids, view.anchors)
         self._table[[keep]] = one
 
     # --- those that come --------------------------------------------------------------------------
-    def _begin(self, view: MapView, regions: Found, left: np.ndarray) -> None:
+    def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
         """A candidate of each region that is left; of too many those seen longest ago go."""
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
-        remember(new, view.keyframe, np.ones(len(left)), regions.boxes[left])
+        add_views(new, view.keyframe, np.ones(len(left)), regions.boxes[left])
         self._derive(new, view.rows, view.labels, view.ids, view.anchors)
         if len(new):
             self._table = np.concatenate([self._table, new])
@@ -356,7 +373,7 @@ class Objects:
         return {"landmarks": table, "counts": np.array(counts, np.int64)}
 
     @staticmethod
-    def unpacked(packed: Mapping[str, Any], config: ObjectsConfig | None = None) -> "Objects":
+    def unpack(packed: Mapping[str, Any], config: ObjectsConfig | None = None) -> "Objects":
         """As it was. Raises ValueError when this is not what `packed` gave."""
         table = np.ascontiguousarray(packed["landmarks"])
         if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
@@ -378,8 +395,10 @@ class Objects:
 
 def _seen(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
-) -> tuple[MapView, Found]:
+) -> tuple[MapView, RegionStatistics]:
     """What a keyframe shows of things, not of their parts."""
-    regions = found(view, T_camera_map, config)
-    whole = with_whole_things(view, regions, config)
-    return whole, regions if whole is view else found(whole, T_camera_map, config)
+    regions = compute_region_statistics(view, T_camera_map, config)
+    whole = merge_parts(view, regions, config)
+    return whole, regions if whole is view else compute_region_statistics(
+        whole, T_camera_map, config
+    )

@@ -4,14 +4,24 @@ import numpy as np
 
 from .data_association import MapView
 from .label_assignment import HIDDEN
-from .object_landmarks import MOST_VOTES, NO_MEMBER, VIEWS, believed, joined, labels_of, rows_of
+from .object_landmarks import (
+    MAX_VOTES,
+    NO_MEMBER,
+    VIEWS,
+    joined,
+    labels_of,
+    reliable_members,
+    rows_of,
+)
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
     return (members != NO_MEMBER).astype(np.int8)
 
 
-def voted(votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray) -> np.ndarray:
+def update_votes(
+    votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray
+) -> np.ndarray:
     """Votes [K, 256] one higher for members, in `rows` of the map, that lie in the region `numbers`
     [K] of their landmark, and one lower for those that were seen beside it or are no more."""
     wanted = np.maximum(rows, 0).astype(view.indices.dtype)  # or all of `indices` is converted
@@ -21,10 +31,10 @@ def voted(votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarra
     is_in = region == numbers[:, None]
     is_out = (rows < 0) | ((region != HIDDEN) & ~is_in)
     change = is_in.astype(np.int8) - is_out.astype(np.int8)
-    return np.where(votes > 0, np.clip(votes + change, 0, MOST_VOTES), 0).astype(np.int8)
+    return np.where(votes > 0, np.clip(votes + change, 0, MAX_VOTES), 0).astype(np.int8)
 
 
-def remember(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
+def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
     """Large boxes with much of the object in them are good views."""
     scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
     add_view(table, np.full(len(table), keyframe), scores, boxes)
@@ -46,7 +56,7 @@ def add_view(
         table[name] = np.take_along_axis(values, at, axis=1)
 
 
-def neighbours(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
+def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
     """Pairs of one of `near` [K] that was `matched` and one that was not, of the same name, whose
     boxes are close enough to meet."""
     here, is_matched = table[near], np.isin(near, matched)
@@ -57,13 +67,13 @@ def neighbours(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list
     return list(zip(near[one[close]].tolist(), near[other[close]].tolist(), strict=True))
 
 
-def coincide(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
+def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
     """Whether that share of one, of two tables [1], lies in the box of the other."""
     shares = inside(other[0], awake(one, view)), inside(one[0], awake(other, view))
     return max(shares) >= least
 
 
-def absorb(one: np.ndarray, gone: np.ndarray) -> None:
+def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
     """Give one landmark what another was, both tables [1], in place; what follows of its members
     is to be derived anew."""
     one["members"], one["votes"] = joined(
@@ -89,5 +99,5 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
 
 def awake(landmark: np.ndarray, view: MapView) -> np.ndarray:
     """Where the Gaussians [M, 3] of one, in a table [1], are."""
-    where = rows_of(landmark["members"][believed(landmark)], view.ids)
+    where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

@@ -14,9 +14,9 @@ from ldo_service.gaussians.model import aligned_rows
 from ldo_service.gaussians.renderer import Rendering, render
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import (
-    Claims,
     ForegroundConfig,
     NestingConfig,
+    RegionDetections,
     foreground,
     surfaces,
     without_nested,
@@ -30,15 +30,15 @@ from .gaussian_labels import (
     Disagreement,
     LabelConfig,
     Observations,
-    agree,
     background,
+    clear_background,
     fields,
-    forget,
     observe,
+    reset_labels,
+    smooth_labels,
     top_labels,
-    without_misses,
 )
-from .label_assignment import HIDDEN, Assigned, AssignmentConfig, Regions, assign
+from .label_assignment import HIDDEN, Assignment, AssignmentConfig, Regions, assign_gaussians
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +59,7 @@ class FusionConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Fused:
+class FusedLabels:
     """labels [V] int16; confidences [V] float32, SemConf; alpha [V] float32, the detector's part;
     by_detector [V] float32, alpha Conf_YOLO"""
 
@@ -69,14 +69,14 @@ class Fused:
     by_detector: np.ndarray
 
 
-def fused(
+def fuse_confidences(
     detector_labels: np.ndarray,
     detector_confidences: np.ndarray,
     overlaps: np.ndarray,
     open_labels: np.ndarray,
     open_confidences: np.ndarray,
     config: FusionConfig,
-) -> Fused:
+) -> FusedLabels:
     """Label and confidence of V Gaussians, or regions.
 
         r_YOLO = overlap Conf_YOLO,  r_VLM = Conf_VLM
@@ -93,7 +93,7 @@ def fused(
     A box of 0.8 over half of a splat, and a labeller that is 0.6 sure: r = 0.4 and 0.6,
     alpha = 0.16 / (0.16 + 0.36), SemConf = 0.308 * 0.8 + 0.692 * 0.6; 0.246 loses against 0.415:
 
-    >>> one = fused(*np.array([[7], [0.8], [0.5], [9], [0.6]]), FusionConfig())
+    >>> one = fuse_confidences(*np.array([[7], [0.8], [0.5], [9], [0.6]]), FusionConfig())
     >>> int(one.labels[0]), round(float(one.alpha[0]), 3), round(float(one.confidences[0]), 3)
     (9, 0.308, 0.662)
     """
@@ -104,7 +104,7 @@ def fused(
     alpha = alpha.astype(np.float32)
     by_detector, by_labeller = alpha * confidences, (1 - alpha) * open_confidences
     labels = np.where(by_detector >= by_labeller, detector_labels, open_labels)
-    return Fused(labels.astype(np.int16), by_detector + by_labeller, alpha, by_detector)
+    return FusedLabels(labels.astype(np.int16), by_detector + by_labeller, alpha, by_detector)
 
 
 def _alpha(r_detector: np.ndarray, r_open: np.ndarray, config: FusionConfig) -> np.ndarray:
@@ -114,7 +114,7 @@ def _alpha(r_detector: np.ndarray, r_open: np.ndarray, config: FusionConfig) -> 
     return ours / (ours + r_open.astype(float) ** config.beta + config.epsilon)
 
 
-def reliable_image(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
+def reliable_label_mask(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
     """[H, W] bool, where the Gaussian that made most of a pixel, `top` [H, W], has a label but
     background with that probability, or more."""
     rows = labels[np.maximum(top, 0).ravel()]
@@ -159,7 +159,7 @@ def label_image(
 
 
 @dataclass(frozen=True, slots=True)
-class LabellingConfig:
+class SemanticFusionConfig:
     region: Literal["foreground", "box"] = "foreground"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     nesting: NestingConfig = field(default_factory=NestingConfig)
@@ -174,8 +174,8 @@ class LabellingConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Labelled:
-    assigned: Assigned
+class FusionResult:
+    assigned: Assignment
     seen: Observations
     disagreement: Disagreement
 
@@ -187,13 +187,13 @@ def label_keyframe(
     camera: Camera,
     T_map_camera: np.ndarray,
     depth_m: np.ndarray,
-    claims: Claims,
-    config: LabellingConfig,
+    claims: RegionDetections,
+    config: SemanticFusionConfig,
     *,
     is_late: bool = False,
     spared: np.ndarray | None = None,
     threads: int = 1,
-) -> Labelled:
+) -> FusionResult:
     """Fold what is claimed of a keyframe into the labels [N, 32] of the map, in place.
 
     rows [N, 16]; indices [V] uint32, the Gaussians that made its image; depth_m [H, W] as it was
@@ -205,7 +205,7 @@ def label_keyframe(
     # which Gaussians are where
     regions = regions_of(claims, depth_m, camera, config)
     T_camera_map = se3.inverse(T_map_camera)
-    where = assign(
+    where = assign_gaussians(
         rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
     )
     # what they were seen as
@@ -215,17 +215,19 @@ def label_keyframe(
         is_spared = spared[top_labels(labels[indices])] & (seen.labels == MISS)
         seen.labels[is_spared] = NOT_SEEN
         is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
-        without_misses(labels, indices[is_named])
-    if claims.anew and config.region == "foreground":
-        forget(labels, indices[seen.labels >= 0])
+        clear_background(labels, indices[is_named])
+    if claims.replaces_labels and config.region == "foreground":
+        reset_labels(labels, indices[seen.labels >= 0])
     observe(labels, seen, config.labels, threads=threads)
     # what their neighbours say
     touched = indices[seen.labels != NOT_SEEN]
-    return Labelled(where, seen, agree(rows, labels, touched, config.consistency, threads=threads))
+    return FusionResult(
+        where, seen, smooth_labels(rows, labels, touched, config.consistency, threads=threads)
+    )
 
 
 def regions_of(
-    claims: Claims, depth_m: np.ndarray, camera: Camera, config: LabellingConfig
+    claims: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
     """The boxes, or the objects in them, each without those that lie on it."""
     if config.region == "box" or len(claims.boxes) == 0:
@@ -243,11 +245,11 @@ def regions_of(
 
 
 def observations(
-    where: Assigned,
+    where: Assignment,
     indices: np.ndarray,
     camera: Camera,
-    claims: Claims,
-    config: LabellingConfig,
+    claims: RegionDetections,
+    config: SemanticFusionConfig,
     *,
     is_late: bool = False,
 ) -> Observations:
@@ -266,7 +268,7 @@ def observations(
     if is_fused.any():
         both = np.flatnonzero(is_fused.take(outcome))
         of = where.regions[both]
-        one = fused(
+        one = fuse_confidences(
             claims.labels.take(of),
             claims.confidences.take(of),
             where.overlaps[both],

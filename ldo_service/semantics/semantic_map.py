@@ -6,41 +6,41 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
+from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Contributions
-from ldo_service.gaussians.training_views import View
-from ldo_service.regions.foreground import Claims
-from ldo_service.regions.open_vocabulary import Naming, NamingConfig
-from ldo_service.regions.region import Answer, Region
+from ldo_service.gaussians.training_views import TrainingView
+from ldo_service.regions.foreground import RegionDetections
+from ldo_service.regions.open_vocabulary import OpenVocabularyConfig, OpenVocabularyLabeling
+from ldo_service.regions.region import Region, RegionLabelResult
 
 from .data_association import MapView
-from .gaussian_labels import BACKGROUND, MOST_LABELS, Disagreement, top_labels
-from .objects import Objects, ObjectsConfig, Observed
-from .semantic_fusion import Labelled, LabellingConfig, label_keyframe, reliable_image
+from .gaussian_labels import BACKGROUND, MAX_LABELS, Disagreement, top_labels
+from .objects import Objects, ObjectsConfig, ObjectUpdate
+from .semantic_fusion import FusionResult, SemanticFusionConfig, label_keyframe, reliable_label_mask
 
 
 @dataclass(frozen=True, slots=True)
 class SemanticMapConfig:
-    labelling: LabellingConfig = field(default_factory=LabellingConfig)
+    labelling: SemanticFusionConfig = field(default_factory=SemanticFusionConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
-    naming: NamingConfig = field(default_factory=NamingConfig)
-    movable: MovableConfig = field(default_factory=MovableConfig)
+    naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
+    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
     movable_confidence: float = 0.6  # of the detector: below, it is not relied on elsewhere, and a
     # hole where a picture was taken for a person would be worse than the person
-    most_names: int = MOST_LABELS  # of the vocabulary; a later name is `other`
+    most_names: int = MAX_LABELS  # of the vocabulary; a later name is `other`
     most_waiting: int = 8  # keyframes whose boxes came before they were mapped: as many as may be
     # on their way to the mapper
     most_said_again: int = 64  # the newest keyframes whose boxes came: after a restart those of a
     # window, 8, come once more
 
     def __post_init__(self) -> None:
-        if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MOST_LABELS:
+        if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MAX_LABELS:
             raise ConfigError(
                 named(self, "most_names", "most_waiting", "most_said_again")
-                + (f": most_waiting at least 0, most_said_again 1, most_names up to {MOST_LABELS}.")
+                + (f": most_waiting at least 0, most_said_again 1, most_names up to {MAX_LABELS}.")
             )
 
     @property
@@ -49,11 +49,11 @@ class SemanticMapConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Learnt:
+class KeyframeSemantics:
     """What a keyframe told, and which of its regions a labeller is to be asked about."""
 
     keyframe: int
-    observed: Observed
+    observed: ObjectUpdate
     asked: tuple[Region, ...] = ()
 
 
@@ -79,11 +79,15 @@ class SemanticMap:
         self.vocabulary = Vocabulary(self.config.most_names)
         self.objects = Objects(self.config.objects)
         is_heard = self.config.hears_labeller
-        self.naming = Naming(self.config.naming, is_heard=is_heard) if has_labeller else None
+        self.naming = (
+            OpenVocabularyLabeling(self.config.naming, is_heard=is_heard) if has_labeller else None
+        )
         self._map, self._threads = map_, threads
         self._by_detector, self._by_labeller = set[int](), set[int]()  # labels they gave
         self._done: dict[int, None] = {}  # the newest keyframes, in order
-        self._waiting: dict[int, Claims | None] = {}  # by keyframe, the first to come first
+        self._waiting: dict[
+            int, RegionDetections | None
+        ] = {}  # by keyframe, the first to come first
         self._disagreement = Disagreement(0.0, 0.0)
         self._labelled = 0  # keyframes
         self._boxes = self._repeated = self._too_early = self._without_images = 0
@@ -100,7 +104,9 @@ class SemanticMap:
         return self.vocabulary.names if self.is_used else ()
 
     # --- keyframes --------------------------------------------------------------------------------
-    def claim(self, keyframe: int, claims: Claims | None) -> Learnt | None:
+    def add_detections(
+        self, keyframe: int, claims: RegionDetections | None
+    ) -> KeyframeSemantics | None:
         """What a detector found in a keyframe; None: nobody looked. It waits until the keyframe is
         mapped; said again, it is left out."""
         if claims is None and self.naming is None:
@@ -108,7 +114,7 @@ class SemanticMap:
         if keyframe in self._done or keyframe in self._waiting:
             self._repeated += 1
         elif keyframe in self._map.views:
-            return self._learn(keyframe, claims)
+            return self._fuse_keyframe(keyframe, claims)
         else:
             self._waiting[keyframe] = claims
             while len(self._waiting) > self.config.most_waiting:
@@ -116,13 +122,15 @@ class SemanticMap:
                 self._too_early += 1
         return None
 
-    def mapped(self, keyframe: int) -> Learnt | None:
+    def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
         """A keyframe is in the map: learn what waits for it."""
         if keyframe not in self._waiting:
             return None
-        return self._learn(keyframe, self._waiting.pop(keyframe))
+        return self._fuse_keyframe(keyframe, self._waiting.pop(keyframe))
 
-    def _learn(self, keyframe: int, found: Claims | None) -> Learnt | None:
+    def _fuse_keyframe(
+        self, keyframe: int, found: RegionDetections | None
+    ) -> KeyframeSemantics | None:
         """Its images may be forgotten by now, then nobody can tell what is in the boxes."""
         self._done[keyframe] = None
         self._labelled += 1
@@ -136,26 +144,28 @@ class SemanticMap:
         # who makes its image
         view, made_by = self._seen(keyframe)
         # what is said of it, and what is to be asked
-        claims, asked = self._with_names(view, made_by.top, found or Claims.none())
+        claims, asked = self._with_names(view, made_by.top, found or RegionDetections.none())
         # what they are
         labelled = self._label(view, made_by.indices, claims, is_late=found is None)
         self._boxes += len(found.boxes) if found else 0
         self._disagreement = labelled.disagreement
         # which objects they are
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims)
-        return Learnt(keyframe, self.objects.observe(seen, self._spared()), asked)
+        return KeyframeSemantics(
+            keyframe, self.objects.observe(seen, self._undetectable_labels()), asked
+        )
 
-    def _seen(self, keyframe: int) -> tuple[View, Contributions]:
+    def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
         """A keyframe, and who makes its image. Where depth is missing, as on what is dark, it is
         the map's, which other keyframes measured; what was left out of the map has none."""
-        made_by, view = self._map.made_by(keyframe), self._map.views[keyframe]
-        in_map_m = self._map.shown(keyframe).median_depth_m
+        made_by, view = self._map.visible_contributions(keyframe), self._map.views[keyframe]
+        in_map_m = self._map.render_keyframe(keyframe).median_depth_m
         depth_m = np.where(view.depth_m > 0, view.depth_m, in_map_m)
         if view.mask is not None:
             depth_m *= view.mask > 0
         return replace(view, depth_m=depth_m), made_by
 
-    def _without_movable(self, keyframe: int, found: Claims) -> Claims:
+    def _without_movable(self, keyframe: int, found: RegionDetections) -> RegionDetections:
         """What may walk away belongs to no map: neither its surface nor its name."""
         names, sure = self.config.movable.classes, self.config.movable_confidence
         said = [self.vocabulary.name(int(label)) for label in found.labels]
@@ -163,20 +173,22 @@ class SemanticMap:
         if is_movable.any():
             boxes = [Box(said[i], *(found.boxes[i] + 0.5)) for i in np.flatnonzero(is_movable)]
             depth_m = self._map.views[keyframe].depth_m
-            pixels = movable_pixels(boxes, depth_m, self.config.movable)
-            self._movable += self._map.leave_out(keyframe, pixels)
+            pixels = dynamic_class_mask(boxes, depth_m, self.config.movable)
+            self._movable += self._map.mask_pixels(keyframe, pixels)
         return found.where(~is_movable)
 
     def _with_names(
-        self, view: View, top: np.ndarray, claims: Claims
-    ) -> tuple[Claims, tuple[Region, ...]]:
+        self, view: TrainingView, top: np.ndarray, claims: RegionDetections
+    ) -> tuple[RegionDetections, tuple[Region, ...]]:
         """With what a labeller said before of what is there; what it is asked now."""
         self._by_detector.update(claims.labels.astype(int).tolist())
         if self.naming is None:
             return claims, ()
-        is_labelled = reliable_image(self._map.gaussians.labels, top, self.naming.config.reliable)
+        is_labelled = reliable_label_mask(
+            self._map.gaussians.labels, top, self.naming.config.reliable
+        )
         T_map_keyframe = self._map.views.poses
-        claims, questions = self.naming.see(
+        claims, questions = self.naming.observe_keyframe(
             view, claims, self.vocabulary, is_labelled, T_map_keyframe
         )
         return claims, tuple(question.region for question in questions)
@@ -185,15 +197,20 @@ class SemanticMap:
         """Only the labeller gave it: of such things the detector says nothing."""
         return label in self._by_labeller and label not in self._by_detector
 
-    def _spared(self) -> np.ndarray | None:
+    def _undetectable_labels(self) -> np.ndarray | None:
         """[256] bool, labels that only the labeller gave: a detector cannot miss them."""
         if not self._by_labeller:
             return None
-        return np.array([self._is_labellers(label) for label in range(MOST_LABELS)])
+        return np.array([self._is_labellers(label) for label in range(MAX_LABELS)])
 
     def _label(
-        self, view: View, indices: np.ndarray, claims: Claims, *, is_late: bool = False
-    ) -> Labelled:
+        self,
+        view: TrainingView,
+        indices: np.ndarray,
+        claims: RegionDetections,
+        *,
+        is_late: bool = False,
+    ) -> FusionResult:
         is_told = claims.open_confidences > 0
         self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
         gaussians = self._map.gaussians
@@ -208,15 +225,15 @@ class SemanticMap:
             claims,
             self.config.labelling,
             is_late=is_late,
-            spared=self._spared(),
+            spared=self._undetectable_labels(),
             threads=self._threads,
         )
         is_new = np.any(gaussians.labels[indices] != before, axis=1)
-        self._map.relabelled(indices[is_new])
+        self._map.mark_relabeled(indices[is_new])
         return labelled
 
     def _map_view(
-        self, view: View, indices: np.ndarray, regions: np.ndarray, claims: Claims
+        self, view: TrainingView, indices: np.ndarray, regions: np.ndarray, claims: RegionDetections
     ) -> MapView:
         gaussians = self._map.gaussians
         at = view.keyframe, view.camera, view.T_map_camera
@@ -225,12 +242,14 @@ class SemanticMap:
         return MapView(*at, *known, *seen)
 
     # --- answers ----------------------------------------------------------------------------------
-    def answer(self, region: int, keyframe: int, answer: Answer) -> bool:
+    def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
         """What a labeller takes a region for, as that keyframe showed it; whether it was folded in.
 
         Without the images of the keyframe nobody can tell which Gaussians are meant.
         """
-        claims = self.naming and self.naming.answered(region, keyframe, answer, self.vocabulary)
+        claims = self.naming and self.naming.apply_label_result(
+            region, keyframe, answer, self.vocabulary
+        )
         if claims is None:
             return False
         if not self._map.views.is_readable(keyframe):
@@ -256,7 +275,7 @@ class SemanticMap:
                 self._label(view, made_by.indices, claims, is_late=True)
                 self.refresh(view)
 
-    def refresh(self, view: View | None = None) -> None:
+    def refresh(self, view: TrainingView | None = None) -> None:
         """Make objects what has become of their Gaussians, or those that a keyframe may show."""
         gaussians = self._map.gaussians
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
@@ -277,16 +296,19 @@ class SemanticMap:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        self.vocabulary = Vocabulary.unpacked(state["vocabulary"])
-        self.objects = Objects.unpacked(state["objects"], self.config.objects)
+        self.vocabulary = Vocabulary.unpack(state["vocabulary"])
+        self.objects = Objects.unpack(state["objects"], self.config.objects)
         self._done, self._labelled = dict.fromkeys(state["done"]), state["labelled"]
         self._waiting = {
-            keyframe: Claims(*arrays) if arrays else None for keyframe, arrays in state["waiting"]
+            keyframe: RegionDetections(*arrays) if arrays else None
+            for keyframe, arrays in state["waiting"]
         }
         self._by_detector, self._by_labeller = map(set, state["given"])
         if self.naming and state["naming"]:
             is_heard = self.config.hears_labeller
-            self.naming = Naming.unpacked(state["naming"], self.config.naming, is_heard=is_heard)
+            self.naming = OpenVocabularyLabeling.unpack(
+                state["naming"], self.config.naming, is_heard=is_heard
+            )
 
     def statistics(self) -> dict[str, float]:
         """`label_disagreement` is that of the newest keyframe labelled, summed over its Gaussians:
@@ -312,7 +334,7 @@ class SemanticMap:
         }
 
 
-def _packed(claims: Claims | None) -> list[np.ndarray]:
+def _packed(claims: RegionDetections | None) -> list[np.ndarray]:
     """Arrays of a detector's claims; none where nobody looked."""
-    names = [f.name for f in fields(Claims) if f.name not in ("parts", "anew")]
+    names = [f.name for f in fields(RegionDetections) if f.name not in ("parts", "replaces_labels")]
     return [getattr(claims, name) for name in names] if claims else []

@@ -18,10 +18,10 @@ from ldo_service.errors import DataError
 from ldo_service.gaussians.model import new_labels
 from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
-from .gaussian_labels import MOST_LABELS, ROW, fields
+from .gaussian_labels import MAX_LABELS, ROW, fields
 
 COLUMNS = ROW.names or ()
-LARGEST_BYTES = 1 << 32  # of 128 million Gaussians
+MAX_BYTES = 1 << 32  # of 128 million Gaussians
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,7 +47,7 @@ def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
     Raises DataError for a file that cannot be read, is something else, or fits another map.
     """
     try:
-        saved = read_arrays(path, LARGEST_BYTES)
+        saved = read_arrays(path, MAX_BYTES)
         arrays = {name: saved[name] for name in ("names", *COLUMNS)}
     except UNREADABLE as error:
         raise DataError(f"{path} cannot be read as labels: {error}") from error
@@ -76,5 +76,5 @@ def _require(path: Path, name: str, values: np.ndarray, count: int) -> None:
 def _require_names(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> None:
     rows = fields(labels)
     last = int(rows["ids"][rows["weights"] > 0].max(initial=0))
-    if not last < len(names) <= MOST_LABELS:
+    if not last < len(names) <= MAX_LABELS:
         raise DataError(f"{path} names {len(names)} labels, and uses number {last}.")

@@ -8,14 +8,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ldo_service.schemas import Health
-from ldo_service.schemas.map import MOST_ITERATIONS
+from ldo_service.schemas.map import MAX_ITERATIONS
 
 SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians)
 IDLE_S = 5.0  # a mailbox with messages is emptied within a step; a camera sends many a second
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ActorStatus:
     """What was seen of an actor while somebody listened for `listened_s`."""
 
     actor: str
@@ -26,7 +26,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class Trouble:
+class Problem:
     what: str
     advice: str
 
@@ -34,10 +34,10 @@ class Trouble:
         return f"{self.what}: {self.advice}"
 
 
-def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
+def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
     """What must be mended; nothing when the actor is well."""
     if not seen.has_token and seen.health is None:
-        yield Trouble(
+        yield Problem(
             "is not running",
             "the log of `ldo serve` says how it ended, and when it is started again",
         )
@@ -47,7 +47,7 @@ def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
         yield _silent(f"for {seen.heartbeat_age_s:.1f} s")
     else:
         if not seen.has_token:
-            yield Trouble(
+            yield Problem(
                 "reports, and its liveliness token is absent",
                 "it is ending, or the router's access control hides it: look again in 10 s",
             )
@@ -57,25 +57,25 @@ def troubles(seen: Seen, heartbeat_s: float = 0.5) -> Iterator[Trouble]:
         yield from _of_models(seen.health)
 
 
-def _silent(how_long: str) -> Trouble:
-    return Trouble(
+def _silent(how_long: str) -> Problem:
+    return Problem(
         f"has a process, and no heartbeat {how_long}",
         "the process is stopped or its machine overloaded; the service kills and restarts one "
         "that stays so for service.heartbeat_timeout_s",
     )
 
 
-def _of_steps(health: Health) -> Iterator[Trouble]:
+def _of_steps(health: Health) -> Iterator[Problem]:
     waiting = _waiting(health)
     if health.busy_s > SLOW_STEP_S:
         if _waits_for_server(health):
             return
-        yield Trouble(
+        yield Problem(
             f"has been busy with one message for {health.busy_s:.0f} s",
             "give it less work per message; beyond supervision.step_timeout_s it is given up",
         )
     elif waiting and not health.busy_s and health.step_age_s > IDLE_S and not health.held:
-        yield Trouble(
+        yield Problem(
             f"took none of {waiting} waiting messages for {health.step_age_s:.0f} s",
             "it waits for room at a consumer: look at the actors that take what it makes",
         )
@@ -90,46 +90,46 @@ def _waits_for_server(health: Health) -> bool:
     return "attempts" in health.facts
 
 
-def _of_failures(health: Health) -> Iterator[Trouble]:
+def _of_failures(health: Health) -> Iterator[Problem]:
     if health.set_aside or health.restarts:
-        yield Trouble(
+        yield Problem(
             f"failed {health.failures} times, was restarted {health.restarts} times and set "
             f"{health.set_aside} messages aside",
             "the log of `ldo serve` has each failure",
         )
 
 
-def _of_disk(health: Health) -> Iterator[Trouble]:
+def _of_disk(health: Health) -> Iterator[Problem]:
     if health.facts.get("is_unsaved"):
-        yield Trouble(
+        yield Problem(
             "cannot save its last step, and takes no more keyframes until it can",
             "free some disk space, or start the service with another folder for --state",
         )
 
 
-def _of_models(health: Health) -> Iterator[Trouble]:
+def _of_models(health: Health) -> Iterator[Problem]:
     """Networks and labellers that an actor was told to use."""
     facts = health.facts
     for what in ("network", "labeller"):
         if facts.get(f"{what}s_missing"):
-            yield Trouble(
+            yield Problem(
                 f"goes on without the {what} that it was told to use",
                 "the log of `ldo serve` says why; `ldo models list` shows those there are",
             )
     if failed := facts.get("inferences_failed"):
-        yield Trouble(
+        yield Problem(
             f"had {failed:.0f} inferences fail, and these keyframes have no labels",
             "the log of `ldo serve` has the first of them; try inference.providers=[cpu]",
         )
     if facts.get("labeller_failing"):
-        yield Trouble(
+        yield Problem(
             f"gets no answer from its labeller, {facts.get('labellings_failed', 0):.0f} regions so "
             "far stay unnamed",
             "the log of `ldo serve` has the first failure; is the server at vlm_labeller.url up?",
         )
 
 
-def remarks(seen: Seen) -> Iterator[str]:
+def notes(seen: ActorStatus) -> Iterator[str]:
     """What a person wants to know and nobody has to mend."""
     health = seen.health
     if health is None:
@@ -150,7 +150,7 @@ def remarks(seen: Seen) -> Iterator[str]:
     if due := health.facts.get("iterations_due"):
         yield (
             f"is due {due:.0f} iterations since a correction tore the map: keyframes bring some, "
-            f"`ldo control refine --iterations {min(int(due), MOST_ITERATIONS)}` at once"
+            f"`ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` at once"
         )
     yield from _of_answers(health)
 

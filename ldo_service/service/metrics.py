@@ -25,7 +25,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 from ldo_service.transport.endpoint import LOOPBACK
 
-MOST_ACTORS = 64  # that are kept; a name is what a message says
+MAX_ACTORS = 64  # that are kept; a name is what a message says
 COMES_BACK_S = 5.0  # an actor, once it was killed for its silence
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
@@ -76,14 +76,14 @@ class HealthCollector(Collector):
         self._last: dict[str, tuple[float, Health]] = {}  # by actor: when it was heard
         self._begun_anew: dict[str, int] = {}  # by actor: how often it came in another process
 
-    def heard(self, _header: bytes, body: memoryview) -> None:
+    def on_health(self, _header: bytes, body: memoryview) -> None:
         """On any thread; bytes that are no health message are left alone."""
         try:
             health = decode(body, Health)
         except msgspec.DecodeError:
             return
         with self._lock:
-            if health.actor not in self._last and len(self._last) >= MOST_ACTORS:
+            if health.actor not in self._last and len(self._last) >= MAX_ACTORS:
                 return
             _, before = self._last.get(health.actor, (0.0, health))
             self._begun_anew.setdefault(health.actor, 0)
@@ -115,7 +115,7 @@ class HealthCollector(Collector):
                 sample.labels["robot"] = self._robot
             yield metric
 
-    def silent(self) -> list[str]:
+    def silent_actors(self) -> list[str]:
         """Those of the actors that do not report; all of them before the first heartbeat."""
         since_s = time.monotonic() - self._silent_after_s
         with self._lock:
@@ -184,7 +184,7 @@ class _Quiet(WSGIRequestHandler):
 
 
 @contextmanager
-def exported(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
+def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
     """Serve http://ADDRESS:PORT/metrics and /healthz inside the block.
 
     Raises ConfigError when the port or the address cannot be had.
@@ -197,7 +197,7 @@ def exported(collector: HealthCollector, port: int, address: str = LOOPBACK) -> 
 
     def answer(environ: Any, start_response: Any) -> Iterable[bytes]:
         if environ["PATH_INFO"] == "/healthz":
-            return _how_it_is(collector.silent(), start_response)
+            return _how_it_is(collector.silent_actors(), start_response)
         return metrics(environ, start_response)
 
     try:

@@ -18,7 +18,7 @@ from pathlib import Path
 import zenoh
 
 from ldo_service import kernels, versions
-from ldo_service.actors.topology import GRAPH, Box, box_named
+from ldo_service.actors.topology import GRAPH, ActorSpec, actor_spec
 from ldo_service.config import (
     Config,
     actor_parameters,
@@ -34,18 +34,18 @@ from ldo_service.runtime.actor_graph import lossless_consumers
 from ldo_service.runtime.journal import Journal
 from ldo_service.runtime.process import (
     ChildProcess,
-    leave_with_parent,
+    exit_with_parent,
     python_command,
 )
 from ldo_service.runtime.stage import Stage
 from ldo_service.runtime.stage_commands import Control
-from ldo_service.runtime.supervision import Runner, Stop, Watchdog, supervise
+from ldo_service.runtime.supervision import Runner, StopRequest, Watchdog, supervise
 from ldo_service.schemas.topics import CONTROL, FROM_OUTSIDE, HEALTH
 from ldo_service.storage.state_store import FolderStore
 from ldo_service.transport.worker import Worker
-from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
+from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
-from .metrics import HealthCollector, exported
+from .metrics import HealthCollector, serve_metrics
 from .state_folder import claim_state
 
 log = logging.getLogger(__name__)
@@ -74,7 +74,7 @@ class Service:
     """What to serve, and where. `only` names the actors of this process; empty: all of them."""
 
     config: Config
-    network: Network
+    network: Endpoint
     state: Path
     only: tuple[str, ...] = ()
     is_router: bool = True  # False: there is one on the network already
@@ -88,7 +88,7 @@ class Service:
         Raises ConfigError when the port cannot be had, StageError when an actor was given up.
         """
         check_graph(GRAPH)
-        self.config.check_patience()
+        self.config.check_timeouts()
         self._require_known(self.only)
         self._require_known(self.config.service.process_actors)
         names, silent_after_s = [box.name for box in GRAPH], self.config.service.heartbeat_timeout_s
@@ -100,7 +100,7 @@ class Service:
                 claim_state(self.state, stack)
             if self.metrics_port is not None:
                 address = self.config.service.metrics_address
-                stack.enter_context(exported(health, self.metrics_port, address))
+                stack.enter_context(serve_metrics(health, self.metrics_port, address))
             session = stack.enter_context(open_session(self.network, router=self.is_router))
             try:
                 asyncio.run(self._serve(session, health))
@@ -112,22 +112,22 @@ class Service:
     async def _serve(self, session: zenoh.Session, health: HealthCollector) -> None:
         transport = ZenohTransport(session, self.network)
         if self.metrics_port is not None:
-            transport.subscribe(HEALTH.subscribed_as, health.heard)
-        stop = Stop()
+            transport.subscribe(HEALTH.subscription_key, health.on_health)
+        stop = StopRequest()
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, stop.ask)
+            loop.add_signal_handler(number, stop.request)
         watch = asyncio.create_task(self._stop_with_parent(stop))
         watchdog = Watchdog({} if self.only else os.environ)
         pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
         control = None if self.only else self._open_control(transport)
         log.info("serving %s on %s", ", ".join(r.name for r in runners), self.network.endpoint)
-        watchdog.tell("READY=1")
+        watchdog.notify("READY=1")
         try:
             await supervise(runners, stop, self.config.service.shutdown_timeout_s)
         finally:
-            watchdog.tell("STOPPING=1")
+            watchdog.notify("STOPPING=1")
             pings.cancel()
             watch.cancel()
             if control:
@@ -166,7 +166,7 @@ class Service:
         return runners
 
     def _stage(
-        self, box: Box, transport: ZenohTransport, children: dict[str, ChildProcess]
+        self, box: ActorSpec, transport: ZenohTransport, children: dict[str, ChildProcess]
     ) -> Stage:
         def evicted(consumer: str) -> None:
             if consumer in children:
@@ -198,7 +198,7 @@ class Service:
             return Journal()
         return open_recorder(self.recording, actor, self.network.robot, self.config)
 
-    def _child(self, box: Box, transport: ZenohTransport) -> ChildProcess:
+    def _child(self, box: ActorSpec, transport: ZenohTransport) -> ChildProcess:
         config = self.state / "config.yaml"
         config.write_text(config_yaml(self.config))
         command = python_command(
@@ -219,25 +219,25 @@ class Service:
             silent_after_s=self.config.service.heartbeat_timeout_s,
         )
 
-    async def _stop_with_parent(self, stop: Stop) -> None:
+    async def _stop_with_parent(self, stop: StopRequest) -> None:
         if self.only:
-            await leave_with_parent()
-            stop.ask()
-            stop.ask()
+            await exit_with_parent()
+            stop.request()
+            stop.request()
 
     def _require_known(self, names: Sequence[str]) -> None:
         for name in names:
-            box_named(name)
+            actor_spec(name)
 
 
-def _is_fed_from_outside(box: Box) -> bool:
+def _is_fed_from_outside(box: ActorSpec) -> bool:
     return any(port.topic in FROM_OUTSIDE for port in box.inputs)
 
 
 def _leave_if_busy(exit_code: int, why: str) -> None:
     """A thread in the middle of a step cannot be stopped, and aborts the process that ends around
     it: then leave without ending."""
-    if busy := Worker.left_busy(LEAVE_WITHIN_S):
+    if busy := Worker.busy_workers(LEAVE_WITHIN_S):
         log.error("%s (left in the middle of a step: %s)", why, ", ".join(busy))
         logging.shutdown()
         os._exit(exit_code)

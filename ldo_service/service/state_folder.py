@@ -8,10 +8,11 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from ldo_service.errors import ConfigError
-from ldo_service.runtime.delivery_state import Past
+from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.storage.state_store import FolderStore
 
-ENTANGLED = ("tracker", "mapper", "optimizer")  # have state before the first keyframe is made
+# have state before the first keyframe is made
+INTERDEPENDENT_ACTORS = ("tracker", "mapper", "optimizer")
 
 
 def state_folder(folder: Path | None, stack: ExitStack) -> Path:
@@ -54,14 +55,14 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
             f"another service keeps its state in {folder}: choose another with --state."
         ) from error
     store = FolderStore(folder / "state")
-    pasts = {name: Past.of(store.load(name)) for name in ENTANGLED}
+    pasts = {name: RestoredState.of(store.load(name)) for name in INTERDEPENDENT_ACTORS}
     missing = [name for name, past in pasts.items() if past.is_none]
     if missing and any(past.has_passed for past in pasts.values()):
         raise ConfigError(
             f"{folder} has no readable state of {', '.join(missing)} beside that of the others. "
             "Choose another folder with --state, or delete this one to start anew."
         )
-    for topic, producer, consumer in _ahead(pasts):
+    for topic, producer, consumer in _inconsistent_states(pasts):
         raise ConfigError(
             f"in {folder} the state of {consumer} is newer than that of {producer}: it has had "
             f"messages of {topic} that were not made yet. Bring all of the folder back from one "
@@ -69,7 +70,7 @@ def claim_state(folder: Path, stack: ExitStack) -> None:
         )
 
 
-def _ahead(pasts: Mapping[str, Past]) -> Iterator[tuple[str, str, str]]:
+def _inconsistent_states(pasts: Mapping[str, RestoredState]) -> Iterator[tuple[str, str, str]]:
     """Topics of which a consumer had more than its producer made, and both their names."""
     for producer, past in pasts.items():
         for topic, made in past.outputs.items():

@@ -25,7 +25,7 @@ _MAGIC = b"LDO1"
 _OF_PROCESS = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # limits that say nothing of a file
 
 
-class SealedFolder:
+class ChecksummedFolder:
     """Files `<number>.<suffix>` in `folder`, which is made; others there are left alone.
 
     folder       None: a temporary one, which goes with this object

@@ -32,7 +32,7 @@ class StateStore(Protocol):
 
     def load(self, actor: str) -> State | None: ...
 
-    def forget(self, actor: str) -> None:
+    def delete(self, actor: str) -> None:
         """As if nothing had been saved."""
         ...
 
@@ -50,7 +50,7 @@ class MemoryStore:
     def load(self, actor: str) -> State | None:
         return self._states.get(actor)
 
-    def forget(self, actor: str) -> None:
+    def delete(self, actor: str) -> None:
         self._states.pop(actor, None)
 
 
@@ -76,7 +76,7 @@ class FolderStore:
             if self._syncs:
                 sync(self._folder)
             self._files[actor] = _read_contents_or_nothing(folder)
-            _sweep(folder, self._files[actor])
+            _remove_unreferenced(folder, self._files[actor])
         saved, old = self._saved.get(actor, {}), self._files[actor]
         new = dict(old)
         for part, value in state.items():
@@ -120,7 +120,7 @@ class FolderStore:
             ) from error
         return parts or None
 
-    def forget(self, actor: str) -> None:
+    def delete(self, actor: str) -> None:
         folder = self._folder / actor
         self._saved.pop(actor, None)
         (folder / CONTENTS).unlink(missing_ok=True)  # first: what it does not name is not read
@@ -137,7 +137,7 @@ def _set_aside(folder: Path) -> None:
         log.error("%s cannot be kept as %s: %s", folder, aside.name, error.strerror)
 
 
-def _sweep(folder: Path, files: Mapping[str, str]) -> None:
+def _remove_unreferenced(folder: Path, files: Mapping[str, str]) -> None:
     """Remove what a killed process wrote and did not name, or no longer named."""
     for file in folder.glob("*"):
         if file.name not in (CONTENTS, *files.values()):

@@ -24,7 +24,7 @@ for _one in (_Loader, _Dumper):
     )
 
 
-def plain_values(text: str | bytes) -> Any:
+def load_yaml(text: str | bytes) -> Any:
     """Numbers, text, dates, lists and dictionaries. Raises yaml.YAMLError in one line, whatever the
     text is.
 
@@ -46,8 +46,8 @@ def _loaded(text: str | bytes) -> Any:
         loader.dispose()
 
 
-def plain_text(values: Any, *, flow: bool | None = False, width: float = 80) -> str:
-    """YAML that `plain_values` reads as the same.
+def dump_yaml(values: Any, *, flow: bool | None = False, width: float = 80) -> str:
+    """YAML that `load_yaml` reads as the same.
 
     flow  all on one line; None: only what is innermost
     """

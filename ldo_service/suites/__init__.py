@@ -4,17 +4,17 @@ The files beside this one are the tables of the paper that LDO-SLAM implements, 
 its ablation; `published` in them are the figures that the paper prints, of its own and of others.
 """
 
-from .runner import Outcome, Work
-from .suite import FIGURES, Entry, Judged, Suite, known_suites, load_suite
+from .runner import Outcome, SuiteRunner
+from .suite import FIGURES, Judged, Suite, SuiteRun, known_suites, load_suite
 from .tables import markdown
 
 __all__ = [
     "FIGURES",
-    "Entry",
     "Judged",
     "Outcome",
     "Suite",
-    "Work",
+    "SuiteRun",
+    "SuiteRunner",
     "known_suites",
     "load_suite",
     "markdown",

@@ -16,7 +16,7 @@ from ldo_service import versions
 from ldo_service.errors import ConfigError
 from ldo_service.runs.front_end import FRONT_END
 
-from .suite import SYNTHETIC, Entry, Judged, Suite
+from .suite import SYNTHETIC, Judged, Suite, SuiteRun
 
 log = logging.getLogger(__name__)
 
@@ -28,13 +28,13 @@ TOLD, RESULTS = "entry.json", "eval.json"
 class Outcome:
     """judged: None where there are no figures, and `missing` says why."""
 
-    entry: Entry
+    entry: SuiteRun
     judged: Judged | None
     missing: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Work:
+class SuiteRunner:
     """data: where the sources lie; out: where runs go; settings: of all runs, before those of a
     variant."""
 
@@ -44,16 +44,16 @@ class Work:
     settings: tuple[str, ...] = ()
     overwrite: bool = False
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[SuiteRun]:
         return list(self.suite.entries(self.data))
 
-    def outcomes(self, begun: Callable[[Entry], None]) -> Iterator[Outcome]:
+    def outcomes(self, begun: Callable[[SuiteRun], None]) -> Iterator[Outcome]:
         """Each entry when it is finished; `begun` is told before."""
         for entry in self.entries():
             begun(entry)
             yield self._outcome(entry)
 
-    def _outcome(self, entry: Entry) -> Outcome:
+    def _outcome(self, entry: SuiteRun) -> Outcome:
         if not entry.source.startswith(SYNTHETIC) and not Path(entry.source).exists():
             return Outcome(entry, None, "no data")
         folder = self.out / entry.folder
@@ -68,7 +68,7 @@ class Work:
             log.error("%s", error)
             return Outcome(entry, None, "failed")
 
-    def _told(self, entry: Entry) -> str:
+    def _told(self, entry: SuiteRun) -> str:
         """What its figures depend on."""
         told = {
             **asdict(entry),
@@ -82,12 +82,12 @@ class Work:
             told["front_end_settings"] = self.suite.front_end_settings()
         return json.dumps(told, indent=1)
 
-    def _is_finished(self, entry: Entry, folder: Path) -> bool:
+    def _is_finished(self, entry: SuiteRun, folder: Path) -> bool:
         told = folder / TOLD
         is_kept = entry.variant != self.suite.front_end or (folder / FRONT_END).is_file()
         return is_kept and told.is_file() and told.read_text() == self._told(entry)
 
-    def _run(self, entry: Entry, folder: Path) -> str:
+    def _run(self, entry: SuiteRun, folder: Path) -> str:
         """Why it failed; empty when it did not."""
         settings = [
             word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)

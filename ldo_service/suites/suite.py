@@ -11,7 +11,7 @@ import yaml
 from msgspec import field
 
 from ldo_service.errors import ConfigError
-from ldo_service.storage.yaml_io import plain_values
+from ldo_service.storage.yaml_io import load_yaml
 
 HELD_OUT, TRAINING = "A held out", "B training"
 
@@ -45,7 +45,7 @@ class Judged:
 
 
 @dataclass(frozen=True, slots=True)
-class Figure:
+class Score:
     """`read` may find nothing (None, KeyError, IndexError, TypeError): then it is not judged."""
 
     title: str
@@ -68,44 +68,44 @@ def _seconds(stage: str) -> Callable[[Judged], float | None]:
     return lambda run: 1e-3 * run.summary["stage_ms"][stage]["p50"]
 
 
-FIGURES: dict[str, Figure] = {
-    "ate_cm": Figure(
+FIGURES: dict[str, Score] = {
+    "ate_cm": Score(
         "ATE RMSE cm", ".2f", lambda run: 100 * run.trajectory("final")["ate_m"]["rmse"]
     ),
-    "ate_mean_cm": Figure(
+    "ate_mean_cm": Score(
         "ATE mean cm", ".2f", lambda run: 100 * run.trajectory("final")["ate_m"]["mean"]
     ),
-    "ate_online_cm": Figure(
+    "ate_online_cm": Score(
         "ATE RMSE cm online", ".2f", lambda run: 100 * run.trajectory("online")["ate_m"]["rmse"]
     ),
-    "psnr_db": Figure("PSNR dB", ".2f", lambda run: run.rendering(HELD_OUT, "psnr_db")),
-    "psnr_online_db": Figure(
+    "psnr_db": Score("PSNR dB", ".2f", lambda run: run.rendering(HELD_OUT, "psnr_db")),
+    "psnr_online_db": Score(
         "PSNR dB online", ".2f", lambda run: run.rendering(HELD_OUT, "psnr_db", newest=False)
     ),
-    "psnr_training_db": Figure(
+    "psnr_training_db": Score(
         "PSNR dB, training views", ".2f", lambda run: run.rendering(TRAINING, "psnr_db")
     ),
-    "ssim": Figure("SSIM", ".3f", lambda run: run.rendering(HELD_OUT, "ssim")),
-    "ssim_training": Figure(
+    "ssim": Score("SSIM", ".3f", lambda run: run.rendering(HELD_OUT, "ssim")),
+    "ssim_training": Score(
         "SSIM, training views", ".3f", lambda run: run.rendering(TRAINING, "ssim")
     ),
-    "depth_l1_cm": Figure("depth L1 cm", ".2f", _depth_l1_cm),
-    "miou": Figure("mIoU %", ".1f", lambda run: 100 * run.labels()["mean_iou"]),
-    "object_iou": Figure("object mIoU %", ".1f", lambda run: 100 * run.labels()["object_iou"]),
-    "consistency": Figure("consistency", ".3f", lambda run: run.consistency()),
-    "loop_precision": Figure("precision", ".3f", lambda run: run.results["loops"]["precision"]),
-    "loop_recall": Figure("recall", ".3f", lambda run: run.results["loops"]["recall"]),
-    "fps": Figure("FPS", ".2f", lambda run: run.summary["fps"]),
-    "tracking_s": Figure("tracking s/frame", ".3f", _seconds("tracker")),
-    "mapping_s": Figure("mapping s/keyframe", ".3f", _seconds("mapper")),
-    "gaussians": Figure("Gaussians", ",.0f", lambda run: run.summary["gaussians"]),
-    "optimizations": Figure("optimisations", ".0f", lambda run: run.summary["optimizations"]),
-    "loops": Figure("closures", ".1f", lambda run: run.summary["loops_accepted"]),
+    "depth_l1_cm": Score("depth L1 cm", ".2f", _depth_l1_cm),
+    "miou": Score("mIoU %", ".1f", lambda run: 100 * run.labels()["mean_iou"]),
+    "object_iou": Score("object mIoU %", ".1f", lambda run: 100 * run.labels()["object_iou"]),
+    "consistency": Score("consistency", ".3f", lambda run: run.consistency()),
+    "loop_precision": Score("precision", ".3f", lambda run: run.results["loops"]["precision"]),
+    "loop_recall": Score("recall", ".3f", lambda run: run.results["loops"]["recall"]),
+    "fps": Score("FPS", ".2f", lambda run: run.summary["fps"]),
+    "tracking_s": Score("tracking s/frame", ".3f", _seconds("tracker")),
+    "mapping_s": Score("mapping s/keyframe", ".3f", _seconds("mapper")),
+    "gaussians": Score("Gaussians", ",.0f", lambda run: run.summary["gaussians"]),
+    "optimizations": Score("optimisations", ".0f", lambda run: run.summary["optimizations"]),
+    "loops": Score("closures", ".1f", lambda run: run.summary["loops_accepted"]),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class SuiteRun:
     """One run: `sequence` and `variant` by their names, with what `ldo run` is told."""
 
     sequence: str
@@ -169,18 +169,18 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                 f"{self.front_end!r}: leave out the figure, or front_end."
             )
 
-    def entries(self, data: Path) -> Iterator[Entry]:
+    def entries(self, data: Path) -> Iterator[SuiteRun]:
         """All runs, sequence by sequence; sources lie in the folder `data`."""
         for sequence, source in self.sequences.items():
             for variant, settings in self.variants.items():
                 front_end = None if variant == self.front_end else self.front_end
                 if not source.startswith(SYNTHETIC):
                     where = str(data / source)
-                    yield Entry(sequence, variant, where, settings, None, front_end)
+                    yield SuiteRun(sequence, variant, where, settings, None, front_end)
                     continue
                 for seed in self.seeds:
                     where = f"{source}@{seed}"
-                    yield Entry(sequence, variant, where, settings, seed, front_end)
+                    yield SuiteRun(sequence, variant, where, settings, seed, front_end)
 
     def front_end_settings(self) -> tuple[str, ...] | None:
         """Of the variant that alone looks at frames; None: each does."""
@@ -207,6 +207,6 @@ def load_suite(name: str) -> Suite:
             f"there is no suite {name}: neither a file nor one of {', '.join(known_suites())}."
         )
     try:
-        return msgspec.convert(plain_values(path.read_text()), Suite)
+        return msgspec.convert(load_yaml(path.read_text()), Suite)
     except (OSError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"{path} is not a suite: {error}") from error

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from statistics import mean, stdev
 
 from .runner import Outcome
-from .suite import FIGURES, Figure, Suite
+from .suite import FIGURES, Score, Suite
 
 AVERAGE = "average"
 Cells = dict[str, str]  # by column
@@ -58,7 +58,7 @@ def _table(corner: str, columns: dict[str, str], rows: dict[str, Cells]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _cell(figure: Figure, outcomes: Sequence[Outcome]) -> str:
+def _cell(figure: Score, outcomes: Sequence[Outcome]) -> str:
     values = _values(figure, outcomes)
     if not values:
         return next((o.missing for o in outcomes if o.missing), "-")
@@ -66,7 +66,7 @@ def _cell(figure: Figure, outcomes: Sequence[Outcome]) -> str:
     return f"{mean(values):{figure.form}}{spread}"
 
 
-def _average(suite: Suite, figure: Figure, outcomes: Sequence[Outcome]) -> str:
+def _average(suite: Suite, figure: Score, outcomes: Sequence[Outcome]) -> str:
     """Over sequences; none where one is missing, since it would be the mean of other ones."""
     means = [
         _values(figure, [o for o in outcomes if o.entry.sequence == sequence])
@@ -75,6 +75,6 @@ def _average(suite: Suite, figure: Figure, outcomes: Sequence[Outcome]) -> str:
     return f"{mean(map(mean, means)):{figure.form}}" if all(means) else "-"
 
 
-def _values(figure: Figure, outcomes: Sequence[Outcome]) -> list[float]:
+def _values(figure: Score, outcomes: Sequence[Outcome]) -> list[float]:
     found = [figure.of(o.judged) for o in outcomes if o.judged is not None]
     return [value for value in found if value is not None]

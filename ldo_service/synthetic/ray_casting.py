@@ -28,7 +28,7 @@ class Hits:
             yield int(surface), order[start:stop]
 
 
-class View:
+class RayCaster:
     """The rays of one camera pose, and what each solid within the shell can cover in its image."""
 
     def __init__(

@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.geometry import Camera
 
 from .light import interpolated, light_on_face, plane_axes, shade
-from .ray_casting import Hits, View, outline
+from .ray_casting import Hits, RayCaster, outline
 from .room import Room
 from .solids import Solid, Vector, vector
 
@@ -40,7 +40,7 @@ class Renderer:
         are solids beside the furniture; they cast no shadow."""
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         solids = (*self._room.furniture, *visitors)
-        view = View(self._room.shell, solids, camera, T_world_camera)
+        view = RayCaster(self._room.shell, solids, camera, T_world_camera)
         hits = view.cast(u, v)
         color = self._color(view, solids, u, v, hits)
         edge = outline(hits.surface.reshape(camera.height, camera.width)).ravel()
@@ -53,7 +53,7 @@ class Renderer:
         )
 
     def _antialiased(
-        self, view: View, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray
+        self, view: RayCaster, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray
     ) -> np.ndarray:
         total = np.zeros((len(u), 3))
         for du, dv in QUARTERS_PX:
@@ -61,7 +61,7 @@ class Renderer:
         return total / len(QUARTERS_PX)
 
     def _color(
-        self, view: View, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray, hits: Hits
+        self, view: RayCaster, solids: tuple[Solid, ...], u: np.ndarray, v: np.ndarray, hits: Hits
     ) -> np.ndarray:
         """Reflected light [P, 3] in 0..1: albedo times diffuse shading."""
         color = np.empty((len(u), 3))

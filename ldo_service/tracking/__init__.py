@@ -2,9 +2,9 @@
 
 from .alignment import AlignConfig, Alignment, align
 from .odometry import Odometry, OdometryConfig
-from .odometry_prior import Prior, PriorConfig, Reading
-from .pyramid import Pyramid, PyramidConfig, Reference, build_reference, pyramid_of
-from .tracking_quality import Status
+from .odometry_prior import OdometryPriorBuffer, PriorConfig, PriorPose
+from .pyramid import Pyramid, PyramidConfig, ReferencePoints, build_reference, pyramid_of
+from .tracking_quality import TrackingStatus
 from .tracking_result import TrackingResult
 
 __all__ = [
@@ -12,14 +12,14 @@ __all__ = [
     "Alignment",
     "Odometry",
     "OdometryConfig",
-    "Prior",
+    "OdometryPriorBuffer",
     "PriorConfig",
+    "PriorPose",
     "Pyramid",
     "PyramidConfig",
-    "Reading",
-    "Reference",
-    "Status",
+    "ReferencePoints",
     "TrackingResult",
+    "TrackingStatus",
     "align",
     "build_reference",
     "pyramid_of",

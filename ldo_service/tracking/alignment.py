@@ -18,7 +18,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.kernels import _align
 
-from .pyramid import DepthNoise, Level, Pyramid, Reference
+from .pyramid import DepthNoise, Level, Pyramid, ReferencePoints
 
 DEGREES_OF_FREEDOM = 5.0  # Kerl et al. 2013, III.B; the kernel has the same
 INLIER_SIGMA = 3.0
@@ -39,7 +39,7 @@ class ResidualConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Appearance:
+class BrightnessModel:
     """Brightness change and noise, estimated beside the pose."""
 
     gain: float = 1.0
@@ -49,7 +49,7 @@ class Appearance:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class ResidualStatistics:
     """One kind of residual: how many, how many within 3 sigma, and sum of w (r / sigma)^2."""
 
     count: float
@@ -62,24 +62,24 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True)
-class Equations:
+class NormalEquations:
     """hessian [8, 8] and gradient [8] of half the weighted squares; `visible` points."""
 
     hessian: np.ndarray
     gradient: np.ndarray
     visible: float
-    photometric: Term
-    geometric: Term
+    photometric: ResidualStatistics
+    geometric: ResidualStatistics
 
 
 def normal_equations(
     points: np.ndarray,
     target: Level,
     T_camera_reference: np.ndarray,
-    appearance: Appearance,
+    appearance: BrightnessModel,
     config: ResidualConfig,
-) -> Equations:
-    """Linearise all residuals of points [7, N] (see `Reference`) in a target level.
+) -> NormalEquations:
+    """Linearise all residuals of points [7, N] (see `ReferencePoints`) in a target level.
 
     Raises ValueError for arrays of another shape or a transform that is not rigid. Bitwise
     reproducible on one instruction set.
@@ -97,13 +97,19 @@ def normal_equations(
         config.gate,
         config.occlusion,
     )
-    return Equations(hessian, gradient, counts[0], Term(*counts[1:4]), Term(*counts[4:7]))
+    return NormalEquations(
+        hessian,
+        gradient,
+        counts[0],
+        ResidualStatistics(*counts[1:4]),
+        ResidualStatistics(*counts[4:7]),
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class AlignConfig:
     residuals: ResidualConfig = field(default_factory=ResidualConfig)
-    start: Appearance = field(default_factory=Appearance)
+    start: BrightnessModel = field(default_factory=BrightnessModel)
     iterations: tuple[int, ...] = (8, 8, 10, 10)  # at most, per level, the finest first
     stop_px: float = 0.02  # image motion of the last step, at the level's resolution
     largest_step: float = 0.15  # rad, and fraction of the median depth: one step's limit
@@ -146,12 +152,12 @@ class Alignment:
     condition: float  # of the information, translation in median depths; inf if singular
 
     @property
-    def appearance(self) -> Appearance:
-        return Appearance(self.gain, self.bias, self.intensity_sigma, self.depth_noise_scale)
+    def appearance(self) -> BrightnessModel:
+        return BrightnessModel(self.gain, self.bias, self.intensity_sigma, self.depth_noise_scale)
 
 
 def align(
-    reference: Reference,
+    reference: ReferencePoints,
     frame: Pyramid,
     T_camera_reference: np.ndarray,
     config: AlignConfig,
@@ -161,7 +167,7 @@ def align(
     Noise of intensity and depth is estimated along the way (Kerl et al. 2013, equation 13), and
     weighs colour against geometry. Deterministic: bitwise equal for equal input.
     """
-    T, appearance = se3.orthonormalised(T_camera_reference), config.start
+    T, appearance = se3.orthonormalize(T_camera_reference), config.start
     count, converged = 0, False
     levels = min(len(reference.points), len(frame.levels))
     for level in reversed(range(levels)):
@@ -179,16 +185,16 @@ def align(
 
 
 def evaluate(
-    reference: Reference,
+    reference: ReferencePoints,
     frame: Pyramid,
     T_camera_reference: np.ndarray,
-    appearance: Appearance,
+    appearance: BrightnessModel,
     config: AlignConfig,
     iterations: int = 0,
     converged: bool = True,
 ) -> Alignment:
     """The alignment that a pose [4, 4] and an appearance make, measured on the finest level."""
-    T = se3.orthonormalised(T_camera_reference)
+    T = se3.orthonormalize(T_camera_reference)
     points = reference.points[0]
     e = normal_equations(points, frame.levels[0], T, appearance, config.residuals)
     information = _pose_information(e) * config.independent_fraction
@@ -210,7 +216,7 @@ def evaluate(
     )
 
 
-def _step(equations: Equations, median_depth_m: float, config: AlignConfig) -> np.ndarray:
+def _step(equations: NormalEquations, median_depth_m: float, config: AlignConfig) -> np.ndarray:
     hessian = equations.hessian.copy()
     hessian[BRIGHTNESS, BRIGHTNESS] += np.diag(BRIGHTNESS_PRIOR)
     hessian[np.diag_indices(8)] += config.damping * np.diag(hessian) + 1e-9
@@ -222,8 +228,8 @@ def _step(equations: Equations, median_depth_m: float, config: AlignConfig) -> n
 
 
 def _improved(
-    appearance: Appearance, step: np.ndarray, equations: Equations, config: AlignConfig
-) -> Appearance:
+    appearance: BrightnessModel, step: np.ndarray, equations: NormalEquations, config: AlignConfig
+) -> BrightnessModel:
     sigma = _rescaled(appearance.intensity_sigma, equations.photometric)
     scale = _rescaled(appearance.depth_noise_scale, equations.geometric)
     return replace(
@@ -235,16 +241,16 @@ def _improved(
     )
 
 
-def _rescaled(sigma: float, term: Term) -> float:
+def _rescaled(sigma: float, term: ResidualStatistics) -> float:
     return sigma * (term.square / term.count) ** 0.5 if term.count else sigma
 
 
-def _image_motion_px(step: np.ndarray, target: Level, reference: Reference) -> float:
+def _image_motion_px(step: np.ndarray, target: Level, reference: ReferencePoints) -> float:
     angle = np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / reference.median_depth_m
     return float(angle * target.camera.fx)
 
 
-def _pose_information(equations: Equations) -> np.ndarray:
+def _pose_information(equations: NormalEquations) -> np.ndarray:
     """The pose's part, gain and bias marginalised (Schur complement)."""
     hessian = equations.hessian
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)

@@ -18,11 +18,11 @@ import small_gicp
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
 
-from .pyramid import Level, Pyramid, Reference
+from .pyramid import Level, Pyramid, ReferencePoints
 
 SIFT_SIZE = 128
 
-NEIGHBOURS = 10  # that the covariance of a point is taken from, small_gicp's default
+NEIGHBORS = 10  # that the covariance of a point is taken from, small_gicp's default
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ def detect(view: Pyramid, config: FeatureConfig) -> Features:
     return _measured(keypoints, descriptors, view.depth_m, view.camera)
 
 
-def detect_across_scales(
+def detect_sift(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, count: int, config: FeatureConfig
 ) -> Features:
     """The strongest SIFT features (Lowe 2004) of a grey image [H, W] uint8, as `detect` has ORB."""
@@ -155,11 +155,11 @@ def estimate_pose(
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation_vector)[0], translation[:, 0]
-    return FeaturePose(se3.orthonormalised(T), len(inliers)) if np.isfinite(T).all() else None
+    return FeaturePose(se3.orthonormalize(T), len(inliers)) if np.isfinite(T).all() else None
 
 
 @dataclass(frozen=True, slots=True)
-class ShapeConfig:
+class GicpConfig:
     level: int = 2  # of the pyramid: 80 pixels wide
     spacing: float = 0.03  # of the points, in median depths
     reach: float = 0.25  # between partners, in median depths: a large step of a robot
@@ -179,8 +179,8 @@ class ShapeConfig:
             )
 
 
-def pose_from_shape(
-    reference: Reference, view: Pyramid, T_reference_camera: np.ndarray, config: ShapeConfig
+def register_gicp(
+    reference: ReferencePoints, view: Pyramid, T_reference_camera: np.ndarray, config: GicpConfig
 ) -> np.ndarray | None:
     """T_reference_camera [4, 4] by GICP (Koide 2024), from a guess; None where that finds nothing.
 
@@ -189,7 +189,7 @@ def pose_from_shape(
     scale_m = reference.median_depth_m
     level = min(config.level, len(view.levels) - 1, len(reference.points) - 1)
     clouds = reference.points[level][:3].T, _points(view.levels[level])
-    if min(map(len, clouds)) < NEIGHBOURS:
+    if min(map(len, clouds)) < NEIGHBORS:
         return None
     (there, tree), (here, _) = (_cloud(points, config.spacing * scale_m) for points in clouds)
     found = small_gicp.align(
@@ -202,11 +202,11 @@ def pose_from_shape(
     )
     if not found.converged or found.num_inliers < config.min_partners * here.size():
         return None
-    return se3.orthonormalised(found.T_target_source)
+    return se3.orthonormalize(found.T_target_source)
 
 
 def _cloud(points: np.ndarray, spacing_m: float) -> tuple[small_gicp.PointCloud, small_gicp.KdTree]:
-    return small_gicp.preprocess_points(points.astype(np.float64), spacing_m, NEIGHBOURS)
+    return small_gicp.preprocess_points(points.astype(np.float64), spacing_m, NEIGHBORS)
 
 
 def _points(level: Level) -> np.ndarray:

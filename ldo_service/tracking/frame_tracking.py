@@ -11,23 +11,28 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ldo_service.detection.dynamic_classes import MovableConfig
+from ldo_service.detection.dynamic_classes import DynamicClassConfig
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 
 from .alignment import AlignConfig, Alignment
-from .features import FeatureConfig, ShapeConfig
-from .keyframe_database import Places, PlacesConfig, thumbnail_of
-from .keyframes import Keyframe, KeyframeConfig, is_due, is_worth_mapping
+from .features import FeatureConfig, GicpConfig
+from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, make_thumbnail
+from .keyframes import Keyframe, KeyframeConfig, needs_keyframe, needs_mapping_keyframe
 from .motion import Motion
-from .motion_segmentation import MovingConfig, spread, watch
-from .odometry_prior import Anchor, PriorConfig, Reading
-from .pose_candidates import Candidate, CandidateConfig, Guesses
+from .motion_segmentation import MotionSegmentationConfig, grow_mask, segment_motion
+from .odometry_prior import DeadReckoningStart, PriorConfig, PriorPose
+from .pose_candidates import InitialGuessAligner, PoseHypothesis, PoseHypothesisConfig
 from .pyramid import Pyramid, PyramidConfig, pyramid_of
-from .relocalization import RelocalisationConfig, Relocaliser, ReturnConfig
-from .state import Origin, State
-from .submaps import Look, SegmentConfig, SubmapMeasurement
-from .tracking_quality import History, JudgementConfig, Status, judge
+from .relocalization import KeyframeReuseConfig, RelocalizationConfig, Relocalizer
+from .state import KeyframeOrigin, OdometryState
+from .submaps import SubmapConfig, SubmapMatch, SubmapMeasurement
+from .tracking_quality import (
+    ResidualHistory,
+    TrackingQualityConfig,
+    TrackingStatus,
+    classify_tracking,
+)
 from .tracking_result import KeyframeKind, TrackedFrame
 from .window import WindowConfig
 
@@ -39,17 +44,17 @@ class OdometryConfig:
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
-    shape: ShapeConfig = field(default_factory=ShapeConfig)
-    candidates: CandidateConfig = field(default_factory=CandidateConfig)
+    shape: GicpConfig = field(default_factory=GicpConfig)
+    candidates: PoseHypothesisConfig = field(default_factory=PoseHypothesisConfig)
     keyframes: KeyframeConfig = field(default_factory=KeyframeConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
-    places: PlacesConfig = field(default_factory=PlacesConfig)
-    relocalisation: RelocalisationConfig = field(default_factory=RelocalisationConfig)
-    returning: ReturnConfig = field(default_factory=ReturnConfig)
-    segments: SegmentConfig = field(default_factory=SegmentConfig)
-    judgement: JudgementConfig = field(default_factory=JudgementConfig)
-    moving: MovingConfig = field(default_factory=MovingConfig)
-    movable: MovableConfig = field(default_factory=MovableConfig)
+    places: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
+    relocalisation: RelocalizationConfig = field(default_factory=RelocalizationConfig)
+    returning: KeyframeReuseConfig = field(default_factory=KeyframeReuseConfig)
+    segments: SubmapConfig = field(default_factory=SubmapConfig)
+    judgement: TrackingQualityConfig = field(default_factory=TrackingQualityConfig)
+    moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
+    movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
     large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
 
@@ -66,15 +71,15 @@ class FrameTracker:
 
     def __init__(self, config: OdometryConfig) -> None:
         self.config = config
-        self.state = State()
-        self._relocalizer = Relocaliser(
+        self.state = OdometryState()
+        self._relocalizer = Relocalizer(
             config.pyramid,
             config.align,
             config.features,
             config.judgement,
             config.relocalisation,
         )
-        self._guesses = Guesses(
+        self._guesses = InitialGuessAligner(
             config.align,
             config.features,
             config.shape,
@@ -82,14 +87,14 @@ class FrameTracker:
             config.large_motion,
         )
         self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
-        self._prior: Reading | None = None  # Of the last frame.
+        self._prior: PriorPose | None = None  # Of the last frame.
 
     @property
     def can_reuse_keyframes(self) -> bool:
         """True once so many keyframes were made that known ones are reused."""
         return 0 < self.config.returning.after <= self.state.next_id
 
-    def track(self, frame: RgbdFrame, prior: Reading | None = None) -> TrackedFrame:
+    def track(self, frame: RgbdFrame, prior: PriorPose | None = None) -> TrackedFrame:
         """Return the pose of a frame. The frame may be blank.
 
         Args:
@@ -104,17 +109,21 @@ class FrameTracker:
         # Alignment, and how far it is trusted.
         candidate = self._track_against(keyframe, view, frame.stamp_ns)
         status = self._classify(candidate)
-        if status is Status.WEAK and not self._relocalizer.is_familiar(view, self.state.trusted):
-            status = Status.LOST
+        if status is TrackingStatus.WEAK and not self._relocalizer.resembles_last_trusted(
+            view, self.state.trusted_thumbnail
+        ):
+            status = TrackingStatus.LOST
         # Relocalization.
-        if status is Status.LOST:
+        if status is TrackingStatus.LOST:
             found = self._relocalize(view, self._places_when_lost(), is_lost=True)
             if found is None:
                 return self._lost_result(frame, keyframe, candidate.alignment)
-            (keyframe, candidate), status = found, Status.OK
+            (keyframe, candidate), status = found, TrackingStatus.OK
             # Noise differs between scenes, and pixels that moved belong to one keyframe.
-            origin = Origin.KNOWN if self.can_reuse_keyframes else Origin.NEW
-            self.state = replace(self.state, history=History(), suspicion=None, origin=origin)
+            origin = KeyframeOrigin.KNOWN if self.can_reuse_keyframes else KeyframeOrigin.NEW
+            self.state = replace(
+                self.state, history=ResidualHistory(), motion_evidence=None, origin=origin
+            )
         # Motion, dynamic pixels, the need of a keyframe, and views of other submaps.
         tracked = self._accepted_result(frame, keyframe, candidate, status)
         return self._search_other_submaps(tracked, keyframe, view)
@@ -131,7 +140,11 @@ class FrameTracker:
         if T_odom_camera is None:
             T_odom_camera = self.state.motion.T_odom_camera
         return TrackedFrame(
-            Status.OK, "first", T_odom_camera, submap=submap, needed_keyframe=KeyframeKind.FIRST
+            TrackingStatus.OK,
+            "first",
+            T_odom_camera,
+            submap=submap,
+            needed_keyframe=KeyframeKind.FIRST,
         )
 
     def restart_at(self, frame: RgbdFrame, T_odom_camera: np.ndarray) -> None:
@@ -139,16 +152,18 @@ class FrameTracker:
         self.state = replace(
             self.state,
             motion=Motion(T_odom_camera, stamp_ns=frame.stamp_ns),
-            status=Status.OK,
-            trusted=thumbnail_of(self.view(frame)),
-            history=History(),
-            segments=self.state.segments.begun(),
+            status=TrackingStatus.OK,
+            trusted_thumbnail=make_thumbnail(self.view(frame)),
+            history=ResidualHistory(),
+            segments=self.state.segments.started(),
             is_moving=None,
-            suspicion=None,
-            anchor=self._prior and Anchor(T_odom_camera, self._prior),
+            motion_evidence=None,
+            dead_reckoning_start=self._prior and DeadReckoningStart(T_odom_camera, self._prior),
         )
 
-    def relocalize_in(self, frame: RgbdFrame, places: Places) -> tuple[Keyframe, Alignment] | None:
+    def relocalize_in(
+        self, frame: RgbdFrame, places: KeyframeDatabase
+    ) -> tuple[Keyframe, Alignment] | None:
         """Return the keyframe of `places` that the frame just tracked shows, and the alignment."""
         found = self._relocalize(self.view(frame), places, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
@@ -159,89 +174,95 @@ class FrameTracker:
             self._view = (frame, pyramid_of(frame, self.config.pyramid))
         return self._view[1]
 
-    def restore(self, state: State) -> None:
+    def restore(self, state: OdometryState) -> None:
         """Continue from a state."""
         self.state, self._view = state, None
 
     # --- initial guesses and the tracking status --------------------------------------------------
     def _first_result(self, view: Pyramid) -> TrackedFrame:
         if not self._is_usable(view):
-            return TrackedFrame(Status.LOST, "none", np.eye(4))
-        return TrackedFrame(Status.OK, "first", np.eye(4), needed_keyframe=KeyframeKind.FIRST)
+            return TrackedFrame(TrackingStatus.LOST, "none", np.eye(4))
+        return TrackedFrame(
+            TrackingStatus.OK, "first", np.eye(4), needed_keyframe=KeyframeKind.FIRST
+        )
 
     def _is_usable(self, view: Pyramid) -> bool:
         """Return whether frames could be aligned to a view: enough of its depth is measured."""
         measured = float(np.mean(view.levels[0].depth_m > 0))
         return measured >= self.config.judgement.min_paired
 
-    def _track_against(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> Candidate:
+    def _track_against(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> PoseHypothesis:
         """Align from the predicted pose, and from all other guesses when that is not sure."""
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
         resting = T_keyframe_odom @ motion.T_odom_camera
-        predicted = self._guesses.from_motion(
+        predicted = self._guesses.align_from_guess(
             keyframe, view, T_keyframe_odom @ motion.predicted(stamp_ns)
         )
-        is_sure = self._classify(predicted) is Status.OK
+        is_sure = self._classify(predicted) is TrackingStatus.OK
         if is_sure and not self._guesses.is_large_step(predicted, resting, view):
             return predicted
         T_odom_camera = self._dead_reckoned_pose()
         carried = None if T_odom_camera is None else T_keyframe_odom @ T_odom_camera
-        return self._guesses.best_of_all(predicted, keyframe, view, resting, carried)
+        return self._guesses.align_from_all_guesses(predicted, keyframe, view, resting, carried)
 
     def _dead_reckoned_pose(self) -> np.ndarray | None:
         """Return T_odom_camera [4, 4] by the prior's motion since the last OK frame, if known."""
-        start, now = self.state.anchor, self._prior
+        start, now = self.state.dead_reckoning_start, self._prior
         if start is None or now is None:
             return None
-        return start.carried_to(now, self.config.prior)
+        return start.dead_reckon(now, self.config.prior)
 
-    def _classify(self, candidate: Candidate) -> Status:
+    def _classify(self, candidate: PoseHypothesis) -> TrackingStatus:
         state = self.state
-        return judge(candidate, state.history, state.status, self.config.judgement)
+        return classify_tracking(candidate, state.history, state.status, self.config.judgement)
 
     # --- relocalization ---------------------------------------------------------------------------
-    def _places_when_lost(self) -> Places:
+    def _places_when_lost(self) -> KeyframeDatabase:
         """Add the last mapping keyframe to the database, and return the database.
 
         It shows more of the camera's last position than the reference keyframe does.
         """
         before = self.state
-        if before.supporting is not None:
-            places = before.places.added(before.supporting, self.config.places)
-            self.state = replace(before, places=places, supporting=None)
+        if before.mapping_keyframe is not None:
+            places = before.places.with_record(before.mapping_keyframe, self.config.places)
+            self.state = replace(before, places=places, mapping_keyframe=None)
         return self.state.places
 
     def _relocalize(
-        self, view: Pyramid, places: Places, *, is_lost: bool
-    ) -> tuple[Keyframe, Candidate] | None:
+        self, view: Pyramid, places: KeyframeDatabase, *, is_lost: bool
+    ) -> tuple[Keyframe, PoseHypothesis] | None:
         if not self._is_usable(view):
             return None
         state = self.state
-        self.state = replace(state, searches=state.searches + 1)
-        return self._relocalizer.find(view, places, state.searches, state.history, is_lost=is_lost)
+        self.state = replace(state, relocalization_count=state.relocalization_count + 1)
+        return self._relocalizer.find(
+            view, places, state.relocalization_count, state.history, is_lost=is_lost
+        )
 
-    def _places_of_other_submaps(self, submap: int) -> Places:
+    def _places_of_other_submaps(self, submap: int) -> KeyframeDatabase:
         """Return the places of all submaps that are not merged with one."""
         state = self.state
         are_merged = state.segments.are_merged
-        return Places(tuple(p for p in state.places.all if not are_merged(p.segment, submap)))
+        return KeyframeDatabase(
+            tuple(p for p in state.places.all if not are_merged(p.segment, submap))
+        )
 
     def _search_other_submaps(
         self, tracked: TrackedFrame, keyframe: Keyframe, view: Pyramid
     ) -> TrackedFrame:
         """Search other submaps at intervals; a confirmed match makes the frame a keyframe."""
         before, config = self.state.segments, self.config.segments
-        if tracked.status is not Status.OK or not before.is_search_due(config):
+        if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
             return tracked
         places = self._places_of_other_submaps(keyframe.segment)
         found = self._relocalize(view, places, is_lost=False)
         look = measurement = None
         if found is not None:
             there, alignment = found[0], found[1].alignment
-            look = Look.at(there, alignment, tracked.submap, tracked.T_odom_camera)
+            look = SubmapMatch.at(there, alignment, tracked.submap, tracked.T_odom_camera)
             measurement = SubmapMeasurement.of(there, alignment)
-        self.state = replace(self.state, segments=before.looked(look, config))
+        self.state = replace(self.state, segments=before.with_search_result(look, config))
         if look is None or not before.is_confirmed_by(look, config):
             return tracked
         needed = KeyframeKind.REFERENCE
@@ -251,15 +272,15 @@ class FrameTracker:
     def _lost_result(
         self, frame: RgbdFrame, keyframe: Keyframe, alignment: Alignment
     ) -> TrackedFrame:
-        motion = self.state.motion.stopped()
-        self._remember(frame, keyframe, motion, self.state.history, Status.LOST)
-        self.state = replace(self.state, is_moving=None, suspicion=None)
+        motion = self.state.motion.without_velocity()
+        self._remember(frame, keyframe, motion, self.state.history, TrackingStatus.LOST)
+        self.state = replace(self.state, is_moving=None, motion_evidence=None)
         T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
         lost = TrackedFrame.of(
             replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
             motion.T_odom_camera,
             keyframe,
-            Status.LOST,
+            TrackingStatus.LOST,
             "none",
         )
         is_long_lost = self.state.segments.should_start(frame.stamp_ns, self.config.segments)
@@ -267,26 +288,34 @@ class FrameTracker:
         return replace(lost, should_start_submap=should_start)
 
     def _accepted_result(
-        self, frame: RgbdFrame, keyframe: Keyframe, candidate: Candidate, status: Status
+        self,
+        frame: RgbdFrame,
+        keyframe: Keyframe,
+        candidate: PoseHypothesis,
+        status: TrackingStatus,
     ) -> TrackedFrame:
         alignment, history, config = candidate.alignment, self.state.history, self.config
-        T_odom_camera = se3.orthonormalised(keyframe.T_odom_keyframe @ alignment.T_reference_camera)
+        T_odom_camera = se3.orthonormalize(keyframe.T_odom_keyframe @ alignment.T_reference_camera)
         motion = self.state.motion.moved_to(T_odom_camera, frame.stamp_ns)
-        is_steady = status is Status.OK and self.state.status is Status.OK
-        if status is Status.OK:
+        is_steady = status is TrackingStatus.OK and self.state.status is TrackingStatus.OK
+        if status is TrackingStatus.OK:
             history = history.extended(alignment, config.judgement)
-            anchor = self._prior and Anchor(T_odom_camera, self._prior)
-            trusted = thumbnail_of(self.view(frame))
-            self.state = replace(self.state, trusted=trusted, anchor=anchor)
-        self._remember(frame, keyframe, motion if is_steady else motion.stopped(), history, status)
+            anchor = self._prior and DeadReckoningStart(T_odom_camera, self._prior)
+            trusted = make_thumbnail(self.view(frame))
+            self.state = replace(self.state, trusted_thumbnail=trusted, dead_reckoning_start=anchor)
+        self._remember(
+            frame, keyframe, motion if is_steady else motion.without_velocity(), history, status
+        )
         dynamic_mask = None  # Surfaces contradict each other where a pose is unsure.
-        if status is Status.OK:
+        if status is TrackingStatus.OK:
             dynamic_mask = self._segment_motion(keyframe, self.view(frame), alignment)
-        if self.state.origin is Origin.KNOWN:
+        if self.state.origin is KeyframeOrigin.KNOWN:
             # What was put there since the keyframe was made does not move.
             dynamic_mask = None
             self.state = replace(self.state, is_moving=None)
-        needed = self._needed_keyframe(T_odom_camera, candidate) if status is Status.OK else None
+        needed = (
+            self._needed_keyframe(T_odom_camera, candidate) if status is TrackingStatus.OK else None
+        )
         return TrackedFrame.of(
             alignment,
             T_odom_camera,
@@ -299,18 +328,18 @@ class FrameTracker:
         )
 
     def _needed_keyframe(
-        self, T_odom_camera: np.ndarray, candidate: Candidate
+        self, T_odom_camera: np.ndarray, candidate: PoseHypothesis
     ) -> KeyframeKind | None:
         """Return the keyframe that an OK frame should become, by its distance to the last one."""
         config, frames = self.config.keyframes, self.state.frames_since_keyframe
-        is_known = self.state.origin is Origin.KNOWN
+        is_known = self.state.origin is KeyframeOrigin.KNOWN
         if is_known:  # A known keyframe serves for any time.
             frames = min(frames, config.max_frames - 1)
         alignment, depth_m = candidate.alignment, candidate.median_depth_m
-        if is_due(alignment.T_reference_camera, alignment.overlap, depth_m, frames, config):
+        if needs_keyframe(alignment.T_reference_camera, alignment.overlap, depth_m, frames, config):
             return KeyframeKind.REFERENCE
-        T_mapped_camera = se3.inverse(self.state.T_odom_mapped) @ T_odom_camera
-        if not is_known and is_worth_mapping(T_mapped_camera, depth_m, config):
+        T_mapped_camera = se3.inverse(self.state.T_odom_last_mapped) @ T_odom_camera
+        if not is_known and needs_mapping_keyframe(T_mapped_camera, depth_m, config):
             return KeyframeKind.MAPPING
         return None
 
@@ -324,30 +353,30 @@ class FrameTracker:
         config = self.config.moving
         if not config.is_on:
             return None
-        seen = watch(
+        seen = segment_motion(
             view,
             keyframe.view,
-            keyframe.has_moved,
+            keyframe.moved_mask,
             alignment.T_reference_camera,
             alignment.depth_noise_scale,
-            self.state.suspicion,
+            self.state.motion_evidence,
             config,
             self.config.align.residuals.noise,
         )
-        self.state = replace(self.state, is_moving=seen.is_moving, suspicion=seen.suspicion)
-        if seen.is_much_news(keyframe.has_moved, config):
-            left_out = spread(seen.has_moved, keyframe.view, config)
-            renewed = replace(keyframe, has_moved=seen.has_moved, left_out=left_out)
+        self.state = replace(self.state, is_moving=seen.is_moving, motion_evidence=seen.suspicion)
+        if seen.has_large_change(keyframe.moved_mask, config):
+            left_out = grow_mask(seen.has_moved, keyframe.view, config)
+            renewed = replace(keyframe, moved_mask=seen.has_moved, ignore_mask=left_out)
             self.state = replace(self.state, keyframe=renewed)
-        return spread(seen.is_moving, view, config)
+        return grow_mask(seen.is_moving, view, config)
 
     def _remember(
         self,
         frame: RgbdFrame,
         keyframe: Keyframe,
         motion: Motion,
-        history: History,
-        status: Status,
+        history: ResidualHistory,
+        status: TrackingStatus,
     ) -> None:
         before = self.state
         if status is not before.status:
@@ -359,5 +388,5 @@ class FrameTracker:
             history=history,
             status=status,
             frames_since_keyframe=before.frames_since_keyframe + 1,
-            segments=before.segments.after(status is Status.LOST, frame.stamp_ns),
+            segments=before.segments.after(status is TrackingStatus.LOST, frame.stamp_ns),
         )

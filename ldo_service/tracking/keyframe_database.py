@@ -19,23 +19,23 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, codecs, se3
 from ldo_service.storage.state_codec import decode_state
 
-from .features import FeatureConfig, Features, detect, detect_across_scales
+from .features import FeatureConfig, Features, detect, detect_sift
 from .keyframes import Keyframe
-from .motion import extents
+from .motion import image_motions_rad
 from .motion_segmentation import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
-from .tracking_quality import History
+from .tracking_quality import ResidualHistory
 
 THUMBNAIL = 20, 15  # columns, rows: so blurred that a hand's width of motion matters little
 CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactly in float32
 DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
-NO_PAST = History()
+NO_PAST = ResidualHistory()
 
-PLACES = "places.msgpack"  # in the folder of a run
+DATABASE_FILE = "places.msgpack"  # in the folder of a run
 
 
 @dataclass(frozen=True, slots=True)
-class PlacesConfig:
+class KeyframeDatabaseConfig:
     count: int = 1000  # places kept, 0.13 MB each at 640x480 (kitchen); then the path is thinned
     features: int = 500  # of each: half of a frame's, which halves the time to match
     same: float = 0.1  # rad, as `motion.extent`: a place so near is replaced by the newer one,
@@ -50,7 +50,7 @@ class PlacesConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class KeyframeRecord:
     """A keyframe in some 130 kB.
 
     thumbnail      [300] int8, of mean 0 and one contrast
@@ -77,19 +77,19 @@ class Place:
         points = self.points_camera.astype(np.float64)
         return Features(self.camera.project(points), points, self.descriptors)
 
-    def features_across_scales(self, config: FeatureConfig) -> Features:
+    def sift_features(self, config: FeatureConfig) -> Features:
         """SIFT of the small image, detected when first asked for; half as many as of a frame."""
         if "_across_scales" not in self.__dict__:
             image = self._gray, self.depth_m, self.camera
-            seen = detect_across_scales(*image, config.count_across_scales // 2, config)
+            seen = detect_sift(*image, config.count_across_scales // 2, config)
             self.__dict__["_across_scales"] = seen
         return self.__dict__["_across_scales"]
 
-    def history(self, otherwise: History) -> History:
+    def history(self, otherwise: ResidualHistory) -> ResidualHistory:
         """What a frame that shows this place is judged by: scenes differ in noise."""
         if not self.intensity_sigma:
             return otherwise
-        return History((self.intensity_sigma,), (self.depth_noise_scale,))
+        return ResidualHistory((self.intensity_sigma,), (self.depth_noise_scale,))
 
     @cached_property
     def packed(self) -> dict[str, Any]:
@@ -98,9 +98,9 @@ class Place:
         return {**kept, "camera": asdict(self.camera)}
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Place":
+    def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
         """The inverse of `packed`."""
-        return Place(**{**kept, "camera": Camera.of(kept["camera"])})
+        return KeyframeRecord(**{**kept, "camera": Camera.of(kept["camera"])})
 
     @property
     def nbytes(self) -> int:
@@ -111,10 +111,10 @@ class Place:
         """The keyframe as frames can be aligned to it; bitwise equal each time."""
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return Keyframe(
-            view, self.T_odom_keyframe, self.id, self.segment, kept_features=self.features
+            view, self.T_odom_keyframe, self.id, self.segment, stored_features=self.features
         )
 
-    def without(self, left_out: np.ndarray) -> "Place":
+    def without(self, left_out: np.ndarray) -> "KeyframeRecord":
         """The same with nothing known of pixels [H, W] bool, at the size of its camera."""
         if not left_out.any():
             return self
@@ -139,25 +139,25 @@ class Place:
         return steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
 
 
-def place_of(
+def make_keyframe_record(
     keyframe: Keyframe,
     features: FeatureConfig,
-    config: PlacesConfig,
-    history: History = NO_PAST,
-) -> Place:
+    config: KeyframeDatabaseConfig,
+    history: ResidualHistory = NO_PAST,
+) -> KeyframeRecord:
     """What is kept of a keyframe without what moves in it, and of the noise of frames before it."""
     view, level = keyframe.view, keyframe.view.levels[0]
-    left_out = resized(keyframe.left_out, level.depth_m.shape)
+    left_out = resized(keyframe.ignore_mask, level.depth_m.shape)
     seen = detect(view, replace(features, count=config.features))
     kept = _are_still(seen.points_camera, level.camera, left_out)
-    return Place(
+    return KeyframeRecord(
         id=keyframe.id,
         segment=keyframe.segment,
         T_odom_keyframe=keyframe.T_odom_keyframe,
         median_depth_m=keyframe.reference.median_depth_m,
         intensity_sigma=median(history.intensity_sigmas or (0.0,)),
         depth_noise_scale=median(history.depth_noise_scales or (0.0,)),
-        thumbnail=thumbnail_of(view),
+        thumbnail=make_thumbnail(view),
         points_camera=seen.points_camera[kept].astype(np.float32),
         descriptors=seen.descriptors[kept],
         camera=level.camera,
@@ -186,7 +186,7 @@ def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.n
     return kept
 
 
-def thumbnail_of(view: Pyramid) -> np.ndarray:
+def make_thumbnail(view: Pyramid) -> np.ndarray:
     """[300] int8: the image in 20x15, free of brightness and contrast."""
     small = cv2.resize(view.gray, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
     small -= small.mean()
@@ -195,37 +195,43 @@ def thumbnail_of(view: Pyramid) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
-    """Places along the path, the oldest first. Immutable: `added` makes another."""
+class KeyframeDatabase:
+    """Places along the path, the oldest first. Immutable: `with_record` makes another."""
 
-    all: tuple[Place, ...] = ()
+    all: tuple[KeyframeRecord, ...] = ()
 
     def __len__(self) -> int:
         return len(self.all)
 
-    def added(self, place: Place, config: PlacesConfig) -> "Places":
+    def with_record(
+        self, place: KeyframeRecord, config: KeyframeDatabaseConfig
+    ) -> "KeyframeDatabase":
         """With one more, and without the one that it shows anew; where there are too many, one that
         leaves the smallest gap is gone."""
         kept = (*self._others(place, config), place)
         if len(kept) > config.count:
-            spare = int(np.argmin(gaps(kept))) + 1
+            spare = int(np.argmin(neighbor_distances(kept))) + 1
             kept = (*kept[:spare], *kept[spare + 1 :])
-        return Places(kept)
+        return KeyframeDatabase(kept)
 
-    def returned_to(self, place: Place) -> "Places":
+    def with_reused(self, place: KeyframeRecord) -> "KeyframeDatabase":
         """With a known one as the newest, where odometry has it now."""
-        return Places((*(other for other in self.all if other.id != place.id), place))
+        return KeyframeDatabase((*(other for other in self.all if other.id != place.id), place))
 
-    def without(self, left_out: np.ndarray, keyframe: int) -> "Places":
-        """With nothing known of pixels [H, W] bool of one of them: see `Place.without`."""
+    def without(self, left_out: np.ndarray, keyframe: int) -> "KeyframeDatabase":
+        """With nothing known of pixels [H, W] bool of one of them: see `KeyframeRecord.without`."""
         places = (p.without(left_out) if p.id == keyframe else p for p in self.all)
-        return Places(tuple(places))
+        return KeyframeDatabase(tuple(places))
 
-    def of(self, segment: int, without: Set[int] = frozenset()) -> tuple[Place, ...]:
+    def in_submap(
+        self, segment: int, without: Set[int] = frozenset()
+    ) -> tuple[KeyframeRecord, ...]:
         """Those of a segment but for some, by id."""
         return tuple(p for p in self.all if p.segment == segment and p.id not in without)
 
-    def _others(self, place: Place, config: PlacesConfig) -> tuple[Place, ...]:
+    def _others(
+        self, place: KeyframeRecord, config: KeyframeDatabaseConfig
+    ) -> tuple[KeyframeRecord, ...]:
         """All but the nearest of those that are the same place, the last ones aside."""
         older = self.all[: max(0, len(self.all) - config.recent)]
         if not older:
@@ -236,9 +242,9 @@ class Places:
             return self.all
         return (*self.all[:nearest], *self.all[nearest + 1 :])
 
-    def alike(self, view: Pyramid) -> list[int]:
+    def rank_by_similarity(self, view: Pyramid) -> list[int]:
         """Indices of all places, the one whose thumbnail correlates best first."""
-        correlations = self._thumbnails @ thumbnail_of(view).astype(np.float32)
+        correlations = self._thumbnails @ make_thumbnail(view).astype(np.float32)
         return np.argsort(-correlations, kind="stable").tolist()
 
     @cached_property
@@ -249,39 +255,42 @@ class Places:
         )
 
 
-def gaps(path: Sequence[Place]) -> np.ndarray:
+def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
     """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`.
 
     Infinite where they are of two segments.
     """
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
-    apart = extents(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
+    apart = image_motions_rad(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
     segment = np.array([place.segment for place in path])
     return np.where(segment[:-2] == segment[2:], apart, np.inf)
 
 
-def _apart(places: tuple[Place, ...], other: Place) -> np.ndarray:
+def _apart(places: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndarray:
     """[N] rad: how far each is from another one, as `motion.extent`; infinite in other segments."""
     moved = se3.inverse(_poses(places)) @ other.T_odom_keyframe
     segment = np.array([place.segment for place in places])
-    return np.where(segment == other.segment, extents(moved, other.median_depth_m), np.inf)
+    return np.where(
+        segment == other.segment, image_motions_rad(moved, other.median_depth_m), np.inf
+    )
 
 
-def _poses(places: Sequence[Place]) -> np.ndarray:
+def _poses(places: Sequence[KeyframeRecord]) -> np.ndarray:
     return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
 
 
-def places_of(folder: Path) -> Places:
+def places_of(folder: Path) -> KeyframeDatabase:
     """Of the map that a finished run left in its folder. Raises DataError when it left none."""
-    path = folder / PLACES
+    path = folder / DATABASE_FILE
     if not path.is_file():
         raise DataError(
-            f"{folder} has no {PLACES}, so nothing can be localised in it. Name the folder that "
+            f"{folder} has no {DATABASE_FILE}, so nothing can be localised in it. Name the folder "
+            f"that "
             "`ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
         )
     try:
         kept = decode_state(path.read_bytes())
-        places = Places(tuple(Place.unpacked(place) for place in kept["places"]))
+        places = KeyframeDatabase(tuple(KeyframeRecord.unpack(place) for place in kept["places"]))
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:

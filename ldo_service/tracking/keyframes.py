@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
+from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, se3
 
 from .features import FeatureConfig, Features, detect
-from .pyramid import Pyramid, PyramidConfig, Reference, build_pyramid, build_reference
+from .pyramid import Pyramid, PyramidConfig, ReferencePoints, build_pyramid, build_reference
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,21 +55,23 @@ class Keyframe:
     T_odom_keyframe: np.ndarray  # [4, 4]
     id: int  # ascending, given by the odometry: a camera's frame numbers may start again
     segment: int = 0  # whose odometry frame T_odom_keyframe leads to
-    has_moved: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
-    left_out: np.ndarray | None = None  # [H, W] bool: what of it was seen to move
-    movable: np.ndarray | None = None  # [H, W] bool: what of it a detector knows to move by itself
-    kept_features: Features | None = None  # of a place; its image is smaller than what they saw
+    moved_mask: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
+    ignore_mask: np.ndarray | None = None  # [H, W] bool: what of it was seen to move
+    dynamic_class_mask: np.ndarray | None = (
+        None  # [H, W] bool: what of it a detector knows to move by itself
+    )
+    stored_features: Features | None = None  # of a place; its image is smaller than what they saw
 
     @cached_property
-    def reference(self) -> Reference:
+    def reference(self) -> ReferencePoints:
         """Without what moves."""
-        masks = [mask for mask in (self.left_out, self.movable) if mask is not None]
+        masks = [mask for mask in (self.ignore_mask, self.dynamic_class_mask) if mask is not None]
         return build_reference(self.view, np.logical_or.reduce(masks) if masks else None)
 
     def features(self, config: FeatureConfig) -> Features:
         """Detected when first asked for: most keyframes never are."""
-        if self.kept_features is not None:
-            return self.kept_features
+        if self.stored_features is not None:
+            return self.stored_features
         if "_features" not in self.__dict__:
             self.__dict__["_features"] = detect(self.view, config)
         return self.__dict__["_features"]
@@ -77,7 +79,7 @@ class Keyframe:
     @cached_property
     def packed(self) -> dict[str, Any]:
         """Arrays and plain values, one and the same object each time."""
-        view, features = self.view, self.kept_features
+        view, features = self.view, self.stored_features
         return {
             "gray": view.gray,
             "depth_m": view.depth_m,
@@ -85,14 +87,14 @@ class Keyframe:
             "T_odom_keyframe": self.T_odom_keyframe,
             "id": self.id,
             "segment": self.segment,
-            "has_moved": self.has_moved,
-            "left_out": self.left_out,
-            "movable": self.movable,
+            "has_moved": self.moved_mask,
+            "left_out": self.ignore_mask,
+            "movable": self.dynamic_class_mask,
             "features": None if features is None else asdict(features),
         }
 
     @staticmethod
-    def unpacked(kept: dict[str, Any], config: PyramidConfig) -> "Keyframe":
+    def unpack(kept: dict[str, Any], config: PyramidConfig) -> "Keyframe":
         """The inverse of `packed`, under the same configuration."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
@@ -108,7 +110,7 @@ class Keyframe:
         )
 
 
-def is_due(
+def needs_keyframe(
     T_keyframe_camera: np.ndarray,
     overlap: float,
     median_depth_m: float,
@@ -122,28 +124,28 @@ def is_due(
     rotation_rad = se3.rotation_angle(T_keyframe_camera)
     if max(translation, rotation_rad) < config.still_motion and overlap > config.still_overlap:
         return False  # a robot that waits must not fill its map
-    return frames >= config.max_frames or has_left(
+    return frames >= config.max_frames or left_keyframe_view(
         T_keyframe_camera, overlap, median_depth_m, config
     )
 
 
-def has_left(
+def left_keyframe_view(
     T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
     """Whether a view is elsewhere than its keyframe, or shows too little of it."""
-    is_elsewhere = bool(shares_of_limits(T_keyframe_camera, median_depth_m, config) > 1)
+    is_elsewhere = bool(limit_ratios(T_keyframe_camera, median_depth_m, config) > 1)
     return is_elsewhere or overlap < config.min_overlap
 
 
-def is_worth_mapping(
+def needs_mapping_keyframe(
     T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
     """Whether a view has left the last one that was mapped far enough to support it."""
-    left = float(shares_of_limits(T_mapped_camera, median_depth_m, config))
+    left = float(limit_ratios(T_mapped_camera, median_depth_m, config))
     return left > config.supporting and config.supporting <= 1
 
 
-def shares_of_limits(
+def limit_ratios(
     T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray | float, config: KeyframeConfig
 ) -> np.ndarray:
     """[...] of how far a camera may go before a keyframe is due, the larger share of translation
@@ -153,9 +155,12 @@ def shares_of_limits(
     return np.maximum(translation / config.max_translation, rotation_rad / config.max_rotation_rad)
 
 
-def movable_in(view: Pyramid, boxes: Sequence[Box], config: MovableConfig) -> np.ndarray:
-    """`movable_pixels` [H, W] bool at working resolution, of boxes in pixels of the whole image."""
+def keyframe_dynamic_class_mask(
+    view: Pyramid, boxes: Sequence[Box], config: DynamicClassConfig
+) -> np.ndarray:
+    """`dynamic_class_mask` [H, W] bool at working resolution, of boxes in pixels of the whole
+    image."""
     finest = view.levels[0]
     times = view.camera.width / finest.camera.width
     smaller = [box.in_smaller(times) for box in boxes]
-    return movable_pixels(smaller, finest.depth_m, config)
+    return dynamic_class_mask(smaller, finest.depth_m, config)

@@ -14,39 +14,39 @@ import numpy as np
 from ldo_service.geometry import RgbdFrame, se3
 
 from .frame_tracking import OdometryConfig
-from .keyframe_database import Places
+from .keyframe_database import KeyframeDatabase
 from .map_frame import MapCorrection
 from .odometry import Odometry
-from .odometry_prior import Prior
-from .submaps import Look, SegmentConfig
-from .tracking_quality import Status
+from .odometry_prior import OdometryPriorBuffer
+from .submaps import SubmapConfig, SubmapMatch
+from .tracking_quality import TrackingStatus
 from .tracking_result import KeyframeKind, TrackedFrame, TrackingResult, make_tracking_result
 
 MAP = -1  # Stands for the map in place of the number of a submap.
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
+class MapFix:
     """Odometry frame in the map, and the last match that speaks for it."""
 
     segment: int = 0  # Submap of odometry.
     T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found.
-    last: Look | None = None
+    last: SubmapMatch | None = None
     since_look: int = 0  # Frames since the last search.
 
-    def is_search_due(self, config: SegmentConfig) -> bool:
+    def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether to search in this frame: in every one until the camera is found."""
         return self.T_map_odom is None or self.since_look >= config.look_every
 
-    def after(self, tracked: TrackedFrame) -> "Fix":
+    def after(self, tracked: TrackedFrame) -> "MapFix":
         """Return the fix one frame later; a new submap of odometry may be anywhere."""
         if tracked.submap != self.segment:
-            return Fix(tracked.submap)
+            return MapFix(tracked.submap)
         return replace(self, since_look=self.since_look + 1)
 
-    def looked(self, look: Look, config: SegmentConfig) -> "Fix":
+    def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
         """Return the fix after a match, which is accepted when the last one agrees with it."""
-        is_confirmed = self.last is not None and self.last.agrees(look, config)
+        is_confirmed = self.last is not None and self.last.is_consistent_with(look, config)
         T_map_odom = look.T_there_here if is_confirmed else self.T_map_odom
         # A match that contradicts the last one is followed by another search soon.
         since = 0 if is_confirmed else config.look_every - config.confirm_after
@@ -58,10 +58,10 @@ class Fix:
         return asdict(self)
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Fix":
+    def unpack(kept: dict[str, Any]) -> "MapFix":
         """Return the fix from its packed form."""
-        last = None if kept["last"] is None else Look(**kept["last"])
-        return Fix(**{**kept, "last": last})
+        last = None if kept["last"] is None else SubmapMatch(**kept["last"])
+        return MapFix(**{**kept, "last": last})
 
 
 class Localizer(Odometry):
@@ -69,7 +69,7 @@ class Localizer(Odometry):
 
     def __init__(
         self,
-        places: Places,
+        places: KeyframeDatabase,
         config: OdometryConfig | None = None,
         T_base_camera: np.ndarray | None = None,
     ) -> None:
@@ -82,12 +82,12 @@ class Localizer(Odometry):
         """
         super().__init__(config, T_base_camera)
         self._places = places
-        self._fix = Fix()
+        self._fix = MapFix()
 
     def process(
         self,
         frame: RgbdFrame,
-        prior: Prior | None = None,
+        prior: OdometryPriorBuffer | None = None,
         *,
         may_map: bool = True,  # noqa: ARG002
     ) -> TrackingResult:
@@ -111,11 +111,11 @@ class Localizer(Odometry):
             self._add_reference(frame, tracked)
         # Odometry in the map.
         self._fix = self._fix.after(tracked)
-        if tracked.status is Status.OK and self._fix.is_search_due(self.config.segments):
+        if tracked.status is TrackingStatus.OK and self._fix.is_search_due(self.config.segments):
             self._search(frame, tracked)
         T_map_odom = self._fix.T_map_odom
         if T_map_odom is None:
-            tracked, T_map_odom = replace(tracked, status=Status.LOST), np.eye(4)
+            tracked, T_map_odom = replace(tracked, status=TrackingStatus.LOST), np.eye(4)
         return make_tracking_result(
             tracked,
             T_map_odom,
@@ -132,7 +132,7 @@ class Localizer(Odometry):
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:
         """Continue from a snapshot; see `Odometry.restore`."""
         super().restore(state, correction)
-        self._fix = Fix.unpacked(state["fix"])
+        self._fix = MapFix.unpack(state["fix"])
 
     def _search(self, frame: RgbdFrame, tracked: TrackedFrame) -> None:
         """Search the frame just tracked in the map, and update the fix."""
@@ -142,7 +142,7 @@ class Localizer(Odometry):
             return
         keyframe, alignment = found
         T_map_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
-        T_map_odom = se3.orthonormalised(T_map_camera @ se3.inverse(tracked.T_odom_camera))
+        T_map_odom = se3.orthonormalize(T_map_camera @ se3.inverse(tracked.T_odom_camera))
         median_depth_m = keyframe.reference.median_depth_m
-        look = Look(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
-        self._fix = self._fix.looked(look, self.config.segments)
+        look = SubmapMatch(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
+        self._fix = self._fix.with_search_result(look, self.config.segments)

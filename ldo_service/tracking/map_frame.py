@@ -88,7 +88,7 @@ class MapFrame:
             tracked: The frame.
             next_reference: The keyframe that the next frame is aligned to; it is kept too.
         """
-        self._poses.chain(
+        self._poses.add(
             keyframe,
             tracked.reference,
             tracked.T_reference_camera,
@@ -107,7 +107,7 @@ class MapFrame:
             return
         T_odom_keyframe = tracked.T_odom_camera @ se3.inverse(tracked.T_reference_camera)
         newest = max(self._poses, default=keyframe)
-        self._poses.chain(keyframe, None, np.eye(4), T_odom_keyframe, tracked.submap)
+        self._poses.add(keyframe, None, np.eye(4), T_odom_keyframe, tracked.submap)
         T_map_keyframe = self.T_map_keyframe.get(keyframe)
         if T_map_keyframe is not None:
             self._poses.place(keyframe, T_map_keyframe)

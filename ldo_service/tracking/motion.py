@@ -26,22 +26,22 @@ class Motion:
         elapsed_ns = stamp_ns - self.stamp_ns
         timed = elapsed_ns > 0 and self.interval_ns > 0
         steps = min(elapsed_ns / self.interval_ns, MAX_STEPS) if timed else 1.0
-        return se3.orthonormalised(self.T_odom_camera @ se3.exp(self.twist * steps))
+        return se3.orthonormalize(self.T_odom_camera @ se3.exp(self.twist * steps))
 
     def moved_to(self, T_odom_camera: np.ndarray, stamp_ns: int) -> "Motion":
         twist = se3.log(se3.inverse(self.T_odom_camera) @ T_odom_camera)
         return Motion(T_odom_camera, twist, stamp_ns - self.stamp_ns, stamp_ns)
 
-    def stopped(self) -> "Motion":
+    def without_velocity(self) -> "Motion":
         """The same place without velocity: after a loss, nothing is known of it."""
         return Motion(self.T_odom_camera, np.zeros(6), 0, self.stamp_ns)
 
 
-def extent(T: np.ndarray, median_depth_m: float) -> float:
+def image_motion_rad(T: np.ndarray, median_depth_m: float) -> float:
     """How far T [4, 4] shifts the image of a scene at the median depth, in rad."""
-    return float(extents(T, median_depth_m))
+    return float(image_motions_rad(T, median_depth_m))
 
 
-def extents(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:
+def image_motions_rad(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:
     """Shifts [...] in rad of T [..., 4, 4] at median_depth_m [...]."""
     return se3.rotation_angles(T) + se3.distances(T) / median_depth_m

@@ -21,7 +21,7 @@ NOTHING_M = 1e4  # the depth of a pixel without one, for minima
 
 
 @dataclass(frozen=True, slots=True)
-class MovingConfig:
+class MotionSegmentationConfig:
     is_on: bool = True  # False: the world is taken as static
     level: int = 1  # of the pyramid that is looked at: 160 pixels wide
     least_m: float = 0.06  # by which a surface must contradict: pose errors of a keyframe's length
@@ -59,7 +59,7 @@ class MovingConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Suspicion:
+class MotionEvidence:
     """What is kept from frame to frame, at the level that is looked at.
 
     contradicts  [h, w] bool, pixels of the last frame that contradict
@@ -74,20 +74,20 @@ class Suspicion:
         is_of_keyframe = self.gone is None or self.gone.shape == then.depth_m.shape
         return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
-    def of_new_keyframe(self) -> "Suspicion":
-        return Suspicion(self.contradicts, None)
+    def of_new_keyframe(self) -> "MotionEvidence":
+        return MotionEvidence(self.contradicts, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Watched:
+class MotionMasks:
     """is_moving [H, W] bool of the frame and has_moved [H, W] bool of the keyframe, both at
     working resolution."""
 
     is_moving: np.ndarray
     has_moved: np.ndarray
-    suspicion: Suspicion
+    suspicion: MotionEvidence
 
-    def is_much_news(self, known: np.ndarray | None, config: MovingConfig) -> bool:
+    def has_large_change(self, known: np.ndarray | None, config: MotionSegmentationConfig) -> bool:
         """Whether much has moved beside what is known, [H, W] bool; None: nothing is."""
         news = self.has_moved if known is None else self.has_moved & ~known
         return bool(np.mean(news) > config.renewed_share)
@@ -102,7 +102,7 @@ class _Pair:
     T_then_now: np.ndarray  # [4, 4]
     noise: DepthNoise
     noise_scale: float
-    config: MovingConfig
+    config: MotionSegmentationConfig
 
     def limit_m(self, level: Level) -> np.ndarray:
         """By how much [h, w] a surface may differ from a static one by errors alone."""
@@ -111,30 +111,30 @@ class _Pair:
 
     def came(self, has_moved: np.ndarray) -> np.ndarray:
         """Pixels [h, w] bool of the frame in front of what the keyframe saw, or on what moved."""
-        ahead_m = gap_m(self.now, self.then, self.T_then_now, self.config)
+        ahead_m = depth_gap_m(self.now, self.then, self.T_then_now, self.config)
         limit_m = self.limit_m(self.now)
         on_moved = _lies_on(has_moved, self.now, self.then, self.T_then_now)
         return (ahead_m > limit_m) | (on_moved & (ahead_m > -limit_m))
 
-    def gone(self, before: Suspicion | None) -> np.ndarray:
+    def gone(self, before: MotionEvidence | None) -> np.ndarray:
         """In how many frames [h, w] uint8 each point of the keyframe was seen through."""
-        ahead_m = gap_m(self.then, self.now, se3.inverse(self.T_then_now), self.config)
+        ahead_m = depth_gap_m(self.then, self.now, se3.inverse(self.T_then_now), self.config)
         through = _bytes(ahead_m > self.limit_m(self.then))
         count = cv2.morphologyEx(through, cv2.MORPH_OPEN, _square(1))
         known = None if before is None else before.gone
         return count if known is None else cv2.add(count, known)
 
 
-def watch(
+def segment_motion(
     view: Pyramid,
     keyframe: Pyramid,
     has_moved: np.ndarray | None,
     T_keyframe_camera: np.ndarray,
     noise_scale: float,
-    before: Suspicion | None,
-    config: MovingConfig,
+    before: MotionEvidence | None,
+    config: MotionSegmentationConfig,
     noise: DepthNoise,
-) -> Watched:
+) -> MotionMasks:
     """What moved between a keyframe and an aligned frame.
 
     has_moved          [H, W] bool of the keyframe as known so far, None: nothing
@@ -152,18 +152,18 @@ def watch(
     came, gone = pair.came(known), pair.gone(before)
     is_moving = _in_pieces(came, None if before is None else before.contradicts, config)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
-    return Watched(
+    return MotionMasks(
         resized(is_moving, view.levels[0].depth_m.shape),
         resized(known, keyframe.levels[0].depth_m.shape),
-        Suspicion(came, gone),
+        MotionEvidence(came, gone),
     )
 
 
-def spread(is_moving: np.ndarray, view: Pyramid, config: MovingConfig) -> np.ndarray:
+def grow_mask(is_moving: np.ndarray, view: Pyramid, config: MotionSegmentationConfig) -> np.ndarray:
     """Pixels [H, W] bool to leave out: what moves, all that is as far away beside it, and a rim.
 
-    is_moving [H, W] bool at working resolution, as `watch` gives it. What this adds must not be
-    given to `watch` again, or it would spread on from frame to frame.
+    is_moving [H, W] bool at working resolution, as `segment_motion` gives it. What this adds must
+    not be given to `segment_motion` again, or it would spread on from frame to frame.
     """
     if not is_moving.any():
         return is_moving
@@ -178,7 +178,9 @@ def spread(is_moving: np.ndarray, view: Pyramid, config: MovingConfig) -> np.nda
     return resized(whole, is_moving.shape)
 
 
-def gap_m(view: Level, other: Level, T_other_view: np.ndarray, config: MovingConfig) -> np.ndarray:
+def depth_gap_m(
+    view: Level, other: Level, T_other_view: np.ndarray, config: MotionSegmentationConfig
+) -> np.ndarray:
     """By how much [h, w] each point of `view` lies in front of what `other` measured there.
 
     The nearest surface within `edge_px` is taken for what was measured, so that outlines that are
@@ -226,7 +228,7 @@ def _rays(camera: Camera) -> np.ndarray:
 
 
 def _in_pieces(
-    contradicts: np.ndarray, before: np.ndarray | None, config: MovingConfig
+    contradicts: np.ndarray, before: np.ndarray | None, config: MotionSegmentationConfig
 ) -> np.ndarray:
     """Pieces [h, w] bool that are large enough and touch what contradicted before."""
     opened = cv2.morphologyEx(_bytes(contradicts), cv2.MORPH_OPEN, _square(1))
@@ -240,7 +242,7 @@ def _in_pieces(
     return kept[np.asarray(labels, np.int32)]
 
 
-def _level(view: Pyramid, config: MovingConfig) -> Level:
+def _level(view: Pyramid, config: MotionSegmentationConfig) -> Level:
     return view.levels[min(config.level, len(view.levels) - 1)]
 
 

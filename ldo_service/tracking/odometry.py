@@ -29,15 +29,15 @@ from ldo_service.detection.dynamic_classes import Box
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .alignment import Appearance
+from .alignment import BrightnessModel
 from .frame_tracking import FrameTracker, OdometryConfig
-from .keyframe_database import Place, place_of
-from .keyframes import Keyframe, movable_in
+from .keyframe_database import KeyframeRecord, make_keyframe_record
+from .keyframes import Keyframe, keyframe_dynamic_class_mask
 from .map_frame import MapCorrection, MapFrame
-from .odometry_prior import Prior, Reading
-from .relocalization import KeyframeReuse, ReusedKeyframe, nearby
-from .state import Origin, packed, unpacked
-from .tracking_quality import Status
+from .odometry_prior import OdometryPriorBuffer, PriorPose
+from .relocalization import KeyframeReuse, ReusedKeyframe, find_nearby_keyframes
+from .state import KeyframeOrigin, pack, unpack
+from .tracking_quality import TrackingStatus
 from .tracking_result import (
     KeyframeKind,
     NewKeyframe,
@@ -45,7 +45,7 @@ from .tracking_result import (
     TrackingResult,
     make_tracking_result,
 )
-from .window import EarlierKeyframes, measured_from
+from .window import RecentKeyframeCache, measure_against
 
 
 class Odometry:
@@ -75,10 +75,10 @@ class Odometry:
             self.config.judgement,
             self.config.returning,
         )
-        self._earlier = EarlierKeyframes(self.config.pyramid)
+        self._earlier = RecentKeyframeCache(self.config.pyramid)
 
     def process(
-        self, frame: RgbdFrame, prior: Prior | None = None, *, may_map: bool = True
+        self, frame: RgbdFrame, prior: OdometryPriorBuffer | None = None, *, may_map: bool = True
     ) -> TrackingResult:
         """Track a frame, and decide what becomes of it. The frame may be blank.
 
@@ -147,11 +147,11 @@ class Odometry:
         state = self._frames.state
         if state.keyframe is None or state.keyframe.id != keyframe:
             return
-        mask = movable_in(state.keyframe.view, boxes, self.config.movable)
+        mask = keyframe_dynamic_class_mask(state.keyframe.view, boxes, self.config.movable)
         if mask.any():
             self._frames.state = replace(
                 state,
-                keyframe=replace(state.keyframe, movable=mask),
+                keyframe=replace(state.keyframe, dynamic_class_mask=mask),
                 places=state.places.without(mask, keyframe),
             )
 
@@ -165,10 +165,10 @@ class Odometry:
         """Return all that the next frames depend on, except for the last correction.
 
         Returns:
-            Arrays and plain values. `places`, `keyframe` and `supporting` hold the same objects
-            until they change.
+            Arrays and plain values. `places`, `keyframe` and `mapping_keyframe` hold the same
+            objects until they change.
         """
-        return {**packed(self._frames.state), "poses": self._map.snapshot()}
+        return {**pack(self._frames.state), "poses": self._map.snapshot()}
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:
         """Continue from a snapshot: the next frames give bitwise equal results.
@@ -177,11 +177,11 @@ class Odometry:
             state: The snapshot.
             correction: The last correction before it.
         """
-        self._frames.restore(unpacked(dict(state), self.config.pyramid))
+        self._frames.restore(unpack(dict(state), self.config.pyramid))
         self._map.restore(state["poses"], correction)
-        self._earlier = EarlierKeyframes(self.config.pyramid)
+        self._earlier = RecentKeyframeCache(self.config.pyramid)
 
-    def _read(self, prior: Prior | None, frame: RgbdFrame) -> Reading | None:
+    def _read(self, prior: OdometryPriorBuffer | None, frame: RgbdFrame) -> PriorPose | None:
         """Return the camera pose of the other odometry at the time of a frame, if it is known."""
         if prior is None:
             return None
@@ -191,7 +191,7 @@ class Odometry:
     @property
     def _is_connected_to_map(self) -> bool:
         """True when the reference is a known keyframe, or was measured from one."""
-        return self._frames.state.origin is not Origin.NEW
+        return self._frames.state.origin is not KeyframeOrigin.NEW
 
     def _find_reusable_keyframe(
         self, frame: RgbdFrame, tracked: TrackedFrame
@@ -210,7 +210,9 @@ class Odometry:
             if place.id != tracked.reference
             and state.segments.are_merged(place.segment, tracked.submap)
         ]
-        near = nearby(known, self._map.T_map_keyframe, T_map_camera, self.config.keyframes)
+        near = find_nearby_keyframes(
+            known, self._map.T_map_keyframe, T_map_camera, self.config.keyframes
+        )
         return self._reuse.find(self._frames.view(frame), near, state.history)
 
     def _switch_to_keyframe(self, known: ReusedKeyframe, tracked: TrackedFrame) -> TrackedFrame:
@@ -219,14 +221,16 @@ class Odometry:
         Odometry goes on where it is: the keyframe gets another pose in it, and its submap.
         """
         alignment = known.candidate.alignment
-        T_odom_keyframe = se3.orthonormalised(
+        T_odom_keyframe = se3.orthonormalize(
             tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
         )
         here = {"T_odom_keyframe": T_odom_keyframe, "segment": tracked.submap}
         place, keyframe = replace(known.place, **here), replace(known.keyframe, **here)
-        self._frames.state = self._frames.state.with_known(keyframe, place, tracked.T_odom_camera)
+        self._frames.state = self._frames.state.with_reused_keyframe(
+            keyframe, place, tracked.T_odom_camera
+        )
         switched = TrackedFrame.of(
-            alignment, tracked.T_odom_camera, keyframe, Status.OK, known.candidate.method
+            alignment, tracked.T_odom_camera, keyframe, TrackingStatus.OK, known.candidate.method
         )
         self._map.place_reference(switched)
         return switched
@@ -277,7 +281,7 @@ class Odometry:
             frames.restart_at(frame, tracked.T_odom_camera)
         if tracked.submap_measurement is not None:
             other = tracked.submap_measurement.segment
-            submaps = frames.state.segments.joined(tracked.submap, other)
+            submaps = frames.state.segments.with_merge(tracked.submap, other)
             frames.state = replace(frames.state, segments=submaps)
         keyframe = self._keyframe_of(frame, tracked)
         place = self._place_of(keyframe)
@@ -294,9 +298,9 @@ class Odometry:
         keyframe = self._keyframe_of(frame, tracked)
         self._frames.state = replace(
             self._frames.state,
-            supporting=self._place_of(keyframe),
+            mapping_keyframe=self._place_of(keyframe),
             next_id=keyframe.id + 1,
-            T_odom_mapped=tracked.T_odom_camera,
+            T_odom_last_mapped=tracked.T_odom_camera,
         )
         return keyframe.id
 
@@ -306,12 +310,12 @@ class Odometry:
         if keyframe is None or tracked.reference is None:
             return []
         without = {keyframe.id, tracked.reference}
-        places = self._frames.state.places.of(keyframe.segment, without)
+        places = self._frames.state.places.in_submap(keyframe.segment, without)
         earlier = self._earlier.newest_first(places, self.config.window.reach)
-        usual = Appearance(
+        usual = BrightnessModel(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
-        return measured_from(earlier, keyframe, usual, self.config.align, self.config.window)
+        return measure_against(earlier, keyframe, usual, self.config.align, self.config.window)
 
     def _keyframe_of(self, frame: RgbdFrame, tracked: TrackedFrame) -> Keyframe:
         view = self._frames.view(frame)
@@ -321,10 +325,10 @@ class Odometry:
             tracked.T_odom_camera,
             self._frames.state.next_id,
             tracked.submap,
-            has_moved=self._frames.state.is_moving,
-            left_out=tracked.dynamic_mask,
+            moved_mask=self._frames.state.is_moving,
+            ignore_mask=tracked.dynamic_mask,
         )
 
-    def _place_of(self, keyframe: Keyframe) -> Place:
+    def _place_of(self, keyframe: Keyframe) -> KeyframeRecord:
         history = self._frames.state.history
-        return place_of(keyframe, self.config.features, self.config.places, history)
+        return make_keyframe_record(keyframe, self.config.features, self.config.places, history)

@@ -49,7 +49,7 @@ class PriorConfig:
             )
 
 
-class Verdict(StrEnum):
+class PriorCheck(StrEnum):
     """On a pose that was added."""
 
     FOLLOWS = "follows the last one"
@@ -66,7 +66,7 @@ class StampedPose:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class PriorPose:
     """Where the other odometry had the camera at one time. Compares within its stretch alone."""
 
     stamp_ns: int
@@ -75,7 +75,7 @@ class Reading:
 
 
 @dataclass(frozen=True, slots=True)
-class Prior:
+class OdometryPriorBuffer:
     """The last poses of the current stretch, ascending."""
 
     poses: tuple[StampedPose, ...] = ()
@@ -83,33 +83,33 @@ class Prior:
 
     def added(
         self, stamp_ns: int, T_prior_base: np.ndarray, config: PriorConfig
-    ) -> tuple["Prior", Verdict]:
+    ) -> tuple["OdometryPriorBuffer", PriorCheck]:
         """With one pose [4, 4] more, if it can be used."""
         pose = StampedPose(stamp_ns, T_prior_base)
         verdict = self._judged(pose, config)
-        if verdict in (Verdict.LATE, Verdict.BROKEN):
+        if verdict in (PriorCheck.LATE, PriorCheck.BROKEN):
             return self, verdict
-        if verdict is Verdict.FOLLOWS:
+        if verdict is PriorCheck.FOLLOWS:
             return replace(self, poses=(*self.poses[1 - KEPT :], pose)), verdict
-        return Prior((pose,), self.stretch + 1), verdict
+        return OdometryPriorBuffer((pose,), self.stretch + 1), verdict
 
-    def _judged(self, pose: StampedPose, config: PriorConfig) -> Verdict:
+    def _judged(self, pose: StampedPose, config: PriorConfig) -> PriorCheck:
         if not np.isfinite(pose.T_prior_base).all():
-            return Verdict.BROKEN
+            return PriorCheck.BROKEN
         if not self.poses:
-            return Verdict.FOLLOWS
+            return PriorCheck.FOLLOWS
         last = self.poses[-1]
         elapsed_s = (pose.stamp_ns - last.stamp_ns) * 1e-9
         if elapsed_s <= 0:
-            return Verdict.RESTARTED if -elapsed_s > config.restart_after_s else Verdict.LATE
+            return PriorCheck.RESTARTED if -elapsed_s > config.restart_after_s else PriorCheck.LATE
         moved = se3.inverse(last.T_prior_base) @ pose.T_prior_base
         is_possible = (
             np.linalg.norm(moved[:3, 3]) <= config.max_speed_m_per_s * elapsed_s
             and se3.rotation_angle(moved) <= config.max_turn_rad_per_s * elapsed_s
         )
-        return Verdict.FOLLOWS if is_possible else Verdict.JUMPED
+        return PriorCheck.FOLLOWS if is_possible else PriorCheck.JUMPED
 
-    def at(self, stamp_ns: int, T_base_camera: np.ndarray, config: PriorConfig) -> Reading | None:
+    def at(self, stamp_ns: int, T_base_camera: np.ndarray, config: PriorConfig) -> PriorPose | None:
         """The camera [4, 4] at a stamp; None where the poses do not reach it."""
         following = bisect_left(self.poses, stamp_ns, key=attrgetter("stamp_ns"))
         if following < len(self.poses):
@@ -118,7 +118,7 @@ class Prior:
             T_prior_base = self._beyond(stamp_ns, config)
         if T_prior_base is None:
             return None
-        return Reading(stamp_ns, T_prior_base @ T_base_camera, self.stretch)
+        return PriorPose(stamp_ns, T_prior_base @ T_base_camera, self.stretch)
 
     def _between(self, following: int, stamp_ns: int, config: PriorConfig) -> np.ndarray | None:
         after = self.poses[following]
@@ -151,9 +151,9 @@ class Prior:
         }
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Prior":
+    def unpack(kept: dict[str, Any]) -> "OdometryPriorBuffer":
         pairs = zip(kept["stamps_ns"], kept["T_prior_base"], strict=True)
-        return Prior(tuple(StampedPose(*pair) for pair in pairs), kept["stretch"])
+        return OdometryPriorBuffer(tuple(StampedPose(*pair) for pair in pairs), kept["stretch"])
 
 
 def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
@@ -168,13 +168,13 @@ def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
-class Anchor:
+class DeadReckoningStart:
     """An OK frame: where it was taken, and where the other odometry had it."""
 
     T_odom_camera: np.ndarray  # [4, 4]
-    reading: Reading
+    reading: PriorPose
 
-    def carried_to(self, now: Reading, config: PriorConfig) -> np.ndarray | None:
+    def dead_reckon(self, now: PriorPose, config: PriorConfig) -> np.ndarray | None:
         """T_odom_camera [4, 4] by the motion since; None over two stretches, or too long after.
 
         T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
@@ -183,7 +183,7 @@ class Anchor:
         if now.stretch != then.stretch or not 0 <= elapsed_s <= config.max_carried_s:
             return None
         moved = se3.inverse(then.T_prior_camera) @ now.T_prior_camera
-        return se3.orthonormalised(self.T_odom_camera @ moved)
+        return se3.orthonormalize(self.T_odom_camera @ moved)
 
     @property
     def packed(self) -> dict[str, Any]:
@@ -191,5 +191,5 @@ class Anchor:
         return asdict(self)
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Anchor":
-        return Anchor(kept["T_odom_camera"], Reading(**kept["reading"]))
+    def unpack(kept: dict[str, Any]) -> "DeadReckoningStart":
+        return DeadReckoningStart(kept["T_odom_camera"], PriorPose(**kept["reading"]))

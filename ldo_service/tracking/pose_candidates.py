@@ -12,16 +12,17 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
 from .alignment import AlignConfig, Alignment, align, evaluate
-from .features import FeatureConfig, ShapeConfig, detect, estimate_pose, pose_from_shape
+from .features import FeatureConfig, GicpConfig, detect, estimate_pose, register_gicp
 from .keyframes import Keyframe
-from .motion import extent
+from .motion import image_motion_rad
 from .pyramid import Pyramid
 
-COLOUR_ALONE = 0.05  # weight of points without a depth to compare with, against points with one
+# weight of points without a depth to compare with, against points with one
+PHOTOMETRIC_ONLY_WEIGHT = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class CandidateConfig:
+class PoseHypothesisConfig:
     agreement_rad: float = 0.06  # rotation plus parallax; 9 of 10 ORB-PnP poses erred 3 cm or less
     rival_support: float = 0.5  # of the best: a pose with less is refuted by the images
 
@@ -31,35 +32,35 @@ class CandidateConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
-    """`second_agrees` is None where there was no second opinion, or the images refute it."""
+class PoseHypothesis:
+    """`is_confirmed` is None where there was no second opinion, or the images refute it."""
 
     alignment: Alignment
     # "direct" from a motion guess, "prior" from another odometry, "features" from ORB, "shape" from
     # point clouds
     method: str
     median_depth_m: float  # of the keyframe
-    second_agrees: bool | None = None
+    is_confirmed: bool | None = None
     disagreement_rad: float = 0.0  # from the farthest rival that the images support
-    is_expected: bool = False  # a prior has the camera there too
+    agrees_with_prior: bool = False  # a prior has the camera there too
 
 
-def attempt(
+def align_hypothesis(
     keyframe: Keyframe,
     view: Pyramid,
     T_keyframe_camera: np.ndarray,
     method: str,
     config: AlignConfig,
-) -> Candidate:
+) -> PoseHypothesis:
     """Direct alignment from a guessed pose."""
     guess = se3.inverse(T_keyframe_camera)
     reference = keyframe.reference
-    return Candidate(align(reference, view, guess, config), method, reference.median_depth_m)
+    return PoseHypothesis(align(reference, view, guess, config), method, reference.median_depth_m)
 
 
 def support(
-    candidate: Candidate,
-    others: Sequence[Candidate],
+    candidate: PoseHypothesis,
+    others: Sequence[PoseHypothesis],
     keyframe: Keyframe,
     view: Pyramid,
     config: AlignConfig,
@@ -78,18 +79,18 @@ def support(
     T_camera_keyframe = se3.inverse(own.T_reference_camera)
     seen = evaluate(keyframe.reference, view, T_camera_keyframe, common, config)
     return seen.photometric_inliers * (
-        COLOUR_ALONE * seen.overlap + seen.geometric_inliers * seen.paired
+        PHOTOMETRIC_ONLY_WEIGHT * seen.overlap + seen.geometric_inliers * seen.paired
     )
 
 
-def best(
-    candidates: Sequence[Candidate],
+def select_hypothesis(
+    candidates: Sequence[PoseHypothesis],
     T_keyframe_second: np.ndarray | None,
     keyframe: Keyframe,
     view: Pyramid,
-    config: CandidateConfig,
+    config: PoseHypothesisConfig,
     align_config: AlignConfig,
-) -> Candidate:
+) -> PoseHypothesis:
     """The candidate with the most support, told whether a second opinion is with it.
 
     T_keyframe_second [4, 4] is the camera's pose as features or shape have it, without a guess; the
@@ -97,75 +98,78 @@ def best(
     """
     supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
     winner, least = int(np.argmax(supports)), config.rival_support * max(supports)
-    apart = [apart_rad(candidates[winner], c.alignment.T_reference_camera) for c in candidates]
+    apart = [
+        hypothesis_distance_rad(candidates[winner], c.alignment.T_reference_camera)
+        for c in candidates
+    ]
     farthest = max(a for a, supported in zip(apart, supports, strict=True) if supported >= least)
     chosen = replace(candidates[winner], disagreement_rad=farthest)
     if T_keyframe_second is None:
         return chosen
     *unled, led = apart
     others = unled if winner == len(unled) else [led]  # two starts that met are two witnesses
-    if min(*others, apart_rad(chosen, T_keyframe_second)) < config.agreement_rad:
-        return replace(chosen, second_agrees=True)
-    return replace(chosen, second_agrees=False if supports[-1] > least else None)
+    if min(*others, hypothesis_distance_rad(chosen, T_keyframe_second)) < config.agreement_rad:
+        return replace(chosen, is_confirmed=True)
+    return replace(chosen, is_confirmed=False if supports[-1] > least else None)
 
 
-def apart_rad(candidate: Candidate, T_keyframe_camera: np.ndarray) -> float:
+def hypothesis_distance_rad(candidate: PoseHypothesis, T_keyframe_camera: np.ndarray) -> float:
     """Rotation plus parallax, rad."""
     difference = se3.inverse(candidate.alignment.T_reference_camera) @ T_keyframe_camera
-    return extent(difference, candidate.median_depth_m)
+    return image_motion_rad(difference, candidate.median_depth_m)
 
 
 @dataclass(frozen=True, slots=True)
-class Guesses:
+class InitialGuessAligner:
     """Alignments from each guess; knows nothing from frame to frame."""
 
     align: AlignConfig
     features: FeatureConfig
-    shape: ShapeConfig
-    candidates: CandidateConfig
+    shape: GicpConfig
+    candidates: PoseHypothesisConfig
     large_motion: float  # image widths per frame
 
-    def from_motion(
+    def align_from_guess(
         self,
         keyframe: Keyframe,
         view: Pyramid,
         T_keyframe_camera: np.ndarray,
         method: str = "direct",
-    ) -> Candidate:
-        return attempt(keyframe, view, T_keyframe_camera, method, self.align)
+    ) -> PoseHypothesis:
+        return align_hypothesis(keyframe, view, T_keyframe_camera, method, self.align)
 
-    def best_of_all(
+    def align_from_all_guesses(
         self,
-        predicted: Candidate,
+        predicted: PoseHypothesis,
         keyframe: Keyframe,
         view: Pyramid,
         resting: np.ndarray,
         carried: np.ndarray | None,
-    ) -> Candidate:
+    ) -> PoseHypothesis:
         """The best of `predicted`, what rest leads to and what a second opinion leads to.
 
         resting  T_keyframe_camera [4, 4] of the frame before
         carried  T_keyframe_camera [4, 4] by a prior; None: there is none
         """
-        candidates = [predicted, self.from_motion(keyframe, view, resting)]
+        candidates = [predicted, self.align_from_guess(keyframe, view, resting)]
         if carried is not None:
-            candidates.append(self.from_motion(keyframe, view, carried, "prior"))
-        second, method = self._second_opinion(keyframe, view, resting)
+            candidates.append(self.align_from_guess(keyframe, view, carried, "prior"))
+        second, method = self._independent_estimate(keyframe, view, resting)
         if second is not None:
-            candidates.append(attempt(keyframe, view, second, method, self.align))
-        chosen = best(candidates, second, keyframe, view, self.candidates, self.align)
+            candidates.append(align_hypothesis(keyframe, view, second, method, self.align))
+        chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
         if carried is None:
             return chosen
-        is_expected = apart_rad(chosen, carried) < self.candidates.agreement_rad
-        return replace(chosen, is_expected=is_expected)
+        is_expected = hypothesis_distance_rad(chosen, carried) < self.candidates.agreement_rad
+        return replace(chosen, agrees_with_prior=is_expected)
 
-    def is_large_step(self, candidate: Candidate, resting: np.ndarray, view: Pyramid) -> bool:
+    def is_large_step(self, candidate: PoseHypothesis, resting: np.ndarray, view: Pyramid) -> bool:
         """Whether the image moved so far since the last frame that a minimum may be a wrong one."""
         moved = se3.inverse(resting) @ candidate.alignment.T_reference_camera
-        shift_rad = extent(moved, candidate.median_depth_m)
+        shift_rad = image_motion_rad(moved, candidate.median_depth_m)
         return shift_rad * view.camera.fx > self.large_motion * view.camera.width
 
-    def _second_opinion(
+    def _independent_estimate(
         self, keyframe: Keyframe, view: Pyramid, resting: np.ndarray
     ) -> tuple[np.ndarray | None, str]:
         """T_keyframe_camera [4, 4] by features; by shape, where there is too little texture."""
@@ -173,4 +177,4 @@ class Guesses:
         pose = estimate_pose(known, seen, view.camera, self.features)
         if pose is not None:
             return se3.inverse(pose.T_camera_reference), "features"
-        return pose_from_shape(keyframe.reference, view, resting, self.shape), "shape"
+        return register_gicp(keyframe.reference, view, resting, self.shape), "shape"

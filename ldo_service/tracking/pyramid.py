@@ -72,7 +72,7 @@ def intrinsics(camera: Camera) -> Intrinsics:
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
-def told(gray: np.ndarray) -> np.ndarray:
+def mask_clipped(gray: np.ndarray) -> np.ndarray:
     """Grey levels [H, W] float32 of an image uint8, 0 where it is clipped, black or white.
 
     The brightness of a clipped pixel does not follow that of its surface: after a jump of the
@@ -98,7 +98,7 @@ def build_pyramid(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, config: PyramidConfig
 ) -> Pyramid:
     """The pyramid of an image [H, W] uint8 and its depth [H, W] float32."""
-    image, depth, scaled = told(gray), np.ascontiguousarray(depth_m), camera
+    image, depth, scaled = mask_clipped(gray), np.ascontiguousarray(depth_m), camera
     levels: list[Level] = []
     while True:
         if scaled.width < 1.5 * config.working_width_px:
@@ -152,7 +152,7 @@ class DepthNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class Reference:
+class ReferencePoints:
     """Points [7, N] float32 of each level, the finest first.
 
     Rows: x y z in m in the reference camera, grey level, and a normal (0 0 0 where none).
@@ -163,12 +163,12 @@ class Reference:
     median_depth_m: float
 
 
-def build_reference(pyramid: Pyramid, left_out: np.ndarray | None = None) -> Reference:
+def build_reference(pyramid: Pyramid, left_out: np.ndarray | None = None) -> ReferencePoints:
     """Of the pixels with depth, but for those `left_out` [H, W] bool at working resolution."""
     levels = (_without(level, left_out) for level in pyramid.levels)
     points = tuple(_level_points(level, i) for i, level in enumerate(levels))
     depth_m = points[0][2]
-    return Reference(points, float(np.median(depth_m)) if depth_m.size else 1.0)
+    return ReferencePoints(points, float(np.median(depth_m)) if depth_m.size else 1.0)
 
 
 def _without(level: Level, left_out: np.ndarray | None) -> Level:

@@ -33,25 +33,30 @@ from .features import (
     FeaturePose,
     Features,
     detect,
-    detect_across_scales,
+    detect_sift,
     estimate_pose,
 )
-from .keyframe_database import Place, Places, thumbnail_of
-from .keyframes import Keyframe, KeyframeConfig, has_left, shares_of_limits
-from .motion import extent
-from .pose_candidates import Candidate, apart_rad, attempt
+from .keyframe_database import KeyframeDatabase, KeyframeRecord, make_thumbnail
+from .keyframes import Keyframe, KeyframeConfig, left_keyframe_view, limit_ratios
+from .motion import image_motion_rad
+from .pose_candidates import PoseHypothesis, align_hypothesis, hypothesis_distance_rad
 from .pyramid import Pyramid, PyramidConfig
-from .tracking_quality import History, JudgementConfig, Status, judge
+from .tracking_quality import (
+    ResidualHistory,
+    TrackingQualityConfig,
+    TrackingStatus,
+    classify_tracking,
+)
 
 NEWEST = 2  # places that a lost camera is looked for at each time: it may not have gone far
 RANKED = 10  # times `alike`: places looked through for likely ones that are apart
 
 
-PosedPlace = tuple[Place, FeaturePose]
+PosedPlace = tuple[KeyframeRecord, FeaturePose]
 
 
 @dataclass(frozen=True, slots=True)
-class RelocalisationConfig:
+class RelocalizationConfig:
     alike: int = 5  # places per lost frame, by thumbnail: the prototype's number
     in_turn: int = 3  # further ones: 1000 places in 11 s at 30 Hz
     across_scales: int = 8  # further ones in turn, by features that know near from far; 0: none
@@ -78,18 +83,24 @@ class RelocalisationConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Relocaliser:
+class Relocalizer:
     """How a lost camera is found; knows nothing from frame to frame."""
 
     pyramid: PyramidConfig
     align: AlignConfig
     features: FeatureConfig
-    judgement: JudgementConfig
-    config: RelocalisationConfig
+    judgement: TrackingQualityConfig
+    config: RelocalizationConfig
 
     def find(
-        self, view: Pyramid, places: Places, turn: int, history: History, *, is_lost: bool = True
-    ) -> tuple[Keyframe, Candidate] | None:
+        self,
+        view: Pyramid,
+        places: KeyframeDatabase,
+        turn: int,
+        history: ResidualHistory,
+        *,
+        is_lost: bool = True,
+    ) -> tuple[Keyframe, PoseHypothesis] | None:
         """The keyframe that a view surely shows, and its alignment to it.
 
         `turn` counts the searches; it decides whose turn it is beside the likely places. A camera
@@ -97,26 +108,28 @@ class Relocaliser:
         """
         if not len(places):
             return None
-        likely = self._likely(places.all[index] for index in places.alike(view))
+        likely = self._distinct_candidates(
+            places.all[index] for index in places.rank_by_similarity(view)
+        )
         poses = self._poses(view, _each_once(likely, _due(places, turn, self.config.in_turn)))
-        sure = self._surest(view, poses, history)
+        sure = self._first_verified(view, poses, history)
         if sure is None and is_lost and self.config.across_scales:
             newest, due = places.all[-NEWEST:], _due(places, turn, self.config.across_scales)
             others = self._poses_across_scales(view, _each_once(newest, due))
-            sure, poses = self._surest(view, others, history), [*poses, *others]
-        if sure is None or self._has_rival(*sure[0], poses):
+            sure, poses = self._first_verified(view, others, history), [*poses, *others]
+        if sure is None or self._is_ambiguous(*sure[0], poses):
             return None
         return sure[1]
 
-    def is_familiar(self, view: Pyramid, trusted: np.ndarray) -> bool:
+    def resembles_last_trusted(self, view: Pyramid, trusted: np.ndarray) -> bool:
         """Whether a view looks like the thumbnail [300] of the last trusted one."""
-        seen, trusted = thumbnail_of(view).astype(float), trusted.astype(float)
+        seen, trusted = make_thumbnail(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
 
-    def _likely(self, ranked: Iterable[Place]) -> list[Place]:
+    def _distinct_candidates(self, ranked: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
         """The first of each neighbourhood."""
-        likely: list[Place] = []
+        likely: list[KeyframeRecord] = []
         for place in islice(ranked, RANKED * self.config.alike):
             if len(likely) == self.config.alike:
                 break
@@ -124,83 +137,91 @@ class Relocaliser:
                 likely.append(place)
         return likely
 
-    def _poses(self, view: Pyramid, places: Iterable[Place]) -> list[PosedPlace]:
+    def _poses(self, view: Pyramid, places: Iterable[KeyframeRecord]) -> list[PosedPlace]:
         """Places with a feature pose, most inliers first."""
         seen = detect(view, self.features)
         return self._posed(view, seen, ((place, place.features) for place in places))
 
-    def _poses_across_scales(self, view: Pyramid, places: Iterable[Place]) -> list[PosedPlace]:
+    def _poses_across_scales(
+        self, view: Pyramid, places: Iterable[KeyframeRecord]
+    ) -> list[PosedPlace]:
         """Likewise, of a camera that has come much nearer or gone farther."""
         config = self.features
         image = view.gray, view.depth_m, view.camera
-        seen = detect_across_scales(*image, config.count_across_scales, config)
-        known = ((place, place.features_across_scales(config)) for place in places)
+        seen = detect_sift(*image, config.count_across_scales, config)
+        known = ((place, place.sift_features(config)) for place in places)
         return self._posed(view, seen, known)
 
     def _posed(
-        self, view: Pyramid, seen: Features, known: Iterable[tuple[Place, Features]]
+        self, view: Pyramid, seen: Features, known: Iterable[tuple[KeyframeRecord, Features]]
     ) -> list[PosedPlace]:
         poses = [(p, estimate_pose(there, seen, view.camera, self.features)) for p, there in known]
         found = [(place, pose) for place, pose in poses if pose is not None]
         return sorted(found, key=lambda pp: -pp[1].inliers)
 
-    def _surest(
-        self, view: Pyramid, poses: Sequence[PosedPlace], history: History
-    ) -> tuple[PosedPlace, tuple[Keyframe, Candidate]] | None:
+    def _first_verified(
+        self, view: Pyramid, poses: Sequence[PosedPlace], history: ResidualHistory
+    ) -> tuple[PosedPlace, tuple[Keyframe, PoseHypothesis]] | None:
         """The first that the images confirm."""
         for place, pose in poses[: self.config.attempts]:
             keyframe = place.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
-            candidate = attempt(keyframe, view, guess, "relocalised", self.align)
+            candidate = align_hypothesis(keyframe, view, guess, "relocalised", self.align)
             if self._is_sure(candidate, guess, place.history(history)):
-                return (place, pose), (keyframe, replace(candidate, second_agrees=True))
+                return (place, pose), (keyframe, replace(candidate, is_confirmed=True))
         return None
 
-    def _is_sure(self, candidate: Candidate, guess: np.ndarray, history: History) -> bool:
-        agrees = apart_rad(candidate, guess) < self.config.agreement_rad
-        witnessed = replace(candidate, second_agrees=agrees)
-        verdict = judge(witnessed, history, Status.LOST, self.judgement)
+    def _is_sure(
+        self, candidate: PoseHypothesis, guess: np.ndarray, history: ResidualHistory
+    ) -> bool:
+        agrees = hypothesis_distance_rad(candidate, guess) < self.config.agreement_rad
+        witnessed = replace(candidate, is_confirmed=agrees)
+        verdict = classify_tracking(witnessed, history, TrackingStatus.LOST, self.judgement)
         inliers = candidate.alignment.geometric_inliers
-        return verdict is Status.OK and inliers >= self.config.min_geometric_inliers
+        return verdict is TrackingStatus.OK and inliers >= self.config.min_geometric_inliers
 
-    def _has_rival(self, place: Place, pose: FeaturePose, poses: Iterable[PosedPlace]) -> bool:
+    def _is_ambiguous(
+        self, place: KeyframeRecord, pose: FeaturePose, poses: Iterable[PosedPlace]
+    ) -> bool:
         """Whether another place explains the view nearly as well, from far elsewhere."""
         T_odom_camera = _seen_from(place, pose)
         return any(
             other.segment == place.segment
             and rival.inliers > self.config.rival_inliers * pose.inliers
-            and extent(se3.inverse(T_odom_camera) @ _seen_from(other, rival), place.median_depth_m)
+            and image_motion_rad(
+                se3.inverse(T_odom_camera) @ _seen_from(other, rival), place.median_depth_m
+            )
             > self.config.rival_rad
             for other, rival in poses
         )
 
 
-def _due(places: Places, turn: int, count: int) -> list[Place]:
+def _due(places: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
     """Those whose turn it is: `count` each time, and from the first again."""
     numbers = range(turn * count, (turn + 1) * count)
     return [places.all[number % len(places)] for number in numbers]
 
 
-def _each_once(*groups: Iterable[Place]) -> list[Place]:
+def _each_once(*groups: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
     return list(dict.fromkeys(chain(*groups)))
 
 
-def _seen_from(place: Place, pose: FeaturePose) -> np.ndarray:
+def _seen_from(place: KeyframeRecord, pose: FeaturePose) -> np.ndarray:
     """T_odom_camera [4, 4]."""
     return place.T_odom_keyframe @ se3.inverse(pose.T_camera_reference)
 
 
-def _is_apart(place: Place, other: Place, limit_rad: float) -> bool:
+def _is_apart(place: KeyframeRecord, other: KeyframeRecord, limit_rad: float) -> bool:
     T_other_place = se3.inverse(other.T_odom_keyframe) @ place.T_odom_keyframe
-    is_far = extent(T_other_place, other.median_depth_m) > limit_rad
+    is_far = image_motion_rad(T_other_place, other.median_depth_m) > limit_rad
     return is_far or place.segment != other.segment
 
 
-Nearby = tuple[Place, np.ndarray]  # a place, and T_place_camera [4, 4] as the map has it
+Nearby = tuple[KeyframeRecord, np.ndarray]  # a place, and T_place_camera [4, 4] as the map has it
 
 
 @dataclass(frozen=True, slots=True)
-class ReturnConfig:
+class KeyframeReuseConfig:
     after: int = 1500  # keyframes, supporting ones too: from then on known ones are looked for; 0:
     # never. Until then the map gains more by new views than they take, a few kB each
     tries: int = 2  # places per frame, the nearest first: 8 ms each at 640x480
@@ -224,9 +245,9 @@ class ReturnConfig:
 class ReusedKeyframe:
     """A place, the keyframe that it was, and the alignment of a view to that."""
 
-    place: Place
+    place: KeyframeRecord
     keyframe: Keyframe
-    candidate: Candidate
+    candidate: PoseHypothesis
 
     def measures(self, keyframe: int) -> RelativePose:
         """The pose of the keyframe that the view was made."""
@@ -241,11 +262,11 @@ class KeyframeReuse:
     pyramid: PyramidConfig
     align: AlignConfig
     keyframes: KeyframeConfig
-    judgement: JudgementConfig
-    config: ReturnConfig
+    judgement: TrackingQualityConfig
+    config: KeyframeReuseConfig
 
     def find(
-        self, view: Pyramid, near: Sequence[Nearby], history: History
+        self, view: Pyramid, near: Sequence[Nearby], history: ResidualHistory
     ) -> ReusedKeyframe | None:
         """The first that a view surely shows, from where the map has the camera, and has not left.
 
@@ -253,30 +274,34 @@ class KeyframeReuse:
         """
         for place, T_place_camera in near[: self.config.tries]:
             keyframe = place.keyframe(self.pyramid)
-            candidate = attempt(keyframe, view, T_place_camera, "returned", self.align)
+            candidate = align_hypothesis(keyframe, view, T_place_camera, "returned", self.align)
             histories = history, place.history(history)
             if self._is_sure(candidate, T_place_camera, histories):
                 return ReusedKeyframe(place, keyframe, candidate)
         return None
 
     def _is_sure(
-        self, candidate: Candidate, T_place_camera: np.ndarray, histories: Sequence[History]
+        self,
+        candidate: PoseHypothesis,
+        T_place_camera: np.ndarray,
+        histories: Sequence[ResidualHistory],
     ) -> bool:
         seen, T = candidate.alignment, candidate.alignment.T_reference_camera
-        agrees = apart_rad(candidate, T_place_camera) < self.config.agreement_rad
-        witnessed = replace(candidate, second_agrees=agrees)
+        agrees = hypothesis_distance_rad(candidate, T_place_camera) < self.config.agreement_rad
+        witnessed = replace(candidate, is_confirmed=agrees)
         return (
-            not has_left(T, seen.overlap, candidate.median_depth_m, self.keyframes)
+            not left_keyframe_view(T, seen.overlap, candidate.median_depth_m, self.keyframes)
             and seen.geometric_inliers >= self.config.min_geometric_inliers
             and all(
-                judge(witnessed, history, Status.OK, self.judgement) is Status.OK
+                classify_tracking(witnessed, history, TrackingStatus.OK, self.judgement)
+                is TrackingStatus.OK
                 for history in histories
             )
         )
 
 
-def nearby(
-    places: Sequence[Place],
+def find_nearby_keyframes(
+    places: Sequence[KeyframeRecord],
     T_map_keyframe: Mapping[int, np.ndarray],
     T_map_camera: np.ndarray,
     config: KeyframeConfig,
@@ -289,6 +314,6 @@ def nearby(
     if not known:
         return []
     T_camera = se3.inverse(np.array([T_map_keyframe[p.id] for p in known])) @ T_map_camera
-    left = shares_of_limits(T_camera, np.array([place.median_depth_m for place in known]), config)
+    left = limit_ratios(T_camera, np.array([place.median_depth_m for place in known]), config)
     order = np.argsort(left, kind="stable")
     return [(known[k], T_camera[k]) for k in order if left[k] <= 1]

@@ -6,17 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from .keyframe_database import Place, Places, PlacesConfig
+from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, KeyframeRecord
 from .keyframes import Keyframe
 from .motion import Motion
-from .motion_segmentation import Suspicion
-from .odometry_prior import Anchor
+from .motion_segmentation import MotionEvidence
+from .odometry_prior import DeadReckoningStart
 from .pyramid import PyramidConfig
 from .submaps import Submaps
-from .tracking_quality import History, Status
+from .tracking_quality import ResidualHistory, TrackingStatus
 
 
-class Origin(StrEnum):
+class KeyframeOrigin(StrEnum):
     """Of the keyframe tracked against, where a map holds many."""
 
     NEW = "new"
@@ -25,98 +25,116 @@ class Origin(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class State:
-    places: Places = field(default_factory=Places)  # for relocalisation
+class OdometryState:
+    places: KeyframeDatabase = field(default_factory=KeyframeDatabase)  # for relocalisation
     keyframe: Keyframe | None = None  # the one tracked against, usually the newest
-    supporting: Place | None = None  # the last frame mapped, where it is none of these
+    mapping_keyframe: KeyframeRecord | None = (
+        None  # the last frame mapped, where it is none of these
+    )
     motion: Motion = field(default_factory=Motion)
-    history: History = field(default_factory=History)
-    status: Status = Status.OK
+    history: ResidualHistory = field(default_factory=ResidualHistory)
+    status: TrackingStatus = TrackingStatus.OK
     frames_since_keyframe: int = 0
     next_id: int = 0  # of the next keyframe
-    origin: Origin = Origin.NEW
-    trusted: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
-    searches: int = 0  # frames that were looked for among the places
+    origin: KeyframeOrigin = KeyframeOrigin.NEW
+    trusted_thumbnail: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
+    relocalization_count: int = 0  # frames that were looked for among the places
     segments: Submaps = field(default_factory=Submaps)
-    T_odom_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))  # the last frame mapped
+    T_odom_last_mapped: np.ndarray = field(
+        default_factory=lambda: np.eye(4)
+    )  # the last frame mapped
     is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
-    suspicion: Suspicion | None = None
-    anchor: Anchor | None = None  # the last OK frame, where a prior says where it was too
+    motion_evidence: MotionEvidence | None = None
+    dead_reckoning_start: DeadReckoningStart | None = (
+        None  # the last OK frame, where a prior says where it was too
+    )
 
     def with_new(
-        self, keyframe: Keyframe, place: Place, config: PlacesConfig, *, is_tied: bool
-    ) -> "State":
+        self,
+        keyframe: Keyframe,
+        place: KeyframeRecord,
+        config: KeyframeDatabaseConfig,
+        *,
+        is_tied: bool,
+    ) -> "OdometryState":
         """Tracking against the frame just tracked, which is a keyframe and a place from now on."""
         return replace(
             self._against(keyframe, keyframe.T_odom_keyframe),
-            places=self.places.added(place, config),
+            places=self.places.with_record(place, config),
             next_id=keyframe.id + 1,
-            origin=Origin.TIED if is_tied else Origin.NEW,
+            origin=KeyframeOrigin.TIED if is_tied else KeyframeOrigin.NEW,
         )
 
-    def with_known(self, keyframe: Keyframe, place: Place, T_odom_camera: np.ndarray) -> "State":
+    def with_reused_keyframe(
+        self, keyframe: Keyframe, place: KeyframeRecord, T_odom_camera: np.ndarray
+    ) -> "OdometryState":
         """Tracking against a keyframe of old, seen from T_odom_camera [4, 4] by the last frame."""
         return replace(
             self._against(keyframe, T_odom_camera),
-            places=self.places.returned_to(place),
-            origin=Origin.KNOWN,
+            places=self.places.with_reused(place),
+            origin=KeyframeOrigin.KNOWN,
             is_moving=None,
         )
 
-    def _against(self, keyframe: Keyframe, T_odom_mapped: np.ndarray) -> "State":
+    def _against(self, keyframe: Keyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
         return replace(
             self,
             keyframe=keyframe,
-            supporting=None,
+            mapping_keyframe=None,
             frames_since_keyframe=0,
-            T_odom_mapped=T_odom_mapped,
-            suspicion=self.suspicion and self.suspicion.of_new_keyframe(),
+            T_odom_last_mapped=T_odom_mapped,
+            motion_evidence=self.motion_evidence and self.motion_evidence.of_new_keyframe(),
         )
 
 
-def packed(state: State) -> dict[str, Any]:
+def pack(state: OdometryState) -> dict[str, Any]:
     """Arrays and plain values. The keyframe is grey image, depth and pose: the rest follows."""
     return {
         "places": [place.packed for place in state.places.all],
         "keyframe": None if state.keyframe is None else state.keyframe.packed,
-        "supporting": None if state.supporting is None else state.supporting.packed,
+        "supporting": None if state.mapping_keyframe is None else state.mapping_keyframe.packed,
         "motion": asdict(state.motion),
         "history": asdict(state.history),
         "status": state.status.value,
         "frames_since_keyframe": state.frames_since_keyframe,
         "next_id": state.next_id,
         "origin": state.origin.value,
-        "trusted": state.trusted,
-        "searches": state.searches,
+        "trusted": state.trusted_thumbnail,
+        "searches": state.relocalization_count,
         "segments": state.segments.packed,
-        "T_odom_mapped": state.T_odom_mapped,
+        "T_odom_mapped": state.T_odom_last_mapped,
         "is_moving": _bits(state.is_moving),
-        "suspicion": state.suspicion and (_bits(state.suspicion.contradicts), state.suspicion.gone),
-        "anchor": state.anchor and state.anchor.packed,
+        "suspicion": state.motion_evidence
+        and (_bits(state.motion_evidence.contradicts), state.motion_evidence.gone),
+        "anchor": state.dead_reckoning_start and state.dead_reckoning_start.packed,
     }
 
 
-def unpacked(values: dict[str, Any], config: PyramidConfig) -> State:
+def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
     """The inverse of `packed`, under the same configuration."""
     keyframe, suspicion, is_moving = values["keyframe"], values["suspicion"], values["is_moving"]
     supporting, anchor = values["supporting"], values["anchor"]
-    return State(
-        places=Places(tuple(Place.unpacked(place) for place in values["places"])),
-        keyframe=None if keyframe is None else Keyframe.unpacked(keyframe, config),
-        supporting=None if supporting is None else Place.unpacked(supporting),
+    return OdometryState(
+        places=KeyframeDatabase(tuple(KeyframeRecord.unpack(place) for place in values["places"])),
+        keyframe=None if keyframe is None else Keyframe.unpack(keyframe, config),
+        mapping_keyframe=None if supporting is None else KeyframeRecord.unpack(supporting),
         motion=Motion(**values["motion"]),
-        history=History(**{name: tuple(noise) for name, noise in values["history"].items()}),
-        status=Status(values["status"]),
+        history=ResidualHistory(
+            **{name: tuple(noise) for name, noise in values["history"].items()}
+        ),
+        status=TrackingStatus(values["status"]),
         frames_since_keyframe=values["frames_since_keyframe"],
         next_id=values["next_id"],
-        origin=Origin(values["origin"]),
-        trusted=values["trusted"],
-        searches=values["searches"],
-        segments=Submaps.unpacked(values["segments"]),
-        T_odom_mapped=values["T_odom_mapped"],
+        origin=KeyframeOrigin(values["origin"]),
+        trusted_thumbnail=values["trusted"],
+        relocalization_count=values["searches"],
+        segments=Submaps.unpack(values["segments"]),
+        T_odom_last_mapped=values["T_odom_mapped"],
         is_moving=None if is_moving is None else _mask(is_moving),
-        suspicion=None if suspicion is None else Suspicion(_mask(suspicion[0]), suspicion[1]),
-        anchor=None if anchor is None else Anchor.unpacked(anchor),
+        motion_evidence=None
+        if suspicion is None
+        else MotionEvidence(_mask(suspicion[0]), suspicion[1]),
+        dead_reckoning_start=None if anchor is None else DeadReckoningStart.unpack(anchor),
     )
 
 

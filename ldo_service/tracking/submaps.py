@@ -17,11 +17,11 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import Alignment
 from .keyframes import Keyframe
-from .motion import extent
+from .motion import image_motion_rad
 
 
 @dataclass(frozen=True, slots=True)
-class SegmentConfig:
+class SubmapConfig:
     begin_after_s: float = 3.0  # LOST without a break: ORB-SLAM3's patience; 0: never
     # Frames between looks for the other segments: twice a second at 30 Hz. A prime, so that it
     # does not meet a frame held out from mapping each time.
@@ -67,7 +67,7 @@ class SubmapMeasurement:
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class SubmapMatch:
     """One segment as seen from another: where their odometry frames are to each other."""
 
     here: int
@@ -79,23 +79,23 @@ class Look:
     @staticmethod
     def at(
         keyframe: Keyframe, alignment: Alignment, here: int, T_here_camera: np.ndarray
-    ) -> "Look":
+    ) -> "SubmapMatch":
         """By the alignment of a frame at T_here_camera [4, 4] to a keyframe of another segment."""
         T_there_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_there_here = T_there_camera @ se3.inverse(T_here_camera)
         median_depth_m = keyframe.reference.median_depth_m
-        return Look(here, keyframe.segment, T_there_here, T_here_camera, median_depth_m)
+        return SubmapMatch(here, keyframe.segment, T_there_here, T_here_camera, median_depth_m)
 
-    def agrees(self, other: "Look", config: SegmentConfig) -> bool:
+    def is_consistent_with(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
         if (self.here, self.there) != (other.here, other.there):
             return False
         difference = se3.inverse(self.T_there_here) @ other.T_there_here
-        return extent(difference, self.median_depth_m) < config.confirm_rad
+        return image_motion_rad(difference, self.median_depth_m) < config.confirm_rad
 
-    def is_apart_from(self, other: "Look", config: SegmentConfig) -> bool:
+    def is_distinct_from(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
         """Whether the views are so different that a chance likeness of both is unlikely."""
         moved = se3.inverse(self.T_here_camera) @ other.T_here_camera
-        return extent(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad
+        return image_motion_rad(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +105,10 @@ class Submaps:
     roots: tuple[int, ...] = ()
     lost_since_ns: int | None = None  # stamp of the first frame of those LOST in a row
     since_look: int = 0  # frames
-    last: Look | None = None  # the find that is to be confirmed
+    last: SubmapMatch | None = None  # the find that is to be confirmed
     missed: int = 0  # looks in a row since it that found nothing
 
-    def begun(self) -> "Submaps":
+    def started(self) -> "Submaps":
         return Submaps((*self.roots, len(self.roots)))
 
     def after(self, is_lost: bool, stamp_ns: int) -> "Submaps":
@@ -119,13 +119,13 @@ class Submaps:
             self, lost_since_ns=since_ns if is_lost else None, since_look=self.since_look + 1
         )
 
-    def should_start(self, stamp_ns: int, config: SegmentConfig) -> bool:
+    def should_start(self, stamp_ns: int, config: SubmapConfig) -> bool:
         """Whether a frame of this stamp is LOST, and those before it were for long enough."""
         if self.lost_since_ns is None or config.begin_after_s == 0:
             return False
         return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
-    def is_search_due(self, config: SegmentConfig) -> bool:
+    def is_search_due(self, config: SubmapConfig) -> bool:
         """Whether any segments are apart, and the last look was long enough ago."""
         wait = config.look_every if self.last is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.since_look >= wait
@@ -133,22 +133,26 @@ class Submaps:
     def are_merged(self, segment: int, other: int) -> bool:
         return self.roots[segment] == self.roots[other]
 
-    def is_confirmed_by(self, look: Look, config: SegmentConfig) -> bool:
+    def is_confirmed_by(self, look: SubmapMatch, config: SubmapConfig) -> bool:
         """Whether both say the same of different views."""
         last = self.last
-        return last is not None and last.agrees(look, config) and last.is_apart_from(look, config)
+        return (
+            last is not None
+            and last.is_consistent_with(look, config)
+            and last.is_distinct_from(look, config)
+        )
 
-    def looked(self, found: Look | None, config: SegmentConfig) -> "Submaps":
+    def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
         """The oldest find that nothing speaks against is kept."""
         if found is None:
             is_kept = self.missed < config.misses
             return replace(
                 self, since_look=0, last=self.last if is_kept else None, missed=self.missed + 1
             )
-        is_same = self.last is not None and self.last.agrees(found, config)
+        is_same = self.last is not None and self.last.is_consistent_with(found, config)
         return replace(self, since_look=0, last=self.last if is_same else found, missed=0)
 
-    def joined(self, segment: int, other: int) -> "Submaps":
+    def with_merge(self, segment: int, other: int) -> "Submaps":
         older, younger = sorted((self.roots[segment], self.roots[other]))
         roots = tuple(older if root == younger else root for root in self.roots)
         return replace(self, roots=roots, last=None)
@@ -159,6 +163,6 @@ class Submaps:
         return asdict(self)
 
     @staticmethod
-    def unpacked(kept: dict[str, Any]) -> "Submaps":
-        last = None if kept["last"] is None else Look(**kept["last"])
+    def unpack(kept: dict[str, Any]) -> "Submaps":
+        last = None if kept["last"] is None else SubmapMatch(**kept["last"])
         return Submaps(**{**kept, "roots": tuple(kept["roots"]), "last": last})

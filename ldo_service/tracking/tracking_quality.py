@@ -15,20 +15,20 @@ import numpy as np
 from ldo_service.errors import ConfigError
 
 from .alignment import Alignment
-from .motion import extent
-from .pose_candidates import Candidate
+from .motion import image_motion_rad
+from .pose_candidates import PoseHypothesis
 
-LEAST_GAIN = 0.05  # a frame this dark shows nothing
+MIN_GAIN = 0.05  # a frame this dark shows nothing
 
 
-class Status(StrEnum):
+class TrackingStatus(StrEnum):
     OK = "OK"
     WEAK = "WEAK"  # a pose, but nothing to build a map on
     LOST = "LOST"  # no pose
 
 
 @dataclass(frozen=True, slots=True)
-class JudgementConfig:
+class TrackingQualityConfig:
     min_overlap: float = 0.15  # visible reference points; chosen on apartment_floor1, not elsewhere
     min_paired: float = 0.05  # of the reference points met by a depth: below, colour is alone
     max_condition: float = 1e5  # of the information in median depths
@@ -66,69 +66,78 @@ class JudgementConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class History:
+class ResidualHistory:
     """Noise of the last trusted frames."""
 
     intensity_sigmas: tuple[float, ...] = ()
     depth_noise_scales: tuple[float, ...] = ()
 
-    def extended(self, alignment: Alignment, config: JudgementConfig) -> "History":
+    def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
         keep = config.history - 1
-        return History(
-            (*self.intensity_sigmas[-keep:], exposed_sigma(alignment)),
+        return ResidualHistory(
+            (*self.intensity_sigmas[-keep:], exposure_corrected_sigma(alignment)),
             (*self.depth_noise_scales[-keep:], alignment.depth_noise_scale),
         )
 
-    def residual_ratio(self, alignment: Alignment, config: JudgementConfig) -> float:
+    def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
         """The alignment's noise over its running median, the larger of colour and depth."""
         usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
         usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
         intensity = max(usual_sigma, config.least_intensity_sigma)
         depth = max(usual_scale, config.least_depth_noise_scale)
-        return max(exposed_sigma(alignment) / intensity, alignment.depth_noise_scale / depth)
+        return max(
+            exposure_corrected_sigma(alignment) / intensity, alignment.depth_noise_scale / depth
+        )
 
 
-def exposed_sigma(alignment: Alignment) -> float:
+def exposure_corrected_sigma(alignment: Alignment) -> float:
     """Photometric noise in grey levels of the reference: it grows with the exposure."""
-    return alignment.intensity_sigma / max(alignment.gain, LEAST_GAIN)
+    return alignment.intensity_sigma / max(alignment.gain, MIN_GAIN)
 
 
-def judge(
-    candidate: Candidate, history: History, previous: Status, config: JudgementConfig
-) -> Status:
+def classify_tracking(
+    candidate: PoseHypothesis,
+    history: ResidualHistory,
+    previous: TrackingStatus,
+    config: TrackingQualityConfig,
+) -> TrackingStatus:
     """The status of a frame by its best alignment, after a frame of `previous` status.
 
     Hysteresis: limits are stricter after a WEAK frame, unless features vouch for this one, and
     strictest after a loss, from which only OK leads back: there a prior must expect it too.
     """
     alignment = candidate.alignment
-    is_known = previous is Status.WEAK or candidate.is_expected
-    vouched = candidate.second_agrees and is_known
+    is_known = previous is TrackingStatus.WEAK or candidate.agrees_with_prior
+    vouched = candidate.is_confirmed and is_known
     limits = config if vouched else _limits(previous, candidate, config)
     ratio = history.residual_ratio(alignment, config)
     if ratio > config.lost_residual or alignment.overlap < config.lost_overlap:
-        return Status.LOST
+        return TrackingStatus.LOST
     plausible = (
         alignment.overlap >= limits.min_overlap
         and alignment.paired >= limits.min_paired
         and alignment.condition <= limits.max_condition
         and abs(np.log(max(alignment.gain, 1e-6))) <= np.log(limits.max_gain)
         and ratio <= limits.weak_residual
-        and candidate.second_agrees is not False
+        and candidate.is_confirmed is not False
     )
     if plausible:
-        return Status.OK
-    return Status.LOST if previous is Status.LOST else Status.WEAK
+        return TrackingStatus.OK
+    return TrackingStatus.LOST if previous is TrackingStatus.LOST else TrackingStatus.WEAK
 
 
-def _limits(previous: Status, candidate: Candidate, config: JudgementConfig) -> JudgementConfig:
-    if previous is Status.OK:
+def _limits(
+    previous: TrackingStatus, candidate: PoseHypothesis, config: TrackingQualityConfig
+) -> TrackingQualityConfig:
+    if previous is TrackingStatus.OK:
         return config
-    if previous is Status.LOST:
-        moved_rad = extent(candidate.alignment.T_reference_camera, candidate.median_depth_m)
+    if previous is TrackingStatus.LOST:
+        moved_rad = image_motion_rad(
+            candidate.alignment.T_reference_camera, candidate.median_depth_m
+        )
         residual = config.relocalised_residual + config.relocalised_residual_per_rad * moved_rad
         overlap = config.min_overlap / config.recovery_margin
-        if not candidate.second_agrees:
+        if not candidate.is_confirmed:
             overlap = max(overlap, config.relocalised_overlap)
         return replace(
             config,

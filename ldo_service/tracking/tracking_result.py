@@ -11,7 +11,7 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from .alignment import Alignment
 from .keyframes import Keyframe
 from .submaps import SubmapMeasurement
-from .tracking_quality import Status
+from .tracking_quality import TrackingStatus
 
 
 class KeyframeKind(StrEnum):
@@ -32,7 +32,7 @@ class TrackedFrame:
     T_reference_camera * exp(xi) with xi = (rotation rad, translation m), and zero while LOST.
     """
 
-    status: Status
+    status: TrackingStatus
     method: str  # The initial guess that won: "first", "direct", "prior", "features", "shape", ...
     T_odom_camera: np.ndarray  # [4, 4]
     T_reference_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
@@ -55,7 +55,7 @@ class TrackedFrame:
         alignment: Alignment,
         T_odom_camera: np.ndarray,
         keyframe: Keyframe,
-        status: Status,
+        status: TrackingStatus,
         method: str,
         *,
         needed_keyframe: KeyframeKind | None = None,
@@ -113,7 +113,7 @@ class TrackingResult:
     """
 
     # Pose.
-    status: Status
+    status: TrackingStatus
     method: str  # The initial guess that won: "first", "direct", "prior", "features", "shape", ...
     T_odom_camera: np.ndarray  # [4, 4]
     T_map_odom: np.ndarray  # [4, 4]
@@ -170,7 +170,7 @@ def make_tracking_result(
         status=tracked.status,
         method=tracked.method,
         T_odom_camera=tracked.T_odom_camera,
-        T_map_odom=se3.orthonormalised(T_map_odom),
+        T_map_odom=se3.orthonormalize(T_map_odom),
         graph_version=graph_version,
         submap=submap,
         reference=reference,

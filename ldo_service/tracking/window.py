@@ -13,8 +13,8 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
-from .alignment import AlignConfig, Alignment, Appearance, align
-from .keyframe_database import Place
+from .alignment import AlignConfig, Alignment, BrightnessModel, align
+from .keyframe_database import KeyframeRecord
 from .keyframes import Keyframe
 from .pyramid import PyramidConfig
 
@@ -43,14 +43,14 @@ class WindowConfig:
             raise ConfigError(f"iterations={self.iterations}: at least 1 for each level.")
 
 
-class EarlierKeyframes:
+class RecentKeyframeCache:
     """The last keyframes from their places, each rebuilt once and kept while it is among them."""
 
     def __init__(self, config: PyramidConfig) -> None:
         self._config = config
-        self._rebuilt: dict[int, tuple[Place, Keyframe]] = {}
+        self._rebuilt: dict[int, tuple[KeyframeRecord, Keyframe]] = {}
 
-    def newest_first(self, places: Sequence[Place], reach: int) -> Iterator[Keyframe]:
+    def newest_first(self, places: Sequence[KeyframeRecord], reach: int) -> Iterator[Keyframe]:
         """The last `reach` of places, which come oldest first."""
         last = places[-reach:]
         ids = {place.id for place in last}
@@ -62,10 +62,10 @@ class EarlierKeyframes:
             yield known[1]
 
 
-def measured_from(
+def measure_against(
     earlier: Iterable[Keyframe],
     keyframe: Keyframe,
-    usual: Appearance,
+    usual: BrightnessModel,
     align_config: AlignConfig,
     config: WindowConfig,
 ) -> list[RelativePose]:
@@ -91,7 +91,7 @@ def _aligned(other: Keyframe, keyframe: Keyframe, config: AlignConfig, levels: i
     return align(reference, keyframe.view, guess, config)
 
 
-def _is_sure(alignment: Alignment, usual: Appearance, config: WindowConfig) -> bool:
+def _is_sure(alignment: Alignment, usual: BrightnessModel, config: WindowConfig) -> bool:
     return (
         alignment.converged
         and alignment.overlap >= config.min_overlap

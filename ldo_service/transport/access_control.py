@@ -31,7 +31,7 @@ from ldo_service.schemas.topics import (
     TOPICS,
     Topic,
 )
-from ldo_service.storage.yaml_io import plain_values
+from ldo_service.storage.yaml_io import load_yaml
 
 from .flow_control import ALIVE
 
@@ -51,19 +51,19 @@ EVERYTHING = (
 )
 
 
-class Grantee(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class AccessEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     role: Role
     robot: str  # whose topics; EVERY_ROBOT: of each
     until: date | None = None  # the certificate's last day
 
 
-Access = Mapping[str, Grantee]  # by common name of the certificate
+Access = Mapping[str, AccessEntry]  # by common name of the certificate
 
 
-def read_access(path: Path) -> dict[str, Grantee]:
+def read_access(path: Path) -> dict[str, AccessEntry]:
     """Raises ConfigError for a file that cannot be read or says something else."""
     try:
-        return msgspec.convert(plain_values(path.read_bytes()), dict[str, Grantee])
+        return msgspec.convert(load_yaml(path.read_bytes()), dict[str, AccessEntry])
     except OSError as error:
         raise ConfigError(
             f"{path} cannot be read: {error.strerror}. `ldo keys` writes it for each service."
@@ -124,7 +124,7 @@ def rules_of(role: Role) -> Iterator[Rule]:
 
 
 def _rules_of_readers() -> Iterator[Rule]:
-    topics = tuple(topic.subscribed_as for topic in READABLE)
+    topics = tuple(topic.subscription_key for topic in READABLE)
     states = tuple(topic.name for topic in READABLE if topic.is_state)
     tokens = (f"{ALIVE}/*",)
     yield Rule("subscribe", ("ingress",), ("declare_subscriber",), topics)

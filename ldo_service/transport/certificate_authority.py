@@ -21,9 +21,9 @@ import msgspec
 
 from ldo_service.errors import ConfigError
 from ldo_service.storage.atomic_write import folder_made_atomically, write_atomically
-from ldo_service.storage.yaml_io import plain_text
+from ldo_service.storage.yaml_io import dump_yaml
 
-from .access_control import EVERY_ROBOT, Grantee, Role, read_access
+from .access_control import EVERY_ROBOT, AccessEntry, Role, read_access
 from .certificates import (
     Certificate,
     certificate_pem,
@@ -49,11 +49,12 @@ class Entry:
 
     name: str
     common_name: str
-    grantee: Grantee
+    grantee: AccessEntry
 
 
-class Authority:
-    """Opened in a folder that `Authority.new` made. Raises ConfigError for another one."""
+class CertificateAuthority:
+    """Opened in a folder that `CertificateAuthority.new` made. Raises ConfigError for another
+    one."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -68,7 +69,7 @@ class Authority:
         self._access = read_access(folder / ACCESS)
 
     @classmethod
-    def new(cls, folder: Path, days: int) -> "Authority":
+    def new(cls, folder: Path, days: int) -> "CertificateAuthority":
         """Raises ConfigError when something is there already, which is left as it is."""
         if folder.exists():
             raise ConfigError(
@@ -116,7 +117,7 @@ class Authority:
         reached = (*HERE, *hosts) if role == "service" else ()
         certificate = self._make(name, common_name, days, reached, now or datetime.now(UTC))
         until = certificate.not_valid_after_utc.date()
-        self._grant({**self._access, common_name: Grantee(role, robot, until)})
+        self._grant({**self._access, common_name: AccessEntry(role, robot, until)})
         return self.folder / name
 
     def remove(self, name: str) -> None:
@@ -149,10 +150,10 @@ class Authority:
             raise ConfigError(f"{self.folder} cannot be written: {error}.") from error
         return certificate
 
-    def _grant(self, access: dict[str, Grantee]) -> None:
+    def _grant(self, access: dict[str, AccessEntry]) -> None:
         """Write the list, here and for every service."""
         self._access = access
-        text = HEAD + plain_text(msgspec.to_builtins(access))
+        text = HEAD + dump_yaml(msgspec.to_builtins(access))
         services = {entry.name for entry in self.entries if entry.grantee.role == "service"}
         for folder in (self.folder, *(self.folder / name for name in sorted(services))):
             if folder.is_dir():  # a service's may have been moved away

@@ -17,7 +17,7 @@ except ImportError as error:
         "making keys needs the extra `keys`: `pip install 'ldo-slam[keys]'` brings it."
     ) from error
 
-MOST_DAYS = 36500
+MAX_DAYS = 36500
 CLOCKS_DIFFER = timedelta(hours=1)  # of machines: a certificate is valid so long before it is made
 
 PrivateKey = ec.EllipticCurvePrivateKey
@@ -102,8 +102,8 @@ def _valid(
     days: int,
     now: datetime,
 ) -> x509.CertificateBuilder:
-    if not 1 <= days <= MOST_DAYS:
-        raise ConfigError(f"--days {days}: keys are valid for 1 to {MOST_DAYS} days.")
+    if not 1 <= days <= MAX_DAYS:
+        raise ConfigError(f"--days {days}: keys are valid for 1 to {MAX_DAYS} days.")
     return (
         x509.CertificateBuilder()
         .subject_name(subject)

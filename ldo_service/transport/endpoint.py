@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from ldo_service.errors import ConfigError
 from ldo_service.schemas.topics import ROBOT_PREFIX
 
-from .keys import Keys
+from .keys import TlsKeys
 
 LOOPBACK = "127.0.0.1"  # anyone who may read them may also see where the robot is at work
 
@@ -22,12 +22,12 @@ NOT_IN_NAMES = "/*$?#@ "  # Zenoh's own, and what separates parts of a topic
 
 
 @dataclass(frozen=True, slots=True)
-class Network:
+class Endpoint:
     """A robot, and the address of its router."""
 
     robot: str = "robot"
     endpoint: str = DEFAULT_ENDPOINT
-    keys: Keys | None = None
+    keys: TlsKeys | None = None
     max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped where they arrive
 
     def __post_init__(self) -> None:

@@ -11,8 +11,8 @@ All three state what is, not what changed: they may be lost, repeated or replace
 The producer keeps the messages that were not handled, at most one window, and sends them again from
 `arrived` when a grant shows a gap. A consumer that died and joined again gets what it had not
 handled. Both ends keep their position beside the actor's state (`runtime.delivery_state`), in one
-write with it: so each message takes effect once, whichever process is killed, and when. `Numbers`
-follows the sequence numbers that a producer gave to the messages of a topic.
+write with it: so each message takes effect once, whichever process is killed, and when.
+`SequenceTracker` follows the sequence numbers that a producer gave to the messages of a topic.
 """
 
 import secrets
@@ -25,7 +25,7 @@ from ldo_service.schemas import decode
 MAX_SEQ = 1 << 62
 ALIVE = "link/alive"  # tokens of the actors that are there
 
-MOST_MISSING = 1024  # numbers that may come late yet: half a minute of a camera
+MAX_MISSING = 1024  # numbers that may come late yet: half a minute of a camera
 
 
 class Header(msgspec.Struct, frozen=True, array_like=True):
@@ -42,14 +42,15 @@ class Header(msgspec.Struct, frozen=True, array_like=True):
             raise ValueError(f"header with epoch {self.epoch}, seq {self.seq}")
 
 
-OUTSIDE = Header("outside", 1, 0, 0)  # of a message that a foreign program sends without one
+# of a message that a foreign program sends without one
+EXTERNAL_HEADER = Header("outside", 1, 0, 0)
 
 
-class Join(msgspec.Struct, frozen=True, tag="join", array_like=True):
+class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
     consumer: str
 
 
-class Grant(msgspec.Struct, frozen=True, tag="grant", array_like=True):
+class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
     consumer: str
     epoch: int
     handled: int  # every seq below is done with
@@ -63,12 +64,12 @@ class Grant(msgspec.Struct, frozen=True, tag="grant", array_like=True):
             raise ValueError(f"impossible grant {self.handled}, {self.arrived}, {self.limit}")
 
 
-class Welcome(msgspec.Struct, frozen=True, array_like=True):
+class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
     epoch: int
     starts: dict[str, int]  # by consumer: the first seq to come
 
 
-class Sent(NamedTuple):
+class UnackedMessage(NamedTuple):
     """A message that was numbered."""
 
     seq: int
@@ -76,12 +77,12 @@ class Sent(NamedTuple):
     body: bytes
 
 
-class OutletPast(NamedTuple):
+class OutletPosition(NamedTuple):
     """Where a producer stood, and what some consumer had not handled."""
 
     epoch: int
     seq: int  # of the next message
-    unhandled: tuple[Sent, ...] = ()
+    unhandled: tuple[UnackedMessage, ...] = ()
 
     @property
     def handled(self) -> int:
@@ -89,7 +90,7 @@ class OutletPast(NamedTuple):
         return self.unhandled[0].seq if self.unhandled else self.seq
 
 
-class InletPast(NamedTuple):
+class InletPosition(NamedTuple):
     """Where a consumer stood."""
 
     epoch: int  # of its producer; 0: none was known
@@ -104,28 +105,28 @@ def new_epoch() -> int:
 encode_link = msgspec.msgpack.Encoder().encode
 
 
-def decode_request(body: memoryview) -> Join | Grant:
-    return decode(body, Join | Grant)  # type: ignore[arg-type]
+def decode_request(body: memoryview) -> ConsumerHello | Credit:
+    return decode(body, ConsumerHello | Credit)  # type: ignore[arg-type]
 
 
 def data_key(topic: str) -> str:
     return topic
 
 
-def again_key(topic: str) -> str:
+def retransmit_key(topic: str) -> str:
     """Repetitions go to lossless consumers only: others see each message once."""
     return f"link/again/{topic}"
 
 
-def grant_key(topic: str) -> str:
+def credit_key(topic: str) -> str:
     return f"link/grant/{topic}"
 
 
-def welcome_key(topic: str) -> str:
+def producer_hello_key(topic: str) -> str:
     return f"link/welcome/{topic}"
 
 
-class Numbers:
+class SequenceTracker:
     """How many never came. One that comes late after all is none of them, one that comes again
     neither: a producer that was started again repeats what some consumer may not have had."""
 
@@ -135,7 +136,7 @@ class Numbers:
         self._next = 0  # number of that producer
         self._missing: dict[int, None] = {}  # in order
 
-    def came(self, header: Header) -> bool:
+    def observe(self, header: Header) -> bool:
         """Take note of a message; False: it came before."""
         if (header.source, header.epoch) != self._producer:
             self._producer, self._next = (header.source, header.epoch), header.seq
@@ -143,9 +144,9 @@ class Numbers:
         if header.seq < self._next:
             return self._came_late(header.seq)
         self.lost += header.seq - self._next
-        missed = range(max(self._next, header.seq - MOST_MISSING), header.seq)
+        missed = range(max(self._next, header.seq - MAX_MISSING), header.seq)
         self._missing |= dict.fromkeys(missed)
-        while len(self._missing) > MOST_MISSING:
+        while len(self._missing) > MAX_MISSING:
             del self._missing[next(iter(self._missing))]
         self._next = header.seq + 1
         return True

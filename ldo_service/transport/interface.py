@@ -35,15 +35,15 @@ class Transport(Protocol):
 
     def subscribe(self, key: str, on_message: OnMessage) -> None: ...
 
-    def announce(self, name: str) -> None:
+    def declare_liveliness(self, name: str) -> None:
         """Be seen as alive until this process ends."""
         ...
 
-    def watch(self, on_presence: OnPresence) -> None:
+    def watch_liveliness(self, on_presence: OnPresence) -> None:
         """Be told who is alive, who joins and who is gone."""
         ...
 
-    def answer(self, key: str, last_values: LastValues) -> None:
+    def serve_queries(self, key: str, last_values: LastValues) -> None:
         """Answer queries on a key with its last values.
 
         The parts of a value share the key: over Zenoh, ask with consolidation NONE to get all.
@@ -80,7 +80,7 @@ class MemoryTransport:
     def subscribe(self, key: str, on_message: OnMessage) -> None:
         self._subscribers.setdefault(key, []).append(on_message)
 
-    def announce(self, name: str) -> None:
+    def declare_liveliness(self, name: str) -> None:
         self._alive.append(name)
         for on_presence in self._watchers:
             on_presence(name, True)
@@ -91,12 +91,12 @@ class MemoryTransport:
         for on_presence in self._watchers:
             on_presence(name, False)
 
-    def watch(self, on_presence: OnPresence) -> None:
+    def watch_liveliness(self, on_presence: OnPresence) -> None:
         self._watchers.append(on_presence)
         for name in self._alive:
             on_presence(name, True)
 
-    def answer(self, key: str, last_values: LastValues) -> None:
+    def serve_queries(self, key: str, last_values: LastValues) -> None:
         self._answers[key] = last_values
 
     def query(self, key: str) -> Sequence[tuple[bytes, bytes]]:

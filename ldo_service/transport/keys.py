@@ -40,11 +40,11 @@ def _tls(folder: Path, side: str) -> dict[str, Any]:
 
 
 @dataclass(frozen=True, slots=True)
-class Keys:
+class TlsKeys:
     folder: Path
 
     @classmethod
-    def of(cls, folder: str | Path | None) -> "Keys | None":
+    def of(cls, folder: str | Path | None) -> "TlsKeys | None":
         return None if folder is None else cls(Path(folder).expanduser().resolve())
 
     def __post_init__(self) -> None:
@@ -81,7 +81,7 @@ class Keys:
             ) from error
         return context
 
-    def why_refused(self, host: str, port: int) -> str:
+    def tls_error(self, host: str, port: int) -> str:
         """What TLS says of a server that Zenoh got no connection to; empty: nothing is wrong."""
         try:
             with (

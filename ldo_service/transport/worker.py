@@ -64,7 +64,7 @@ class Worker:
         self._thread.join(timeout_s)
 
     @classmethod
-    def left_busy(cls, within_s: float) -> list[str]:
+    def busy_workers(cls, within_s: float) -> list[str]:
         """Names of closed ones that are still at work after so long: the interpreter must not end
         around them."""
         until_s = time.monotonic() + within_s
@@ -74,7 +74,7 @@ class Worker:
         return sorted(worker.name for worker in closed if worker._thread.is_alive())
 
     def _work(self) -> None:
-        _step_back(self.name, self._nice)
+        _lower_priority(self.name, self._nice)
         while entry := self._jobs.get():
             future, job = entry
             if future.set_running_or_notify_cancel():
@@ -82,7 +82,7 @@ class Worker:
             del entry, future, job  # a waiting thread holds on to nothing
 
 
-def _step_back(name: str, nice: int) -> None:
+def _lower_priority(name: str, nice: int) -> None:
     """Of the thread that calls it, from where its process is; not where a sandbox forbids it."""
     if not nice or sys.platform != "linux":
         return

@@ -23,7 +23,7 @@ import zenoh
 
 from ldo_service.errors import ConfigError
 
-from .endpoint import CLOSED, DEFAULT_ENDPOINT, Network
+from .endpoint import CLOSED, DEFAULT_ENDPOINT, Endpoint
 from .flow_control import ALIVE
 from .interface import LastValues, OnMessage, OnPresence, call_soon
 from .worker import Worker
@@ -35,7 +35,7 @@ CONNECT_WITHIN_MS = 3000
 LEAVE_WITHIN_S = 2.0  # for what is still being sent when a transport closes
 
 
-def open_session(network: Network, router: bool = False) -> zenoh.Session:
+def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
     """Open the service's router, or a client of it. Use it in a `with` block.
 
     Raises ConfigError when the port is taken, nobody answers there, or the keys are refused.
@@ -53,7 +53,7 @@ def open_session(network: Network, router: bool = False) -> zenoh.Session:
         raise ConfigError(f"{advice} ({str(error).split(' at /')[0]})") from error
 
 
-def _session_config(network: Network, router: bool) -> zenoh.Config:
+def _session_config(network: Endpoint, router: bool) -> zenoh.Config:
     settings = {
         "mode": "router" if router else "client",
         "listen/endpoints" if router else "connect/endpoints": [network.endpoint],
@@ -68,16 +68,16 @@ def _session_config(network: Network, router: bool) -> zenoh.Config:
     return config
 
 
-def _why_not_listening(network: Network) -> str:
+def _why_not_listening(network: Endpoint) -> str:
     return (
         f"cannot listen on {network.endpoint}: is another `ldo serve` running there? "
         "Stop it, or choose another port with --endpoint."
     )
 
 
-def _why_not_connected(network: Network) -> str:
+def _why_not_connected(network: Endpoint) -> str:
     host, port = network.address
-    if network.keys and port.isdecimal() and (why := network.keys.why_refused(host, int(port))):
+    if network.keys and port.isdecimal() and (why := network.keys.tls_error(host, int(port))):
         return (
             f"{network.endpoint} and the keys in {network.keys.folder} do not accept each other: "
             f"{why}. `ldo keys list` tells what is valid; keys of one network have one authority."
@@ -91,7 +91,7 @@ def _why_not_connected(network: Network) -> str:
 class ZenohTransport:
     """Made inside a running event loop, on an open session that outlives it."""
 
-    def __init__(self, session: zenoh.Session, network: Network) -> None:
+    def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
         self._session, self._network = session, network
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
@@ -115,11 +115,11 @@ class ZenohTransport:
         expression = self._network.expression(key)
         self._declared.append(self._session.declare_subscriber(expression, handler))
 
-    def announce(self, name: str) -> None:
+    def declare_liveliness(self, name: str) -> None:
         expression = self._network.expression(f"{ALIVE}/{name}")
         self._declared.append(self._session.liveliness().declare_token(expression))
 
-    def watch(self, on_presence: OnPresence) -> None:
+    def watch_liveliness(self, on_presence: OnPresence) -> None:
         def changed(sample: zenoh.Sample) -> None:
             name = str(sample.key_expr).rsplit("/", 1)[1]
             alive = sample.kind == zenoh.SampleKind.PUT
@@ -130,7 +130,7 @@ class ZenohTransport:
         liveliness = self._session.liveliness()
         self._declared.append(liveliness.declare_subscriber(expression, handler, history=True))
 
-    def answer(self, key: str, last_values: LastValues) -> None:
+    def serve_queries(self, key: str, last_values: LastValues) -> None:
         expression = self._network.expression(key)
 
         def reply(query: zenoh.Query) -> None:
@@ -154,7 +154,8 @@ class ZenohTransport:
     def respond(self, key: str, respond: Callable[[bytes], Awaitable[bytes]]) -> None:
         """Answer each query on a key with what `respond`, on the event loop, makes of its payload.
 
-        For requests that are done before they are answered; `answer` is for values that are there.
+        For requests that are done before they are answered; `serve_queries` is for values that are
+        there.
         """
         expression = self._network.expression(key)
 

@@ -14,14 +14,14 @@ HALF_VIEW_RAD = 0.65  # half the height of the browser's picture: viser has 75 d
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """position, look_at  [3] metres, map frame"""
 
     position: np.ndarray
     look_at: np.ndarray
 
 
-def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> View:
+def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
     """The object as it was seen from the keyframe that shows it best, so that nothing is between,
     and as near as shows the whole of it; from the side of `eye` [3] where no keyframe is known.
 
@@ -35,16 +35,16 @@ def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray
     radius_m = float(np.linalg.norm(one.size)) / 2
     whole_m = radius_m / (FILLS * np.tan(HALF_VIEW_RAD))
     distance_m = max(NEAREST_M, min(whole_m, away_m) if known else whole_m)
-    return View(center + distance_m * toward, center)
+    return CameraView(center + distance_m * toward, center)
 
 
-def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0) -> View:
+def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0) -> CameraView:
     """From a little behind a camera [4, 4], in its direction."""
     position, ahead = T_map_camera[:3, 3], T_map_camera[:3, 2]
-    return View(position - back_m * ahead, position + ahead_m * ahead)
+    return CameraView(position - back_m * ahead, position + ahead_m * ahead)
 
 
-def up_of(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
+def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
     """Up [3] in the map, for a horizon that is level: a camera in a hand is tilted more than it is
     rolled. With x and y the axes of the cameras, to the right and down, it is the unit vector u
     with the least
@@ -61,12 +61,12 @@ def up_of(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
     return up if y.mean(axis=0) @ up < 0 else -up
 
 
-def flight(start: View, end: View, steps: int) -> Iterator[View]:
+def interpolate_views(start: CameraView, end: CameraView, steps: int) -> Iterator[CameraView]:
     """Views from one to the other, slow at both ends; the last is `end`."""
     for step in range(1, steps + 1):
         t = step / steps
         share = t * t * (3 - 2 * t)
-        yield View(
+        yield CameraView(
             start.position + share * (end.position - start.position),
             start.look_at + share * (end.look_at - start.look_at),
         )

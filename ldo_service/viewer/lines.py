@@ -9,11 +9,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.geometry import Camera, se3
 from ldo_service.schemas import MapObject
 
-from .scene import Sight
+from .scene import ObjectBox
 
 Color = tuple[int, int, int]  # RGB, 0..255
 
@@ -21,7 +21,7 @@ Color = tuple[int, int, int]  # RGB, 0..255
 JUMP_M = 1.0  # at least
 JUMPS = 10.0  # times the median step
 FRUSTUM_M = 0.12  # from a keyframe to its drawn image
-MOST_SIGHTS = 8  # of a keyframe, the first: more are a tangle
+MAX_SIGHTS = 8  # of a keyframe, the first: more are a tangle
 UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # how a keyframe looks until it is
 
 ONLINE, FINAL = (220, 90, 0), (0, 150, 30)
@@ -75,13 +75,13 @@ def keyframe_lines(
 def sight_lines(
     keyframes: Mapping[int, np.ndarray],
     camera: Camera | None,
-    sights: Mapping[int, Iterable[Sight]],
+    sights: Mapping[int, Iterable[ObjectBox]],
 ) -> Lines:
     """What keyframes show, as boxes in their drawn images; nothing without their camera."""
     shown = [
         (T, sight)
         for keyframe, T in keyframes.items()
-        for sight in itertools.islice(sights.get(keyframe, ()), MOST_SIGHTS)
+        for sight in itertools.islice(sights.get(keyframe, ()), MAX_SIGHTS)
     ]
     if camera is None or not shown:
         return Lines.together(())
@@ -99,7 +99,7 @@ def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines
     """The edges of each object's box; without a colour in that of its name."""
     return Lines.together(
         Lines.of(
-            se3.transform(transform(one.T_map_object), EDGES * one.size),
+            se3.transform(pose_from_message(one.T_map_object), EDGES * one.size),
             color or color_of(one.name),
         )
         for one in objects

@@ -7,7 +7,7 @@ from itertools import islice
 from typing import get_args
 
 from ldo_service.client import Client
-from ldo_service.conversions.frames import camera_of
+from ldo_service.conversions.frames import camera_from_message
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
     Correction,
@@ -35,13 +35,13 @@ from ldo_service.schemas.topics import (
 )
 
 from . import panel
-from .lines import MOST_SIGHTS
+from .lines import MAX_SIGHTS
 from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
-from .scene import Layer, Scene, Sight, sights_of
+from .scene import Layer, ObjectBox, Scene, sights_of
 from .view_config import ViewerConfig
 
-MOST_ACTORS = 64  # whose health is told; a name is what a message says
-MOST_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with
+MAX_ACTORS = 64  # whose health is told; a name is what a message says
+MAX_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with
 FACTS_EVERY_S = 1.0  # words that change faster cannot be read
 
 KEPT: dict[
@@ -67,13 +67,13 @@ class LiveScene:
 
     def __init__(self, config: ViewerConfig, clock: Callable[[], float]) -> None:
         self._config, self._clock = config, clock
-        self._heard: dict[str, panel.Heard] = {}
+        self._heard: dict[str, panel.HeartbeatRecord] = {}
         self._pose_rate, self._poses = panel.Rate(), 0
         self._told_s = -FACTS_EVERY_S
         self.scene = Scene()
-        self.begin_anew()
+        self.reset()
 
-    def begin_anew(self) -> None:
+    def reset(self) -> None:
         """The map is empty, and what comes is of another one."""
         self._gaussians = MapReplica(self._config.most_gaussians)
         self.scene = Scene(camera=self.scene.camera)
@@ -94,7 +94,7 @@ class LiveScene:
             case Correction():
                 self._take_correction(message)
             case Keyframe():
-                self.scene.camera = camera_of(message.camera)
+                self.scene.camera = camera_from_message(message.camera)
                 self._changed.add("keyframes")
             case DetectionBoxes():
                 self._take_boxes(message)
@@ -138,7 +138,7 @@ class LiveScene:
         self._changed.add("objects")
 
     def _take_boxes(self, boxes: DetectionBoxes) -> None:
-        found = (Sight(one.label, one.box_px) for one in islice(boxes.detections, MOST_SIGHTS))
+        found = (ObjectBox(one.label, one.box_px) for one in islice(boxes.detections, MAX_SIGHTS))
         sights = self.scene.sights
         sights[boxes.keyframe] = tuple(found)
         while len(sights) > self._config.most_keyframes:
@@ -147,23 +147,23 @@ class LiveScene:
 
     def _take_loop(self, loop: LoopClosure) -> None:
         self._loops[loop.pose.reference, loop.pose.keyframe] = None
-        while len(self._loops) > MOST_LOOPS:
+        while len(self._loops) > MAX_LOOPS:
             del self._loops[next(iter(self._loops))]
         self._changed.add("loops")
 
     def _take_map(self, message: MapDelta | MapSnapshot) -> None:
         if isinstance(message, MapDelta) and message.since == 0 and self._gaussians.version:
-            self.begin_anew()  # on request, see `ldo control reset`
+            self.reset()  # on request, see `ldo control reset`
         if self._gaussians.apply(message):
             self._changed.add("gaussians")
 
     def _take_health(self, health: Health) -> None:
-        if health.actor not in self._heard and len(self._heard) >= MOST_ACTORS:
+        if health.actor not in self._heard and len(self._heard) >= MAX_ACTORS:
             return
         heard = self._heard.get(health.actor)
         rate = heard.rate if heard else panel.Rate()
         rate.add(self._clock(), health.steps)
-        self._heard[health.actor] = panel.Heard(health, self._clock(), rate)
+        self._heard[health.actor] = panel.HeartbeatRecord(health, self._clock(), rate)
 
     # --- together ---------------------------------------------------------------------------------
     def update(self) -> set[Layer]:
@@ -212,7 +212,7 @@ class LiveScene:
         )
 
 
-class Live:
+class LiveSource:
     """Made by `live`."""
 
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
@@ -221,18 +221,18 @@ class Live:
         self._began_s: dict[str, float] = {}  # when another one was first heard of
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
-            stack.enter_context(service.listen(topic.subscribed_as, topic.message, keep))
+            stack.enter_context(service.poller(topic.subscription_key, topic.message, keep))
             for topic, keep in KEPT.items()
         ]
         self._until_camera = stack.enter_context(ExitStack())
-        listen = service.listen(KEYFRAME_NEW.name, Keyframe, keep=1)
+        listen = service.poller(KEYFRAME_NEW.name, Keyframe, keep=1)
         self._keyframes: Callable[[], list[Keyframe]] = self._until_camera.enter_context(listen)
         self._ask()
 
     def _ask(self) -> None:
         """For what was said before."""
         for topic in STATES:
-            for message in self._service.last(topic):
+            for message in self._service.latest(topic):
                 self._live.take(message)
 
     @property
@@ -260,7 +260,7 @@ class Live:
         began_s = self._began_s.values()
         if len(began_s) == len(ANEW) and max(began_s) - min(began_s) < TOGETHER_S:
             self._began_s.clear()
-            self._live.begin_anew()
+            self._live.reset()
             self._ask()
 
     def _learn_camera(self) -> None:
@@ -271,7 +271,7 @@ class Live:
 
 
 @contextmanager
-def live(service: Client, config: ViewerConfig) -> Iterator[Live]:
+def live(service: Client, config: ViewerConfig) -> Iterator[LiveSource]:
     """Subscribe to all that is shown, and ask for what was said before."""
     with ExitStack() as stack:
-        yield Live(service, config, stack)
+        yield LiveSource(service, config, stack)

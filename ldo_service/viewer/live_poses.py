@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ldo_service.conversions.poses import keyframe_poses_of, transform
+from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
 from ldo_service.geometry import se3
 from ldo_service.schemas import Correction, TrackedPose
 
@@ -21,10 +21,10 @@ class LiveKeyframes:
         """The frame became a keyframe."""
         assert pose.keyframe is not None
         self.T_map = {**self.T_map, pose.keyframe: T_map_camera}
-        self._newer[pose.keyframe] = pose.reference, transform(pose.T_reference_camera)
+        self._newer[pose.keyframe] = pose.reference, pose_from_message(pose.T_reference_camera)
 
     def correct(self, correction: Correction) -> None:
-        T_map = keyframe_poses_of(correction)
+        T_map = keyframe_poses_from_correction(correction)
         newest = max(T_map, default=-1)
         self._newer = {k: link for k, link in self._newer.items() if k > newest}
         for keyframe, (reference, T_reference_keyframe) in sorted(self._newer.items()):
@@ -81,4 +81,6 @@ class LivePath:
 
 def T_map_camera_of(pose: TrackedPose) -> np.ndarray:
     """[4, 4], as the tracker published it."""
-    return se3.orthonormalised(transform(pose.T_map_odom) @ transform(pose.T_odom_camera))
+    return se3.orthonormalize(
+        pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
+    )

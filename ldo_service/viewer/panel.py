@@ -10,7 +10,7 @@ from ldo_service.schemas import Health, TrackedPose
 
 RATE_OVER_S = 5.0  # ten heartbeats
 SILENT_AFTER_S = 1.5  # three heartbeats
-MOST_NAME = 40  # characters; a panel is narrow
+MAX_NAME = 40  # characters; a panel is narrow
 
 
 def escaped(text: str) -> str:
@@ -76,7 +76,7 @@ class Rate:
 
 
 @dataclass(slots=True)
-class Heard:
+class HeartbeatRecord:
     """The last heartbeat of an actor."""
 
     health: Health
@@ -103,7 +103,7 @@ def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
     return f"**{pose.status}** at frame {pose.frame:,}, {poses.hz:.1f} poses/s{where}"
 
 
-def of_health(heard: Iterable[Heard], now_s: float) -> str:
+def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
     rows = [_row(one, now_s) for one in sorted(heard, key=lambda one: one.health.actor)]
     if not rows:
         return "No actor reports: is this the name of the robot? `ldo doctor` tells."
@@ -112,12 +112,12 @@ def of_health(heard: Iterable[Heard], now_s: float) -> str:
     )
 
 
-def _row(one: Heard, now_s: float) -> str:
+def _row(one: HeartbeatRecord, now_s: float) -> str:
     health, silent_s = one.health, now_s - one.at_s
     state = "held" if health.held else health.state
     state = f"**silent {silent_s:.0f} s**" if silent_s > SILENT_AFTER_S else state
     cells = (
-        escaped(health.actor[:MOST_NAME]),
+        escaped(health.actor[:MAX_NAME]),
         state,
         f"{one.rate.hz:.1f}",
         f"{health.step_ms_p50:.0f}",

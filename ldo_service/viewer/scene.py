@@ -21,7 +21,7 @@ Layer = Literal["gaussians", "camera", "online", "final", "keyframes", "objects"
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
+class ObjectBox:
     """What a keyframe shows: a name, and its box in the image in pixels."""
 
     name: str
@@ -39,7 +39,7 @@ class Scene:
     final: np.ndarray = field(default_factory=NOTHING.copy)  # [K, 3] after the last correction
     keyframes: dict[int, np.ndarray] = field(default_factory=dict)  # T_map_camera [4, 4] by id
     camera: Camera | None = None  # of the keyframes, rectified; None where it is not known yet
-    sights: dict[int, tuple[Sight, ...]] = field(default_factory=dict)  # by keyframe
+    sights: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)  # by keyframe
     objects: MapObjects | None = None
     loops: tuple[tuple[int, int], ...] = ()  # pairs of keyframes
     T_map_camera: np.ndarray | None = None  # [4, 4] where the camera is, or was at the end
@@ -57,13 +57,13 @@ class Source(Protocol):
         ...
 
 
-def sights_of(objects: MapObjects) -> dict[int, tuple[Sight, ...]]:
+def sights_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
     """Those that it names as the views of its objects, by keyframe."""
-    sights: dict[int, tuple[Sight, ...]] = {}
+    sights: dict[int, tuple[ObjectBox, ...]] = {}
     for one in objects.objects:
         for view in one.views:
             others = sights.get(view.keyframe, ())
-            sights[view.keyframe] = (*others, Sight(one.name, view.box_px))
+            sights[view.keyframe] = (*others, ObjectBox(one.name, view.box_px))
     return sights
 
 

@@ -13,11 +13,11 @@ import numpy as np
 import viser
 
 from ldo_service.errors import ConfigError, LdoError
-from ldo_service.maps.object_search import Answer, answer
+from ldo_service.maps.object_search import ObjectMatch, find_objects
 from ldo_service.schemas import MapObject
 from ldo_service.transport.endpoint import LOOPBACK
 
-from .flight import View, flight, overview, up_of, view_of
+from .flight import CameraView, estimate_up, interpolate_views, overview, view_of
 from .lines import (
     FINAL,
     FOUND,
@@ -35,7 +35,7 @@ from .view_config import ViewerConfig
 
 FLIGHT_STEPS, FLIGHT_STEP_S = 30, 1 / 30
 THICK_PX, VERY_THICK_PX = 1.5, 4.0
-MOST_ANSWERS = 10  # that are told of
+MAX_ANSWERS = 10  # that are told of
 LEGEND = {  # what can be hidden
     "gaussians": "Gaussians",
     "online": "path, online",
@@ -73,7 +73,7 @@ class Window:
         self._begin()
         self._nodes: dict[str, Any] = {}  # of viser, by name
         self._names: dict[int, Any] = {}  # labels, by object
-        server.scene.set_up_direction(up_of({}))
+        server.scene.set_up_direction(estimate_up({}))
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._build_panel(title)
 
@@ -247,7 +247,7 @@ class Window:
     def _level(self) -> None:
         """By the keyframes so far: the first one alone may be tilted."""
         self._leveled_by = max(1, len(self._scene.keyframes))
-        self._server.scene.set_up_direction(up_of(self._scene.keyframes))
+        self._server.scene.set_up_direction(estimate_up(self._scene.keyframes))
 
     def _look_along(self, T_map_camera: np.ndarray) -> None:
         """For all browsers that are there and will be; from then on the view is theirs."""
@@ -257,10 +257,10 @@ class Window:
         for client in self._server.get_clients().values():
             _set_view(client, view)
 
-    def eyes(self) -> list[View]:
+    def eyes(self) -> list[CameraView]:
         """From where each browser looks."""
         cameras = (client.camera for client in self._server.get_clients().values())
-        return [View(camera.position, camera.look_at) for camera in cameras]
+        return [CameraView(camera.position, camera.look_at) for camera in cameras]
 
     def _fly_to_answer(self, event: viser.GuiEvent[Any]) -> None:
         """In a thread of viser's."""
@@ -271,30 +271,32 @@ class Window:
         if found is None:
             self._answers.content = "The map has no objects: a detector has to find them."
             return
-        start = View(client.camera.position, client.camera.look_at)
+        start = CameraView(client.camera.position, client.camera.look_at)
         try:
-            answers = answer(text, found, start.position)
+            answers = find_objects(text, found, start.position)
         except LdoError as error:
             self._answers.content = escaped(str(error))
             return
-        self._answers.content = "\n".join(map(_line, answers[:MOST_ANSWERS]))
+        self._answers.content = "\n".join(map(_line, answers[:MAX_ANSWERS]))
         (best,) = (one for one in found.objects if one.id == answers[0].id)
         self._found = best.id
         self._due.add("objects")
-        for view in flight(start, view_of(best, keyframes, start.position), FLIGHT_STEPS):
+        for view in interpolate_views(
+            start, view_of(best, keyframes, start.position), FLIGHT_STEPS
+        ):
             if client.client_id not in self._server.get_clients():
                 return  # it was closed
             _set_view(client, view)
             time.sleep(FLIGHT_STEP_S)
 
 
-def _set_view(client: viser.ClientHandle, view: View) -> None:
+def _set_view(client: viser.ClientHandle, view: CameraView) -> None:
     with client.atomic():
         client.camera.position, client.camera.look_at = view.position, view.look_at
     client.flush()
 
 
-def _line(one: Answer) -> str:
+def _line(one: ObjectMatch) -> str:
     away = "" if one.distance is None else f", {one.distance:.1f} m away"
     return f"- **{escaped(one.name)}** {one.id}: {one.score:.2f}{away}"
 

@@ -48,7 +48,7 @@ def marching_cubes(cells: np.ndarray, values: np.ndarray, attributes: np.ndarray
     edge = triangles[cell, which].ravel()
     cell = np.repeat(cell, 3)
     # One point for each edge of the lattice, whichever cells it is met in.
-    key = (4 * packed(cells))[cell] + np.array(EDGE_KEYS)[edge]
+    key = (4 * pack(cells))[cell] + np.array(EDGE_KEYS)[edge]
     _, first, point = np.unique(key, return_index=True, return_inverse=True)
     cell, (lower, upper) = cell[first], np.array(EDGES)[edge[first]].T
     a, b = values[cell, lower], values[cell, upper]
@@ -61,7 +61,7 @@ def marching_cubes(cells: np.ndarray, values: np.ndarray, attributes: np.ndarray
     )
 
 
-def packed(lattice: np.ndarray) -> np.ndarray:
+def pack(lattice: np.ndarray) -> np.ndarray:
     """One int64 [...] for each integer triple [..., 3], in the same order; below 2^60.
 
     Raises ConfigError for what lies 2^19 or more from the origin: 10 km of voxels of 2 cm.

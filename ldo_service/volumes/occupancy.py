@@ -14,7 +14,7 @@ import yaml
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 
-from .marching_cubes import packed
+from .marching_cubes import pack
 from .viewpoints import Viewpoint, surface_depth_m
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
@@ -30,7 +30,7 @@ UP = {
     "-y": (0, 2, 1, -1),
     "-z": (1, 0, 2, -1),
 }
-GREY = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}  # as map_saver has them
+GRAY = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}  # as map_saver has them
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
     axes = se3.rotation(rows[:, 6:10]).swapaxes(1, 2) * sigmas_m[:, :, None]  # [N, axis, 3]
     means, cover_m2 = _split(rows[:, 0:3], axes, cover_m2, config.voxel_m / 4)
     voxels = np.floor(means / config.voxel_m).astype(np.int64)
-    _, first, which = np.unique(packed(voxels), return_index=True, return_inverse=True)
+    _, first, which = np.unique(pack(voxels), return_index=True, return_inverse=True)
     covered = np.bincount(which, cover_m2, len(first)) >= config.min_cover * config.voxel_m**2
     return voxels[first[covered]]
 
@@ -242,8 +242,8 @@ def floor_plan(
 
 def write_floor_plan(path: Path, plan: FloorPlan) -> None:
     """Write `path` (.yaml) and the picture beside it (.pgm), y upwards."""
-    grey = np.array([GREY[state] for state in (UNKNOWN, FREE, OCCUPIED)], np.uint8)
-    picture = np.ascontiguousarray(grey[plan.states].T[::-1])
+    gray = np.array([GRAY[state] for state in (UNKNOWN, FREE, OCCUPIED)], np.uint8)
+    picture = np.ascontiguousarray(gray[plan.states].T[::-1])
     path.with_suffix(".pgm").write_bytes(cv2.imencode(".pgm", picture)[1].tobytes())
     facts = {
         "image": path.with_suffix(".pgm").name,

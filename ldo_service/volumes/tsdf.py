@@ -12,7 +12,7 @@ import numpy as np
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 
-from .marching_cubes import CORNERS, Mesh, marching_cubes, packed
+from .marching_cubes import CORNERS, Mesh, marching_cubes, pack
 from .viewpoints import Viewpoint, surface_color, surface_depth_m
 
 SIDE = 8  # voxels of a block
@@ -128,7 +128,7 @@ class Tsdf:
                 f"{self.config.max_memory_mb} MB for this map. Choose larger voxels or allow more."
             )
         self._blocks = np.concatenate([self._blocks, new])
-        keys = packed(self._blocks)
+        keys = pack(self._blocks)
         self._slots = np.argsort(keys)
         self._keys = keys[self._slots]
         self._distance_m = _grown(self._distance_m, total)
@@ -139,7 +139,7 @@ class Tsdf:
         """Slots [B] of blocks [B, 3], -1 where there is none."""
         if not len(self._keys):
             return np.full(len(blocks), -1)
-        keys = packed(blocks)
+        keys = pack(blocks)
         at = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where(self._keys[at] == keys, self._slots[at], -1)
 
@@ -201,16 +201,16 @@ class Tsdf:
         """For each voxel of these blocks, where the 8 corners x + 2 y + 4 z of its cell are: slots
         [B, 512, 8], -1 for none, and voxels [512, 8] in them."""
         corners = BLOCK[:, None] + CORNERS  # [512, 8, 3]
-        neighbours = np.stack([self._find(self._blocks[slots] + step) for step in CORNERS], -1)
+        neighbors = np.stack([self._find(self._blocks[slots] + step) for step in CORNERS], -1)
         over = corners // SIDE @ [1, 2, 4]
         inner = corners % SIDE @ [SIDE * SIDE, SIDE, 1]
-        return neighbours[:, over], inner
+        return neighbors[:, over], inner
 
 
 def _unique(lattice: np.ndarray) -> np.ndarray:
     """The distinct integer triples of [..., 3], as [B, 3], in a fixed order."""
     flat = lattice.reshape(-1, 3).astype(np.int64)
-    return flat[np.unique(packed(flat), return_index=True)[1]]
+    return flat[np.unique(pack(flat), return_index=True)[1]]
 
 
 def _grown(array: np.ndarray, length: int) -> np.ndarray:

@@ -6,13 +6,13 @@ import pytest
 
 from ldo_service.actors.frame_source import FrameSource
 from ldo_service.actors.tracker import Tracker
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.schemas import CameraRgbd, FrameRgbd, Keyframe, Message, TrackedPose
 
 
 def camera_messages(sequence: Sequence, indices: Iterable[int]) -> list[CameraRgbd]:
-    return [camera_rgbd_message(sequence.read(i), compress_depth=False) for i in indices]
+    return [raw_frame_to_message(sequence.read(i), compress_depth=False) for i in indices]
 
 
 def handled(actor, messages: Iterable[Message]) -> Iterator[Message]:

@@ -58,7 +58,7 @@ def test_a_keyframe_has_its_boxes_by_name(model: Path, red: Keyframe) -> None:
     assert (found.label, found.box_px) == ("red", (15.5, 47.5, 31.5, 63.5))
     assert found.score == pytest.approx(254 / 255)
     assert boxes.network.startswith("squares ")
-    assert actor.facts() == {
+    assert actor.metrics() == {
         "networks": 1,
         "networks_missing": 0,
         "inferences_failed": 0,
@@ -86,7 +86,7 @@ def test_without_a_model_every_keyframe_is_answered_and_nobody_looked(red: Keyfr
     actor = Detector()
     boxes = only(actor.handle(red))
     assert (boxes.keyframe, boxes.detections, boxes.network) == (red.keyframe, (), "")
-    assert (actor.facts()["networks"], actor.facts()["networks_missing"]) == (0, 0)
+    assert (actor.metrics()["networks"], actor.metrics()["networks_missing"]) == (0, 0)
 
 
 @pytest.mark.parametrize("body", [b"garbage", None])
@@ -102,7 +102,7 @@ def test_a_model_that_cannot_be_used_is_said_once_and_the_service_goes_on(
     (record,) = caplog.records
     assert record.levelno == logging.ERROR
     assert str(path) in record.getMessage()
-    assert actor.facts()["networks_missing"] == 1
+    assert actor.metrics()["networks_missing"] == 1
 
 
 def test_a_model_of_other_classes_is_not_taken_for_one_of_coco(
@@ -121,7 +121,7 @@ def test_a_network_that_fails_is_counted_and_warned_about_once(
     answers = [only(actor.handle(frame)) for frame in (red, white, white, red, white)]
     assert [bool(answer.network) for answer in answers] == [True, False, False, True, False]
     assert [len(answer.detections) for answer in answers] == [1, 0, 0, 1, 0]
-    assert actor.facts()["inferences_failed"] == 3
+    assert actor.metrics()["inferences_failed"] == 3
     assert len(caplog.records) == 2, "once an episode"
     assert "NaN" in caplog.text
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.frame_source import FrameSource, FrameSourceConfig
-from ldo_service.conversions.frames import camera_message, camera_rgbd_message
-from ldo_service.conversions.poses import pose_message
+from ldo_service.conversions.frames import camera_to_message, raw_frame_to_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, codecs, se3
@@ -24,10 +24,10 @@ from ldo_service.schemas import (
 
 @pytest.fixture
 def message(room: Sequence) -> CameraRgbd:
-    return camera_rgbd_message(room.read(3))
+    return raw_frame_to_message(room.read(3))
 
 
-def test_a_frame_comes_out_in_metres(room: Sequence, message: CameraRgbd) -> None:
+def test_a_frame_comes_out_in_meters(room: Sequence, message: CameraRgbd) -> None:
     (frame,) = FrameSource().handle(message)
     np.testing.assert_array_equal(frame.color.numpy(), room[3].color)
     np.testing.assert_array_equal(frame.depth_m.numpy(), room[3].depth_m)
@@ -53,7 +53,7 @@ def test_stamps_that_go_back_are_rejected(message: CameraRgbd) -> None:
     source = FrameSource()
     assert len(list(source.handle(message))) == 1
     assert list(source.handle(message)) == []
-    assert source.facts()["frames_rejected"] == 1
+    assert source.metrics()["frames_rejected"] == 1
 
 
 def test_a_broken_image_is_rejected_and_the_stream_goes_on(
@@ -66,7 +66,7 @@ def test_a_broken_image_is_rejected_and_the_stream_goes_on(
         assert list(source.handle(bad)) == []
     later = msgspec.structs.replace(message, stamp_ns=message.stamp_ns + 10)
     assert len(list(source.handle(later))) == 1
-    assert source.facts()["frames_rejected"] == 3
+    assert source.metrics()["frames_rejected"] == 3
     assert len(caplog.records) == 1, "one warning per episode, not one per frame"
 
 
@@ -77,7 +77,7 @@ def test_an_image_of_another_size_than_announced_is_rejected(
     lying = Image(encoding="jpeg", width=320, height=240, data=memoryview(half))
     source = FrameSource()
     assert list(source.handle(msgspec.structs.replace(message, color=lying))) == []
-    assert source.facts()["frames_rejected"] == 1
+    assert source.metrics()["frames_rejected"] == 1
 
 
 def test_a_successor_still_knows_the_last_stamp(message: CameraRgbd) -> None:
@@ -92,7 +92,7 @@ def color_half(frame: RgbdFrame, stamp_ns: int | None = None) -> CameraColor:
     return CameraColor(
         stamp_ns=frame.stamp_ns if stamp_ns is None else stamp_ns,
         frame=frame.index,
-        camera=camera_message(frame.camera),
+        camera=camera_to_message(frame.camera),
         image=Image.raw("rgb8", frame.color),
     )
 
@@ -103,10 +103,10 @@ def depth_half(
     return CameraDepth(
         stamp_ns=frame.stamp_ns if stamp_ns is None else stamp_ns,
         frame=frame.index + 1000,
-        camera=camera_message(frame.camera),
+        camera=camera_to_message(frame.camera),
         image=Image.raw("f32", frame.depth_m),
         depth_scale=1.0,
-        T_color_depth=pose_message(np.eye(4) if T_color_depth is None else T_color_depth),
+        T_color_depth=pose_to_message(np.eye(4) if T_color_depth is None else T_color_depth),
     )
 
 
@@ -123,19 +123,19 @@ def coarser(frame: RgbdFrame) -> RgbdFrame:
 
 
 def test_halves_of_one_camera_become_the_frame_that_a_whole_exposure_would(room: Sequence) -> None:
-    whole = frames_of(FrameSource(), camera_rgbd_message(room.read(3)))
+    whole = frames_of(FrameSource(), raw_frame_to_message(room.read(3)))
     color, depth = color_half(room[3]), depth_half(room[3])
     assert frames_of(FrameSource(), color, depth) == whole
     assert frames_of(FrameSource(), depth, color) == whole, "in either order"
 
 
-def test_a_pair_has_the_stamp_and_the_number_of_its_colour(room: Sequence) -> None:
+def test_a_pair_has_the_stamp_and_the_number_of_its_color(room: Sequence) -> None:
     color = color_half(room[3], stamp_ns=50_000_000)
     depth = depth_half(room[3], stamp_ns=57_000_000)
     source = FrameSource()
     (frame,) = frames_of(source, color, depth)
     assert (frame.stamp_ns, frame.frame) == (50_000_000, 3)
-    facts = source.facts()
+    facts = source.metrics()
     assert (facts["pairs"], facts["skew_ms_p50"], facts["skew_ms_max"]) == (1, 7.0, 7.0)
 
 
@@ -150,7 +150,7 @@ def test_halves_further_apart_than_the_allowed_skew_are_lost_and_counted(room: S
         )
     ]
     assert frames_of(source, *halves) == []
-    facts = source.facts()
+    facts = source.metrics()
     assert (facts["pairs"], facts["lost_color"], facts["lost_depth"]) == (0, 5, 4)
 
 
@@ -163,7 +163,7 @@ def test_two_clocks_are_said_once(room: Sequence, caplog: pytest.LogCaptureFixtu
     assert len(caplog.records) == 1
 
 
-def test_coarser_depth_is_brought_to_the_colour_image(room: Sequence) -> None:
+def test_coarser_depth_is_brought_to_the_color_image(room: Sequence) -> None:
     color, depth = color_half(room[3]), depth_half(coarser(room[3]))
     (frame,) = frames_of(FrameSource(), color, depth)
     assert frame.camera == color.camera
@@ -210,7 +210,7 @@ def test_halves_whose_stamps_go_back_are_rejected(room: Sequence) -> None:
     source = FrameSource()
     assert len(frames_of(source, color_half(room[3]), depth_half(room[3]))) == 1
     assert frames_of(source, color_half(room[2]), depth_half(room[2])) == []
-    assert source.facts()["frames_rejected"] == 2
+    assert source.metrics()["frames_rejected"] == 2
     assert len(frames_of(source, color_half(room[4]), depth_half(room[4]))) == 1
 
 
@@ -226,7 +226,7 @@ def test_an_image_too_small_to_track_is_rejected() -> None:
     )
     source = FrameSource()
     assert frames_of(source, tiny) == []
-    assert source.facts()["frames_rejected"] == 1
+    assert source.metrics()["frames_rejected"] == 1
 
 
 @pytest.mark.parametrize(
@@ -240,16 +240,16 @@ def test_impossible_settings_are_refused(fields: dict[str, float]) -> None:
 def test_a_camera_that_starts_again_is_followed(room: Sequence) -> None:
     """With recorded stamps, as when a recording is published twice."""
     source = FrameSource()
-    messages = [camera_rgbd_message(room.read(i)) for i in range(0, 60, 20)]
+    messages = [raw_frame_to_message(room.read(i)) for i in range(0, 60, 20)]
     for _ in range(2):
         assert len([out for message in messages for out in source.handle(message)]) == 3
-    assert source.facts()["camera_sessions"] == 2
-    assert source.facts()["frames_rejected"] == 0
+    assert source.metrics()["camera_sessions"] == 2
+    assert source.metrics()["frames_rejected"] == 0
 
 
 def test_one_stamp_in_the_far_future_does_not_lock_the_camera_out(room: Sequence) -> None:
     source = FrameSource()
-    message = camera_rgbd_message(room.read(0))
+    message = raw_frame_to_message(room.read(0))
     future = msgspec.structs.replace(message, stamp_ns=10**18)
-    frames = [message, future, camera_rgbd_message(room.read(1))]
+    frames = [message, future, raw_frame_to_message(room.read(1))]
     assert len([out for frame in frames for out in source.handle(frame)]) == 3

@@ -6,19 +6,19 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.actors.loop_closer import MOST_WAITING, LoopCloser, LoopCloserConfig
-from ldo_service.conversions.frames import camera_message
+from ldo_service.actors.loop_closer import MAX_PENDING_KEYFRAMES, LoopCloser, LoopCloserConfig
+from ldo_service.conversions.frames import camera_to_message
 from ldo_service.conversions.poses import (
-    correction_message,
-    matrix6_message,
-    pose_message,
-    transform,
+    correction_to_message,
+    matrix6_to_message,
+    pose_from_message,
+    pose_to_message,
 )
 from ldo_service.geometry import se3
 from ldo_service.loop_closing import LoopsConfig
-from ldo_service.loop_closing.consistency_check import PlausibilityConfig
+from ldo_service.loop_closing.consistency_check import ConsistencyCheckConfig
 from ldo_service.loop_closing.place_database import RetrievalConfig
-from ldo_service.loop_closing.verification import Proposal, VerificationConfig, Verifier
+from ldo_service.loop_closing.verification import LoopHypothesis, VerificationConfig, Verifier
 from ldo_service.schemas import (
     Array,
     Detection,
@@ -36,7 +36,7 @@ FIRST_WALK, SECOND_WALK = range(0, 20, 2), range(1, 21, 2)
 DRIFT = se3.exp(np.array([0.02, -0.03, 0.02, 0.15, -0.1, 0.1]))  # 2 degrees and 20 cm
 LONG_AFTER = 500  # frames
 AS_TRACKED = np.eye(4)
-SURE = matrix6_message(1e4 * np.eye(6))
+SURE = matrix6_to_message(1e4 * np.eye(6))
 
 
 def keyframes_of(
@@ -56,13 +56,13 @@ def keyframe_of(room, index: int, number: int, frame: int, T_drift: np.ndarray) 
         stamp_ns=10**8 * number,
         keyframe=number,
         frame=frame,
-        camera=camera_message(view.camera),
+        camera=camera_to_message(view.camera),
         color=Array.of(view.color),
         depth_m=Array.of(view.depth_m),
         reference=None,
-        T_reference_keyframe=pose_message(np.eye(4)),
+        T_reference_keyframe=pose_to_message(np.eye(4)),
         information=SURE,
-        T_odom_keyframe=pose_message(T_odom),
+        T_odom_keyframe=pose_to_message(T_odom),
     )
 
 
@@ -119,7 +119,7 @@ def test_the_return_is_closed_with_the_true_pose_whatever_odometry_says(said, ro
     for closure in found:
         old, new = closure.pose.reference, closure.pose.keyframe - len(FIRST_WALK)
         T_true = se3.inverse(true_pose(room, FIRST_WALK[old])) @ true_pose(room, SECOND_WALK[new])
-        T = transform(closure.pose.T_reference_keyframe)
+        T = pose_from_message(closure.pose.T_reference_keyframe)
         assert np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]) < 0.01
         assert se3.rotation_angle(se3.inverse(T_true) @ T) < 0.005
         assert closure.overlap > 0.2
@@ -147,7 +147,7 @@ def test_where_features_do_not_match_the_map_says_where_to_look(there, room) -> 
     for closure in found:
         old, new = closure.pose.reference, closure.pose.keyframe - len(FIRST_WALK)
         T_true = se3.inverse(true_pose(room, FIRST_WALK[old])) @ true_pose(room, SECOND_WALK[new])
-        T = transform(closure.pose.T_reference_keyframe)
+        T = pose_from_message(closure.pose.T_reference_keyframe)
         assert np.linalg.norm((se3.inverse(T_true) @ T)[:3, 3]) < 0.01
 
 
@@ -202,8 +202,8 @@ def test_what_was_seen_before_a_break_is_a_place(there, last, subgraphs) -> None
     before = there[:last]
     after = msgspec.structs.replace(there[5], segment=1)
     handled(actor, told([*before, after]))
-    assert len(actor.recogniser.subgraphs) == subgraphs
-    for subgraph in actor.recogniser.subgraphs:
+    assert len(actor.recognizer.subgraphs) == subgraphs
+    for subgraph in actor.recognizer.subgraphs:
         assert list(subgraph.keyframes) == [k.keyframe for k in before]
 
 
@@ -213,7 +213,7 @@ def test_a_place_that_two_old_ones_explain_is_closed_with_neither(there, room) -
     T_twin[0, 3] = 3.0
     twin = keyframes_of(room, FIRST_WALK, len(there), LONG_AFTER, T_twin)
     again = keyframes_of(room, SECOND_WALK[:5], 2 * len(there), 2 * LONG_AFTER, DRIFT)
-    believing = PlausibilityConfig(drift_m=100.0, turn_rad=7.0)
+    believing = ConsistencyCheckConfig(drift_m=100.0, turn_rad=7.0)
     actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(plausibility=believing)))
     handled(actor, told([*there, *twin]))
     found = handled(actor, told(again))
@@ -225,17 +225,17 @@ def test_planted_poses_are_refused(there, back) -> None:
     """Two keyframes that do show one place: with their pose they close a loop, with others not."""
     actor, config = LoopCloser(), LoopsConfig()
     handled(actor, told([*there, *back]))
-    first, *_, last = actor.recogniser.subgraphs
+    first, *_, last = actor.recognizer.subgraphs
     old, new = first.views[-1], last.views[0]
     verifier = Verifier(config.pyramid, config.align, config.features, config.verification)
     T = se3.inverse(old.place.T_odom_keyframe) @ se3.inverse(DRIFT) @ new.place.T_odom_keyframe
-    assert verifier.confirm(Proposal(old, new, T, "features", 99)).closure is not None
+    assert verifier.verify(LoopHypothesis(old, new, T, "features", 99)).closure is not None
     for axis, step in ((0, 0.5), (2, 0.7), (3, 0.8), (4, 0.6), (5, -0.9)):
         xi = np.zeros(6)
         xi[axis] = step
-        planted = verifier.confirm(Proposal(old, new, T @ se3.exp(xi), "features", 99))
+        planted = verifier.verify(LoopHypothesis(old, new, T @ se3.exp(xi), "features", 99))
         assert planted.closure is None
-        assert planted.refused
+        assert planted.rejected_reason
 
 
 def test_landmarks_alone_are_not_believed_where_little_is_seen_twice(room) -> None:
@@ -243,11 +243,13 @@ def test_landmarks_alone_are_not_believed_where_little_is_seen_twice(room) -> No
     actor, config = LoopCloser(), LoopsConfig()
     keyframes = keyframes_of(room, range(9, 14), 0, 0), keyframes_of(room, range(72, 77), 5, 500)
     handled(actor, told([*keyframes[0], *keyframes[1]]))
-    old, new = (subgraph.views[0] for subgraph in actor.recogniser.subgraphs)
+    old, new = (subgraph.views[0] for subgraph in actor.recognizer.subgraphs)
     verifier = Verifier(config.pyramid, config.align, config.features, config.verification)
     T = se3.inverse(true_pose(room, 9)) @ true_pose(room, 72)
-    assert verifier.confirm(Proposal(old, new, T, "features", 99)).closure is not None
-    assert verifier.confirm(Proposal(old, new, T, "landmarks", 99)).refused.startswith("overlap")
+    assert verifier.verify(LoopHypothesis(old, new, T, "features", 99)).closure is not None
+    assert verifier.verify(LoopHypothesis(old, new, T, "landmarks", 99)).rejected_reason.startswith(
+        "overlap"
+    )
 
 
 def test_nothing_depends_on_anything_but_the_messages(there, back, said) -> None:
@@ -292,8 +294,8 @@ def test_boxes_alone_write_no_poses(there) -> None:
 def test_a_keyframe_sent_twice_counts_once(there) -> None:
     actor = LoopCloser()
     handled(actor, told([*there[:4], *there[2:4], *there[4:]]))
-    assert actor.facts()["keyframes_repeated"] == 2
-    assert [k for s in actor.recogniser.subgraphs for k in s.keyframes] == list(range(len(there)))
+    assert actor.metrics()["keyframes_repeated"] == 2
+    assert [k for s in actor.recognizer.subgraphs for k in s.keyframes] == list(range(len(there)))
 
 
 def test_boxes_that_never_come_hold_nobody_up(there, back) -> None:
@@ -301,21 +303,23 @@ def test_boxes_that_never_come_hold_nobody_up(there, back) -> None:
     lost = [m for m in messages if not (isinstance(m, DetectionBoxes) and m.keyframe == 4)]
     actor = LoopCloser()
     assert len(closures(handled(actor, lost))) >= 2
-    assert actor.facts()["keyframes_without_boxes"] == 1
+    assert actor.metrics()["keyframes_without_boxes"] == 1
     alone = LoopCloser()
     handled(alone, [*there, *back])
-    assert alone.facts()["keyframes_without_boxes"] == len([*there, *back]) - MOST_WAITING
+    assert (
+        alone.metrics()["keyframes_without_boxes"] == len([*there, *back]) - MAX_PENDING_KEYFRAMES
+    )
 
 
 def test_what_a_walk_ends_with_is_compared_though_no_keyframe_follows(there, back) -> None:
     actor = LoopCloser()
     said = handled(actor, told([*there, *back[:3]]))
     assert not any(one.keyframe == back[2].keyframe for one in candidates(said))
-    last = list(actor.finish())
+    last = list(actor.on_stop())
     (closure,) = closures(last)
     assert {one.keyframes for one in candidates(last)} == {tuple(k.keyframe for k in back[:3])}
     assert closure.pose.reference in {k.keyframe for k in there}
-    assert not list(actor.finish()), "once"
+    assert not list(actor.on_stop()), "once"
 
 
 def test_keyframes_that_do_not_follow_each_other_are_no_subgraph(room) -> None:
@@ -325,7 +329,7 @@ def test_keyframes_that_do_not_follow_each_other_are_no_subgraph(room) -> None:
     there = keyframes_of(room, range(0, 20, 2), 2, LONG_AFTER, elsewhere)
     closer = LoopCloser()
     handled(closer, told([*here, *there]))
-    together = [{k < 2 for k in subgraph.keyframes} for subgraph in closer.recogniser.subgraphs]
+    together = [{k < 2 for k in subgraph.keyframes} for subgraph in closer.recognizer.subgraphs]
     assert len(together) > 1
     assert all(old == {False} for old in together)
 
@@ -334,7 +338,7 @@ def test_memory_is_bounded(there, back) -> None:
     config = LoopCloserConfig(loops=LoopsConfig(retrieval=RetrievalConfig(count=3)))
     actor = LoopCloser(config)
     handled(actor, told([*there, *back]))
-    assert actor.facts()["subgraphs"] == 3
+    assert actor.metrics()["subgraphs"] == 3
 
 
 def test_corrections_move_what_is_judged_by(there, back) -> None:
@@ -342,9 +346,9 @@ def test_corrections_move_what_is_judged_by(there, back) -> None:
     messages = told([*there, *back[:5]])
     T_away = np.eye(4)
     T_away[0, 3] = 3.0
-    T_map = {k.keyframe: transform(k.T_odom_keyframe) for k in (*there, *back[:5])}
+    T_map = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in (*there, *back[:5])}
     T_map |= {k.keyframe: T_away @ T_map[k.keyframe] for k in there}
-    corrected = [*messages[:-2], correction_message(0, 1, T_map), *messages[-2:]]
+    corrected = [*messages[:-2], correction_to_message(0, 1, T_map), *messages[-2:]]
     kept, moved = (closures(handled(LoopCloser(), said)) for said in (messages, corrected))
     assert len(kept) > len(moved)
 
@@ -378,7 +382,7 @@ def test_other_names_keep_places_apart_when_images_have_no_say(there, back) -> N
 def test_people_are_no_mark_of_a_place(there) -> None:
     actor = LoopCloser()
     handled(actor, named(there, "person"))
-    assert all(not subgraph.names.any() for subgraph in actor.recogniser.subgraphs)
+    assert all(not subgraph.names.any() for subgraph in actor.recognizer.subgraphs)
 
 
 @pytest.mark.parametrize("stages", ["geometric", "semantic"])

@@ -9,23 +9,28 @@ import pytest
 
 from ldo_service.actors.mapper import Mapper, MapperConfig
 from ldo_service.actors.optimizer import Optimizer
-from ldo_service.conversions.frames import mask_message, mask_of, rgbd_of
+from ldo_service.conversions.frames import frame_from_message, mask_from_array, mask_to_array
 from ldo_service.conversions.poses import (
-    correction_message,
-    keyframe_poses_of,
-    matrix6_message,
-    measurements_of,
-    pose_message,
-    transform,
+    correction_to_message,
+    keyframe_poses_from_correction,
+    matrix6_to_message,
+    measurements_from_message,
+    pose_from_message,
+    pose_to_message,
 )
 from ldo_service.evaluation.views import psnr
-from ldo_service.gaussians import InsertionConfig, OptimiserConfig, PruningConfig, render
+from ldo_service.gaussians import (
+    DensificationConfig,
+    GaussianOptimizerConfig,
+    PruningConfig,
+    render,
+)
 from ldo_service.gaussians.map_builder import MapBuilderConfig
-from ldo_service.gaussians.visibility import SleepConfig
+from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.maps.replica import MapReplica
-from ldo_service.runtime.actor import Situation
-from ldo_service.runtime.delivery_state import Past, Taken, successor
+from ldo_service.runtime.actor import FlowStatus
+from ldo_service.runtime.delivery_state import LoggedInput, RestoredState, restore_actor
 from ldo_service.schemas import (
     Detection,
     DetectionBoxes,
@@ -39,7 +44,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.semantics.gaussian_labels import top_labels
-from ldo_service.semantics.semantic_fusion import LabellingConfig
+from ldo_service.semantics.semantic_fusion import SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 
@@ -80,11 +85,12 @@ def last_snapshot_part(messages) -> MapSnapshot:
 
 def shifted(keyframes, xi):
     """A correction that moves each keyframe a little more than the one before."""
-    return correction_message(
+    return correction_to_message(
         0,
         1,
         {
-            k.keyframe: se3.exp(np.array(xi) * (1 + k.keyframe)) @ transform(k.T_odom_keyframe)
+            k.keyframe: se3.exp(np.array(xi) * (1 + k.keyframe))
+            @ pose_from_message(k.T_odom_keyframe)
             for k in keyframes
         },
     )
@@ -98,7 +104,7 @@ def correction(keyframes):
 def test_the_view_shows_what_the_camera_saw(keyframes) -> None:
     for message in handled(Mapper(CONFIG), keyframes):
         if isinstance(message, ModelView):
-            frame = rgbd_of(keyframes[message.keyframe])
+            frame = frame_from_message(keyframes[message.keyframe])
             assert psnr(message.color.numpy(), frame.color) > 25
             seen = (message.depth_m.numpy() > 0) & (frame.depth_m > 0)
             assert seen.mean() > 0.95
@@ -109,15 +115,15 @@ def test_the_view_shows_what_the_camera_saw(keyframes) -> None:
 def test_what_is_explained_is_not_inserted_again(keyframes) -> None:
     mapper = Mapper(CONFIG)
     handled(mapper, keyframes[:1])
-    first = mapper.facts()["gaussians"]
+    first = mapper.metrics()["gaussians"]
     handled(mapper, keyframes[1:2])
-    assert mapper.facts()["gaussians"] < 1.6 * first
+    assert mapper.metrics()["gaussians"] < 1.6 * first
 
 
 def test_following_every_delta_gives_equal_arrays(keyframes, correction) -> None:
     mapper = Mapper(CONFIG)
     messages = handled(mapper, [*keyframes[:-1], correction, keyframes[-1]])
-    deltas = deltas_of([*messages, *mapper.finish()])
+    deltas = deltas_of([*messages, *mapper.on_stop()])
     assert any(delta.motions for delta in deltas)
     assert any(len(delta.changed.ids.numpy()) for delta in deltas)
     assert_equal_maps(followed(deltas), mapper)
@@ -125,16 +131,19 @@ def test_following_every_delta_gives_equal_arrays(keyframes, correction) -> None
 
 def test_followers_hold_to_the_bit_what_sleeps_and_wakes(keyframes) -> None:
     """Through corrections: what is 3 m away sleeps, and wakes where a camera comes near."""
-    sleep = SleepConfig(max_active=500, reach_m=3.0, clump_m=0.5)
+    sleep = OffloadConfig(max_active=500, reach_m=3.0, clump_m=0.5)
     builder = MapBuilderConfig(sleep=sleep, recent_cameras=1)
     config = replace(CONFIG, builder=builder, changed_keyframes=1, iterations=1, least_iterations=1)
     mapper, follower = Mapper(replace(config, mended_at_end=0)), MapReplica()
     for version, keyframe in enumerate(keyframes, 1):
-        poses = {0: se3.exp(0.01 * version * np.ones(6)) @ transform(keyframes[0].T_odom_keyframe)}
-        correction = correction_message(0, version, poses)
+        poses = {
+            0: se3.exp(0.01 * version * np.ones(6))
+            @ pose_from_message(keyframes[0].T_odom_keyframe)
+        }
+        correction = correction_to_message(0, version, poses)
         followed(deltas_of(handled(mapper, [keyframe, correction])), follower)
-    assert mapper.facts()["gaussians_asleep"] > 1000
-    assert mapper.facts()["gaussians_woken"] > 1000
+    assert mapper.metrics()["gaussians_asleep"] > 1000
+    assert mapper.metrics()["gaussians_woken"] > 1000
     assert_equal_maps(follower, mapper)
 
 
@@ -151,10 +160,10 @@ def test_what_gaussians_became_is_told_now_and_then(keyframes) -> None:
 
 def test_gaussians_that_were_pruned_leave_the_followers(keyframes) -> None:
     builder = MapBuilderConfig(
-        prune_keyframes=1, pruning=PruningConfig(min_opacity=0.9), insertion=InsertionConfig()
+        prune_keyframes=1, pruning=PruningConfig(min_opacity=0.9), insertion=DensificationConfig()
     )
     mapper = Mapper(replace(CONFIG, builder=builder, iterations=4))
-    deltas = deltas_of([*handled(mapper, keyframes[:5]), *mapper.finish()])
+    deltas = deltas_of([*handled(mapper, keyframes[:5]), *mapper.on_stop()])
     assert any(len(delta.removed.numpy()) for delta in deltas)
     assert_equal_maps(followed(deltas), mapper)
 
@@ -163,10 +172,10 @@ def test_fewer_iterations_when_keyframes_wait(keyframes) -> None:
     mapper = Mapper(replace(CONFIG, iterations=12, least_iterations=3))
     spent = []
     for keyframe, waiting in zip(keyframes, (0, 1, 3), strict=False):
-        before = mapper.facts()["iterations"]
-        mapper.situation = Situation(waiting={KEYFRAME_NEW: waiting})
+        before = mapper.metrics()["iterations"]
+        mapper.situation = FlowStatus(backlog={KEYFRAME_NEW: waiting})
         list(mapper.handle(keyframe))
-        spent.append(mapper.facts()["iterations"] - before)
+        spent.append(mapper.metrics()["iterations"] - before)
     assert spent[0] > spent[1] > spent[2]
     assert spent[0] > 2 * spent[2]
 
@@ -174,13 +183,13 @@ def test_fewer_iterations_when_keyframes_wait(keyframes) -> None:
 def test_a_request_to_refine_makes_the_map_better_and_is_told(keyframes) -> None:
     mapper = Mapper(CONFIG)
     messages = handled(mapper, keyframes[:4])
-    before = followed(deltas_of([*messages, *mapper.finish()]))
+    before = followed(deltas_of([*messages, *mapper.on_stop()]))
     rows = before.map.rows.copy()
     asked = MapRefine(stamp_ns=0, iterations=40, first_rate=1.0, last_rate=0.2)
     deltas = deltas_of(mapper.handle(asked))
     after = followed(deltas, before)
     assert_equal_maps(after, mapper)
-    frame, T = rgbd_of(keyframes[1]), transform(keyframes[1].T_odom_keyframe)
+    frame, T = frame_from_message(keyframes[1]), pose_from_message(keyframes[1].T_odom_keyframe)
     assert seen_psnr(after.map.rows, frame, T) > seen_psnr(rows, frame, T) + 1
 
 
@@ -194,8 +203,8 @@ def test_what_was_refined_is_in_the_checkpoint_at_once(keyframes) -> None:
 
 
 def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
-    optimiser = OptimiserConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
-    builder = MapBuilderConfig(optimiser=optimiser)
+    optimizer = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
+    builder = MapBuilderConfig(optimiser=optimizer)
     mapper = Mapper(replace(CONFIG, builder=builder, iterations=6))
     known = {}
     for keyframe in keyframes[:5]:
@@ -203,11 +212,11 @@ def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
         for message in mapper.handle(keyframe):
             if isinstance(message, KeyframeRefinement):
                 for pose in message.poses:
-                    measured = {m.a: m for m in measurements_of(known[pose.keyframe])}
+                    measured = {m.a: m for m in measurements_from_message(known[pose.keyframe])}
                     before = measured[pose.reference]
-                    assert pose.information == matrix6_message(before.information)
+                    assert pose.information == matrix6_to_message(before.information)
                     moved = se3.log(
-                        se3.inverse(before.T_a_b) @ transform(pose.T_reference_keyframe)
+                        se3.inverse(before.T_a_b) @ pose_from_message(pose.T_reference_keyframe)
                     )
                     assert 1e-5 < np.linalg.norm(moved) < 0.02
                     known[pose.keyframe, "refined"] = pose
@@ -215,8 +224,8 @@ def test_keyframes_that_the_renderer_moved_are_measured_anew(keyframes) -> None:
 
 
 def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyframes) -> None:
-    optimiser = OptimiserConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
-    builder = MapBuilderConfig(optimiser=optimiser)
+    optimizer = GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
+    builder = MapBuilderConfig(optimiser=optimizer)
     mapper, optimizer = Mapper(replace(CONFIG, builder=builder, iterations=6)), Optimizer()
     for keyframe in keyframes[:4]:
         made = list(mapper.handle(keyframe))
@@ -229,9 +238,10 @@ def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyfra
             assert list(mapper.handle(after)) == [], "the graph agrees with the renderer"
     assert after.refinements > 1
     turned = {
-        k: se3.exp(np.array([0, 0, 0, 0.1, 0, 0])) @ T for k, T in keyframe_poses_of(after).items()
+        k: se3.exp(np.array([0, 0, 0, 0.1, 0, 0])) @ T
+        for k, T in keyframe_poses_from_correction(after).items()
     }
-    far = correction_message(0, after.graph_version + 1, turned, after.refinements)
+    far = correction_to_message(0, after.graph_version + 1, turned, after.refinements)
     (delta,) = mapper.handle(far)
     assert len(delta.motions) == 4
 
@@ -254,7 +264,7 @@ def test_a_late_joiner_ends_with_equal_arrays(keyframes, correction) -> None:
     late = messages[messages.index(last_snapshot_part(messages)) + 1 :]
     follower = followed(late)
     assert follower.version == 0, "it has not had a whole snapshot yet"
-    followed(mapper.finish(), follower)
+    followed(mapper.on_stop(), follower)
     assert_equal_maps(follower, mapper)
 
 
@@ -264,14 +274,14 @@ def test_a_missed_delta_is_noticed_and_mended_by_the_next_snapshot(keyframes) ->
     deltas = [m for m in messages if isinstance(m, MapDelta)]
     follower = followed([*deltas[:1], *deltas[2:]])
     assert follower.is_behind
-    followed(mapper.finish(), follower)
+    followed(mapper.on_stop(), follower)
     assert not follower.is_behind
     assert_equal_maps(follower, mapper)
 
 
 def test_a_correction_moves_gaussians_with_their_keyframes(keyframes, correction) -> None:
     mapper = Mapper(CONFIG)
-    before = followed(changes([*handled(mapper, keyframes), *mapper.finish()]))
+    before = followed(changes([*handled(mapper, keyframes), *mapper.on_stop()]))
     means, anchors = before.map.means.copy(), before.map.anchors.copy()
     after = followed(changes(handled(mapper, [correction])), before)
     for k in keyframes:
@@ -282,7 +292,7 @@ def test_a_correction_moves_gaussians_with_their_keyframes(keyframes, correction
 
 def around_again(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
     """The same views, as a camera that has drifted makes them; ids from `first` on."""
-    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
+    poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
     again, before, T_before = [], keyframes[-1].keyframe, poses[keyframes[-1].keyframe]
     for k in keyframes:
         T = T_drift @ poses[k.keyframe]
@@ -291,8 +301,8 @@ def around_again(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
                 k,
                 keyframe=first + k.keyframe,
                 reference=before,
-                T_reference_keyframe=pose_message(se3.inverse(T_before) @ T),
-                T_odom_keyframe=pose_message(T),
+                T_reference_keyframe=pose_to_message(se3.inverse(T_before) @ T),
+                T_odom_keyframe=pose_to_message(T),
                 window=(),
             )
         )
@@ -304,20 +314,20 @@ def test_surface_that_a_correction_lays_over_itself_is_held_once(keyframes) -> N
     """The second time around is 10 cm off, so it is mapped again; then the loop is closed."""
     T_drift = se3.exp(np.array([0, 0, 0, 0, 0.1, 0]))
     second = around_again(keyframes[:3], T_drift, first=100)
-    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes[:3]}
-    closed = correction_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
-    frame, T_map_camera = rgbd_of(keyframes[0]), poses[keyframes[0].keyframe]
+    poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:3]}
+    closed = correction_to_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
+    frame, T_map_camera = frame_from_message(keyframes[0]), poses[keyframes[0].keyframe]
     added, quality = {}, {}
     for mended in (0, 10):
         mapper = Mapper(replace(CONFIG, mended_at_end=mended))
         messages = handled(mapper, keyframes[:3])
-        once = mapper.facts()["gaussians"]
+        once = mapper.metrics()["gaussians"]
         messages += handled(mapper, [*second, closed])
-        held_twice = mapper.facts()["gaussians"]
-        messages += mapper.finish()
-        assert mapper.facts()["keyframes_to_mend"] == 3 * (mended == 0)
-        held = mapper.facts()["gaussians"]
-        assert held_twice - held >= mapper.facts()["gaussians_mended"]
+        held_twice = mapper.metrics()["gaussians"]
+        messages += mapper.on_stop()
+        assert mapper.metrics()["keyframes_to_mend"] == 3 * (mended == 0)
+        held = mapper.metrics()["gaussians"]
+        assert held_twice - held >= mapper.metrics()["gaussians_mended"]
         added[mended] = held - once
         follower = followed(messages)
         assert follower.map.rows.tobytes() == mapper._map.gaussians.all().rows.tobytes()
@@ -330,16 +340,16 @@ def torn(keyframes, config: MapperConfig) -> Mapper:
     """Three keyframes, the same again after drift, and the correction that lays them together."""
     T_drift = se3.exp(np.array([0, 0.02, 0, 0, 0.1, 0]))
     second = around_again(keyframes[:3], T_drift, first=100)
-    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes[:3]}
-    closed = correction_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
+    poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:3]}
+    closed = correction_to_message(0, 1, poses | {100 + k: T for k, T in poses.items()})
     mapper = Mapper(config)
     handled(mapper, [*keyframes[:3], *second, closed])
     return mapper
 
 
 def psnr_of(mapper: Mapper, keyframe: Keyframe) -> float:
-    T_map_camera = transform(keyframe.T_odom_keyframe)
-    return seen_psnr(mapper._map.gaussians.rows, rgbd_of(keyframe), T_map_camera)
+    T_map_camera = pose_from_message(keyframe.T_odom_keyframe)
+    return seen_psnr(mapper._map.gaussians.rows, frame_from_message(keyframe), T_map_camera)
 
 
 def test_what_a_correction_has_torn_fits_as_before_after_the_iterations_that_are_due(
@@ -348,35 +358,35 @@ def test_what_a_correction_has_torn_fits_as_before_after_the_iterations_that_are
     whole = Mapper(CONFIG)
     handled(whole, keyframes[:3])
     mapper = torn(keyframes, CONFIG)
-    facts = mapper.facts()
+    facts = mapper.metrics()
     assert facts["iterations_due"] == 3 * CONFIG.due_iterations
     assert psnr_of(mapper, keyframes[1]) < psnr_of(whole, keyframes[1]) - 1
     handled(mapper, [MapRefine(stamp_ns=0, iterations=30)])
-    assert mapper.facts()["iterations_due"] == 6
+    assert mapper.metrics()["iterations_due"] == 6
     handled(mapper, [MapRefine(stamp_ns=0, iterations=6)])
-    assert mapper.facts()["iterations_due"] == 0
-    assert mapper.facts()["iterations"] == facts["iterations"] + 36
+    assert mapper.metrics()["iterations_due"] == 0
+    assert mapper.metrics()["iterations"] == facts["iterations"] + 36
     assert psnr_of(mapper, keyframes[1]) > psnr_of(whole, keyframes[1])
 
 
 def test_a_keyframe_is_due_no_more_however_often_it_moves(keyframes) -> None:
-    poses = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes[:4]}
+    poses = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes[:4]}
     mapper = Mapper(CONFIG)
     handled(mapper, keyframes[:4])
     for version in range(1, 4):
         T_turned = se3.exp(np.array([0, 0.02 * version, 0, 0, 0, 0]))
         moved = {k: T if k < 2 else T_turned @ T for k, T in poses.items()}
-        handled(mapper, [correction_message(0, version, moved)])
-        assert mapper.facts()["iterations_due"] == 2 * CONFIG.due_iterations
+        handled(mapper, [correction_to_message(0, version, moved)])
+        assert mapper.metrics()["iterations_due"] == 2 * CONFIG.due_iterations
 
 
 def test_a_map_that_moves_as_a_whole_is_as_good_as_before(keyframes) -> None:
     T_moved = se3.exp(np.array([0, 0.3, 0, 1, 0, 0]))
-    moved = {k.keyframe: T_moved @ transform(k.T_odom_keyframe) for k in keyframes}
+    moved = {k.keyframe: T_moved @ pose_from_message(k.T_odom_keyframe) for k in keyframes}
     mapper = Mapper(CONFIG)
-    handled(mapper, [*keyframes, correction_message(0, 1, moved)])
-    assert mapper.facts()["iterations_due"] == 0
-    assert mapper.facts()["keyframes_to_mend"] == len(keyframes)
+    handled(mapper, [*keyframes, correction_to_message(0, 1, moved)])
+    assert mapper.metrics()["iterations_due"] == 0
+    assert mapper.metrics()["keyframes_to_mend"] == len(keyframes)
 
 
 def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes, tmp_path) -> None:
@@ -388,18 +398,18 @@ def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes, tmp
         if i == 2:
             predecessor, mapper = mapper, Mapper(config)
             mapper.restore(predecessor.checkpoint())
-        before = [m.facts()["iterations"] for m in (mapper, never)]
+        before = [m.metrics()["iterations"] for m in (mapper, never)]
         for one in (mapper, never):
-            one.situation = Situation(waiting={KEYFRAME_NEW: int(i == 1)})
+            one.situation = FlowStatus(backlog={KEYFRAME_NEW: int(i == 1)})
             handled(one, [k])
         done, usual = (
-            m.facts()["iterations"] - n for m, n in zip((mapper, never), before, strict=True)
+            m.metrics()["iterations"] - n for m, n in zip((mapper, never), before, strict=True)
         )
-        due.append(mapper.facts()["iterations_due"])
+        due.append(mapper.metrics()["iterations_due"])
         more.append(done - usual)
     assert due == [6, 6, 0, 0]
     assert more == [6, 0, 6, 0]
-    assert never.facts()["iterations_due"] == 12
+    assert never.metrics()["iterations_due"] == 12
 
 
 def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
@@ -407,22 +417,22 @@ def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
     del state["map"]["due"]
     mapper = Mapper(CONFIG)
     mapper.restore(state)
-    assert mapper.facts()["iterations_due"] == 0
-    assert mapper.facts()["keyframes_to_mend"] == 3
+    assert mapper.metrics()["iterations_due"] == 0
+    assert mapper.metrics()["keyframes_to_mend"] == 3
 
 
 def test_a_correction_that_moves_nothing_says_nothing(keyframes) -> None:
     mapper = Mapper(CONFIG)
     handled(mapper, keyframes)
-    same = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
-    assert handled(mapper, [correction_message(0, 1, same)]) == []
+    same = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
+    assert handled(mapper, [correction_to_message(0, 1, same)]) == []
 
 
 def test_a_keyframe_sent_twice_counts_once(keyframes) -> None:
     mapper = Mapper(CONFIG)
     handled(mapper, keyframes[:2])
     assert handled(mapper, keyframes[1:2]) == []
-    assert mapper.facts()["keyframes_repeated"] == 1
+    assert mapper.metrics()["keyframes_repeated"] == 1
 
 
 def test_a_follower_of_a_killed_mapper_ends_with_the_successors_map(keyframes) -> None:
@@ -433,9 +443,9 @@ def test_a_follower_of_a_killed_mapper_ends_with_the_successors_map(keyframes) -
         followed(changes(list(first.handle(keyframe))), follower)
         state = first.snapshot()
     second.restore(state)
-    assert second.facts()["gaussians"] < first.facts()["gaussians"]
+    assert second.metrics()["gaussians"] < first.metrics()["gaussians"]
     followed(changes(handled(second, keyframes[4:])), follower)
-    followed(second.finish(), follower)
+    followed(second.on_stop(), follower)
     assert_equal_maps(follower, second)
 
 
@@ -444,7 +454,7 @@ def test_a_checkpoint_on_request_has_the_whole_map(keyframes) -> None:
     for keyframe in keyframes[:3]:
         list(first.handle(keyframe))
     second.restore(first.checkpoint())
-    assert second.facts()["gaussians"] == first.facts()["gaussians"]
+    assert second.metrics()["gaussians"] == first.metrics()["gaussians"]
 
 
 def test_a_successor_with_the_same_folder_goes_on_as_its_predecessor(keyframes, tmp_path) -> None:
@@ -459,7 +469,8 @@ def test_a_successor_with_the_same_folder_goes_on_as_its_predecessor(keyframes, 
     second.restore(state)
     handled(second, keyframes[5:8])
     assert (
-        followed(second.finish()).map.rows.tobytes() == followed(first.finish()).map.rows.tobytes()
+        followed(second.on_stop()).map.rows.tobytes()
+        == followed(first.on_stop()).map.rows.tobytes()
     )
 
 
@@ -476,29 +487,29 @@ def test_what_was_taken_since_the_checkpoint_gives_the_same_bits_again(
     told = handled(first, taken[1:])
     shutil.copytree(tmp_path / "keyframes", tmp_path / "copy")
     config = replace(config, folder=str(tmp_path / "copy"))
-    past = Past(state, taken=tuple(map(as_taken, taken[1:])))
-    second = successor(Mapper(config), past, lambda: Mapper(config))
+    past = RestoredState(state, taken=tuple(map(as_taken, taken[1:])))
+    second = restore_actor(Mapper(config), past, lambda: Mapper(config))
     one, other = first.checkpoint()["map"], second.checkpoint()["map"]
     for part in ("map", "semantics", "poses", "links", "to_mend", "due"):
         assert encode_state(one[part]) == encode_state(other[part]), part
     version = max(delta.version for delta in deltas_of(told))
-    assert all(delta.version > version for delta in deltas_of(second.resumed()))
+    assert all(delta.version > version for delta in deltas_of(second.on_restored()))
 
 
-def as_taken(message) -> Taken:
+def as_taken(message) -> LoggedInput:
     (port,) = (port for port in Mapper.inputs if port.topic.message is type(message))
-    return Taken.of(port.topic.name, encode(message), Situation())
+    return LoggedInput.of(port.topic.name, encode(message), FlowStatus())
 
 
 def test_a_successor_first_shows_its_whole_map(keyframes) -> None:
     first, second = Mapper(CONFIG), Mapper(CONFIG)
     follower = followed(changes(handled(first, keyframes[:3])))
     second.restore(first.checkpoint())
-    words = list(second.resumed())
+    words = list(second.on_restored())
     followed(changes(words), follower)
     assert_equal_maps(follower, second)
     assert_equal_maps(followed(changes(words)), second)
-    assert list(Mapper(CONFIG).resumed()) == []
+    assert list(Mapper(CONFIG).on_restored()) == []
 
 
 def test_corrections_too_small_to_send_add_up(keyframes) -> None:
@@ -506,15 +517,15 @@ def test_corrections_too_small_to_send_add_up(keyframes) -> None:
     follower = followed(changes(handled(mapper, keyframes[:1])))
     before = follower.map.means.copy()
     for step in range(1, 101):
-        T = transform(keyframes[0].T_odom_keyframe)
+        T = pose_from_message(keyframes[0].T_odom_keyframe)
         T[0, 3] += step * 0.4e-4
-        followed(mapper.handle(correction_message(0, step, {0: T})), follower)
+        followed(mapper.handle(correction_to_message(0, step, {0: T})), follower)
     moved = follower.map.means[:, 0] - before[:, 0]
     assert abs(float(np.median(moved)) - 40e-4) < 1.01e-4
 
 
 def test_a_correction_without_a_map_is_harmless() -> None:
-    assert list(Mapper(CONFIG).handle(correction_message(0, 1, {0: np.eye(4)}))) == []
+    assert list(Mapper(CONFIG).handle(correction_to_message(0, 1, {0: np.eye(4)}))) == []
 
 
 def test_between_checkpoints_the_state_is_the_same_object(keyframes) -> None:
@@ -531,13 +542,13 @@ def test_a_follower_notices_that_the_mapper_began_anew(keyframes) -> None:
     follower = followed(changes(handled(Mapper(config), keyframes[:4])))
     assert follower.version > 1
     anew = Mapper(config)
-    followed(deltas_of([*handled(anew, keyframes[1:3]), *anew.finish()]), follower)
+    followed(deltas_of([*handled(anew, keyframes[1:3]), *anew.on_stop()]), follower)
     assert_equal_maps(follower, anew)
 
 
 def assert_equal_maps(follower: MapReplica, mapper: Mapper) -> None:
     """Of one that heard everything so far: nothing is left to tell it."""
-    last_words = list(mapper.finish())
+    last_words = list(mapper.on_stop())
     assert deltas_of(last_words) == []
     snapshot = followed(last_words)
     assert follower.version == snapshot.version
@@ -552,8 +563,8 @@ def test_what_a_keyframe_says_is_moving_does_not_count_in_the_map(keyframes) -> 
     first = keyframes[0]
     is_moving = np.zeros((first.camera.height, first.camera.width), bool)
     is_moving[40:80, 30:70] = True
-    camera = rgbd_of(first).camera
-    said = msgspec.structs.replace(first, is_moving=mask_message(is_moving[::2, ::2], camera))
+    camera = frame_from_message(first).camera
+    said = msgspec.structs.replace(first, is_moving=mask_to_array(is_moving[::2, ::2], camera))
     mapper = Mapper(CONFIG)
     handled(mapper, [said])
     (view,) = (mapper._map.views[k] for k in mapper._map.views.poses)
@@ -561,9 +572,9 @@ def test_what_a_keyframe_says_is_moving_does_not_count_in_the_map(keyframes) -> 
 
 
 def test_nothing_that_moves_travels_as_an_empty_mask(keyframes) -> None:
-    camera = rgbd_of(keyframes[0]).camera
+    camera = frame_from_message(keyframes[0]).camera
     for nothing in (None, np.zeros((8, 8), bool)):
-        assert mask_of(mask_message(nothing, camera)) is None
+        assert mask_from_array(mask_to_array(nothing, camera)) is None
 
 
 # --- labels -----------------------------------------------------------------------------------
@@ -582,7 +593,7 @@ def boxes_of(keyframe, label: str = "chair", network: str = "test") -> Detection
     )
 
 
-LABELLING = replace(CONFIG, semantics=SemanticMapConfig(LabellingConfig(region="box")))
+LABELLING = replace(CONFIG, semantics=SemanticMapConfig(SemanticFusionConfig(region="box")))
 
 
 def test_followers_hold_labels_to_the_bit_and_know_their_names(keyframes) -> None:
@@ -590,7 +601,7 @@ def test_followers_hold_labels_to_the_bit_and_know_their_names(keyframes) -> Non
     for keyframe in keyframes[:6]:
         boxes = boxes_of(keyframe, "lava lamp" if keyframe.keyframe > 2 else "chair")
         followed(deltas_of(handled(mapper, [keyframe, boxes])), follower)
-    followed(deltas_of(mapper.finish()), follower)
+    followed(deltas_of(mapper.on_stop()), follower)
     assert_equal_maps(follower, mapper)
     assert follower.label_names[-1] == "lava lamp"
     known = {follower.label_names[k] for k in np.unique(top_labels(follower.map.labels))}
@@ -608,7 +619,7 @@ def test_names_travel_when_there_are_new_ones(keyframes) -> None:
 def test_where_nobody_looked_nothing_is_labelled_or_missed(keyframes) -> None:
     mapper = Mapper(LABELLING)
     messages = handled(mapper, [keyframes[0], boxes_of(keyframes[0], network="")])
-    follower = followed([*changes(messages), *mapper.finish()])
+    follower = followed([*changes(messages), *mapper.on_stop()])
     assert not follower.map.labels.any()
     assert follower.label_names == ()
 
@@ -618,7 +629,7 @@ def test_labels_change_nothing_else_of_the_map(keyframes) -> None:
     for keyframe in keyframes[:5]:
         handled(mapper, [keyframe, boxes_of(keyframe)])
         handled(plain, [keyframe])
-    labelled, without = followed(mapper.finish()).map, followed(plain.finish()).map
+    labelled, without = followed(mapper.on_stop()).map, followed(plain.on_stop()).map
     assert top_labels(labelled.labels).any()
     assert labelled.rows.tobytes() == without.rows.tobytes()
 
@@ -633,11 +644,11 @@ def test_a_successor_has_the_labels_and_answers_nothing_twice(keyframes, tmp_pat
     second = Mapper(replace(config, folder=str(tmp_path / "copy")))
     second.restore(state)
     handled(second, [boxes_of(keyframes[3])])
-    assert second.facts()["boxes_repeated"] == 1
+    assert second.metrics()["boxes_repeated"] == 1
     ends = []
     for mapper in (first, second):
         handled(mapper, [boxes_of(keyframes[4]), keyframes[4]])
-        ends.append(followed(mapper.finish()))
+        ends.append(followed(mapper.on_stop()))
     assert ends[0].map.labels.tobytes() == ends[1].map.labels.tobytes()
     assert ends[0].label_names == ends[1].label_names
     assert top_labels(ends[0].map.labels).any()

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.mapper import Mapper, MapperConfig
-from ldo_service.conversions.frames import camera_message
-from ldo_service.conversions.poses import correction_message, matrix6_message, pose_message
+from ldo_service.conversions.frames import camera_to_message
+from ldo_service.conversions.poses import correction_to_message, matrix6_to_message, pose_to_message
 from ldo_service.geometry import se3
 from ldo_service.maps.replica import MapReplica
-from ldo_service.regions.open_vocabulary import Naming, NamingConfig
-from ldo_service.regions.region_proposals import TriggerConfig
-from ldo_service.regions.region_tracker import RegionConfig
+from ldo_service.regions.open_vocabulary import OpenVocabularyConfig, OpenVocabularyLabeling
+from ldo_service.regions.region_proposals import RegionProposalConfig
+from ldo_service.regions.region_tracker import RegionTrackerConfig
 from ldo_service.schemas import (
     Array,
     Detection,
@@ -35,15 +35,15 @@ from ldo_service.schemas import (
     encode,
 )
 from ldo_service.semantics.gaussian_labels import top_labels
-from ldo_service.semantics.semantic_fusion import FusionConfig, LabellingConfig
+from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 from tests.semantics.staged import CAMERA, THINGS, Shot, Thing, poses, shoot, true_things
 
 # of an image of 128x96, where walls hold a fifth each and the ball is 20 px wide
-TRIGGER = TriggerConfig(min_side_px=10)
-REGIONS = RegionConfig(per_keyframe=4, at_once=8)  # the walk is short
-SEMANTICS = SemanticMapConfig(naming=NamingConfig(trigger=TRIGGER, regions=REGIONS))
+TRIGGER = RegionProposalConfig(min_side_px=10)
+REGIONS = RegionTrackerConfig(per_keyframe=4, at_once=8)  # the walk is short
+SEMANTICS = SemanticMapConfig(naming=OpenVocabularyConfig(trigger=TRIGGER, regions=REGIONS))
 CONFIG = MapperConfig(iterations=3, threads=1, semantics=SEMANTICS)
 COUCH, TABLE, VASE, _, CHAIR, BALL = THINGS
 AHEAD = poses(1)[0]
@@ -53,17 +53,17 @@ STAMP_NS = 10**8
 
 def keyframe_of(shot: Shot, number: int) -> Keyframe:
     """Placed exactly; each measured from the one before."""
-    T = pose_message(shot.T_map_camera)
+    T = pose_to_message(shot.T_map_camera)
     return Keyframe(
         stamp_ns=number * STAMP_NS,
         keyframe=number,
         frame=number,
-        camera=camera_message(CAMERA),
+        camera=camera_to_message(CAMERA),
         color=Array.of(shot.frame.color),
         depth_m=Array.of(shot.frame.depth_m),
         reference=None,
         T_reference_keyframe=T,
-        information=matrix6_message(np.eye(6)),
+        information=matrix6_to_message(np.eye(6)),
         T_odom_keyframe=T,
     )
 
@@ -151,11 +151,11 @@ def test_where_nobody_looked_nothing_is_said_of_objects_and_no_bit_differs() -> 
         alone += plain.handle(keyframe_of(shoot(THINGS, T, number), number))
     made = walk(mapper, WAY[:4], known=(), network="")
     ask = MapRefine(stamp_ns=0, iterations=2, first_rate=1.0, last_rate=1.0)
-    turned = correction_message(0, 1, {0: se3.exp(np.full(6, 0.1)) @ WAY[0]})
+    turned = correction_to_message(0, 1, {0: se3.exp(np.full(6, 0.1)) @ WAY[0]})
     for one, said in ((plain, alone), (mapper, made)):
         for message in (ask, turned):
             said += one.handle(message)
-        said += one.finish()
+        said += one.on_stop()
     assert of(MapObjects, made) == of(ObjectObservation, made) == of(LabelRequest, made) == []
     assert [encode(message) for message in made] == [encode(message) for message in alone]
 
@@ -164,7 +164,7 @@ def test_corrections_move_objects_with_the_map() -> None:
     mapper = Mapper(CONFIG)
     (*_, before) = of(MapObjects, walk(mapper, np.tile(AHEAD, (4, 1, 1))))
     T = se3.exp(np.array([0, 0, 0.3, 1.0, 0.5, -0.2]))
-    made = list(mapper.handle(correction_message(0, 7, dict.fromkeys(range(4), T @ AHEAD))))
+    made = list(mapper.handle(correction_to_message(0, 7, dict.fromkeys(range(4), T @ AHEAD))))
     (after,) = of(MapObjects, made)
     (delta,) = of(MapDelta, made)
     assert (after.graph_version, after.version) == (7, delta.version)
@@ -179,9 +179,9 @@ def test_the_last_word_on_objects_is_that_of_the_last_map() -> None:
     walk(mapper, WAY[:6])
     refined = list(mapper.handle(MapRefine(stamp_ns=0, iterations=5, first_rate=1, last_rate=1)))
     assert isinstance(refined[-1], MapObjects)
-    *_, last = mapper.finish()
+    *_, last = mapper.on_stop()
     assert isinstance(last, MapObjects)
-    assert last.version == followed(mapper.finish()).version
+    assert last.version == followed(mapper.on_stop()).version
     assert last.objects == refined[-1].objects
 
 
@@ -200,7 +200,7 @@ def test_a_successor_goes_on_with_objects_bit_for_bit(tmp_path: Path) -> None:
     ends = []
     for mapper in (first, second):
         made = [*mapper.handle(answer(question, "lava lamp")), *walk(mapper, WAY[5:12], first=5)]
-        ends.append([*made, *mapper.finish()])
+        ends.append([*made, *mapper.on_stop()])
     for kind in (MapObjects, ObjectObservation, LabelRequest):
         one, other = ([encode(unversioned(m)) for m in of(kind, end)] for end in ends)
         assert one == other
@@ -268,7 +268,7 @@ def test_answers_land_on_the_gaussians_they_speak_of_however_late(late: int) -> 
         for due, message in waiting:
             new += mapper.handle(message) if due == number else []
         made += new
-    made += mapper.finish()
+    made += mapper.on_stop()
     follower = followed(made)
     top, truth = top_labels(follower.map.labels), true_things(follower.map.means, THINGS, WAY)
     names = np.array([f"my {thing.name}" for thing in THINGS] + ["background"])
@@ -297,12 +297,12 @@ def test_an_answer_speaks_of_all_views_that_were_shown(monkeypatch: pytest.Monke
         for request in of(LabelRequest, made):
             if shown_in(request) == CHAIR:
                 made += mapper.handle(answer(request, name))
-        follower = followed([*made, *mapper.finish()])
+        follower = followed([*made, *mapper.on_stop()])
         said = np.array(follower.label_names)[top_labels(follower.map.labels)]
         return int(np.count_nonzero(said == name))
 
     beyond, of_the_detector = labelled("my chair"), labelled(COUCH.name)
-    monkeypatch.setattr(Naming, "shown_in", lambda *_: ())
+    monkeypatch.setattr(OpenVocabularyLabeling, "shown_in", lambda *_: ())
     assert beyond > 1.05 * labelled("my chair") > 0
     assert of_the_detector == labelled(COUCH.name) > 0
 
@@ -321,8 +321,8 @@ def test_a_box_and_an_answer_are_weighed_as_printed_or_the_box_alone_counts(
     rule: Literal["adaptive", "fixed", "detector"], boxes_vote: bool, sure: float, named: str
 ) -> None:
     regions = replace(REGIONS, boxes_vote=boxes_vote, least_votes=0)
-    labelling = LabellingConfig(fusion=FusionConfig(rule=rule))
-    naming = NamingConfig(trigger=TRIGGER, regions=regions)
+    labelling = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
+    naming = OpenVocabularyConfig(trigger=TRIGGER, regions=regions)
     semantics = SemanticMapConfig(labelling=labelling, naming=naming)
     mapper, made = Mapper(replace(CONFIG, semantics=semantics), has_labeller=True), []
     for number, T in enumerate(np.tile(WAY, (2, 1, 1))):
@@ -332,8 +332,8 @@ def test_a_box_and_an_answer_are_weighed_as_printed_or_the_box_alone_counts(
             *new,
             *(m for one in about_it for m in mapper.handle(answer(one, "samovar", sure))),
         ]
-    assert mapper.facts()["answers_named"] > 0
-    follower = followed([*made, *mapper.finish()])
+    assert mapper.metrics()["answers_named"] > 0
+    follower = followed([*made, *mapper.on_stop()])
     top, truth = top_labels(follower.map.labels), true_things(follower.map.means, THINGS, WAY)
     said = np.array(follower.label_names)[top]
     assert np.mean(said[truth == THINGS.index(COUCH)] == named) > 0.6
@@ -347,11 +347,11 @@ def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:
     for request, label in ((first, "samovar"), (second, "lava lamp"), (third, "")):
         made += mapper.handle(answer(request, label))
     made += mapper.handle(answer(first, "again"))
-    made += mapper.finish()
+    made += mapper.on_stop()
     follower = followed(made)
     assert follower.label_names[-1] == "samovar"
     assert set(top_labels(follower.map.labels).tolist()) == {0, 1, 82}
-    facts = mapper.facts()
+    facts = mapper.metrics()
     assert (facts["answers_named"], facts["answers_unnamed"], facts["answers_unknown"]) == (2, 1, 1)
     assert facts["label_names_refused"] >= 1
 
@@ -361,9 +361,9 @@ def test_walls_and_floors_are_background_whoever_names_them() -> None:
     made = walk(mapper, WAY[:4], known=())
     for request in of(LabelRequest, made):
         made += mapper.handle(answer(request, "Ceiling"))
-    made += mapper.finish()
+    made += mapper.on_stop()
     assert not top_labels(followed(made).map.labels).any()
-    assert mapper.facts()["answers_unnamed"] > 0
+    assert mapper.metrics()["answers_unnamed"] > 0
 
 
 def test_an_answer_about_a_forgotten_keyframe_labels_nothing() -> None:
@@ -372,8 +372,8 @@ def test_an_answer_about_a_forgotten_keyframe_labels_nothing() -> None:
     request = of(LabelRequest, made)[0]
     mapper._map.views.store.keep_only([])
     assert list(mapper.handle(answer(request, "samovar"))) == []
-    assert mapper.facts()["answers_without_images"] == 1
-    assert not top_labels(followed([*made, *mapper.finish()]).map.labels).any()
+    assert mapper.metrics()["answers_without_images"] == 1
+    assert not top_labels(followed([*made, *mapper.on_stop()]).map.labels).any()
 
 
 def test_what_only_the_labeller_knows_the_detector_cannot_miss_however_it_came_to_be_known() -> (
@@ -388,7 +388,7 @@ def test_what_only_the_labeller_knows_the_detector_cannot_miss_however_it_came_t
     made += walk(mapper, AHEAD[None], first=5, known=(COUCH,))
     names = followed(made).label_names
     assert "samovar" in names
-    spared = mapper._semantics._spared()
+    spared = mapper._semantics._undetectable_labels()
     assert spared is not None
     assert np.flatnonzero(spared).tolist() == [names.index("samovar")]
 
@@ -400,5 +400,7 @@ def test_the_map_looks_the_same_whoever_names_it() -> None:
         made += asking.handle(answer(request, "samovar"))
     views = [[encode(unversioned(view)) for view in of(ModelView, said)] for said in (alone, made)]
     assert views[0] == views[1]
-    rows = [followed([*said, *m.finish()]).map.rows for said, m in ((alone, plain), (made, asking))]
+    rows = [
+        followed([*said, *m.on_stop()]).map.rows for said, m in ((alone, plain), (made, asking))
+    ]
     assert rows[0].tobytes() == rows[1].tobytes()

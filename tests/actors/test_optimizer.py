@@ -4,7 +4,11 @@ import msgspec
 import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
-from ldo_service.conversions.poses import keyframe_poses_of, pose_message, transform
+from ldo_service.conversions.poses import (
+    keyframe_poses_from_correction,
+    pose_from_message,
+    pose_to_message,
+)
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import T_map_segment
 from ldo_service.schemas import Keyframe, MeasuredPose, Pose
@@ -22,11 +26,11 @@ def chained(keyframes: list[Keyframe]) -> list[Keyframe]:
 def test_each_keyframe_gives_a_correction_of_all_poses(keyframes) -> None:
     corrections = handled(Optimizer(), chained(keyframes))
     assert [c.graph_version for c in corrections] == list(range(1, len(keyframes) + 1))
-    last = keyframe_poses_of(corrections[-1])
+    last = keyframe_poses_from_correction(corrections[-1])
     assert list(last) == [k.keyframe for k in keyframes]
     for keyframe in keyframes:
         np.testing.assert_allclose(
-            last[keyframe.keyframe], transform(keyframe.T_odom_keyframe), atol=1e-6
+            last[keyframe.keyframe], pose_from_message(keyframe.T_odom_keyframe), atol=1e-6
         )
 
 
@@ -34,7 +38,7 @@ def test_a_keyframe_sent_twice_counts_once(keyframes) -> None:
     optimizer = Optimizer()
     handled(optimizer, keyframes[:2])
     assert handled(optimizer, keyframes[1:2]) == []
-    assert optimizer.facts()["keyframes_repeated"] == 1
+    assert optimizer.metrics()["keyframes_repeated"] == 1
 
 
 def test_a_missing_reference_is_bridged_by_odometry(keyframes, caplog) -> None:
@@ -42,9 +46,11 @@ def test_a_missing_reference_is_bridged_by_odometry(keyframes, caplog) -> None:
     missing = next(k.reference for k in keyframes if k.reference)
     (*_, last) = handled(optimizer, [k for k in chained(keyframes) if k.keyframe != missing])
     assert "its reference is missing" in caplog.text
-    poses = keyframe_poses_of(last)
+    poses = keyframe_poses_from_correction(last)
     newest = keyframes[-1]
-    np.testing.assert_allclose(poses[newest.keyframe], transform(newest.T_odom_keyframe), atol=1e-6)
+    np.testing.assert_allclose(
+        poses[newest.keyframe], pose_from_message(newest.T_odom_keyframe), atol=1e-6
+    )
 
 
 def test_a_window_stands_in_for_a_missing_reference(keyframes) -> None:
@@ -53,17 +59,19 @@ def test_a_window_stands_in_for_a_missing_reference(keyframes) -> None:
     older = last.window[-1]
     handled(optimizer, [k for k in keyframes if k.keyframe <= older.reference])
     (correction,) = handled(optimizer, [last])
-    poses = keyframe_poses_of(correction)
+    poses = keyframe_poses_from_correction(correction)
     T_older_last = se3.inverse(poses[older.reference]) @ poses[last.keyframe]
-    np.testing.assert_allclose(T_older_last, transform(older.T_reference_keyframe), atol=1e-6)
-    assert optimizer.facts()["keyframes_bridged"] == 0
+    np.testing.assert_allclose(
+        T_older_last, pose_from_message(older.T_reference_keyframe), atol=1e-6
+    )
+    assert optimizer.metrics()["keyframes_bridged"] == 0
 
 
 def test_windows_bring_the_keyframes_nearer_to_the_truth(keyframes, room) -> None:
     truth = room.truth().T_world_camera
 
     def error_m(corrections: list) -> float:
-        last = keyframe_poses_of(corrections[-1])
+        last = keyframe_poses_from_correction(corrections[-1])
         T_first_world = se3.inverse(truth[keyframes[0].frame])
         estimated = [last[k.keyframe][:3, 3] for k in keyframes]
         true = [(T_first_world @ truth[k.frame])[:3, 3] for k in keyframes]
@@ -78,13 +86,13 @@ def test_a_successor_says_the_last_correction_anew_and_goes_on(keyframes) -> Non
     first, second = Optimizer(), Optimizer()
     *_, last = handled(first, keyframes[:-1])
     second.restore(first.snapshot())
-    (again,) = second.resumed()
+    (again,) = second.on_restored()
     assert again.graph_version == last.graph_version + 1, "it may have been sent before"
     assert (again.stamp_ns, again.keyframes) == (last.stamp_ns, last.keyframes)
     (expected,) = handled(first, keyframes[-1:])
     (correction,) = handled(second, keyframes[-1:])
-    for keyframe, T in keyframe_poses_of(correction).items():
-        np.testing.assert_allclose(T, keyframe_poses_of(expected)[keyframe], atol=1e-6)
+    for keyframe, T in keyframe_poses_from_correction(correction).items():
+        np.testing.assert_allclose(T, keyframe_poses_from_correction(expected)[keyframe], atol=1e-6)
 
 
 def test_two_runs_say_the_same_bytes(keyframes) -> None:
@@ -115,9 +123,9 @@ def in_two_segments(keyframes: list[Keyframe], split: int) -> list[Keyframe]:
 
 def between(known: Keyframe, keyframe: Keyframe) -> Pose:
     T_odom_known, T_odom_keyframe = map(
-        transform, (known.T_odom_keyframe, keyframe.T_odom_keyframe)
+        pose_from_message, (known.T_odom_keyframe, keyframe.T_odom_keyframe)
     )
-    return pose_message(se3.inverse(T_odom_known) @ T_odom_keyframe)
+    return pose_to_message(se3.inverse(T_odom_known) @ T_odom_keyframe)
 
 
 def joining(keyframe: Keyframe, known: Keyframe) -> Keyframe:
@@ -135,9 +143,11 @@ def test_a_new_segment_is_placed_far_from_the_others(keyframes) -> None:
     (*_, last) = handled(Optimizer(), in_two_segments(keyframes, 3))
     assert last.joined == ()
     for k in keyframes:
-        T_odom_keyframe = transform(k.T_odom_keyframe)
+        T_odom_keyframe = pose_from_message(k.T_odom_keyframe)
         T_expected = T_odom_keyframe if k.keyframe < 3 else T_map_segment(1) @ T_odom_keyframe
-        np.testing.assert_allclose(keyframe_poses_of(last)[k.keyframe], T_expected, atol=1e-6)
+        np.testing.assert_allclose(
+            keyframe_poses_from_correction(last)[k.keyframe], T_expected, atol=1e-6
+        )
 
 
 def test_a_join_brings_the_younger_segment_into_the_older_ones_frame(keyframes, caplog) -> None:
@@ -151,10 +161,12 @@ def test_a_join_brings_the_younger_segment_into_the_older_ones_frame(keyframes, 
         assert correction.joined == ((1, 0),)
         for k in keyframes:
             np.testing.assert_allclose(
-                keyframe_poses_of(correction)[k.keyframe], transform(k.T_odom_keyframe), atol=1e-5
+                keyframe_poses_from_correction(correction)[k.keyframe],
+                pose_from_message(k.T_odom_keyframe),
+                atol=1e-5,
             )
     assert "segment 1 is placed in 0 now" in caplog.text
-    assert first.facts()["segments_apart"] == 1
+    assert first.metrics()["segments_apart"] == 1
 
 
 def test_a_join_to_a_keyframe_that_never_came_is_left_out(keyframes, caplog) -> None:

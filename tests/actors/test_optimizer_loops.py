@@ -7,10 +7,10 @@ import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.conversions.poses import (
-    keyframe_poses_of,
-    matrix6_message,
-    measured_message,
-    pose_message,
+    keyframe_poses_from_correction,
+    matrix6_to_message,
+    pose_to_message,
+    relative_pose_to_message,
 )
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
@@ -63,15 +63,15 @@ def keyframes() -> Iterator[Keyframe]:
             color=Array.of(COLOR),
             depth_m=Array.of(DEPTH),
             reference=k - 1 if k else None,
-            T_reference_keyframe=pose_message(T_of_step(k) if k else np.eye(4)),
-            information=matrix6_message(INFORMATION),
-            T_odom_keyframe=pose_message(T_odom),
+            T_reference_keyframe=pose_to_message(T_of_step(k) if k else np.eye(4)),
+            information=matrix6_to_message(INFORMATION),
+            T_odom_keyframe=pose_to_message(T_odom),
         )
 
 
 def closure(a: int, b: int, T_a_b: np.ndarray | None = None) -> LoopClosure:
     T_a_b = se3.inverse(TRUTH[a]) @ TRUTH[b] if T_a_b is None else T_a_b
-    pose = measured_message(RelativePose(a, b, T_a_b, INFORMATION))
+    pose = relative_pose_to_message(RelativePose(a, b, T_a_b, INFORMATION))
     return LoopClosure(stamp_ns=b * 10**8, pose=pose, overlap=0.6, rmse_m=0.01)
 
 
@@ -104,7 +104,7 @@ def corrections(optimizer: Optimizer, messages: Iterable[Message]) -> list[Corre
 
 
 def error_m(correction: Correction) -> float:
-    T_map = keyframe_poses_of(correction)
+    T_map = keyframe_poses_from_correction(correction)
     off = [T[:3, 3] - TRUTH[k][:3, 3] for k, T in T_map.items()]
     return float(np.sqrt(np.mean(np.square(off).sum(axis=1))))
 
@@ -116,8 +116,8 @@ def test_closures_undo_what_odometry_drifted() -> None:
     assert last.closures == tuple((k - 40, k) for k in range(55, 90, 5))
     assert last.not_believed == ()
     assert error_m(last) < error_m(drifted) / 3, "steps that are 1 % too long stay so"
-    assert optimizer.facts()["closures"] == 7
-    assert optimizer.facts()["keyframes_solved"] < 45  # the newest 20, and ends of closures
+    assert optimizer.metrics()["closures"] == 7
+    assert optimizer.metrics()["keyframes_solved"] < 45  # the newest 20, and ends of closures
 
 
 def test_a_false_closure_is_told_as_not_believed_and_moves_nothing() -> None:
@@ -127,7 +127,7 @@ def test_a_false_closure_is_told_as_not_believed_and_moves_nothing() -> None:
     assert after.closures == ()
     assert after.not_believed == ((10, 70),)
     assert bytes(after.T_map_keyframe.data) == bytes(before.T_map_keyframe.data)
-    assert optimizer.facts()["closures_refused"] == 1
+    assert optimizer.metrics()["closures_refused"] == 1
 
 
 def test_a_closure_waits_for_its_keyframe() -> None:
@@ -151,7 +151,7 @@ def test_an_object_becomes_a_landmark_with_its_name() -> None:
 def test_observations_are_taken_in_when_enough_of_them_wait() -> None:
     optimizer = Optimizer()
     corrections(optimizer, story())
-    facts = optimizer.facts()
+    facts = optimizer.metrics()
     assert facts["landmarks"] == 1
     assert facts["optimizations_saved"] > 40
 
@@ -161,7 +161,7 @@ def test_an_observation_of_a_keyframe_that_is_under_way_waits_for_it() -> None:
     optimizer = Optimizer()
     corrections(optimizer, messages[:10])
     assert corrections(optimizer, [seen(10), *messages[10:13], seen(12)]) != []
-    assert optimizer.facts()["waited_in_vain"] == 0
+    assert optimizer.metrics()["waited_in_vain"] == 0
     assert len(optimizer.snapshot()["rest"]["waiting"]) == 2
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldo_service.actors.topology import GRAPH, box_named, consumers_of, producer_of
+from ldo_service.actors.topology import GRAPH, actor_spec, consumers_of, producer_of
 from ldo_service.errors import ConfigError
 from ldo_service.runtime import check_graph
 from ldo_service.runtime.actor_graph import lossless_consumers
@@ -25,6 +25,6 @@ def test_only_actors_that_run_hold_a_window() -> None:
 
 
 def test_an_actor_is_found_by_its_name_and_no_other() -> None:
-    assert [box_named(box.name) for box in GRAPH] == [*GRAPH]
+    assert [actor_spec(box.name) for box in GRAPH] == [*GRAPH]
     with pytest.raises(ConfigError, match=r"no actor 'dreamer'.*frame_source"):
-        box_named("dreamer")
+        actor_spec("dreamer")

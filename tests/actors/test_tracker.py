@@ -6,19 +6,19 @@ import pytest
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import CameraExtrinsics, Tracker, TrackerConfig
-from ldo_service.conversions.frames import rgbd_message, rgbd_of
+from ldo_service.conversions.frames import frame_from_message, frame_to_message
 from ldo_service.conversions.poses import (
-    correction_message,
-    keyframe_poses_of,
-    measured_message,
-    pose_message,
-    transform,
+    correction_to_message,
+    keyframe_poses_from_correction,
+    pose_from_message,
+    pose_to_message,
+    relative_pose_to_message,
 )
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose, T_map_segment
-from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.actor import FlowStatus
 from ldo_service.schemas import (
     Array,
     Correction,
@@ -34,7 +34,7 @@ from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.submaps import SegmentConfig
+from ldo_service.tracking.submaps import SubmapConfig
 
 
 def poses_of(messages) -> list[TrackedPose]:
@@ -55,7 +55,7 @@ def test_poses_follow_the_true_camera(room: Sequence, tracked) -> None:
     T_odom_world = se3.inverse(truth.T_world_camera[0])
     for pose in poses_of(tracked):
         T_true = T_odom_world @ truth.T_world_camera[pose.frame]
-        error = se3.inverse(T_true) @ transform(pose.T_odom_camera)
+        error = se3.inverse(T_true) @ pose_from_message(pose.T_odom_camera)
         assert pose.status == "OK"
         assert np.linalg.norm(error[:3, 3]) < 2e-3
         assert se3.rotation_angle(error) < 1e-3
@@ -63,10 +63,10 @@ def test_poses_follow_the_true_camera(room: Sequence, tracked) -> None:
 
 def test_every_frame_gets_a_pose_that_hangs_on_a_keyframe(tracked, keyframes, frames) -> None:
     assert len(poses_of(tracked)) == len(frames)
-    T_odom = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
+    T_odom = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
     for pose in poses_of(tracked):
-        T_odom_camera = T_odom[pose.reference] @ transform(pose.T_reference_camera)
-        np.testing.assert_allclose(T_odom_camera, transform(pose.T_odom_camera), atol=1e-9)
+        T_odom_camera = T_odom[pose.reference] @ pose_from_message(pose.T_reference_camera)
+        np.testing.assert_allclose(T_odom_camera, pose_from_message(pose.T_odom_camera), atol=1e-9)
 
 
 def test_keyframes_are_chained_by_ascending_ids(keyframes: list[Keyframe]) -> None:
@@ -82,23 +82,23 @@ def test_without_room_no_keyframe_is_made_and_tracking_goes_on(frames, keyframes
     tracker = Tracker()
     first = handled(tracker, frames[:1])
     assert any(isinstance(out, Keyframe) for out in first)
-    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     blocked = handled(tracker, frames[1:15])
     assert not any(isinstance(out, Keyframe) for out in blocked)
     assert all(pose.status == "OK" and pose.reference == 0 for pose in poses_of(blocked))
-    assert tracker.facts()["keyframes_without_room"] > 0
+    assert tracker.metrics()["keyframes_without_room"] > 0
     assert len(keyframes) > 2, "with room there would have been keyframes"
 
 
 def test_nothing_is_said_before_somebody_can_map_the_first_keyframe(frames) -> None:
     tracker = Tracker()
-    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     assert handled(tracker, frames[:3]) == []
-    tracker.situation = Situation(room={KEYFRAME_NEW: 8})
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 8})
     keyframe, pose = handled(tracker, frames[3:4])
     assert isinstance(keyframe, Keyframe)
     assert keyframe.frame == 3
-    np.testing.assert_array_equal(transform(pose.T_odom_camera), np.eye(4))
+    np.testing.assert_array_equal(pose_from_message(pose.T_odom_camera), np.eye(4))
 
 
 def test_held_out_frames_never_become_keyframes(frames) -> None:
@@ -114,13 +114,13 @@ def test_a_correction_moves_the_map_and_not_the_odometry(frames, keyframes) -> N
     handled(corrected, frames[:20])
     shift = se3.exp(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
     made = [k for k in keyframes if k.frame < 20]
-    new = {k.keyframe: shift @ transform(k.T_odom_keyframe) for k in made}
-    assert handled(corrected, [correction_message(0, 7, new)]) == []
+    new = {k.keyframe: shift @ pose_from_message(k.T_odom_keyframe) for k in made}
+    assert handled(corrected, [correction_to_message(0, 7, new)]) == []
     (expected,) = poses_of(handled(plain, frames[20:21]))
     (pose,) = poses_of(handled(corrected, frames[20:21]))
     assert pose.T_odom_camera == expected.T_odom_camera
     assert pose.graph_version == 7
-    np.testing.assert_allclose(transform(pose.T_map_odom), shift, atol=1e-9)
+    np.testing.assert_allclose(pose_from_message(pose.T_map_odom), shift, atol=1e-9)
 
 
 def test_odometry_does_not_jump_when_a_loop_is_closed(frames, tracked) -> None:
@@ -147,21 +147,23 @@ def closure_off_by(
 ) -> LoopClosure:
     """Between the first keyframe and another, where odometry has it but for a step."""
     *_, correction = optimizer.handle(KeyframeRefinement(stamp_ns=stamp_ns, poses=()))
-    T_map = keyframe_poses_of(correction)
+    T_map = keyframe_poses_from_correction(correction)
     T_0_keyframe = se3.inverse(T_map[0]) @ T_map[keyframe]
     T_0_keyframe[0, 3] += distance_m
     measured = RelativePose(0, keyframe, T_0_keyframe, 1e6 * np.eye(6))
-    return LoopClosure(stamp_ns=stamp_ns, pose=measured_message(measured), overlap=0.5, rmse_m=0.01)
+    return LoopClosure(
+        stamp_ns=stamp_ns, pose=relative_pose_to_message(measured), overlap=0.5, rmse_m=0.01
+    )
 
 
 def test_an_older_correction_is_ignored(frames) -> None:
     tracker = Tracker()
     handled(tracker, frames[:2])
-    handled(tracker, [correction_message(0, 5, {0: np.eye(4)})])
-    handled(tracker, [correction_message(0, 4, {0: se3.exp(np.full(6, 0.5))})])
+    handled(tracker, [correction_to_message(0, 5, {0: np.eye(4)})])
+    handled(tracker, [correction_to_message(0, 4, {0: se3.exp(np.full(6, 0.5))})])
     (pose,) = poses_of(handled(tracker, frames[2:3]))
     assert pose.graph_version == 5
-    np.testing.assert_allclose(transform(pose.T_map_odom), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(pose_from_message(pose.T_map_odom), np.eye(4), atol=1e-12)
 
 
 def test_a_successor_goes_on_bit_for_bit(frames: list[FrameRgbd]) -> None:
@@ -204,15 +206,15 @@ def test_a_lost_camera_is_found_in_the_corrected_map(room: Sequence, frames, key
     handled(tracker, frames)
     known = tracker._odometry._map._poses
     known.keep_only([max(known)])
-    new = {k.keyframe: shift @ transform(k.T_odom_keyframe) for k in keyframes}
-    handled(tracker, [correction_message(0, 7, new)])
+    new = {k.keyframe: shift @ pose_from_message(k.T_odom_keyframe) for k in keyframes}
+    handled(tracker, [correction_to_message(0, 7, new)])
     successor.restore(tracker.snapshot())
     back, again = (poses_of(handled(t, frames[2:3]))[0] for t in (tracker, successor))
     assert back.status == "OK"
     assert back.reference not in (None, max(new))
     truth = room.truth()
     assert truth is not None
-    T_map_camera = transform(back.T_map_odom) @ transform(back.T_odom_camera)
+    T_map_camera = pose_from_message(back.T_map_odom) @ pose_from_message(back.T_odom_camera)
     T_true = shift @ se3.inverse(truth.T_world_camera[0]) @ truth.T_world_camera[2]
     np.testing.assert_allclose(T_map_camera, T_true, atol=5e-3)
     assert back == msgspec.structs.replace(again, keyframe=back.keyframe), "one id was skipped"
@@ -233,15 +235,13 @@ def test_a_lost_camera_may_make_a_keyframe_from_one_it_had_forgotten(
 
 
 def test_a_correction_before_any_frame_is_harmless() -> None:
-    correction: Correction = correction_message(0, 1, {0: np.eye(4)})
+    correction: Correction = correction_to_message(0, 1, {0: np.eye(4)})
     assert list(Tracker().handle(correction)) == []
 
 
 # --- segments -------------------------------------------------------------------------------------
 SOON = OdometryConfig(
-    segments=SegmentConfig(
-        begin_after_s=0.06, look_every=3, confirm_after=2, confirm_apart_rad=0.05
-    )
+    segments=SubmapConfig(begin_after_s=0.06, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
 )
 
 
@@ -250,7 +250,7 @@ def returning(room: Sequence) -> list[FrameRgbd]:
     """Twelve frames, then suddenly far away, and step by step back to the first ones."""
     order = [*range(12), *range(60, 4, -2)]
     return [
-        msgspec.structs.replace(rgbd_message(room[index]), frame=k, stamp_ns=k * 33_000_000)
+        msgspec.structs.replace(frame_to_message(room[index]), frame=k, stamp_ns=k * 33_000_000)
         for k, index in enumerate(order)
     ]
 
@@ -262,7 +262,7 @@ def test_a_lost_camera_begins_a_segment_where_odometry_ended(returning) -> None:
     begun = poses[14]
     assert (begun.segment, poses[11].segment) == (1, 0)
     assert begun.T_odom_camera == poses[11].T_odom_camera, "odometry never jumps"
-    np.testing.assert_allclose(transform(begun.T_map_odom), T_map_segment(1), atol=1e-12)
+    np.testing.assert_allclose(pose_from_message(begun.T_map_odom), T_map_segment(1), atol=1e-12)
     first = next(k for k in made if isinstance(k, Keyframe) and k.segment == 1)
     assert (first.reference, first.keyframe) == (None, begun.reference)
 
@@ -270,9 +270,9 @@ def test_a_lost_camera_begins_a_segment_where_odometry_ended(returning) -> None:
 def test_without_room_for_a_first_keyframe_a_camera_stays_lost(returning) -> None:
     tracker = Tracker(TrackerConfig(odometry=SOON))
     handled(tracker, returning[:12])
-    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     assert {pose.status for pose in poses_of(handled(tracker, returning[12:18]))} == {"LOST"}
-    tracker.situation = Situation(room={KEYFRAME_NEW: 8})
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 8})
     assert [pose.status for pose in poses_of(handled(tracker, returning[18:20]))] == ["OK", "OK"]
 
 
@@ -290,12 +290,12 @@ def test_a_segment_is_joined_by_what_both_see_and_moves_with_the_correction(
     order = [*range(12), *range(60, 4, -2)]
     T_world = {k.keyframe: truth.T_world_camera[order[k.frame]] for k in keyframes}
     T_true = se3.inverse(T_world[join.reference]) @ T_world[join.keyframe]
-    np.testing.assert_allclose(transform(join.T_reference_keyframe), T_true, atol=5e-3)
+    np.testing.assert_allclose(pose_from_message(join.T_reference_keyframe), T_true, atol=5e-3)
     placed = {k: se3.inverse(T_world[0]) @ T for k, T in T_world.items()}
-    handled(tracker, [correction_message(0, 1, placed, joined={1: 0})])
+    handled(tracker, [correction_to_message(0, 1, placed, joined={1: 0})])
     (pose,) = poses_of(handled(tracker, returning[-1:]))
     assert pose.segment == 0
-    T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+    T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
     T_expected = se3.inverse(T_world[0]) @ truth.T_world_camera[order[-1]]
     np.testing.assert_allclose(T_map_camera, T_expected, atol=5e-3)
 
@@ -320,11 +320,11 @@ AHEAD = (0.5, -0.5, 0.5, -0.5)  # optical axes in a base with x forward and z up
 def test_a_pose_says_where_the_camera_sits_on_the_robot(frames) -> None:
     mounting = CameraExtrinsics(translation_m=(0.2, 0.0, 0.5), quaternion_wxyz=AHEAD)
     (pose,) = poses_of(handled(Tracker(TrackerConfig(T_base_camera=mounting)), frames[:1]))
-    T_base_camera = transform(pose.T_base_camera)
+    T_base_camera = pose_from_message(pose.T_base_camera)
     forward, down = [0, 0, 1], [0, 1, 0]
     np.testing.assert_allclose(T_base_camera[:3, :3] @ forward, [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(T_base_camera[:3, :3] @ down, [0, 0, -1], atol=1e-12)
-    T_odom_base = transform(pose.T_odom_camera) @ se3.inverse(T_base_camera)
+    T_odom_base = pose_from_message(pose.T_odom_camera) @ se3.inverse(T_base_camera)
     camera_in_base = se3.transform(se3.inverse(T_odom_base), np.zeros((1, 3)))  # first: odom
     np.testing.assert_allclose(camera_in_base, [[0.2, 0.0, 0.5]], atol=1e-12)
 
@@ -336,7 +336,7 @@ def test_without_a_mounting_the_base_is_the_camera_and_poses_are_as_ever(frames,
         assert pose == msgspec.structs.replace(other, T_base_camera=IDENTITY)
 
 
-def test_a_quaternion_of_four_digits_is_normalised() -> None:
+def test_a_quaternion_of_four_digits_is_normalized() -> None:
     mounting = CameraExtrinsics(quaternion_wxyz=(0.7071, 0.0, 0.7071, 0.0))
     np.testing.assert_allclose(np.linalg.det(mounting.matrix()), 1.0, atol=1e-12)
 
@@ -369,7 +369,7 @@ def helped(room: Sequence, frames) -> list[FrameRgbd | OdometryPrior]:
     messages: list[FrameRgbd | OdometryPrior] = []
     for frame in frames[::2]:
         T_base = T_PRIOR_WORLD @ truth.T_world_camera[frame.frame] @ T_camera_base
-        messages.append(OdometryPrior(stamp_ns=frame.stamp_ns, T_odom_base=pose_message(T_base)))
+        messages.append(OdometryPrior(stamp_ns=frame.stamp_ns, T_odom_base=pose_to_message(T_base)))
         is_covered = 10 <= frame.frame < 20
         messages.append(without_anything(frame) if is_covered else frame)
     return messages
@@ -385,7 +385,7 @@ def test_a_prior_says_nothing_by_itself_and_is_read_at_each_frame(helped) -> Non
     for message in helped:
         made = list(tracker.handle(message))
         assert bool(made) == isinstance(message, FrameRgbd)
-    facts = tracker.facts()
+    facts = tracker.metrics()
     assert (facts["frames_with_prior"], facts["frames_without_prior"]) == (20, 0)
     assert (facts["prior_refused"], facts["prior_restarts"]) == (0, 0)
 
@@ -424,9 +424,9 @@ def test_poses_that_cannot_be_used_are_counted_and_the_first_is_said(helped, cap
     tracker = Tracker()
     prior = [message for message in helped if isinstance(message, OdometryPrior)]
     handled(tracker, [*prior[:5], *prior[:5]])
-    jump = pose_message(se3.exp(np.array([0.0, 0.0, 0.0, 900.0, 0.0, 0.0])))
+    jump = pose_to_message(se3.exp(np.array([0.0, 0.0, 0.0, 900.0, 0.0, 0.0])))
     handled(tracker, [msgspec.structs.replace(prior[6], T_odom_base=jump), prior[7]])
-    facts = tracker.facts()
+    facts = tracker.metrics()
     assert (facts["prior_refused"], facts["prior_restarts"]) == (5, 2)
     warnings = [record.getMessage() for record in caplog.records]
     assert len(warnings) == 2
@@ -440,7 +440,7 @@ def test_a_prior_of_another_clock_changes_nothing_and_is_said_once(frames, helpe
     later = [msgspec.structs.replace(f, stamp_ns=f.stamp_ns + 10**12) for f in frames]
     expected = handled(Tracker(), later)
     assert bodies(handled(tracker, [stale, *later])) == bodies(expected)
-    assert tracker.facts()["frames_without_prior"] == len(frames)
+    assert tracker.metrics()["frames_without_prior"] == len(frames)
     (warning,) = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
     assert "do both stamp by one clock?" in warning
 
@@ -448,18 +448,18 @@ def test_a_prior_of_another_clock_changes_nothing_and_is_said_once(frames, helpe
 # --- frames that are not what they should be ------------------------------------------------------
 def halved(message: FrameRgbd) -> FrameRgbd:
     """Every second pixel: what a camera sends that was switched to half its resolution."""
-    frame, k = rgbd_of(message), rgbd_of(message).camera
+    frame, k = frame_from_message(message), frame_from_message(message).camera
     camera = Camera(k.width // 2, k.height // 2, k.fx / 2, k.fy / 2, k.cx / 2, k.cy / 2)
     color, depth_m = (np.ascontiguousarray(a[::2, ::2]) for a in (frame.color, frame.depth_m))
-    return rgbd_message(RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index))
+    return frame_to_message(RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index))
 
 
 def cropped(message: FrameRgbd) -> FrameRgbd:
     """The middle of the image: what another lens sees."""
-    frame, k = rgbd_of(message), rgbd_of(message).camera
+    frame, k = frame_from_message(message), frame_from_message(message).camera
     camera = Camera(k.width - 80, k.height - 60, k.fx, k.fy, k.cx - 40, k.cy - 30)
     color, depth_m = (np.ascontiguousarray(a[30:-30, 40:-40]) for a in (frame.color, frame.depth_m))
-    return rgbd_message(RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index))
+    return frame_to_message(RgbdFrame(color, depth_m, camera, frame.stamp_ns, frame.index))
 
 
 @pytest.mark.parametrize("other_camera", [halved, cropped])
@@ -476,7 +476,7 @@ def test_another_camera_mid_stream_is_tracked_against_the_same_surface(
     assert [pose.status for pose in poses] == ["OK"] * 30
     for pose in poses:
         T_true = T_odom_world @ truth.T_world_camera[pose.frame]
-        error = se3.inverse(T_true) @ transform(pose.T_odom_camera)
+        error = se3.inverse(T_true) @ pose_from_message(pose.T_odom_camera)
         assert np.linalg.norm(error[:3, 3]) < 5e-3
 
 
@@ -507,6 +507,6 @@ def test_the_smallest_frames_that_come_through_break_nothing(frames) -> None:
         camera = Camera(size, size, 30.0, 30.0, size / 2, size / 2)
         color = np.random.default_rng(0).integers(0, 255, (size, size, 3)).astype(np.uint8)
         depth_m = np.ones((size, size), np.float32)
-        tiny = rgbd_message(RgbdFrame(color, depth_m, camera, 1, 1))
+        tiny = frame_to_message(RgbdFrame(color, depth_m, camera, 1, 1))
         assert len(poses_of(handled(Tracker(), [tiny, tiny]))) == 2
         assert len(poses_of(handled(Tracker(), [*frames[:2], tiny, frames[2]]))) == 4

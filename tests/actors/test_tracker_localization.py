@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.tracker import Tracker, TrackerConfig
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 from ldo_service.schemas import TrackedPose
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.tracking.keyframe_database import PLACES, places_of
+from ldo_service.tracking.keyframe_database import DATABASE_FILE, places_of
 
 
 def localizing(finished_run: Path) -> Tracker:
@@ -31,7 +31,7 @@ def test_poses_are_in_the_frame_of_the_map(room: Sequence, finished_run: Path, f
     T_map_world = se3.inverse(truth.T_world_camera[0])
     for pose in made[1:]:
         assert pose.status == "OK"
-        T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+        T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
         T_true = T_map_world @ truth.T_world_camera[pose.frame]
         np.testing.assert_allclose(T_map_camera[:3, 3], T_true[:3, 3], atol=0.01)
 
@@ -68,12 +68,12 @@ def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("body", [b"", b"nonsense", encode_state({"places": [{"id": 1}]})])
 def test_a_file_that_no_run_wrote_is_refused(tmp_path: Path, body: bytes) -> None:
-    (tmp_path / PLACES).write_bytes(body)
+    (tmp_path / DATABASE_FILE).write_bytes(body)
     with pytest.raises(DataError, match="is not what `ldo run` writes"):
         places_of(tmp_path)
 
 
 def test_a_run_that_made_no_keyframe_is_refused(tmp_path: Path) -> None:
-    (tmp_path / PLACES).write_bytes(encode_state({"places": []}))
+    (tmp_path / DATABASE_FILE).write_bytes(encode_state({"places": []}))
     with pytest.raises(DataError, match="no place"):
         places_of(tmp_path)

@@ -8,7 +8,7 @@ from types import FrameType
 import pytest
 
 from ldo_service.actors.tracker import Tracker, TrackerConfig
-from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.actor import FlowStatus
 from ldo_service.schemas import FrameRgbd, Keyframe, Message, OdometryPrior, TrackedPose
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import KEYFRAME_NEW
@@ -61,7 +61,7 @@ def test_each_frame_enters_tracking_once(frames: Many[FrameRgbd]) -> None:
 
 def test_a_frame_that_may_not_be_mapped_enters_tracking_once(frames: Many[FrameRgbd]) -> None:
     tracker = Tracker()
-    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     assert calls_into_tracking(tracker, frames[0]) == (["Odometry.process"], [])
 
 
@@ -71,7 +71,7 @@ def test_a_frame_with_a_prior_enters_tracking_once(frames: Many[FrameRgbd]) -> N
         list(tracker.handle(OdometryPrior(stamp_ns=frame.stamp_ns, T_odom_base=IDENTITY)))
         calls, _ = calls_into_tracking(tracker, frame)
         assert calls == ["Odometry.process"]
-    assert tracker.facts()["frames_with_prior"] == 3
+    assert tracker.metrics()["frames_with_prior"] == 3
 
 
 @pytest.mark.parametrize("frame", [0, 5])

@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 
 from ldo_service.actors.tracker import Tracker, TrackerConfig
-from ldo_service.conversions.poses import correction_message, transform
+from ldo_service.conversions.poses import correction_to_message, pose_from_message
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import se3
-from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.actor import FlowStatus
 from ldo_service.schemas import FrameRgbd, Keyframe, TrackedPose
 from ldo_service.schemas.topics import KEYFRAME_NEW
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import OdometryConfig
-from ldo_service.tracking.relocalization import ReturnConfig
+from ldo_service.tracking.relocalization import KeyframeReuseConfig
 
 
 def configured(after: int) -> TrackerConfig:
-    return TrackerConfig(odometry=OdometryConfig(returning=ReturnConfig(after=after)))
+    return TrackerConfig(odometry=OdometryConfig(returning=KeyframeReuseConfig(after=after)))
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +46,12 @@ def round_trip(
     [4, 4] the first half of them elsewhere; from one frame on it has but the last."""
     tracker = Tracker(configured(after))
     there = [out for frame in frames for out in tracker.handle(frame)]
-    T_map = {k.keyframe: transform(k.T_odom_keyframe) for k in there if isinstance(k, Keyframe)}
+    T_map = {
+        k.keyframe: pose_from_message(k.T_odom_keyframe) for k in there if isinstance(k, Keyframe)
+    }
     for keyframe in list(T_map)[: len(T_map) // 2] if bend is not None else ():
         T_map[keyframe] = bend @ T_map[keyframe]
-    assert list(tracker.handle(correction_message(0, 7, T_map))) == []
+    assert list(tracker.handle(correction_to_message(0, 7, T_map))) == []
     said = []
     for frame in back:
         if restarts:
@@ -58,7 +60,7 @@ def round_trip(
         said += tracker.handle(frame)
         if frame.frame == forgets_at:
             newest = max(T_map)
-            list(tracker.handle(correction_message(0, 8, {newest: T_map[newest]})))
+            list(tracker.handle(correction_to_message(0, 8, {newest: T_map[newest]})))
     poses = [out for out in said if isinstance(out, TrackedPose)]
     return tracker, poses, [out for out in said if isinstance(out, Keyframe)]
 
@@ -70,13 +72,15 @@ def test_on_the_way_back_one_keyframe_ties_the_new_to_the_known_and_no_more_are_
     tracker, poses, made = round_trip(1, frames, back)
     assert len(otherwise) > 4
     (tie,) = made
-    assert tracker.facts()["keyframes_returned_to"] > 2
-    T_odom = {k.keyframe: transform(k.T_odom_keyframe) for k in keyframes}
+    assert tracker.metrics()["keyframes_returned_to"] > 2
+    T_odom = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
     known = [m for m in tie.window if m.reference < (tie.reference or 0)]
     assert known
     for measured in known:
-        T_true = se3.inverse(T_odom[measured.reference]) @ transform(tie.T_odom_keyframe)
-        np.testing.assert_allclose(transform(measured.T_reference_keyframe), T_true, atol=3e-3)
+        T_true = se3.inverse(T_odom[measured.reference]) @ pose_from_message(tie.T_odom_keyframe)
+        np.testing.assert_allclose(
+            pose_from_message(measured.T_reference_keyframe), T_true, atol=3e-3
+        )
     references = [pose.reference for pose in poses]
     since = references[references.index(tie.keyframe) + 1 :]
     assert max(since) == tie.keyframe
@@ -85,7 +89,7 @@ def test_on_the_way_back_one_keyframe_ties_the_new_to_the_known_and_no_more_are_
     assert truth is not None
     T_map_world = se3.inverse(truth.T_world_camera[0])
     for pose, index in zip(poses, range(len(frames) - 2, -1, -1), strict=True):
-        T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+        T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
         error = se3.inverse(T_map_world @ truth.T_world_camera[index]) @ T_map_camera
         assert pose.status == "OK"
         assert np.linalg.norm(error[:3, 3]) < 3e-3
@@ -96,7 +100,7 @@ def test_odometry_does_not_jump_where_the_camera_returns(room: Sequence, frames,
     _, poses, _ = round_trip(1, frames, back)
     truth = room.truth()
     assert truth is not None
-    T_odom = [transform(pose.T_odom_camera) for pose in poses]
+    T_odom = [pose_from_message(pose.T_odom_camera) for pose in poses]
     T_world = [truth.T_world_camera[k] for k in range(len(frames) - 2, -1, -1)]
     for k in range(1, len(poses)):
         step = se3.inverse(T_odom[k - 1]) @ T_odom[k]
@@ -107,11 +111,11 @@ def test_odometry_does_not_jump_where_the_camera_returns(room: Sequence, frames,
 def test_a_pose_hangs_on_the_keyframe_that_the_map_has(frames, keyframes, back) -> None:
     """So a later correction moves what was tracked with it."""
     tracker, poses, made = round_trip(1, frames, back[:-2])
-    T_odom = {k.keyframe: transform(k.T_odom_keyframe) for k in (*keyframes, *made)}
+    T_odom = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in (*keyframes, *made)}
     assert_hang_on_keyframes(poses, T_odom)
     shift = se3.exp(np.array([0.0, 0.02, 0.0, 0.1, 0.0, 0.0]))
     T_map = {number: shift @ T for number, T in T_odom.items()}
-    assert list(tracker.handle(correction_message(0, 8, T_map))) == []
+    assert list(tracker.handle(correction_to_message(0, 8, T_map))) == []
     after = [out for frame in back[-2:] for out in tracker.handle(frame)]
     assert all(isinstance(out, TrackedPose) for out in after)
     assert_hang_on_keyframes(after, T_map)
@@ -120,8 +124,8 @@ def test_a_pose_hangs_on_the_keyframe_that_the_map_has(frames, keyframes, back) 
 def assert_hang_on_keyframes(poses: Many[TrackedPose], T_map: dict[int, np.ndarray]) -> None:
     for pose in poses:
         assert pose.reference is not None
-        T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
-        expected = T_map[pose.reference] @ transform(pose.T_reference_camera)
+        T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
+        expected = T_map[pose.reference] @ pose_from_message(pose.T_reference_camera)
         np.testing.assert_allclose(T_map_camera, expected, atol=1e-6)
 
 
@@ -148,18 +152,20 @@ def test_a_restart_after_each_frame_changes_nothing(frames, back) -> None:
 def test_without_room_nobody_is_tied_and_nobody_returns(frames, back) -> None:
     tracker = Tracker(configured(1))
     there = [out for frame in frames for out in tracker.handle(frame)]
-    T_map = {k.keyframe: transform(k.T_odom_keyframe) for k in there if isinstance(k, Keyframe)}
-    list(tracker.handle(correction_message(0, 7, T_map)))
-    tracker.situation = Situation(room={KEYFRAME_NEW: 0})
+    T_map = {
+        k.keyframe: pose_from_message(k.T_odom_keyframe) for k in there if isinstance(k, Keyframe)
+    }
+    list(tracker.handle(correction_to_message(0, 7, T_map)))
+    tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     poses = [out for frame in back[:12] for out in tracker.handle(frame)]
     assert all(isinstance(pose, TrackedPose) and pose.status == "OK" for pose in poses)
-    assert tracker.facts()["keyframes_returned_to"] == 0
+    assert tracker.metrics()["keyframes_returned_to"] == 0
 
 
 def test_without_a_map_nobody_returns(frames, back) -> None:
     tracker = Tracker(configured(1))
     said = [out for frame in [*frames, *back] for out in tracker.handle(frame)]
-    assert tracker.facts()["keyframes_returned_to"] == 0
+    assert tracker.metrics()["keyframes_returned_to"] == 0
     assert sum(isinstance(out, Keyframe) for out in said) > 8
 
 

@@ -14,7 +14,7 @@ from ldo_service.config import Config
 from ldo_service.config.network_settings import VlmLabellerSettings
 from ldo_service.detection.labellers import Opinion
 from ldo_service.detection.labellers.chat_completion import HttpConfig
-from ldo_service.detection.labellers.http_endpoint import EndpointConfig
+from ldo_service.detection.labellers.http_endpoint import HttpClientConfig
 from ldo_service.errors import ConfigError, EndpointError, ModelError, ReplayDiverged
 from ldo_service.geometry import codecs
 from ldo_service.runs.replayed import open_recording
@@ -22,7 +22,7 @@ from ldo_service.runtime import Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
-from ldo_service.schemas.labels import MOST_OTHERS
+from ldo_service.schemas.labels import MAX_ALTERNATIVES
 from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
 from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
@@ -100,7 +100,7 @@ class Scripted:
     def add(self, name: str) -> None:
         self.names = (*self.names, name)
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"names": len(self.names)}
 
 
@@ -112,7 +112,7 @@ def test_a_region_gets_its_name(pair: Path, names: Path) -> None:
     assert answer.label == "green"
     assert 0.9 < answer.confidence <= 1
     assert answer.labeller.startswith("colours ")
-    facts = actor.facts()
+    facts = actor.metrics()
     assert (facts["labellers"], facts["regions_named"], facts["names"]) == (1, 1, 2)
 
 
@@ -121,14 +121,16 @@ def test_it_tells_what_else_a_region_may_be() -> None:
     answer = only(VlmLabeller(labeller=Scripted(told)).handle(request()))
     assert (answer.label, answer.others) == ("cup", (("vase", 0.3), ("bowl", 0.1)))
     many = [(f"name {k}", 0.01) for k in range(99)]
-    assert len(only(VlmLabeller(labeller=Scripted(many)).handle(request())).others) == MOST_OTHERS
+    assert (
+        len(only(VlmLabeller(labeller=Scripted(many)).handle(request())).others) == MAX_ALTERNATIVES
+    )
 
 
 def test_without_a_labeller_it_idles_and_answers_at_once() -> None:
     actor = VlmLabeller()
     answer = only(actor.handle(request()))
     assert (answer.label, answer.confidence, answer.labeller) == ("", 0, "")
-    assert (actor.facts()["labellers"], actor.facts()["labellers_missing"]) == (0, 0)
+    assert (actor.metrics()["labellers"], actor.metrics()["labellers_missing"]) == (0, 0)
     assert "vlm_labeller.model" in added(actor, "teapot").refused
 
 
@@ -158,7 +160,7 @@ def test_a_labeller_that_cannot_be_used_is_said_once_and_the_service_goes_on(
         assert only(actor.handle(request())).labeller == ""
     (record,) = caplog.records
     assert record.levelno == logging.ERROR
-    assert actor.facts()["labellers_missing"] == 1
+    assert actor.metrics()["labellers_missing"] == 1
     with pytest.raises(ConfigError):
         require_labeller(VlmLabellerConfig(**config))
 
@@ -177,8 +179,8 @@ def test_failures_are_counted_and_told_once_until_it_works_again(caplog) -> None
     assert [answer.label for answer in answers] == ["cup", "", "", "cup", "cup"]
     assert [bool(answer.labeller) for answer in answers] == [True, False, False, True, True]
     assert len(caplog.records) == 2
-    assert actor.facts()["labellings_failed"] == 2
-    assert actor.facts()["labeller_failing"] == 0
+    assert actor.metrics()["labellings_failed"] == 2
+    assert actor.metrics()["labeller_failing"] == 0
 
 
 def test_a_crop_that_is_no_image_leaves_its_region_unnamed() -> None:
@@ -204,7 +206,7 @@ def test_whatever_a_server_does_nothing_is_mislabelled(
     tmp_path: Path, behaves, facts: dict[str, float]
 ) -> None:
     (tmp_path / "names.txt").write_text("cup\nvase\n")
-    quick = EndpointConfig(timeout_s=0.2, attempts=1, per_minute=1e9)
+    quick = HttpClientConfig(timeout_s=0.2, attempts=1, per_minute=1e9)
     with serving(behaves) as server:
         config = VlmLabellerConfig(
             url=server.url, names=str(tmp_path / "names.txt"), http=HttpConfig(endpoint=quick)
@@ -215,7 +217,7 @@ def test_whatever_a_server_does_nothing_is_mislabelled(
     assert (answer.label, answer.confidence) == (
         ("cup", pytest.approx(0.75)) if is_good else ("", 0)
     )
-    assert facts.items() <= actor.facts().items()
+    assert facts.items() <= actor.metrics().items()
 
 
 def test_a_model_and_a_server_are_one_too_many() -> None:
@@ -235,7 +237,7 @@ def test_a_name_that_is_added_is_found_and_survives_a_restart(pair: Path, names:
     for actor in (first, successor):
         assert only(actor.handle(request(color="blue"))).label == "blue"
     assert only(plain_one.handle(request(color="blue"))).confidence < 0.6
-    assert successor.facts()["names_added"] == 1
+    assert successor.metrics()["names_added"] == 1
 
 
 def test_a_name_that_cannot_be_placed_is_refused_and_later_remembered(
@@ -247,7 +249,7 @@ def test_a_name_that_cannot_be_placed_is_refused_and_later_remembered(
     answer = added(cached, "teapot")
     assert "--text and --vocabulary" in answer.refused
     assert answer.names == ("red", "green", "blue")
-    assert cached.facts()["names_refused"] == 1
+    assert cached.metrics()["names_refused"] == 1
     cached.restore({"added": ["teapot"]})
     assert "'teapot', added before, is left out" in caplog.text
     able = VlmLabeller(VlmLabellerConfig(model=str(pair)))

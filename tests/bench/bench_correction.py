@@ -15,12 +15,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ldo_service.conversions.poses import correction_message, keyframe_poses_of
+from ldo_service.conversions.poses import correction_to_message, keyframe_poses_from_correction
 from ldo_service.gaussians.model import GaussianMap, aligned_rows
-from ldo_service.gaussians.pruning import doubled
+from ldo_service.gaussians.pruning import find_duplicates
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
-from ldo_service.pose_graph.pose_graph import KeyframeGraph
+from ldo_service.pose_graph.pose_graph import PoseGraph
 from ldo_service.schemas import Correction, decode, encode
 from tests.pose_graph.walks import REFINED, between, odometry, round_trips
 
@@ -52,10 +52,10 @@ def measure_mapper(gaussians: int, keyframes: int, repeats: int) -> None:
 
     def correct(number: int) -> None:
         shift = se3.exp(rng.normal(size=6) * 0.01)
-        message = correction_message(0, number + 1, {k: shift @ T for k, T in T_map.items()})
+        message = correction_to_message(0, number + 1, {k: shift @ T for k, T in T_map.items()})
         body = encode(message)
         start = time.process_time()
-        received = keyframe_poses_of(decode(body, Correction))
+        received = keyframe_poses_from_correction(decode(body, Correction))
         before = poses.of(T_map)
         poses.correct(number + 1, received)
         T_new_old = poses.of(T_map) @ se3.inverse(before)
@@ -67,8 +67,10 @@ def measure_mapper(gaussians: int, keyframes: int, repeats: int) -> None:
         correct(number)
     print(f"correct and move   {np.median(took):7.1f} {max(took):7.1f}")
     newest = [keyframes - 1 - i for i in range(repeats)]
-    times = milliseconds(lambda i: doubled(world.rows, world.anchors, newest[i]), repeats)
-    share = np.mean(doubled(world.rows, world.anchors, newest[0])[world.anchors == newest[0]])
+    times = milliseconds(lambda i: find_duplicates(world.rows, world.anchors, newest[i]), repeats)
+    share = np.mean(
+        find_duplicates(world.rows, world.anchors, newest[0])[world.anchors == newest[0]]
+    )
     print(
         f"mend one keyframe  {np.median(times):7.1f} {max(times):7.1f}   {share:.0%} of it merged"
     )
@@ -93,31 +95,31 @@ def walls(gaussians: int, keyframes: int, rng: np.random.Generator) -> GaussianM
 def placed(keyframes: int) -> KeyframePoses:
     poses = KeyframePoses()
     for k in range(keyframes):
-        poses.chain(k, k - 1 if k else None, se3.exp(np.r_[np.zeros(5), 0.1]), np.eye(4))
+        poses.add(k, k - 1 if k else None, se3.exp(np.r_[np.zeros(5), 0.1]), np.eye(4))
     return poses
 
 
 # --- the optimizer --------------------------------------------------------------------------------
 def measure_journey(keyframes: int) -> None:
     truth = round_trips(keyframes, 180)
-    graph, receiver, version = KeyframeGraph(), KeyframePoses(), 0
+    graph, receiver, version = PoseGraph(), KeyframePoses(), 0
     graph.add_first(0, truth[0])
-    receiver.chain(0, None, np.eye(4), truth[0])
+    receiver.add(0, None, np.eye(4), truth[0])
     keyframe_ms, closure_ms, take_ms, size_kb = [], [], [], 0.0
     for measured in odometry(truth, 0, window=3, drift_share=0.005, drift_rad_per_m=0.004):
         b, version = measured[0].b, version + 1
-        receiver.chain(b, b - 1, measured[0].T_a_b, truth[b])
+        receiver.add(b, b - 1, measured[0].T_a_b, truth[b])
         start = time.process_time()
         graph.add(*measured)
-        body = encode(correction_message(0, version, graph.poses()))
+        body = encode(correction_to_message(0, version, graph.poses()))
         keyframe_ms.append(1e3 * (time.process_time() - start))
         if b % 60 == 0 and b > 180:
             start = time.process_time()
-            graph.close(RelativePose(b - 180, b, between(truth, b - 180, b), REFINED))
+            graph.add_loop_closure(RelativePose(b - 180, b, between(truth, b - 180, b), REFINED))
             closure_ms.append(1e3 * (time.process_time() - start))
         if b % 20 == 0 or b % EVERY > EVERY - 5:
             start = time.process_time()
-            receiver.correct(version, keyframe_poses_of(decode(body, Correction)))
+            receiver.correct(version, keyframe_poses_from_correction(decode(body, Correction)))
             take_ms.append(1e3 * (time.process_time() - start))
             size_kb = len(body) / 1e3
         if b in (EVERY, 1000, 2000, 5000, keyframes - 1):

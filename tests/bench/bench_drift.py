@@ -22,15 +22,15 @@ import numpy as np
 
 from ldo_service.actors.topology import make_actors
 from ldo_service.config import Config, actor_parameters, load_config
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.evaluation.views import Judged, evaluate_rendering
+from ldo_service.evaluation.views import EvaluatedFrames, evaluate_rendering
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
-from ldo_service.runs.job import Job
-from ldo_service.runs.offline import run_over_file, with_all_cores
+from ldo_service.runs.job import RunOptions
+from ldo_service.runs.offline import run_offline, with_all_cores
 from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, Message, TrackedPose
@@ -57,7 +57,7 @@ class Watched:
             if isinstance(message, Correction):
                 self.pauses_ms.append(1e3 * (time.thread_time() - start_s))
             self.odometry += [
-                (1e-9 * pose.stamp_ns, transform(pose.T_odom_camera))
+                (1e-9 * pose.stamp_ns, pose_from_message(pose.T_odom_camera))
                 for pose in made
                 if isinstance(pose, TrackedPose) and pose.status != "LOST"
             ]
@@ -75,19 +75,21 @@ def row(sequence: Sequence, config: Config, drift: Drift, folder: Path) -> str:
     tracker, *others = [Watched(actors[name]) for name in ("tracker", "loop_closer", "mapper")]
     prepare(folder, overwrite=False)
     with standing_in(*actors.values()):
-        record = run_over_file(Job(sequence, folder, config, Selection(), print), lambda *_: None)
+        record = run_offline(
+            RunOptions(sequence, folder, config, Selection(), print), lambda *_: None
+        )
     odometry = Trajectory(*map(np.array, zip(*tracker.odometry, strict=True)))
     run = read_run(folder)
     tracks = (odometry, run.estimates["online"], run.estimates["final"])
     truth = sequence.truth()
     assert truth is not None, f"{sequence.name} has no ground truth"
     ate_cm = [100 * evaluate_trajectory(track, truth).ate_m.rmse for track in tracks]
-    held_out = Judged(Judged.of(run.frames).held_out, ())
+    held_out = EvaluatedFrames(EvaluatedFrames.of(run.frames).held_out, ())
     rendered = evaluate_rendering(
         sequence, held_out, run.maps, lambda _: None, threads=os.cpu_count() or 1
     )
     pauses = [f"{max(watched.pauses_ms):.0f}" for watched in (tracker, *others)]
-    awake = actors["mapper"].facts()["gaussians"]
+    awake = actors["mapper"].metrics()["gaussians"]
     return (
         f"{' | '.join(f'{cm:.2f}' for cm in ate_cm)} | {record.loops.accepted} | "
         f"{rendered[0].mean('psnr_db'):.2f} | {' | '.join(pauses)} | {awake:,.0f} |"

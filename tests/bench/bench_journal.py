@@ -14,7 +14,7 @@ import numpy as np
 from ldo_service.recordings.mcap_file import RecordConfig
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.runtime import In, Latest
-from ldo_service.runtime.actor import Situation
+from ldo_service.runtime.actor import FlowStatus
 from ldo_service.runtime.inlet import Delivery
 from ldo_service.runtime.step import Produced
 from ldo_service.schemas import Array, CameraModel, FrameRgbd, encode
@@ -46,8 +46,8 @@ def main(folder: Path) -> None:
         body = bodies[i % 8]
         delivery = Delivery(In(FRAME_RGBD, Latest(1)), Header("camera", 1, i, i), memoryview(body))
         started_s = time.perf_counter()
-        recorder.took(delivery, i)
-        recorder.stepped("done", Situation(), [Produced(FRAME_RGBD, messages[i % 8], body)])
+        recorder.record_input(delivery, i)
+        recorder.record_step("done", FlowStatus(), [Produced(FRAME_RGBD, messages[i % 8], body)])
         loop_s += time.perf_counter() - started_s
         time.sleep(1 / 60)  # the loop has other work, at twice the rate of a camera
     recorder.close().result()

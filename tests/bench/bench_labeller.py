@@ -28,13 +28,13 @@ import msgspec
 import numpy as np
 import zenoh
 
-from ldo_service.conversions.frames import camera_rgbd_message
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.frames import raw_frame_to_message
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
 from ldo_service.schemas import CameraRgbd, TrackedPose, decode
 from ldo_service.synthetic.flat import FlatSequence
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.detection.labellers.server import serving
 from tests.service.conftest import LiveService, live_service
@@ -108,7 +108,7 @@ class Scene:
     @staticmethod
     def of(part: range) -> "Scene":
         sequence, order = flat(), [*part, *part[-2:0:-1]]
-        messages = {index: camera_rgbd_message(sequence.read(index)) for index in part}
+        messages = {index: raw_frame_to_message(sequence.read(index)) for index in part}
         return Scene(sequence, order, [messages[index] for index in order])
 
     def truth(self, frames: list[int], stamps_s: np.ndarray) -> Trajectory:
@@ -130,7 +130,7 @@ class Outcome:
 
     def T_odom_camera(self) -> dict[int, np.ndarray]:
         """By frame."""
-        return {pose.frame: transform(pose.T_odom_camera) for pose in self.live.heard.poses}
+        return {pose.frame: pose_from_message(pose.T_odom_camera) for pose in self.live.heard.poses}
 
     def row(self, alone: "Outcome") -> str:
         poses = [p for p in self.live.heard.poses if p.status == "OK" and p.segment == 0]
@@ -138,7 +138,9 @@ class Outcome:
         p50, p95 = np.percentile(self.live.latencies_ms(), (50, 95))
         rate = f"{len(poses) / self.seconds:.1f}"
         frames, stamps_s = [p.frame for p in poses], np.array([1e-9 * p.stamp_ns for p in poses])
-        T_map = np.array([transform(p.T_map_odom) @ transform(p.T_odom_camera) for p in poses])
+        T_map = np.array(
+            [pose_from_message(p.T_map_odom) @ pose_from_message(p.T_odom_camera) for p in poses]
+        )
         truth = self.scene.truth(frames, stamps_s)
         ate_m = evaluate_trajectory(Trajectory(stamps_s, T_map), truth).ate_m.rmse
         cells = [who, f"{self.rate_hz:g}", rate, f"{p50:.0f}", f"{p95:.0f}", str(self.dropped)]
@@ -180,7 +182,7 @@ def measured(
         service: LiveService = stack.enter_context(live_service(folder, *words))
         service.wait_for_actors()
         live = Live(Heard(service, stack, guide))
-        session = stack.enter_context(open_session(Network("robot", service.endpoint)))
+        session = stack.enter_context(open_session(Endpoint("robot", service.endpoint)))
         handler = zenoh.handlers.Callback(live.arrived, indirect=False)
         stack.enter_context(session.declare_subscriber("ldo/robot/pose/tracked", handler))
         Camera(live, scene.tape, rate_hz).stream_for(seconds)

@@ -34,32 +34,32 @@ from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.evaluation.label_lists import VOID, coco_list, is_void
 from ldo_service.evaluation.label_measures import Correspondences, correspondences
 from ldo_service.evaluation.label_results import LabelPicture, label_sheet
-from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelJudge, LabelView
+from ldo_service.evaluation.semantics import APART, GATES, LabelErrors, LabelEvaluator, LabelView
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.sequence import FrameLabels, TrueLabels
 from ldo_service.regions.foreground import (
-    Claims,
     ForegroundConfig,
+    RegionDetections,
     Surfaces,
     foreground,
     pixels_of,
     surfaces,
 )
-from ldo_service.regions.region_proposals import TriggerConfig
+from ldo_service.regions.region_proposals import RegionProposalConfig
 from ldo_service.runs.source import open_source
 from ldo_service.semantics.gaussian_labels import BACKGROUND, LabelConfig, new_labels, top_labels
 from ldo_service.semantics.label_assignment import AssignmentConfig
 from ldo_service.semantics.semantic_fusion import (
     FusionConfig,
-    LabellingConfig,
+    SemanticFusionConfig,
     label_image,
     label_keyframe,
 )
 
 NETWORKS = {"YOLOX-Nano": "yolox_nano.onnx", "YOLOv5n": "yolov5n_480x640_w16.onnx"}
-TRUE_BOXES, LEAST_SHARE = "true boxes", 0.005
+TRUE_BOXES, MIN_SHARE = "true boxes", 0.005
 DEFAULT = "foreground coverage corrected"
 
 
@@ -95,24 +95,26 @@ class Scene:
 
 
 # --- what is claimed ------------------------------------------------------------------------------
-def detected(scene: Scene, model: str) -> list[Claims]:
+def detected(scene: Scene, model: str) -> list[RegionDetections]:
     network = open_detector(model, NetworkConfig())
     index = np.array([scene.vocabulary.index(name) for name in network.labels])
-    found = [network.find(frame.color) for frame in scene.frames]
+    found = [network.detect(frame.color) for frame in scene.frames]
     return [
-        Claims.of_detector(f.boxes_px, index[f.class_ids], f.scores.astype(np.float32))
+        RegionDetections.of_detector(f.boxes_px, index[f.class_ids], f.scores.astype(np.float32))
         for f in found
     ]
 
 
-def true_boxes(scene: Scene) -> list[Claims]:
+def true_boxes(scene: Scene) -> list[RegionDetections]:
     labels = coco_list(scene.truth.class_names)
     table = labels.of_truth(scene.truth.class_names)
     frames = map(scene.truth.frame, range(len(scene.frames)))
     return [_boxes_of(frame, table[frame.class_ids], labels.names, scene) for frame in frames]
 
 
-def _boxes_of(frame: FrameLabels, truth: np.ndarray, names: tuple[str, ...], s: Scene) -> Claims:
+def _boxes_of(
+    frame: FrameLabels, truth: np.ndarray, names: tuple[str, ...], s: Scene
+) -> RegionDetections:
     boxes, labels = [], []
     for instance in np.flatnonzero(np.bincount(frame.instance_ids.ravel()) >= _least(truth)):
         mask = frame.instance_ids == instance
@@ -122,14 +124,16 @@ def _boxes_of(frame: FrameLabels, truth: np.ndarray, names: tuple[str, ...], s: 
             boxes.append([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
             labels.append(s.vocabulary.index(names[label]))
     ones = np.ones(len(boxes), np.float32)
-    return Claims.of_detector(np.reshape(boxes, (-1, 4)), np.array(labels, int), ones)
+    return RegionDetections.of_detector(np.reshape(boxes, (-1, 4)), np.array(labels, int), ones)
 
 
 def _least(image: np.ndarray) -> float:
-    return LEAST_SHARE * image.size
+    return MIN_SHARE * image.size
 
 
-def asked(scene: Scene, claims: list[Claims], reliability: float) -> list[Claims]:
+def asked(
+    scene: Scene, claims: list[RegionDetections], reliability: float
+) -> list[RegionDetections]:
     """With the answers of the oracle to what the detector is unsure of."""
     rng, names = np.random.default_rng(0), scene.truth.class_names
     usable = [k for k, name in enumerate(names) if not is_void(name)]
@@ -138,7 +142,7 @@ def asked(scene: Scene, claims: list[Claims], reliability: float) -> list[Claims
         shown = scene.truth.frame(k).class_ids
         labels, sure = said.labels.copy(), np.zeros(len(said.boxes), np.float32)
         found = surfaces(frame.depth_m, frame.camera, ForegroundConfig())
-        for i in np.flatnonzero(said.confidences < TriggerConfig().sure):
+        for i in np.flatnonzero(said.confidences < RegionProposalConfig().sure):
             mask = region(said.boxes[i], frame, found)
             true = np.bincount(shown[mask], minlength=len(names))[usable]
             right, wrong = usable[int(true.argmax())], usable[rng.integers(len(usable))]
@@ -159,13 +163,13 @@ def region(box: np.ndarray, frame: RgbdFrame, found: Surfaces) -> np.ndarray:
 
 
 # --- runs -----------------------------------------------------------------------------------------
-def variants() -> dict[str, LabellingConfig]:
+def variants() -> dict[str, SemanticFusionConfig]:
     out = {}
     for area in ("foreground", "box"):
         for rule in ("coverage", "iou"):
             for ema in ("corrected", "paper"):
                 labels = LabelConfig(ema=ema, hold_back=0.0 if ema == "paper" else 1.0)
-                out[f"{area} {rule} {ema}"] = LabellingConfig(
+                out[f"{area} {rule} {ema}"] = SemanticFusionConfig(
                     region=area, assignment=AssignmentConfig(rule), labels=labels
                 )
     return out
@@ -174,7 +178,9 @@ def variants() -> dict[str, LabellingConfig]:
 class Follower:
     """Labels of a map that grows and loses Gaussians."""
 
-    def __init__(self, name: str, what: str, claims: list[Claims], config: LabellingConfig) -> None:
+    def __init__(
+        self, name: str, what: str, claims: list[RegionDetections], config: SemanticFusionConfig
+    ) -> None:
         self.name, self.what, self.claims, self.config = name, what, claims, config
         self.labels, self._ids = new_labels(0), np.zeros(0, np.int64)
 
@@ -190,7 +196,7 @@ class Follower:
 
 
 def followers(
-    scene: Scene, claims: dict[str, list[Claims]], only: str, reliability: float | None
+    scene: Scene, claims: dict[str, list[RegionDetections]], only: str, reliability: float | None
 ) -> Iterator[Follower]:
     for name, said in claims.items():
         for what, config in variants().items():
@@ -201,7 +207,7 @@ def followers(
             calls = np.mean([np.any(c.open_confidences > 0) for c in answered])
             print(f"{name}: the oracle is asked on {calls:.0%} of the frames")
             for rule in ("fixed", "adaptive"):
-                config = LabellingConfig(fusion=FusionConfig(rule=rule))
+                config = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
                 yield Follower(name, f"{DEFAULT}, {rule} fusion", answered, config)
 
 
@@ -210,7 +216,7 @@ def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
     for k in range(0, len(scene.frames), 2):
         frame, T = scene.frames[k], scene.T_map_camera[k]
         builder.add(frame, T, k, iterations)
-        shown = builder.seen_from(frame.camera, T, contributions=True)
+        shown = builder.render_from(frame.camera, T, contributions=True)
         assert shown.contributions is not None
         indices, gaussians = shown.contributions.indices, builder.gaussians
         for run in runs:
@@ -220,7 +226,7 @@ def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
     return builder
 
 
-def painted(claims: Claims, frame: RgbdFrame, area: str) -> np.ndarray:
+def painted(claims: RegionDetections, frame: RgbdFrame, area: str) -> np.ndarray:
     """The regions of one frame, the surest on top."""
     image, config = np.zeros(frame.depth_m.shape, np.uint8), ForegroundConfig()
     found = surfaces(frame.depth_m, frame.camera, config) if area == "foreground" else None
@@ -256,7 +262,7 @@ class Report:
 
     def _errors(self, image: Callable[[int], np.ndarray]) -> LabelErrors:
         scene, images = self._scene, {}
-        judge = LabelJudge(scene.vocabulary.names, scene.truth.class_names)
+        judge = LabelEvaluator(scene.vocabulary.names, scene.truth.class_names)
         for k, frame in enumerate(scene.frames):
             images[k] = image(k)
             judge.see(LabelView(frame, scene.truth.frame(k), images[k]))
@@ -287,7 +293,8 @@ def top_image(labels: np.ndarray, shown: Rendering) -> np.ndarray:
 def judge_all(scene: Scene, runs: list[Follower], builder: MapBuilder, report: Report) -> None:
     frames, T = scene.frames, scene.T_map_camera
     shown: list[Rendering] = [
-        builder.seen_from(frame.camera, T[k], contributions=True) for k, frame in enumerate(frames)
+        builder.render_from(frame.camera, T[k], contributions=True)
+        for k, frame in enumerate(frames)
     ]
     rows = builder.gaussians.rows
     for run in sorted(runs, key=lambda run: run.what != DEFAULT):

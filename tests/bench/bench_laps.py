@@ -22,8 +22,8 @@ import numpy as np
 from ldo_service.actors.mapper import Mapper, MapperConfig, Output
 from ldo_service.actors.topology import make_actors
 from ldo_service.config import actor_parameters, latency_frames, load_config
-from ldo_service.conversions.frames import camera_rgbd_message
-from ldo_service.conversions.poses import pose_message
+from ldo_service.conversions.frames import raw_frame_to_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.pictures import save_picture
 from ldo_service.runs.source import open_source
@@ -93,11 +93,11 @@ class TimedMapper(Mapper):
     def _placed(self, keyframe: Keyframe) -> Keyframe:
         if self._T_world_camera is None:
             return keyframe
-        truth = pose_message(self._T_world_camera[keyframe.frame % self._frames_per_lap])
+        truth = pose_to_message(self._T_world_camera[keyframe.frame % self._frames_per_lap])
         return msgspec.structs.replace(keyframe, reference=None, T_odom_keyframe=truth)
 
     def _note(self, keyframe: Keyframe, cpu_ms: float) -> None:
-        facts = self.facts()
+        facts = self.metrics()
         self.mapped.append(
             Mapped(
                 keyframe=keyframe.keyframe,
@@ -125,7 +125,7 @@ def laps_of(sequence: Sequence, laps: int, stride: int) -> Iterator[CameraRgbd]:
             raw = sequence.read(index)
             frame = lap * len(indices) + place
             raw = replace(raw, index=frame, stamp_ns=raw.stamp_ns + lap * lap_ns)
-            yield camera_rgbd_message(raw, compress_depth=False)
+            yield raw_frame_to_message(raw, compress_depth=False)
 
 
 def plot(mapped: list[Mapped]) -> np.ndarray:

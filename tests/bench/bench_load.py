@@ -34,7 +34,7 @@ import zenoh
 from ldo_service.client import Client, connect
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import CameraRgbd, Health, TrackedPose, decode
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.faults.camera import frames
 from tests.ports import free_endpoint
@@ -122,7 +122,7 @@ class Camera:
 # --- the company ----------------------------------------------------------------------------------
 @contextmanager
 def robots_on(
-    network: Network, count: int, folder: Path, settings: tuple[str, ...]
+    network: Endpoint, count: int, folder: Path, settings: tuple[str, ...]
 ) -> Iterator[list[Robot]]:
     with ExitStack() as stack:
         endpoint = network.endpoint
@@ -146,7 +146,7 @@ def _robot(
     )
     stack.callback(_end, process)
     robot = Robot(name, process, stack.enter_context(connect(name, endpoint)))
-    session = stack.enter_context(open_session(Network(name, endpoint)))
+    session = stack.enter_context(open_session(Endpoint(name, endpoint)))
     for topic, heard in (("pose/tracked", robot.heard), ("health/*", robot.reported)):
         handler = zenoh.handlers.Callback(heard, indirect=False)
         stack.enter_context(session.declare_subscriber(f"ldo/{name}/{topic}", handler))
@@ -224,7 +224,7 @@ def loaded(
     scene: list[CameraRgbd],
 ) -> Outcome:
     with ExitStack() as stack:
-        network = Network("router", free_endpoint())
+        network = Endpoint("router", free_endpoint())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="load-")))
         stack.enter_context(open_session(network, router=True))
         robots = stack.enter_context(robots_on(network, count, folder, settings))

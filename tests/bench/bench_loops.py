@@ -29,13 +29,13 @@ from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
 from ldo_service.config import actor_parameters, latency_frames, load_config
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.loops import (
+    ComparedPair,
     FoundLoops,
     LoopClosed,
     LoopErrors,
-    PairCompared,
     SeenKeyframe,
     evaluate_loops,
     seen_keyframes,
@@ -43,13 +43,13 @@ from ldo_service.evaluation.loops import (
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.loop_closing import LoopsConfig
-from ldo_service.loop_closing.consistency_check import Plausibility, PlausibilityConfig
+from ldo_service.loop_closing.consistency_check import ConsistencyCheckConfig, ConsistencyChecker
 from ldo_service.loop_closing.object_points import LAYOUT_WORDS
-from ldo_service.loop_closing.place_database import Memory, RetrievalConfig, Stages
-from ldo_service.runs.source import Reader, Selection
+from ldo_service.loop_closing.place_database import PlaceDatabase, RetrievalConfig, Stages
+from ldo_service.runs.source import FrameReader, Selection
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopClosure, Message
-from ldo_service.semantics.gaussian_labels import MOST_LABELS
+from ldo_service.semantics.gaussian_labels import MAX_LABELS
 
 SUBGRAPHS = 1000
 Taken = Keyframe | DetectionBoxes | Correction  # by the loop closer
@@ -60,16 +60,16 @@ def coarse_ms(repeats: int = 20) -> float:
     """CPU time of one search among 1000 subgraphs, in the median."""
     rng = np.random.default_rng(0)
     config, poses = LoopsConfig(), KeyframePoses()
-    memory = Memory(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
+    memory = PlaceDatabase(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
 
     def subgraph(number: int) -> Any:
         place = SimpleNamespace(segment=0, median_depth_m=2.0)
-        poses.chain(number, None, np.eye(4), se3.exp(rng.normal(size=6)))
+        poses.add(number, None, np.eye(4), se3.exp(rng.normal(size=6)))
         return SimpleNamespace(
             views=[SimpleNamespace(keyframe=number, place=place, path_m=float(number))],
             first_frame=20 * number,
             last_frame=20 * number + 15,
-            names=rng.poisson(0.02, MOST_LABELS).astype(np.float32),
+            names=rng.poisson(0.02, MAX_LABELS).astype(np.float32),
             layout=rng.poisson(0.05, LAYOUT_WORDS).astype(np.float32),
             words=rng.poisson(2.0, config.words.count).astype(np.float32),
         )
@@ -79,9 +79,11 @@ def coarse_ms(repeats: int = 20) -> float:
     new, times_ms = subgraph(SUBGRAPHS + 100), []
     for _ in range(repeats):
         start_s = time.process_time()
-        plausible = Plausibility(poses, {}, PlausibilityConfig())
-        is_possible = plausible.may_meet([old.views[0] for old in memory.subgraphs], new.views[0])
-        assert memory.alike(new, is_possible)
+        plausible = ConsistencyChecker(poses, {}, ConsistencyCheckConfig())
+        is_possible = plausible.possible_matches(
+            [old.views[0] for old in memory.subgraphs], new.views[0]
+        )
+        assert memory.query(new, is_possible)
         times_ms.append(1e3 * (time.process_time() - start_s))
     return float(np.median(times_ms))
 
@@ -103,7 +105,7 @@ def tracked(sequence: Sequence, model: str) -> list[Taken]:
             taken.append(message)
 
     with LogicalClock(actors, latency_frames(config), observe) as clock:
-        for _ in clock.run(Reader(sequence, Selection().indices(sequence), print)):
+        for _ in clock.run(FrameReader(sequence, Selection().indices(sequence), print)):
             pass
     return taken
 
@@ -111,18 +113,18 @@ def tracked(sequence: Sequence, model: str) -> list[Taken]:
 def closed(messages: list[Taken], seen: dict[int, SeenKeyframe], stages: Stages) -> LoopErrors:
     actor = LoopCloser(LoopCloserConfig(loops=LoopsConfig(stages=stages)))
     candidates, closures = [], []
-    for step in (*(partial(actor.handle, message) for message in messages), actor.finish):
+    for step in (*(partial(actor.handle, message) for message in messages), actor.on_stop):
         start_s = time.process_time()
         said = list(step())
         ms = 1e3 * (time.process_time() - start_s)
         compared = [one for one in said if not isinstance(one, LoopClosure)]
         closures += [one for one in said if isinstance(one, LoopClosure)]
         candidates += [
-            PairCompared(one.keyframes, one.references, not one.refused, ms / len(compared))
+            ComparedPair(one.keyframes, one.references, not one.refused, ms / len(compared))
             for one in compared
         ]
     poses = [
-        LoopClosed(p.keyframe, p.reference, transform(p.T_reference_keyframe))
+        LoopClosed(p.keyframe, p.reference, pose_from_message(p.T_reference_keyframe))
         for p in (closure.pose for closure in closures)
     ]
     return evaluate_loops(FoundLoops(tuple(candidates), tuple(poses)), seen)

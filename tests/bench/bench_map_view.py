@@ -22,11 +22,11 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.gaussians.renderer import Rendering
 from ldo_service.geometry import RgbdFrame, Trajectory
-from ldo_service.tracking import Odometry, OdometryConfig, Status
+from ldo_service.tracking import Odometry, OdometryConfig, TrackingStatus
 from ldo_service.tracking.tracking_result import TrackedFrame
 from ldo_service.tracking.window import WindowConfig
 
-LEAST_OPACITY, NEAR = 0.9, 0.03  # NEAR: share of the depth
+MIN_OPACITY, NEAR = 0.9, 0.03  # NEAR: share of the depth
 ITERATIONS = 10  # of the mapper, per keyframe
 MODELS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray] | None] = {
     "sensor": None,
@@ -62,7 +62,7 @@ class MapViewOdometry(Odometry):
     def _as_mapped(self, frame: RgbdFrame, tracked: TrackedFrame) -> RgbdFrame:
         if self._mix is None:
             return frame
-        seen = self._builder.seen_from(frame.camera, tracked.T_odom_camera)
+        seen = self._builder.render_from(frame.camera, tracked.T_odom_camera)
         mixed = self._mix(seen.median_depth_m, frame.depth_m)
         depth_m = np.where(_agrees(seen, frame), mixed, frame.depth_m)
         return replace(frame, depth_m=depth_m.astype(np.float32))
@@ -71,7 +71,7 @@ class MapViewOdometry(Odometry):
 def _agrees(seen: Rendering, frame: RgbdFrame) -> np.ndarray:
     """[H, W] bool: where the map is opaque and shows the surface that the sensor measured."""
     apart_m = np.abs(seen.median_depth_m - frame.depth_m)
-    return (seen.opacity > LEAST_OPACITY) & (frame.depth_m > 0) & (apart_m < NEAR * frame.depth_m)
+    return (seen.opacity > MIN_OPACITY) & (frame.depth_m > 0) & (apart_m < NEAR * frame.depth_m)
 
 
 def row(sequence: Sequence, frames: int, model: str) -> str:
@@ -82,7 +82,7 @@ def row(sequence: Sequence, frames: int, model: str) -> str:
     for index in range(frames):
         result = odometry.process(sequence[index])
         poses.append(result.T_odom_camera)
-        trusted += result.status is Status.OK
+        trusted += result.status is TrackingStatus.OK
     stamps_s = sequence.stamps_ns[:frames] * 1e-9
     ate_m = evaluate_trajectory(Trajectory(stamps_s, np.array(poses)), truth).ate_m.rmse
     return f"| {sequence.name} | {frames} | {model} | {100 * ate_m:.2f} | {trusted / frames:.1%} |"

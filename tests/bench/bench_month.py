@@ -29,7 +29,7 @@ from ldo_service.actors.topology import make_actors
 from ldo_service.config import actor_parameters, latency_frames, load_config
 from ldo_service.runtime import Actor
 from ldo_service.runtime.logical_clock import LogicalClock
-from ldo_service.runtime.process import give_back_free_memory, resident_mb
+from ldo_service.runtime.process import resident_mb, trim_memory
 from ldo_service.schemas import CameraRgbd, Keyframe, Message
 from ldo_service.storage.state_codec import encode_state
 from tests.faults.camera import PERIOD_NS, frames
@@ -37,7 +37,7 @@ from tests.faults.camera import PERIOD_NS, frames
 LIGHT = ("mapper.iterations=2", "mapper.threads=1")
 SHARED = (type, ModuleType, FunctionType, MethodType)  # belong to no actor
 DEEP = 4  # attributes in a name
-LEAST_BYTES = 1.0  # per keyframe, to be told
+MIN_BYTES = 1.0  # per keyframe, to be told
 
 
 class Mallinfo2(ctypes.Structure):
@@ -142,7 +142,7 @@ def keep_state(actor: Actor) -> None:
     def handled(message: Message) -> Iterator[Message]:
         yield from handle(message)
         actor.snapshot()
-        actor.saved()
+        actor.on_saved()
 
     actor.handle = handled
 
@@ -150,7 +150,7 @@ def keep_state(actor: Actor) -> None:
 def sample(actors: list[Actor], keyframes: int) -> Sample:
     saved = {actor.name: len(encode_state(actor.snapshot())) for actor in actors}
     gc.collect()
-    give_back_free_memory()
+    trim_memory()
     return Sample(keyframes, held_by(actors), saved, 1e6 * resident_mb(), *allocated())
 
 
@@ -178,7 +178,7 @@ def report(samples: list[Sample]) -> None:
     unit, held, saved, resident = growth(samples)
     print(f"| held by | bytes per {unit} | kB now |\n|---|---|---|")
     for path, slope in sorted(held.items(), key=lambda item: -item[1]):
-        if slope >= LEAST_BYTES:
+        if slope >= MIN_BYTES:
             print(f"| {path} | {slope:.0f} | {samples[-1].held[path] / 1e3:.0f} |")
     for actor, slope in saved.items():
         mine = sum(s for path, s in held.items() if path.split(".")[0] == actor)

@@ -5,8 +5,8 @@
 Rooms in a row, each with a wall and `in-view` things of 400 Gaussians; every thing is an object.
 Then the first room is seen again, with `regions` of its things detected; all objects are derived
 anew, as after a correction, and told. CPU ms of this thread, the
-median and the least; `assign` of the same Gaussians is measured beside it, to compare with
-where other work slows both. The search is for a class of COCO in the 1000 objects.
+median and the least; `assign_gaussians` of the same Gaussians is measured beside it, to compare
+with where other work slows both. The search is for a class of COCO in the 1000 objects.
 """
 
 import argparse
@@ -19,11 +19,11 @@ import numpy as np
 from ldo_service.detection.vocabulary import COCO, Vocabulary
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera, se3
-from ldo_service.maps.publisher import ObjectsTeller
+from ldo_service.maps.publisher import ObjectPublisher
 from ldo_service.schemas import encode
 from ldo_service.semantics.data_association import MapView
 from ldo_service.semantics.gaussian_labels import fields, new_labels
-from ldo_service.semantics.label_assignment import AssignmentConfig, Regions, assign
+from ldo_service.semantics.label_assignment import AssignmentConfig, Regions, assign_gaussians
 from ldo_service.semantics.objects import Objects
 from ldo_service.semantics.text_search import search
 
@@ -96,7 +96,10 @@ def main() -> None:
     print(f"{len(objects)} objects, {len(view.indices)} Gaussians in view; ms, median and least")
     depth, regions = view.depth_m, Regions.of_boxes(view.boxes, np.ones(len(view.boxes)))
     look = rooms.rows, view.indices, CAMERA, se3.inverse(view.T_map_camera), depth, regions
-    print("assign ", milliseconds(lambda _: assign(*look, AssignmentConfig()), given.repeats))
+    print(
+        "assign ",
+        milliseconds(lambda _: assign_gaussians(*look, AssignmentConfig()), given.repeats),
+    )
 
     def observe(number: int) -> None:
         objects.observe(replace(view, keyframe=keyframe + number))
@@ -106,17 +109,17 @@ def main() -> None:
     print("refresh", milliseconds(lambda _: objects.refresh(*known), given.repeats))
     names = Vocabulary().names
     told = milliseconds(
-        lambda _: encode(ObjectsTeller().message(objects, names, 0, 0, 0)), given.repeats
+        lambda _: encode(ObjectPublisher().message(objects, names, 0, 0, 0)), given.repeats
     )
     print("tell   ", told)
-    teller = ObjectsTeller()
+    teller = ObjectPublisher()
 
     def observe_and_tell(number: int) -> None:
         observe(given.repeats + number)
         encode(teller.message(objects, names, 0, 0, 0))
 
     print("observe and tell", milliseconds(observe_and_tell, given.repeats))
-    found = ObjectsTeller().message(objects, names, 0, 0, 0).objects
+    found = ObjectPublisher().message(objects, names, 0, 0, 0).objects
     print("search ", milliseconds(lambda n: search(COCO[n], _named(found)), given.repeats))
 
 

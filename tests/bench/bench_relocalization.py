@@ -22,15 +22,15 @@ import numpy as np
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import Odometry, OdometryConfig, pyramid_of
-from ldo_service.tracking.keyframe_database import Places, place_of
+from ldo_service.tracking.keyframe_database import KeyframeDatabase, make_keyframe_record
 from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig
-from ldo_service.tracking.relocalization import Relocaliser
-from ldo_service.tracking.tracking_quality import History
+from ldo_service.tracking.relocalization import Relocalizer
+from ldo_service.tracking.tracking_quality import ResidualHistory
 
 APART_FRAMES = 30
 RIGHT_M, RIGHT_RAD = 0.10, float(np.radians(5.0))
 CONFIG = OdometryConfig()
-SEARCH = Relocaliser(
+SEARCH = Relocalizer(
     CONFIG.pyramid, CONFIG.align, CONFIG.features, CONFIG.judgement, CONFIG.relocalisation
 )
 
@@ -40,11 +40,13 @@ class Mapped:
     """A sequence with the places along it, whose ids are frame indices."""
 
     sequence: Sequence
-    places: Places
-    history: History
+    places: KeyframeDatabase
+    history: ResidualHistory
 
-    def apart_from(self, frame: int) -> Places:
-        return Places(tuple(p for p in self.places.all if abs(p.id - frame) > APART_FRAMES))
+    def apart_from(self, frame: int) -> KeyframeDatabase:
+        return KeyframeDatabase(
+            tuple(p for p in self.places.all if abs(p.id - frame) > APART_FRAMES)
+        )
 
 
 @dataclass
@@ -71,17 +73,25 @@ class Tally:
 
 def mapped(source: str) -> Mapped:
     references_only = replace(CONFIG, keyframes=KeyframeConfig(supporting=2.0))
-    sequence, odometry, places = open_sequence(source), Odometry(references_only), Places()
+    sequence, odometry, places = (
+        open_sequence(source),
+        Odometry(references_only),
+        KeyframeDatabase(),
+    )
     for frame in sequence:
         result = odometry.process(frame)
         if result.keyframe is not None:
             view = pyramid_of(frame, CONFIG.pyramid)
             keyframe = Keyframe(view, result.T_odom_camera, frame.index)
-            places = places.added(place_of(keyframe, CONFIG.features, CONFIG.places), CONFIG.places)
-    return Mapped(sequence, places, History(**odometry.snapshot()["history"]))
+            places = places.with_record(
+                make_keyframe_record(keyframe, CONFIG.features, CONFIG.places), CONFIG.places
+            )
+    return Mapped(sequence, places, ResidualHistory(**odometry.snapshot()["history"]))
 
 
-def search(frame: RgbdFrame, places: Places, turn: int, history: History, tally: Tally):
+def search(
+    frame: RgbdFrame, places: KeyframeDatabase, turn: int, history: ResidualHistory, tally: Tally
+):
     """(frame index of the keyframe, T_keyframe_camera), or None."""
     start_s = time.process_time()
     found = SEARCH.find(pyramid_of(frame, CONFIG.pyramid), places, turn, history)

@@ -35,7 +35,7 @@ from ldo_service.evaluation.iteration import (
 from ldo_service.gaussians import render
 from ldo_service.gaussians.renderer import RenderMemory
 from ldo_service.geometry import Camera
-from ldo_service.kernels import _rasterise
+from ldo_service.kernels import _rasterize
 from tests.reference.render import render_reference
 
 SIZES = ((100_000, 640, 480), (100_000, 320, 240), (500_000, 640, 480))
@@ -68,10 +68,10 @@ def ours(iteration: Iteration) -> Steps:
 
 def compiled_prototype(folder: Path) -> ctypes.CDLL | None:
     sketches = os.environ.get("LDO_SKETCHES")
-    if not sketches or _rasterise.isa() == "baseline":
+    if not sketches or _rasterize.isa() == "baseline":
         return None
     library = folder / "prototype.so"
-    machine = ["-march=x86-64-v3", "-DNO512"] if _rasterise.isa() == "avx2" else ["-march=native"]
+    machine = ["-march=x86-64-v3", "-DNO512"] if _rasterize.isa() == "avx2" else ["-march=native"]
     flags = ["-O3", *machine, "-ffast-math", "-fopenmp", "-shared", "-fPIC"]
     source = Path(sketches) / "raster" / "rast.cpp"
     subprocess.run(["g++", *flags, str(source), "-o", str(library)], check=True)
@@ -151,7 +151,7 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, default=len(SIZES), help="how many of the scenes")
     parser.add_argument("--cpu", action="store_true", help="CPU time, for a busy machine")
     arguments = parser.parse_args()
-    isa, threads = _rasterise.isa(), arguments.threads
+    isa, threads = _rasterize.isa(), arguments.threads
     clock = time.process_time if arguments.cpu else time.perf_counter
     print(f"isa {isa}, {threads} thread(s), median of {arguments.repeats}")
     print(f"{'Gaussians':>10} {'image':>9} {'step':>10} {'ours ms':>9} {'prototype ms':>13} ratio")

@@ -21,7 +21,7 @@ from ldo_service.runtime.process import resident_mb
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import Message, encode
 from ldo_service.schemas.topics import Topic
-from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
+from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
 MESSAGES, MESSAGE_BYTES, STEP_S, WINDOW = 300, 1_000_000, 0.010, 4
 
@@ -54,7 +54,7 @@ class Throughput:
     repeated: int
 
 
-async def throughput(network: Network) -> Throughput:
+async def throughput(network: Endpoint) -> Throughput:
     with open_session(network) as one, open_session(network) as other:
         outlet = Outlet(
             Out(BLOCKS), "producer", 1, ZenohTransport(one, network), expected=["consumer"]
@@ -74,7 +74,7 @@ async def throughput(network: Network) -> Throughput:
     return Throughput(total_s, deepest, most_mb - before_mb, outlet.statistics().repeated)
 
 
-async def release_ms(network: Network) -> float:
+async def release_ms(network: Endpoint) -> float:
     """From the kill of a consumer that holds the window to the next message's leaving."""
     with open_session(network) as session:
         outlet = Outlet(Out(BLOCKS), "producer", 1, ZenohTransport(session, network))
@@ -92,7 +92,7 @@ async def release_ms(network: Network) -> float:
 
 
 async def consumer_joined(outlet: Outlet) -> None:
-    while outlet.room() != WINDOW:
+    while outlet.credits() != WINDOW:
         await asyncio.sleep(0.001)
 
 
@@ -107,7 +107,7 @@ async def running(stage: Stage) -> AsyncIterator[None]:
 
 
 async def stuck_consumer(endpoint: str) -> None:
-    network = Network("bench", endpoint)
+    network = Endpoint("bench", endpoint)
     with open_session(network) as session:
         await Stage(lambda: Consumer(1e6), ZenohTransport(session, network)).run()
 
@@ -116,7 +116,7 @@ async def main() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    network = Network("bench", f"tcp/127.0.0.1:{port}")
+    network = Endpoint("bench", f"tcp/127.0.0.1:{port}")
     with open_session(network, router=True):
         runs = [await throughput(network) for _ in range(3)]
         releases = sorted([await release_ms(network) for _ in range(5)])

@@ -19,20 +19,26 @@ import numpy as np
 
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
-from ldo_service.regions.foreground import Claims, Foreground, foreground, surfaces, without_nested
-from ldo_service.semantics.gaussian_labels import NOT_SEEN, agree, new_labels, observe
-from ldo_service.semantics.label_assignment import Regions, assign
-from ldo_service.semantics.semantic_fusion import LabellingConfig, label_keyframe, observations
+from ldo_service.regions.foreground import (
+    Foreground,
+    RegionDetections,
+    foreground,
+    surfaces,
+    without_nested,
+)
+from ldo_service.semantics.gaussian_labels import NOT_SEEN, new_labels, observe, smooth_labels
+from ldo_service.semantics.label_assignment import Regions, assign_gaussians
+from ldo_service.semantics.semantic_fusion import SemanticFusionConfig, label_keyframe, observations
 from tests.reference.assignment import assign_reference
 from tests.reference.consistency import agree_reference
 from tests.reference.foreground import foreground_reference, surfaces_reference
 from tests.reference.labels import observe_reference
 
-CAMERA, CONFIG = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), LabellingConfig()
+CAMERA, CONFIG = Camera(640, 480, 520.0, 520.0, 319.5, 239.5), SemanticFusionConfig()
 SIDE_PX, MARGIN_PX = 80, 10
 
 
-def scene(n: int) -> tuple[np.ndarray, np.ndarray, Claims]:
+def scene(n: int) -> tuple[np.ndarray, np.ndarray, RegionDetections]:
     """Rows [n, 16], depth [H, W], and what is claimed."""
     rng, depth_m = np.random.default_rng(0), np.full((480, 640), 3.0, np.float32)
     corners = [(60 + 150 * k, 40 + 150 * j) for j in range(3) for k in range(4)]
@@ -47,7 +53,7 @@ def scene(n: int) -> tuple[np.ndarray, np.ndarray, Claims]:
     low = np.array(corners) - MARGIN_PX
     boxes = np.concatenate([low, low + SIDE_PX + 2 * MARGIN_PX], axis=1)
     sure = rng.uniform(0.3, 0.9, len(boxes)).astype(np.float32)
-    return rows, depth_m, Claims.of_detector(boxes, 2 + np.arange(len(boxes)) % 5, sure)
+    return rows, depth_m, RegionDetections.of_detector(boxes, 2 + np.arange(len(boxes)) % 5, sure)
 
 
 def cpu_ms(work: Callable[[], object], repeats: int) -> float:
@@ -88,17 +94,17 @@ def main() -> None:
     in_image = depth_m, pieces, CAMERA, CONFIG.foreground
     parts = [foreground(box, *in_image) for box in claims.boxes]
     regions = Regions.of_foregrounds(claims.boxes, claims.scores(), parts)
-    where = assign(rows, indices, CAMERA, T, depth_m, regions, CONFIG.assignment)
+    where = assign_gaussians(rows, indices, CAMERA, T, depth_m, regions, CONFIG.assignment)
     seen = observations(where, indices, CAMERA, claims, CONFIG)
     observe(labels, seen, CONFIG.labels)
     touched = indices[seen.labels != NOT_SEEN]
 
     few, some = indices[: len(indices) // 100], indices[::100].copy()
     masks = [part.image(depth_m.shape) for part in parts]
-    where_few = assign(rows, few, CAMERA, T, depth_m, regions, CONFIG.assignment)
+    where_few = assign_gaussians(rows, few, CAMERA, T, depth_m, regions, CONFIG.assignment)
     seen_few = observations(where_few, few, CAMERA, claims, CONFIG)
     view = CAMERA, T, depth_m, claims.boxes, claims.scores(), masks, CONFIG.assignment
-    # labels of its own: `agree` alone, again and again, spreads those of the steps
+    # labels of its own: `smooth_labels` alone, again and again, spreads those of the steps
     keyframe = rows, new_labels(n), indices, CAMERA, T, depth_m, claims, CONFIG
     steps = [
         Step("surfaces", lambda: surfaces(*image), lambda: surfaces_reference(*image)),
@@ -110,7 +116,7 @@ def main() -> None:
         Step("nesting, tables", lambda: tables(claims, parts)),
         Step(
             "assign",
-            lambda: assign(rows, indices, CAMERA, T, depth_m, regions, CONFIG.assignment),
+            lambda: assign_gaussians(rows, indices, CAMERA, T, depth_m, regions, CONFIG.assignment),
             lambda: assign_reference(rows[some], *view),
             0.01,
         ),
@@ -123,7 +129,7 @@ def main() -> None:
         ),
         Step(
             "agree",
-            lambda: agree(rows, labels, touched, CONFIG.consistency),
+            lambda: smooth_labels(rows, labels, touched, CONFIG.consistency),
             lambda: agree_reference(rows, labels, some, CONFIG.consistency),
             0.01,
         ),
@@ -134,7 +140,7 @@ def main() -> None:
     Step("whole", lambda: label_keyframe(*keyframe)).told(repeats)
 
 
-def tables(claims: Claims, parts: Sequence[Foreground]) -> Regions:
+def tables(claims: RegionDetections, parts: Sequence[Foreground]) -> Regions:
     left = without_nested(parts, claims.scores(), CONFIG.nesting)
     return Regions.of_foregrounds(claims.boxes, claims.scores(), left)
 

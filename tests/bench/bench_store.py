@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.datasets import open_sequence
-from ldo_service.gaussians import GaussianMap, View, insert
+from ldo_service.gaussians import GaussianMap, TrainingView, densify
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
-from ldo_service.gaussians.offloading import SleepingGaussians
+from ldo_service.gaussians.offloading import OffloadedGaussians
 from ldo_service.gaussians.training_views import KeyframeImages
-from ldo_service.gaussians.visibility import AnchorSpheres, PlacedCamera
+from ldo_service.gaussians.visibility import BoundingSpheres, PlacedCamera
 
 
 def timed_ms(do: Callable[[], object]) -> tuple[float, float]:
@@ -37,7 +37,7 @@ def report(what: str, times_ms: list[tuple[float, float]]) -> None:
 def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
     sequence = open_sequence(source)
     frames = [sequence[i] for i in range(0, len(sequence), stride)][:count]
-    images = [KeyframeImages.of(View.of(f, np.eye(4), k)) for k, f in enumerate(frames)]
+    images = [KeyframeImages.of(TrainingView.of(f, np.eye(4), k)) for k, f in enumerate(frames)]
     memory_mb = sum(one.nbytes for one in images) / 1e6
     store = KeyframeStore(folder, KeyframeStoreConfig(cache_mb=memory_mb / 2))  # too little for all
     puts = [timed_ms(lambda one=one: store.put(one)) for one in images]
@@ -67,22 +67,23 @@ def bench_sleep(source: str, count: int, stride: int, active: int, folder: Path)
         poses[anchor] = poses[anchor % count]
         gaussians.add(rows[anchors == anchor % count], anchor)
     print(f"{source}: {len(gaussians)} Gaussians on {len(poses)} anchors")
-    sleeping, before = SleepingGaussians(folder), gaussians.rows.copy()
+    sleeping, before = OffloadedGaussians(folder), gaussians.rows.copy()
     asleep = list(range(0, len(poses), 2))
 
-    def spheres() -> AnchorSpheres:
-        return AnchorSpheres.around(gaussians.rows, gaussians.anchors)
+    def spheres() -> BoundingSpheres:
+        return BoundingSpheres.around(gaussians.rows, gaussians.anchors)
 
     report("spheres", [timed_ms(spheres)])
     report(
-        "half sleep", [timed_ms(lambda: sleeping.take_from(gaussians, gaussians.anchors, asleep))]
+        "half sleep",
+        [timed_ms(lambda: sleeping.offload_from(gaussians, gaussians.anchors, asleep))],
     )
     chunks, memory_mb = len(sleeping.numbers()), len(sleeping) * 64 / 1e6
     disk_mb = sum(file.stat().st_size for file in folder.iterdir()) / 1e6
     camera = PlacedCamera(open_sequence(source).camera, poses[0])
-    sleeping.seen_from(camera)
-    report("who is seen", [timed_ms(lambda: sleeping.seen_from(camera)) for _ in range(9)])
-    report("half wake", [timed_ms(lambda: sleeping.return_to(gaussians, sleeping.numbers()))])
+    sleeping.visible_chunks(camera)
+    report("who is seen", [timed_ms(lambda: sleeping.visible_chunks(camera)) for _ in range(9)])
+    report("half wake", [timed_ms(lambda: sleeping.load_into(gaussians, sleeping.numbers()))])
     if gaussians.rows.tobytes() != before.tobytes():
         sys.exit("the Gaussians did not come back: the times mean nothing.")
     print(
@@ -103,7 +104,7 @@ def mapped(
         frame = sequence[keyframe * stride]
         nearest = int(np.argmin(np.abs(truth.stamps_s - 1e-9 * frame.stamp_ns)))
         poses[keyframe] = truth.T_world_camera[nearest]
-        insert(gaussians, frame, poses[keyframe], keyframe)
+        densify(gaussians, frame, poses[keyframe], keyframe)
     return gaussians.rows, gaussians.anchors, poses
 
 

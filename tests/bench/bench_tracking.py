@@ -24,14 +24,14 @@ import numpy as np
 
 from ldo_service.actors.optimizer import Optimizer
 from ldo_service.actors.tracker import Tracker
-from ldo_service.conversions.frames import rgbd_message
-from ldo_service.conversions.poses import keyframe_poses_of, transform
+from ldo_service.conversions.frames import frame_to_message
+from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory
 from ldo_service.kernels import isa
 from ldo_service.schemas import TrackedPose
-from ldo_service.tracking import Odometry, OdometryConfig, Status
+from ldo_service.tracking import Odometry, OdometryConfig, TrackingStatus
 from ldo_service.tracking.window import WindowConfig
 from tests.bench.tracking_peers import Step, peers
 
@@ -103,7 +103,7 @@ def ours() -> Step:
 
     def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
         result = odometry.process(frame)
-        return result.T_odom_camera, result.status is Status.OK
+        return result.T_odom_camera, result.status is TrackingStatus.OK
 
     return step
 
@@ -126,14 +126,16 @@ def corrected(sequence: Sequence, indices: range) -> Trajectory:
     poses: list[TrackedPose] = []
     T_map: dict[int, np.ndarray] = {}
     for index in indices:
-        for message in tracker.handle(rgbd_message(sequence[index])):
+        for message in tracker.handle(frame_to_message(sequence[index])):
             if isinstance(message, TrackedPose):
                 poses.append(message)
                 continue
             for correction in optimizer.handle(message):
-                T_map = keyframe_poses_of(correction)
+                T_map = keyframe_poses_from_correction(correction)
                 list(tracker.handle(correction))
-    placed = [T_map[_reference(pose)] @ transform(pose.T_reference_camera) for pose in poses]
+    placed = [
+        T_map[_reference(pose)] @ pose_from_message(pose.T_reference_camera) for pose in poses
+    ]
     return Trajectory(np.array([pose.stamp_ns for pose in poses]) * 1e-9, np.array(placed))
 
 

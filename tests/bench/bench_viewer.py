@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.client import Client, connect
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import open_sequence
 from ldo_service.schemas import TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
@@ -70,7 +70,7 @@ class Frames:
 def send(endpoint: str, frames: Frames, wanted: Event) -> None:
     """The camera's process: the frames once, whenever it is wanted."""
     sequence = open_sequence(frames.source)
-    messages = [camera_rgbd_message(sequence.read(index)) for index in range(frames.count)]
+    messages = [raw_frame_to_message(sequence.read(index)) for index in range(frames.count)]
     with connect("robot", endpoint) as service:
         while wanted.wait():
             started_s = time.monotonic()
@@ -84,7 +84,7 @@ def measured(service: LiveService, client: Client, sending: Event, viewer_pid: i
     """One round on an empty map."""
     assert client.control("reset").ok
     pids = family(service.process.pid)
-    with client.listen(POSE_TRACKED.name, TrackedPose, keep=DETAILS) as inbox:
+    with client.poller(POSE_TRACKED.name, TrackedPose, keep=DETAILS) as inbox:
         before_s, viewer_before_s = cpu_s(pids), cpu_s([viewer_pid])
         started_s = time.monotonic()
         sending.set()

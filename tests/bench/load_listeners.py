@@ -12,7 +12,7 @@ from contextlib import ExitStack
 
 import zenoh
 
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 
 TOPICS: tuple[str, ...] = (
@@ -43,7 +43,7 @@ def main(endpoint: str, count: str, kind: str) -> None:
     listeners = [Listener(kind == "slow") for _ in range(int(count))]
     with ExitStack() as stack:
         for listener in listeners:
-            session = stack.enter_context(open_session(Network("robot0", endpoint)))
+            session = stack.enter_context(open_session(Endpoint("robot0", endpoint)))
             listener.subscribe(session, stack)
         print("ready", flush=True)
         sys.stdin.read()

@@ -127,10 +127,10 @@ def gicp_voxels(camera: Camera, scale: float) -> Step:
             guess, reach_m = T_world_camera @ T_motion, scale * REACH_M
             found = small_gicp.align(voxels, cloud, guess, max_correspondence_distance=reach_m)
             # rounding would grow from guess to guess
-            T_motion = se3.orthonormalised(se3.inverse(T_world_camera) @ found.T_target_source)
+            T_motion = se3.orthonormalize(se3.inverse(T_world_camera) @ found.T_target_source)
             is_sane = is_possible(T_motion)
             is_found, T_motion = found.converged and is_sane, T_motion if is_sane else np.eye(4)
-            T_world_camera = se3.orthonormalised(T_world_camera @ T_motion)
+            T_world_camera = se3.orthonormalize(T_world_camera @ T_motion)
         voxels.insert(cloud, T_world_camera)
         return T_world_camera, is_found
 
@@ -153,7 +153,7 @@ def open3d_frames(o3d: ModuleType, camera: Camera) -> Step:
     term = odometry.RGBDOdometryJacobianFromHybridTerm()
 
     def prepare(frame: RgbdFrame) -> object:
-        color, depth = o3d.geometry.Image(frame.color), o3d.geometry.Image(_millimetres(frame))
+        color, depth = o3d.geometry.Image(frame.color), o3d.geometry.Image(_millimeters(frame))
         return o3d.geometry.RGBDImage.create_from_color_and_depth(color, depth)
 
     def align(previous: object, current: object) -> Found:
@@ -168,7 +168,7 @@ def open3d_tensors(o3d: ModuleType, camera: Camera) -> Step:
     matrix, odometry = o3d.core.Tensor(camera.matrix), o3d.t.pipelines.odometry
 
     def prepare(frame: RgbdFrame) -> object:
-        images = (o3d.t.geometry.Image(image) for image in (frame.color, _millimetres(frame)))
+        images = (o3d.t.geometry.Image(image) for image in (frame.color, _millimeters(frame)))
         return o3d.t.geometry.RGBDImage(*images)
 
     def align(previous: object, current: object) -> Found:
@@ -188,7 +188,7 @@ def open3d_model(o3d: ModuleType, camera: Camera) -> Step:
 
     def step(frame: RgbdFrame) -> tuple[np.ndarray, bool]:
         nonlocal T_world_camera, count
-        given.set_data_from_image("depth", o3d.t.geometry.Image(_millimetres(frame)))
+        given.set_data_from_image("depth", o3d.t.geometry.Image(_millimeters(frame)))
         given.set_data_from_image("color", o3d.t.geometry.Image(frame.color))
         found = True
         if count:
@@ -214,5 +214,5 @@ def _tracked(align: Callable[[], Any]) -> Found:
     return T_target_source, found.fitness > 0
 
 
-def _millimetres(frame: RgbdFrame) -> np.ndarray:
+def _millimeters(frame: RgbdFrame) -> np.ndarray:
     return np.round(DEPTH_SCALE * frame.depth_m).astype(np.uint16)

@@ -8,7 +8,7 @@ from pathlib import Path
 import zenoh
 
 from ldo_service.schemas import encode
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.flow_control import Header, encode_link
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_endpoint
@@ -23,7 +23,7 @@ def test_poses_become_transforms() -> None:
     endpoint, pose = free_endpoint(), EXAMPLES["tracked_pose"]
     program = EXAMPLE.read_text().replace("tcp/127.0.0.1:7447", endpoint)
     program = program.replace('connect("robot")', f'connect("robot", "{endpoint}")')
-    with open_session(Network("robot", endpoint), router=True) as session:
+    with open_session(Endpoint("robot", endpoint), router=True) as session:
         heard = session.declare_subscriber("tf", zenoh.handlers.FifoChannel(9))
         with subprocess.Popen([sys.executable, "-c", program, "1"]) as process:
             while process.poll() is None:

@@ -13,7 +13,7 @@ from ldo_service.cameras.realsense import (
     library,
     messages,
 )
-from ldo_service.conversions.frames import camera_of
+from ldo_service.conversions.frames import camera_from_message
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, camera
 
@@ -81,7 +81,7 @@ class SoftwareCamera:
         return self.syncer.wait_for_frames(timeout_ms)
 
 
-def test_depth_is_aligned_to_colour_and_in_the_device_s_units() -> None:
+def test_depth_is_aligned_to_color_and_in_the_device_s_units() -> None:
     camera = SoftwareCamera()
     sent = messages(rs, camera, camera_model(rs, intrinsics(50.0)))
     *_, frame = islice(sent, 5)
@@ -100,7 +100,7 @@ def test_depth_is_aligned_to_colour_and_in_the_device_s_units() -> None:
 
 
 def test_a_camera_without_distortion_has_none() -> None:
-    camera = camera_of(camera_model(rs, intrinsics(50.0)))
+    camera = camera_from_message(camera_model(rs, intrinsics(50.0)))
     assert camera == Camera(WIDTH, HEIGHT, 50.0, 50.0, 31.0, 23.0)
 
 
@@ -110,7 +110,7 @@ def test_a_camera_without_distortion_has_none() -> None:
 def test_opencv_s_lens_sees_what_the_device_s_own_does(name: str) -> None:
     """librealsense is the judge: it says where a point is seen, or where from."""
     theirs = intrinsics(50.0, getattr(rs.distortion, name), LENS)
-    ours = camera_of(camera_model(rs, theirs))
+    ours = camera_from_message(camera_model(rs, theirs))
     if name == "brown_conrady":
         np.testing.assert_allclose(ours.distortion, LENS, atol=1e-5)
     for pixel in ((3.0, 5.0), (31.0, 23.0), (60.0, 40.0), (10.0, 44.0)):

@@ -15,7 +15,7 @@ from ldo_service.cameras.ros2 import KEEP, Inbox, RosCamera, RosTopics, key_of
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import CameraRgbd, TrackedPose, decode
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_endpoint
 from tests.service.conftest import LDO, live_service
@@ -137,7 +137,7 @@ def publisher(endpoint: str, *arguments: str) -> Iterator[subprocess.Popen[str]]
 
 def test_a_publisher_passes_on_what_a_bridge_forwards() -> None:
     endpoint = free_endpoint()
-    with open_session(Network("robot", endpoint), router=True) as session:
+    with open_session(Endpoint("robot", endpoint), router=True) as session:
         channel = zenoh.handlers.FifoChannel(64)
         frames = session.declare_subscriber("ldo/robot/camera/rgbd", channel)
         with publisher(endpoint, "--max-frames", "5") as process:
@@ -179,7 +179,7 @@ def test_a_robot_of_ros_is_tracked(room: Sequence, tmp_path: Path) -> None:
         service.wait_for_actors()
         with (
             publisher(service.endpoint),
-            open_session(Network("robot", service.endpoint)) as bridge,
+            open_session(Endpoint("robot", service.endpoint)) as bridge,
         ):
             frames, poses = cycle(range(20)), list[TrackedPose]()
             for number in count(1):  # a camera goes on, whether anybody listens or not

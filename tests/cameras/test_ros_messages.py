@@ -58,7 +58,7 @@ def depth_m_of(read: RosImage) -> np.ndarray:
         ("bgra8", np.concatenate([BGR, ALPHA], axis=2)),
     ],
 )
-def test_colour_is_rgb_whatever_its_encoding(
+def test_color_is_rgb_whatever_its_encoding(
     encoding: str, pixels: np.ndarray, padding: int, little_endian: bool
 ) -> None:
     body = cdr(image(encoding, pixels, padding=padding), little_endian=little_endian)
@@ -67,7 +67,7 @@ def test_colour_is_rgb_whatever_its_encoding(
     np.testing.assert_array_equal(color_of(read), COLOR)
 
 
-def test_grey_is_the_same_in_all_colours() -> None:
+def test_gray_is_the_same_in_all_colors() -> None:
     read = read_color(cdr(image("mono8", COLOR[..., 0])), "/camera/image_raw")
     np.testing.assert_array_equal(color_of(read), np.repeat(COLOR[..., :1], 3, axis=2))
 
@@ -75,7 +75,7 @@ def test_grey_is_the_same_in_all_colours() -> None:
 @pytest.mark.parametrize("padding", [0, 6])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("encoding", ["16UC1", "mono16", "32FC1"])
-def test_depth_is_in_metres_whatever_its_encoding(encoding: str, order: str, padding: int) -> None:
+def test_depth_is_in_meters_whatever_its_encoding(encoding: str, order: str, padding: int) -> None:
     kind, units = ("f4", 1000) if encoding == "32FC1" else ("u2", 1)
     depth = (DEPTH_MM / units).astype(order + kind)
     read = read_depth(cdr(image(encoding, depth, padding=padding)), "/camera/depth")
@@ -136,7 +136,7 @@ def test_a_camera_that_is_none_is_refused(info, says: str) -> None:
         (camera_info(), "no sensor_msgs/msg/Image|only as rgb8|rows of|empty|pixels"),
     ],
 )
-def test_colour_that_does_not_fit_itself_is_refused(message, says: str) -> None:
+def test_color_that_does_not_fit_itself_is_refused(message, says: str) -> None:
     with pytest.raises(FrameError, match=says):
         read_color(cdr(message), "/image_raw")
 
@@ -180,7 +180,7 @@ def frame_of(depth: RosImage, camera: CameraModel = CAMERA, is_registered: bool 
     return joined(color, depth, camera, 3, is_registered)
 
 
-def test_a_frame_has_both_images_and_the_stamp_of_colour() -> None:
+def test_a_frame_has_both_images_and_the_stamp_of_color() -> None:
     frame = frame_of(depth_of())
     assert (frame.frame, frame.stamp_ns, frame.depth_scale) == (3, 1_500_000_002, 1000)
     assert frame.camera == CAMERA

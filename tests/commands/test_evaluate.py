@@ -11,7 +11,7 @@ from evo.core import metrics, sync
 from evo.tools import file_interface
 
 from ldo_service.runs.folder import MAP_FILES, prepare
-from ldo_service.tracking.keyframe_database import PLACES
+from ldo_service.tracking.keyframe_database import DATABASE_FILE
 from tests.commands.test_cli import ldo
 
 
@@ -41,7 +41,7 @@ def test_the_protocol_stands_above_the_figures(capsys, run: Path, room_folder: P
     assert sheet.shape[0] > 3 * 240, "a row for each held-out frame"
 
 
-def test_a_run_that_localised_has_no_map_and_its_trajectory_is_judged(
+def test_a_run_that_localized_has_no_map_and_its_trajectory_is_judged(
     capsys, run: Path, room_folder: Path, tmp_path: Path
 ) -> None:
     again = tmp_path / "again"
@@ -50,7 +50,11 @@ def test_a_run_that_localised_has_no_map_and_its_trajectory_is_judged(
     )
     assert code == 0
     assert f"The map is that of {run}" in " ".join(out.split())
-    assert not {path.name for path in again.iterdir()} & {"map.ply", "keyframes.json", PLACES}
+    assert not {path.name for path in again.iterdir()} & {
+        "map.ply",
+        "keyframes.json",
+        DATABASE_FILE,
+    }
     code, out, _ = ldo(capsys, "eval", again, room_folder)
     assert code == 0
     assert "renderings are not judged" in out

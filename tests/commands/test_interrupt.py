@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_endpoint
 from tests.service.conftest import LDO, PATIENCE, wait_until
@@ -93,7 +93,7 @@ def test_a_run_ends_with_130_and_keeps_what_is_done(tmp_path: Path, number: sign
 def test_a_publisher_ends_with_130(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     slowly = "--rate", "1", "--endpoint", endpoint
-    with open_session(Network("robot", endpoint), router=True) as session:
+    with open_session(Endpoint("robot", endpoint), router=True) as session:
         frames = session.declare_subscriber("ldo/robot/camera/rgbd", zenoh.handlers.RingChannel(1))
         with started(tmp_path / "log", "publish", "synthetic:room", *slowly) as publisher:
             publisher.wait_until(lambda: frames.try_recv() is not None)

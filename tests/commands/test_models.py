@@ -24,8 +24,8 @@ def file(tmp_path: Path) -> Path:
 
 def test_add_list_remove(capsys, file: Path, tmp_path: Path) -> None:
     (tmp_path / "LICENSE").write_text("Licence of squares\n\nAll rights reversed.\n")
-    licence = ("--licence", tmp_path / "LICENSE")
-    code, out, _ = ldo(capsys, "models", "add", "mine", file, *licence)
+    license = ("--licence", tmp_path / "LICENSE")
+    code, out, _ = ldo(capsys, "models", "add", "mine", file, *license)
     assert code == 0
     assert "mine is registered: yolov5, 3 classes (red, green, blue" in out
     assert Models().get("mine").about.licence.endswith("All rights reversed.\n")
@@ -56,7 +56,7 @@ def test_a_pair_is_added_by_its_files(capsys, tmp_path: Path) -> None:
     assert (code, "of a detector" in err) == (2, True)
 
 
-def test_a_licence_may_be_a_text(capsys, file: Path) -> None:
+def test_a_license_may_be_a_text(capsys, file: Path) -> None:
     ldo(capsys, "models", "add", "mine", file, "--licence", "Apache-2.0, of the authors" * 20)
     assert Models().get("mine").about.licence == "Apache-2.0, of the authors" * 20
 

@@ -68,7 +68,7 @@ def test_from_a_segment_that_is_not_joined_no_distance_is_known(
     pose = msgspec.structs.replace(
         EXAMPLES["tracked_pose"], T_odom_camera=here, T_map_odom=nowhere, segment=segment
     )
-    service = Mock(objects=lambda: FOUND, last=lambda _topic: [pose])
+    service = Mock(objects=lambda: FOUND, latest=lambda _topic: [pose])
     monkeypatch.setattr(query, "connect", lambda *_: nullcontext(service))
     _, out, _ = ldo(capsys, "query", "live", "couch", "--json")
     (answer,) = json.loads(out)

@@ -155,9 +155,9 @@ def test_no_labeller_behind_a_server_may_be_waited_for_until_it_is_given_up(
 ) -> None:
     """The service would end with it; a run has no such limits."""
     endpoint = [f"vlm_labeller.http.{setting}" for setting in settings]
-    load_config(settings=endpoint).check_patience()
+    load_config(settings=endpoint).check_timeouts()
     server = "vlm_labeller.url=http://127.0.0.1:8000/v1"
     config = load_config(settings=[server, *endpoint])
     with pytest.raises(ConfigError, match=f"together must be below {names}"):
-        config.check_patience()
-    load_config(settings=[server]).check_patience()
+        config.check_timeouts()
+    load_config(settings=[server]).check_timeouts()

@@ -10,7 +10,7 @@ from ldo_service.config import (
     stage_parameters,
 )
 from ldo_service.recordings.mcap_file import RecordConfig
-from ldo_service.runtime.supervision_policy import StageConfig
+from ldo_service.runtime.supervision_policy import SupervisionConfig
 from ldo_service.transport.endpoint import MAX_MESSAGE_MB
 from ldo_service.viewer.view_config import ViewerConfig, viewer_config
 
@@ -19,7 +19,7 @@ def test_the_default_configuration_gives_the_defaults_of_the_classes() -> None:
     """The measured reasons stand beside those, so the two must not part."""
     config = Config()
     assert actor_parameters(config) == ActorParameters()
-    assert stage_parameters(config) == StageConfig()
+    assert stage_parameters(config) == SupervisionConfig()
     assert recording_parameters(config) == RecordConfig()
     assert viewer_config(config.viewer) == ViewerConfig()
     assert config.service.max_message_mb == MAX_MESSAGE_MB

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ldo_service.conversions.objects import observation_messages
-from ldo_service.conversions.poses import transform
-from ldo_service.maps.publisher import ObjectsTeller
+from ldo_service.conversions.objects import observations_to_messages
+from ldo_service.conversions.poses import pose_from_message
+from ldo_service.maps.publisher import ObjectPublisher
 from ldo_service.schemas import MapObjects, decode, encode
 from ldo_service.semantics.object_landmarks import distributions, entropies
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
@@ -14,7 +14,7 @@ def test_objects_and_observations_travel_as_they_are() -> None:
     stage = Stage()
     told = list(stage.walk(THINGS, poses(20)[:6]))
     table = stage.objects.landmarks
-    message = ObjectsTeller().message(stage.objects, NAMES.names, 5, 3, stamp_ns=7)
+    message = ObjectPublisher().message(stage.objects, NAMES.names, 5, 3, stamp_ns=7)
     assert decode(encode(message), MapObjects) == message
     assert [one.id for one in message.objects] == table["id"].tolist() != []
     for one, landmark, p in zip(message.objects, table, distributions(table), strict=True):
@@ -24,13 +24,13 @@ def test_objects_and_observations_travel_as_they_are() -> None:
         np.testing.assert_array_equal(one.centroid, landmark["centroid"])
         np.testing.assert_array_equal(np.reshape(one.covariance, (3, 3)), landmark["covariance"])
         np.testing.assert_allclose(
-            transform(one.T_map_object), landmark["T_map_object"], atol=1e-12
+            pose_from_message(one.T_map_object), landmark["T_map_object"], atol=1e-12
         )
         assert (one.seen, one.missed) == (landmark["seen"], landmark["missed"])
         assert 1 <= len(one.views) <= 3
     np.testing.assert_allclose([one.entropy for one in message.objects], entropies(table))
     for keyframe, observed in enumerate(told):
-        sent = observation_messages(observed, NAMES.names, keyframe, stamp_ns=7)
+        sent = observations_to_messages(observed, NAMES.names, keyframe, stamp_ns=7)
         assert [one.object for one in sent] == [seen.object for seen in observed.observations]
         assert all(one.keyframe == keyframe for one in sent)
     assert sent[0].box_px == tuple(told[-1].observations[0].box)

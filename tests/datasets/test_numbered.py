@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from ldo_service.datasets.files import numbered, paired
+from ldo_service.datasets.files import numbered, pair_by_number
 from ldo_service.errors import DataError
 
 
@@ -16,9 +16,9 @@ def test_only_whole_names_that_match_are_numbered(tmp_path: Path) -> None:
 def test_frames_are_the_numbers_that_both_have(tmp_path: Path) -> None:
     color = {k: Path(f"c{k}") for k in (30, 2, 10)}
     depth = {k: Path(f"d{k}") for k in (10, 30, 4)}
-    frames = paired(color, depth, tmp_path)
+    frames = pair_by_number(color, depth, tmp_path)
     assert frames.numbers.tolist() == [10, 30]
     assert (frames.color, frames.depth) == ([color[10], color[30]], [depth[10], depth[30]])
     assert frames.stamps_ns.tolist() == [333_333_333, 1_000_000_000]
     with pytest.raises(DataError, match="1 images of colour and 1 of depth"):
-        paired({1: Path("c1")}, {2: Path("d2")}, tmp_path)
+        pair_by_number({1: Path("c1")}, {2: Path("d2")}, tmp_path)

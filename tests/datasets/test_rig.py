@@ -13,11 +13,11 @@ A, B = Camera(64, 48, 50, 50, 31, 24), Camera(32, 24, 25, 25, 15, 12)
     ("xi", "is_one_view"),
     [([0] * 6, True), ([0, 0, 0, 5e-5, 0, 0], True), ([0, 0, 0, 0, 1e-3, 0], False)],
 )
-def test_cameras_a_millimetre_apart_are_two_views(xi: list[float], is_one_view: bool) -> None:
+def test_cameras_a_millimeter_apart_are_two_views(xi: list[float], is_one_view: bool) -> None:
     assert Rig(A, B, se3.exp(np.array(xi))).is_one_view is is_one_view
 
 
-def test_colour_camera_stands_where_the_transform_says() -> None:
+def test_color_camera_stands_where_the_transform_says() -> None:
     """The origin of colour, seen in depth coordinates, is where T_color_depth maps to zero."""
     T_color_depth = se3.exp(np.array([0.1, 0.2, -0.3, 0.02, -0.01, 0.03]))
     T_world_depth = se3.exp(np.array([-0.5, 0.1, 1.0, 3.0, 2.0, 1.0]))

@@ -15,7 +15,7 @@ DEPTH_CAMERA = Camera(24, 16, 20.0, 21.0, 11.5, 7.5)
 COLOR_CAMERA = Camera(48, 32, 40.0, 42.0, 23.5, 15.5)
 
 
-def test_larger_colour_is_brought_to_the_depth_image(scannet_folder: Writer) -> None:
+def test_larger_color_is_brought_to_the_depth_image(scannet_folder: Writer) -> None:
     sequence = open_sequence(str(scannet_folder([0, 1])))
     assert sequence.camera == DEPTH_CAMERA
     raw = sequence.read(1)
@@ -84,14 +84,14 @@ def test_damaged_first_image_does_not_hide_the_size_of_the_others(scannet_folder
     assert open_sequence(str(folder))[1].camera == DEPTH_CAMERA
 
 
-def test_colour_of_another_size_than_the_first_is_a_bad_frame(scannet_folder: Writer) -> None:
+def test_color_of_another_size_than_the_first_is_a_bad_frame(scannet_folder: Writer) -> None:
     folder = scannet_folder([0, 1])
     cv2.imwrite(str(folder / "color/1.jpg"), np.zeros((16, 24, 3), np.uint8))
     with pytest.raises(FrameError, match="colour is 24x16 pixels and its camera 48x32"):
         open_sequence(str(folder)).read(1)
 
 
-def test_depth_that_colour_does_not_look_at_is_left_out(
+def test_depth_that_color_does_not_look_at_is_left_out(
     scannet_folder: Writer, write_matrix: Callable[..., None]
 ) -> None:
     folder = scannet_folder([0])
@@ -113,7 +113,7 @@ def test_intrinsics_are_required_and_extrinsics_are_not(scannet_folder: Writer) 
         open_sequence(str(folder))
 
 
-def test_cameras_apart_have_depth_registered_to_colour(scannet_folder: Writer) -> None:
+def test_cameras_apart_have_depth_registered_to_color(scannet_folder: Writer) -> None:
     """Depth 0.1 m right of colour: at 2 m its wall moves by 40 * 0.1 / 2 = 2 colour pixels."""
     T_sensor_depth = se3.exp(np.array([0, 0, 0, 0.1, 0, 0]))
     sequence = open_sequence(str(scannet_folder([0, 1], T_sensor_depth)))
@@ -126,7 +126,7 @@ def test_cameras_apart_have_depth_registered_to_colour(scannet_folder: Writer) -
     np.testing.assert_allclose(truth.T_world_camera[:, 0, 3], [-0.1, 0.9], atol=1e-12)
 
 
-def test_registration_into_large_colour_can_be_asked_for(scannet_folder: Writer) -> None:
+def test_registration_into_large_color_can_be_asked_for(scannet_folder: Writer) -> None:
     folder = scannet_folder([0, 1])
     frame = open_sequence(str(folder), SequenceOptions(register_depth=True))[1]
     assert frame.camera == COLOR_CAMERA

@@ -57,7 +57,7 @@ def test_own_intrinsics_are_those_of_the_depth_camera(
         open_sequence(str(folder))
 
 
-def test_registered_depth_moves_to_the_colour_camera(seven_scenes_folder: Writer) -> None:
+def test_registered_depth_moves_to_the_color_camera(seven_scenes_folder: Writer) -> None:
     """A point straight ahead of the depth camera at 1 m is 0.0254 * 525 = 13.3 px left of it."""
     folder = seven_scenes_folder([0])
     depth = np.zeros((480, 640))
@@ -127,7 +127,7 @@ def test_depth_of_another_size_is_a_bad_frame(
         open_sequence(str(folder), options).read(1)
 
 
-def test_colour_without_any_depth_is_an_error(seven_scenes_folder: Writer) -> None:
+def test_color_without_any_depth_is_an_error(seven_scenes_folder: Writer) -> None:
     folder = seven_scenes_folder([0])
     (folder / "frame-000000.depth.png").unlink()
     with pytest.raises(DataError, match="1 images of colour and 0 of depth"):

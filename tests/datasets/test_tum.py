@@ -13,7 +13,7 @@ from ldo_service.geometry import Camera
 Writer = Callable[..., Path]
 
 
-def test_frames_are_read_in_camera_units_and_rectified_in_metres(tum_folder: Writer) -> None:
+def test_frames_are_read_in_camera_units_and_rectified_in_meters(tum_folder: Writer) -> None:
     sequence = open_sequence(str(tum_folder(["1.0", "1.1"], ["1.01", "1.11"])))
     assert (len(sequence), sequence.name) == (2, "desk")
     raw, frame = sequence.read(1), sequence[1]
@@ -91,7 +91,7 @@ def test_camera_json_that_is_not_json_is_named(tum_folder: Writer) -> None:
         open_sequence(str(folder))
 
 
-def test_colour_without_depth_partner_is_left_out(
+def test_color_without_depth_partner_is_left_out(
     tum_folder: Writer, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -102,7 +102,7 @@ def test_colour_without_depth_partner_is_left_out(
     assert "1 of 3 colour images" in caplog.text
 
 
-def test_one_depth_image_serves_one_colour_image(tum_folder: Writer) -> None:
+def test_one_depth_image_serves_one_color_image(tum_folder: Writer) -> None:
     sequence = open_sequence(str(tum_folder(["1.000", "1.012"], ["1.010"])))
     assert sequence.stamps_ns.tolist() == [1_012_000_000]
 
@@ -161,7 +161,7 @@ def test_missing_image_names_its_path(tum_folder: Writer) -> None:
         open_sequence(str(folder)).read(0)
 
 
-def test_colour_in_place_of_depth_is_an_error(tum_folder: Writer) -> None:
+def test_color_in_place_of_depth_is_an_error(tum_folder: Writer) -> None:
     folder = tum_folder(["1"], ["1"])
     (folder / "depth/1.png").write_bytes((folder / "rgb/1.png").read_bytes())
     with pytest.raises(FrameError, match="one channel of 16 bits"):

@@ -50,8 +50,8 @@ def looked(network: onnxruntime.InferenceSession, color: np.ndarray) -> tuple[np
     canvas = cv2.copyMakeBorder(color, 8, 8, 0, 0, cv2.BORDER_CONSTANT, value=(114,) * 3)
     image = canvas.transpose(2, 0, 1)[None].astype(np.float32) / 255
     rows = np.asarray(network.run(None, {"images": image})[0])[0].T
-    centres = rows[:, :2] - [0, 8]
-    return np.hstack((centres - rows[:, 2:4] / 2, centres + rows[:, 2:4] / 2)), rows[:, 4:]
+    centers = rows[:, :2] - [0, 8]
+    return np.hstack((centers - rows[:, 2:4] / 2, centers + rows[:, 2:4] / 2)), rows[:, 4:]
 
 
 def names_of(network: onnxruntime.InferenceSession) -> list[str]:

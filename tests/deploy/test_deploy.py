@@ -22,9 +22,9 @@ from ldo_service.schemas import encode
 from ldo_service.schemas.pose import IDENTITY
 from ldo_service.schemas.topics import CONTROL, ODOMETRY_PRIOR, TOPICS
 from ldo_service.service.metrics import HealthCollector
-from ldo_service.service.metrics import exported as exporting
+from ldo_service.service.metrics import serve_metrics as exporting
 from ldo_service.transport.access_control import read_access, rules_of
-from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.certificate_authority import CertificateAuthority
 from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
 
@@ -63,7 +63,7 @@ def test_every_topic_has_somebody_who_may_put_and_somebody_who_may_read() -> Non
         return {key for rule in rules for key in rule.keys}
 
     assert keys("service", "put") == keys("service", "declare_subscriber") == {"**"}
-    readable = {topic.subscribed_as for topic in TOPICS}
+    readable = {topic.subscription_key for topic in TOPICS}
     for role in ("viewer", "operator"):
         assert keys(role, "declare_subscriber") == readable - {CONTROL.name}
     assert CONTROL.name in keys("operator", "query")
@@ -72,7 +72,7 @@ def test_every_topic_has_somebody_who_may_put_and_somebody_who_may_read() -> Non
 
 def test_a_router_of_its_own_serves_those_whom_the_file_names(tmp_path: Path) -> None:
     """The file is given to Zenoh as `zenohd --config` takes it."""
-    authority = Authority.new(tmp_path / "keys", days=2)
+    authority = CertificateAuthority.new(tmp_path / "keys", days=2)
     for name, role in (("router", "service"), ("wheels", "odometry"), ("desk", "viewer")):
         authority.add(name, role, "*", days=1)
     port = free_port()
@@ -91,7 +91,7 @@ def test_a_router_of_its_own_serves_those_whom_the_file_names(tmp_path: Path) ->
 
 
 def follow(desk: Any, wheels: Any) -> Iterator[Any]:
-    with desk.listen(ODOMETRY_PRIOR.name, ODOMETRY_PRIOR.message) as inbox:
+    with desk.poller(ODOMETRY_PRIOR.name, ODOMETRY_PRIOR.message) as inbox:
         while True:
             wheels.publish_prior(IDENTITY, stamp_ns=1)
             yield from inbox()
@@ -101,7 +101,7 @@ def follow(desk: Any, wheels: Any) -> Iterator[Any]:
 def exported() -> dict[str, set[str]]:
     """Labels of each sample that Prometheus gets, by its name."""
     collector = HealthCollector("mule")
-    collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
+    collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
     samples = [sample for family in collector.collect() for sample in family.samples]
     return {sample.name: set(sample.labels) for sample in samples}
 
@@ -172,12 +172,12 @@ def test_containers_are_asked_for_their_health_where_they_tell_it(port: int) -> 
     collector = HealthCollector("mule", ["mapper"])
     with exporting(collector, port):
         assert subprocess.run([sys.executable, "-c", program], capture_output=True).returncode
-        collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
+        collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
         subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_each_pod_of_the_fleet_sees_the_keys_of_its_own_robot(tmp_path: Path) -> None:
-    authority = Authority.new(tmp_path / "keys", days=2)
+    authority = CertificateAuthority.new(tmp_path / "keys", days=2)
     authority.add("robot-0", "service", "robot-0", days=1)
     made = {path.name for path in (authority.folder / "robot-0").iterdir()}
     (fleet,) = [d for d in documents("kubernetes.yaml") if d["kind"] == "StatefulSet"]

@@ -29,7 +29,7 @@ class Squares:
     is_decoded: bool = True  # boxes in pixels; yolox has them as offsets
     has_nan: bool = False
     has_logits: bool = False
-    is_normalised: bool = False  # boxes in 0..1
+    is_normalized: bool = False  # boxes in 0..1
     is_free: bool = False  # declares no size
     more_outputs: bool = False
     fails_on_white: bool = False  # NaN, where a pixel of the input is 255
@@ -71,7 +71,7 @@ class Squares:
             for r in range(rows)
             for c in range(columns)
         ]
-        size = (self.width, self.height) * 2 if self.is_normalised else 1
+        size = (self.width, self.height) * 2 if self.is_normalized else 1
         return np.array(boxes) / size
 
     def _scores(self, graph: "_Graph", stride: int) -> str:

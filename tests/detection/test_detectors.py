@@ -31,12 +31,12 @@ def opened(tmp_path: Path, layout: str, config: NetworkConfig | None = None, **f
 
 
 def found(detector: OnnxDetector, image: np.ndarray) -> list[tuple[str, list[float]]]:
-    detections = detector.find(image)
+    detections = detector.detect(image)
     names = [detector.labels[class_id] for class_id in detections.class_ids]
     return sorted(zip(names, detections.boxes_px.tolist(), strict=True))
 
 
-def test_the_layout_is_recognised_and_boxes_are_where_the_squares_are(tmp_path, layout) -> None:
+def test_the_layout_is_recognized_and_boxes_are_where_the_squares_are(tmp_path, layout) -> None:
     detector = opened(tmp_path, layout)
     assert (detector.layout, detector.labels, detector.input_px) == (layout, COLORS, (128, 96))
     image = squares_image([("red", 16, 48, 16), ("blue", 112, 80, 16), ("red", 64, 0, 16)])
@@ -45,7 +45,7 @@ def test_the_layout_is_recognised_and_boxes_are_where_the_squares_are(tmp_path, 
         ("red", [15.5, 47.5, 31.5, 63.5]),
         ("red", [63.5, -0.5, 79.5, 15.5]),
     ]
-    assert detector.find(image).scores == pytest.approx(254 / 255, rel=1e-5)
+    assert detector.detect(image).scores == pytest.approx(254 / 255, rel=1e-5)
 
 
 def test_images_of_another_size_are_fitted_in(tmp_path, layout) -> None:
@@ -61,20 +61,20 @@ def test_images_of_another_size_are_fitted_in(tmp_path, layout) -> None:
 def test_a_network_that_takes_any_size_gets_the_configured_one(tmp_path, layout) -> None:
     detector = opened(tmp_path, layout, NetworkConfig(input_px=(128, 96)), is_free=True)
     assert detector.input_px == (128, 96)
-    assert len(detector.find(squares_image([("red", 16, 48, 16)]))) == 1
+    assert len(detector.detect(squares_image([("red", 16, 48, 16)]))) == 1
 
 
 def test_an_image_without_objects_has_no_boxes(tmp_path, layout) -> None:
-    nothing = opened(tmp_path, layout).find(np.full((96, 128, 3), 128, np.uint8))
+    nothing = opened(tmp_path, layout).detect(np.full((96, 128, 3), 128, np.uint8))
     assert (nothing.boxes_px.shape, len(nothing)) == ((0, 4), 0)
 
 
 def test_thresholds_are_those_of_the_configuration(tmp_path, layout) -> None:
     image = squares_image([("red", 16, 48, 16), ("red", 64, 48, 16), ("blue", 0, 0, 16)])
     image[48:64, 64:80] //= 4  # a dim one
-    assert len(opened(tmp_path, layout, NetworkConfig(score_min=0.2)).find(image)) == 3
-    assert len(opened(tmp_path, layout, NetworkConfig(score_min=0.3)).find(image)) == 2
-    (score,) = opened(tmp_path, layout, NetworkConfig(max_boxes=1)).find(image).scores
+    assert len(opened(tmp_path, layout, NetworkConfig(score_min=0.2)).detect(image)) == 3
+    assert len(opened(tmp_path, layout, NetworkConfig(score_min=0.3)).detect(image)) == 2
+    (score,) = opened(tmp_path, layout, NetworkConfig(max_boxes=1)).detect(image).scores
     assert score > 0.9, "the most certain is kept"
 
 
@@ -88,7 +88,7 @@ def test_a_decoded_yolox_is_told_from_one_with_offsets(tmp_path) -> None:
 def test_it_gives_the_same_bits_each_time(tmp_path, layout) -> None:
     image = np.random.default_rng(1).integers(0, 256, (100, 150, 3)).astype(np.uint8)
     config = NetworkConfig(score_min=0.0)
-    one, other = (opened(tmp_path, layout, config).find(image) for _ in range(2))
+    one, other = (opened(tmp_path, layout, config).detect(image) for _ in range(2))
     assert len(one) == config.max_boxes
     for field in ("boxes_px", "scores", "class_ids"):
         np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
@@ -170,7 +170,7 @@ def test_another_output_is_refused(tmp_path, layout, fields, says: str) -> None:
 @pytest.mark.parametrize("pixels", ["yolov5", "yolov8"])
 def test_boxes_in_parts_of_the_image_are_refused(tmp_path, pixels: str) -> None:
     with pytest.raises(ModelError, match="export the network with boxes in pixels"):
-        opened(tmp_path, pixels, is_normalised=True, width=640, height=640)
+        opened(tmp_path, pixels, is_normalized=True, width=640, height=640)
 
 
 def test_boxes_that_fit_no_grid_are_refused(tmp_path, layout) -> None:
@@ -250,7 +250,7 @@ def labels_of(detector: OnnxDetector, detections: Detections) -> list[str]:
 
 
 def test_real_networks_find_the_furniture_of_the_kitchen(data: Path, real: OnnxDetector) -> None:
-    labels = labels_of(real, real.find(color(data / "tum" / "kitchen", 0)))
+    labels = labels_of(real, real.detect(color(data / "tum" / "kitchen", 0)))
     assert {"chair", "cup"} <= set(labels)
     assert "book" not in labels[:2]
     assert set(labels) <= {"chair", "cup", "dining table", "book", "laptop"}
@@ -261,7 +261,7 @@ def test_real_networks_find_the_apartment_where_its_labels_say(
 ) -> None:
     """Boxes of 0.5 and more, against boxes around the true instances of the class."""
     folder = data / "replica" / "apartment_floor1"
-    detections = real.find(color(folder, 100))
+    detections = real.detect(color(folder, 100))
     sure = detections.chosen(np.flatnonzero(detections.scores >= 0.5))
     truth = true_boxes(folder, 100)
     overlaps = [
@@ -317,7 +317,7 @@ def test_plain_loops_and_opencv_read_yolox_the_same(data: Path, real: OnnxDetect
             class_ids.append(int(row[5:].argmax()))
             scores.append(float(row[4] * row[5:].max()))
     kept = cv2.dnn.NMSBoxesBatched(boxes, scores, class_ids, 0.25, 0.45)  # type: ignore[call-overload]
-    ours = real.find(image)
+    ours = real.detect(image)
     assert ours.class_ids.tolist() == [class_ids[i] for i in kept]
     np.testing.assert_allclose(ours.scores, [scores[i] for i in kept], rtol=1e-5)
     theirs = np.array([boxes[i] for i in kept])

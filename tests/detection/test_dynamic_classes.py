@@ -6,7 +6,7 @@ import pytest
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import RgbdFrame
-from ldo_service.regions.foreground import Claims
+from ldo_service.regions.foreground import RegionDetections
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
@@ -37,24 +37,26 @@ def empty() -> RgbdFrame:
     return sequence(person=False)[MIDWAY]
 
 
-def around(mask: np.ndarray, confidence: float) -> Claims:
+def around(mask: np.ndarray, confidence: float) -> RegionDetections:
     v, u = np.nonzero(mask)
     box = np.array([[u.min(), v.min(), u.max(), v.max()]], np.float32)
-    return Claims.of_detector(box, np.array([PERSON]), np.array([confidence], np.float32))
+    return RegionDetections.of_detector(box, np.array([PERSON]), np.array([confidence], np.float32))
 
 
 def test_a_person_who_stands_there_leaves_no_trace(frame, empty, person) -> None:
     builder = MapBuilder()
     semantics = SemanticMap(builder)
     builder.add(frame, np.eye(4), 0, 5)
-    assert np.mean(builder.shown(0).opacity[person]) > 0.9
-    semantics.claim(0, around(person, 0.8))
-    assert np.mean(builder.shown(0).opacity[person]) < 0.4  # splats beside reach a pixel or two in
+    assert np.mean(builder.render_keyframe(0).opacity[person]) > 0.9
+    semantics.add_detections(0, around(person, 0.8))
+    assert (
+        np.mean(builder.render_keyframe(0).opacity[person]) < 0.4
+    )  # splats beside reach a pixel or two in
     assert not np.any(top_labels(builder.gaussians.labels) == PERSON)
     assert not len(semantics.objects)
     # the room behind comes when it is seen, and the old image does not draw the person again
     builder.add(empty, np.eye(4), 1, 10)
-    off_m = np.abs(builder.shown(1).median_depth_m - empty.depth_m)[person]
+    off_m = np.abs(builder.render_keyframe(1).median_depth_m - empty.depth_m)[person]
     assert np.median(off_m) < 0.02
     assert np.mean(off_m < 0.1) > 0.9
 
@@ -63,12 +65,12 @@ def test_the_rest_of_the_image_stays(frame, person) -> None:
     builder, untouched = MapBuilder(), MapBuilder()
     for one in (builder, untouched):
         one.add(frame, np.eye(4), 0, 5)
-    SemanticMap(builder).claim(0, around(person, 0.8))
+    SemanticMap(builder).add_detections(0, around(person, 0.8))
     far = np.ones(person.shape, bool)
     v, u = np.nonzero(person)
     far[v.min() - 5 : v.max() + 6, u.min() - 5 : u.max() + 6] = False
     assert np.count_nonzero(far) > 10_000
-    change = np.abs(builder.shown(0).color - untouched.shown(0).color)[far]
+    change = np.abs(builder.render_keyframe(0).color - untouched.render_keyframe(0).color)[far]
     assert np.quantile(change, 0.999) < 0.02
 
 
@@ -78,12 +80,12 @@ def test_boxes_that_come_first_leave_the_same_map(frame, person) -> None:
         builder = MapBuilder()
         semantics = SemanticMap(builder)
         if is_early:
-            semantics.claim(0, around(person, 0.8))
+            semantics.add_detections(0, around(person, 0.8))
         builder.add(frame, np.eye(4), 0, 5)
         if is_early:
-            semantics.mapped(0)
+            semantics.on_keyframe_mapped(0)
         else:
-            semantics.claim(0, around(person, 0.8))
+            semantics.add_detections(0, around(person, 0.8))
         assert semantics.statistics()["gaussians_movable"] > 100
         maps.append(builder.gaussians.rows.tobytes())
     assert maps[0] == maps[1]
@@ -93,6 +95,6 @@ def test_a_doubtful_box_makes_no_hole(frame, person) -> None:
     builder = MapBuilder()
     builder.add(frame, np.eye(4), 0, 5)
     before = builder.gaussians.rows.tobytes()
-    SemanticMap(builder).claim(0, around(person, 0.4))
+    SemanticMap(builder).add_detections(0, around(person, 0.4))
     assert builder.gaussians.rows.tobytes() == before
     assert np.any(top_labels(builder.gaussians.labels) == PERSON)

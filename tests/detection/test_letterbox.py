@@ -11,10 +11,10 @@ SIDES = st.tuples(st.integers(8, 900), st.integers(8, 900))
 
 
 @pytest.mark.parametrize(
-    ("is_centred", "rows"), [(True, (16, 112)), (False, (0, 96))], ids=["centred", "corner"]
+    ("is_centered", "rows"), [(True, (16, 112)), (False, (0, 96))], ids=["centred", "corner"]
 )
-def test_the_image_keeps_its_proportions_on_grey(is_centred: bool, rows: tuple[int, int]) -> None:
-    letterbox = Letterbox.fit((640, 480), (128, 128), is_centred)
+def test_the_image_keeps_its_proportions_on_gray(is_centered: bool, rows: tuple[int, int]) -> None:
+    letterbox = Letterbox.fit((640, 480), (128, 128), is_centered)
     canvas = letterbox.canvas(np.full((480, 640, 3), 7, np.uint8))
     assert canvas.shape == (128, 128, 3)
     expected = np.full((128, 128, 3), PADDING, np.uint8)
@@ -22,9 +22,9 @@ def test_the_image_keeps_its_proportions_on_grey(is_centred: bool, rows: tuple[i
     np.testing.assert_array_equal(canvas, expected)
 
 
-@given(image=SIDES, inputs=SIDES, is_centred=st.booleans())
-def test_the_whole_image_comes_back_as_itself(image, inputs, is_centred: bool) -> None:
-    letterbox = Letterbox.fit(image, inputs, is_centred)
+@given(image=SIDES, inputs=SIDES, is_centered=st.booleans())
+def test_the_whole_image_comes_back_as_itself(image, inputs, is_centered: bool) -> None:
+    letterbox = Letterbox.fit(image, inputs, is_centered)
     (left, top), (width, height) = letterbox.offset_px, letterbox.inner_px
     assert width in (inputs[0], letterbox.inner_px[0])
     assert left + width <= inputs[0]
@@ -36,23 +36,23 @@ def test_the_whole_image_comes_back_as_itself(image, inputs, is_centred: bool) -
     )
 
 
-@pytest.mark.parametrize("is_centred", [True, False])
+@pytest.mark.parametrize("is_centered", [True, False])
 @pytest.mark.parametrize("input_px", [(640, 480), (416, 416), (160, 320)])
-def test_a_bright_patch_is_where_its_box_says(is_centred: bool, input_px) -> None:
+def test_a_bright_patch_is_where_its_box_says(is_centered: bool, input_px) -> None:
     """Judged by the centre of brightness, to a tenth of a pixel of the input."""
     image = np.zeros((240, 320, 3), np.uint8)
     image[60:120, 200:260] = 255
-    letterbox = Letterbox.fit((320, 240), input_px, is_centred)
+    letterbox = Letterbox.fit((320, 240), input_px, is_centered)
     canvas = letterbox.canvas(image).astype(float)[..., 0]
     canvas[canvas == PADDING] = 0
     rows, columns = np.indices(canvas.shape) + 0.5  # from the corner, as networks count
-    centre = np.array([(columns * canvas).sum(), (rows * canvas).sum()]) / canvas.sum()
-    (box,) = letterbox.to_image(np.r_[centre, centre][None])
+    center = np.array([(columns * canvas).sum(), (rows * canvas).sum()]) / canvas.sum()
+    (box,) = letterbox.to_image(np.r_[center, center][None])
     scale = 320 / letterbox.inner_px[0]
     np.testing.assert_allclose(box[:2], [229.5, 89.5], atol=0.1 * scale)
 
 
 def test_boxes_are_clipped_to_the_image() -> None:
-    letterbox = Letterbox.fit((320, 240), (640, 640), is_centred=True)
+    letterbox = Letterbox.fit((320, 240), (640, 640), is_centered=True)
     boxes = letterbox.to_image(np.array([[-50.0, 0.0, 700.0, 1e9]]))
     np.testing.assert_array_equal(boxes, [[-0.5, -0.5, 319.5, 239.5]])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.detection.detectors import NetworkConfig
-from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, Pair
+from ldo_service.detection.labellers.dual_encoder import DualEncoderConfig, EncoderFiles
 from ldo_service.detection.model_registry import (
     Models,
     default_folder,
@@ -35,14 +35,14 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_what_is_registered_is_a_copy_with_all_that_is_known(models: Models, file: Path) -> None:
-    models.add("squares", file, CONFIG, licence="do what you like")
+    models.add("squares", file, CONFIG, license="do what you like")
     file.unlink()
     assert models.names == ["squares"]
     about = Models().get("squares").about
     assert (about.layout, about.classes) == ("yolox", ("red", "green", "blue"))
     assert (about.licence, about.source) == ("do what you like", "squares.onnx")
     detector = open_detector("squares", CONFIG)
-    assert len(detector.find(squares_image([("red", 16, 48, 16)]))) == 1
+    assert len(detector.detect(squares_image([("red", 16, 48, 16)]))) == 1
     assert detector.identity == f"squares {about.sha256[:12]}"
 
 
@@ -134,21 +134,21 @@ def test_the_configuration_may_overrule_the_names(models: Models, file, tmp_path
     (tmp_path / "names.txt").write_text("a\nb\nc\n")
     detector = open_detector("one", NetworkConfig(names=str(tmp_path / "names.txt")))
     assert detector.labels == ("a", "b", "c")
-    assert np.isfinite(detector.find(squares_image([])).scores).all()
+    assert np.isfinite(detector.detect(squares_image([])).scores).all()
 
 
 # --- pairs that name regions ----------------------------------------------------------------------
 @pytest.fixture
-def pair(tmp_path: Path) -> Pair:
+def pair(tmp_path: Path) -> EncoderFiles:
     colors = ColorPair()
-    return Pair(
+    return EncoderFiles(
         colors.image(tmp_path / "visual.onnx"),
         colors.text(tmp_path / "textual.onnx"),
         vocabulary(tmp_path / "merges.gz"),
     )
 
 
-def test_a_pair_is_registered_with_all_its_files(models: Models, pair: Pair) -> None:
+def test_a_pair_is_registered_with_all_its_files(models: Models, pair: EncoderFiles) -> None:
     about = models.add_pair("colours", pair, ENCODERS, ("Red", "sofa", "green")).about
     for file in (pair.image, pair.text, pair.vocabulary):
         assert file is not None
@@ -163,17 +163,19 @@ def test_a_pair_is_registered_with_all_its_files(models: Models, pair: Pair) -> 
 
 
 def test_embeddings_are_registered_under_words_of_the_same_meaning(
-    models: Models, pair: Pair, tmp_path: Path
+    models: Models, pair: EncoderFiles, tmp_path: Path
 ) -> None:
     path = embeddings(tmp_path / "e.npz", names=np.array(["sofa", "green", "blue"]))
-    models.add_pair("cached", Pair(pair.image, embeddings=path), ENCODERS)
+    models.add_pair("cached", EncoderFiles(pair.image, embeddings=path), ENCODERS)
     for names in ((), ("couch", "green")):
         labeller = open_labeller("cached", ENCODERS, names)
         assert labeller.label([plain("red")])[0][0] == "couch"
 
 
 @pytest.mark.parametrize("part", ["model.onnx", "text.onnx", "bpe.txt.gz"])
-def test_a_pair_with_a_damaged_file_is_refused(models: Models, pair: Pair, part: str) -> None:
+def test_a_pair_with_a_damaged_file_is_refused(
+    models: Models, pair: EncoderFiles, part: str
+) -> None:
     model = models.add_pair("colours", pair, ENCODERS)
     (model.folder / part).write_bytes(b"garbage")
     with pytest.raises(ModelError, match=f"{part} is not what was registered"):
@@ -181,7 +183,7 @@ def test_a_pair_with_a_damaged_file_is_refused(models: Models, pair: Pair, part:
 
 
 def test_a_pair_that_does_not_fit_leaves_nothing_behind(
-    models: Models, pair: Pair, tmp_path: Path
+    models: Models, pair: EncoderFiles, tmp_path: Path
 ) -> None:
     (tmp_path / "merges.gz").write_bytes(b"garbage")
     with pytest.raises(ModelError, match=r"merges\.gz") as caught:
@@ -191,7 +193,7 @@ def test_a_pair_that_does_not_fit_leaves_nothing_behind(
 
 
 def test_detectors_and_pairs_are_not_taken_for_each_other(
-    models: Models, file: Path, pair: Pair
+    models: Models, file: Path, pair: EncoderFiles
 ) -> None:
     models.add("squares", file, CONFIG)
     models.add_pair("colours", pair, ENCODERS)

@@ -33,8 +33,8 @@ def plain_suppression(boxes, scores, class_ids, iou_max: float) -> list[int]:
 def random_boxes(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Many of them overlap, and some scores are equal."""
     rng = np.random.default_rng(seed)
-    centres, sides = rng.uniform(0, 100, (count, 2)), rng.uniform(5, 60, (count, 2))
-    boxes = np.hstack((centres - sides / 2, centres + sides / 2))
+    centers, sides = rng.uniform(0, 100, (count, 2)), rng.uniform(5, 60, (count, 2))
+    boxes = np.hstack((centers - sides / 2, centers + sides / 2))
     return boxes, rng.integers(0, 40, count) / 40, rng.integers(0, 3, count)
 
 

@@ -12,7 +12,7 @@ from ldo_service.detection.vocabulary import (
     answers_to,
     canonical,
     coco_class,
-    normalised,
+    normalized,
     read_names,
 )
 
@@ -25,12 +25,12 @@ def test_the_table_is_about_classes_of_coco_and_each_word_stands_once() -> None:
     assert {column for row in TABLE.values() for column in row} == {"same", "kinds"}
     assert len(WORDS) == len(set(WORDS))
     assert not set(WORDS) & set(COCO)
-    assert [word for word in WORDS if normalised(word) != word] == []
+    assert [word for word in WORDS if normalized(word) != word] == []
 
 
 @pytest.mark.parametrize("name", ["TV-screen", "tv_screen", "  Tv   Screen "])
 def test_case_spaces_hyphens_and_underscores_do_not_matter(name: str) -> None:
-    assert normalised(name) == "tv screen"
+    assert normalized(name) == "tv screen"
     assert canonical(name) == "tv"
 
 

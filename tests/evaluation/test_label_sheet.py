@@ -25,7 +25,7 @@ LABELS = full_list(SOURCE)
 CHAIR, LADDER = 1, 2
 
 
-def test_every_kind_of_error_has_its_colour() -> None:
+def test_every_kind_of_error_has_its_color() -> None:
     truth = np.uint8([[0, CHAIR, CHAIR, LADDER, 0, CHAIR, 0, VOID]])
     shown = np.uint8([[0, CHAIR, 0, 0, CHAIR, LADDER, UNKNOWN, CHAIR]])
     picture = error_colors(np.full((1, 8, 3), 100, np.uint8), truth, shown, LABELS)
@@ -34,7 +34,7 @@ def test_every_kind_of_error_has_its_colour() -> None:
     assert picture[0, 0].tolist() == [146, 146, 146], "background is the image in grey"
 
 
-def test_labels_that_occur_have_colours_of_their_own() -> None:
+def test_labels_that_occur_have_colors_of_their_own() -> None:
     colors = label_colors(range(1, 60))
     assert len(np.unique(colors[1:60], axis=0)) == 59
     apart = np.abs(colors[1:12, None].astype(int) - colors[None, 1:12]).sum(axis=2)

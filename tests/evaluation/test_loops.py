@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ldo_service.evaluation.loops import (
+    ComparedPair,
     FoundLoops,
     LoopClosed,
-    PairCompared,
     SeenKeyframe,
     evaluate_loops,
     overlap,
@@ -46,8 +46,8 @@ def true_pose(reference: int, keyframe: int) -> np.ndarray:
     return T
 
 
-def compared(newer: tuple[int, ...], older: tuple[int, ...], is_closure: bool) -> PairCompared:
-    return PairCompared(newer, older, is_closure, ms=20.0)
+def compared(newer: tuple[int, ...], older: tuple[int, ...], is_closure: bool) -> ComparedPair:
+    return ComparedPair(newer, older, is_closure, ms=20.0)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])

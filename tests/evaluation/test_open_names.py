@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.evaluation.label_lists import full_list
-from ldo_service.evaluation.label_measures import Found, OpenNames, is_beyond_coco
+from ldo_service.evaluation.label_measures import DetectionCounts, OpenNames, is_beyond_coco
 from ldo_service.geometry.sequence import FrameLabels
 
 SOURCE = ("undefined", "wall", "chair", "ladder", "globe", "fan")
@@ -58,15 +58,15 @@ def test_an_object_is_called_what_most_of_its_pixels_are() -> None:
         *(3 * [(2, "globe", "chair")]),
         (3, "chair", "chair"),
     )
-    assert names.objects == Found(right=1, wanted=2, named=1)
-    assert names.pixels == Found(right=100, wanted=200, named=100)
+    assert names.objects == DetectionCounts(right=1, wanted=2, named=1)
+    assert names.pixels == DetectionCounts(right=100, wanted=200, named=100)
 
 
 def test_views_are_pooled() -> None:
     names = seen((1, "ladder", "background"))
     add(names, *(2 * [(1, "ladder", "ladder")]))
-    assert names.objects == Found(1, 1, 1)
-    assert names.pixels == Found(40, 60, 40)
+    assert names.objects == DetectionCounts(1, 1, 1)
+    assert names.pixels == DetectionCounts(40, 60, 40)
 
 
 def test_a_wrong_name_costs_precision_on_objects_of_coco_on_walls_and_by_names_nobody_has() -> None:
@@ -77,15 +77,15 @@ def test_a_wrong_name_costs_precision_on_objects_of_coco_on_walls_and_by_names_n
         (4, "fan", "samovar"),
         (5, "globe", "other"),
     )
-    assert names.objects == Found(right=1, wanted=3, named=4)
+    assert names.objects == DetectionCounts(right=1, wanted=3, named=4)
     assert names.objects.precision == 0.25
     assert names.objects.recall == pytest.approx(1 / 3)
 
 
 def test_void_says_nothing() -> None:
     names = seen((1, "ladder", "ladder"), (7, "undefined", "globe"))
-    assert names.objects == Found(1, 1, 1)
-    assert names.pixels == Found(20, 20, 20)
+    assert names.objects == DetectionCounts(1, 1, 1)
+    assert names.pixels == DetectionCounts(20, 20, 20)
 
 
 def test_what_is_too_small_to_be_found_is_not_asked_for() -> None:
@@ -102,5 +102,5 @@ def test_what_is_too_small_to_be_found_is_not_asked_for() -> None:
 
 
 def test_nothing_named_has_no_precision() -> None:
-    assert np.isnan(Found(0, 3, 0).precision)
-    assert np.isnan(Found(0, 0, 3).recall)
+    assert np.isnan(DetectionCounts(0, 3, 0).precision)
+    assert np.isnan(DetectionCounts(0, 0, 3).recall)

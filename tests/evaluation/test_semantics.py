@@ -13,17 +13,17 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.detection.vocabulary import Vocabulary, coco_class
 from ldo_service.errors import DataError
 from ldo_service.evaluation.finished_run import FinishedRun, RunFrame
-from ldo_service.evaluation.label_measures import Found
+from ldo_service.evaluation.label_measures import DetectionCounts
 from ldo_service.evaluation.label_results import frames_to_show, plain_labels
 from ldo_service.evaluation.results import NO_LABELS, NO_TRUTH
 from ldo_service.evaluation.semantics import GATES, LabelErrors, ListErrors, evaluate_labels
-from ldo_service.evaluation.views import Judged
+from ldo_service.evaluation.views import EvaluatedFrames
 from ldo_service.gaussians.model import new_labels
 from ldo_service.geometry import se3
 from ldo_service.geometry.sequence import FrameLabels
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import SEMANTICS
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.offline import run_offline
 from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.semantics_file import write_semantics
 from tests.commands.test_cli import ldo
@@ -82,7 +82,7 @@ def sequence(folder: Path) -> Sequence:
 @pytest.fixture(scope="module")
 def unlabelled(sequence: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "room"
-    run_over_file(job(sequence, folder, "tracker.hold_out=5"), lambda *_: None)
+    run_offline(job(sequence, folder, "tracker.hold_out=5"), lambda *_: None)
     return folder
 
 
@@ -136,7 +136,7 @@ def renamed(folder: Path, other: dict[str, str]) -> Path:
 
 def errors_of(sequence: Sequence, folder: Path) -> LabelErrors:
     run = read_run(folder)
-    (errors,) = evaluate_labels(sequence, run, Judged.of(run.frames), lambda _done: None)
+    (errors,) = evaluate_labels(sequence, run, EvaluatedFrames.of(run.frames), lambda _done: None)
     return errors
 
 
@@ -154,7 +154,7 @@ def test_a_map_that_knows_the_truth_is_nearly_right(sequence: Sequence, labelled
         assert row.figures(0).classes >= found.classes >= 4
         assert 0.7 < row.per_image_iou() <= 1
     assert (errors.pairs, errors.consistency.share > 0.9) == (2, True), "0 to 3, and 4 to 7"
-    assert errors.objects == Found(right=2, wanted=2, named=2), "speaker and globe"
+    assert errors.objects == DetectionCounts(right=2, wanted=2, named=2), "speaker and globe"
     assert errors.pixels.recall > 0.9
     assert errors.pixels.precision > 0.9
 

@@ -14,8 +14,8 @@ from ldo_service.errors import DataError
 from ldo_service.evaluation import (
     ErrorStatistics,
     TrajectoryErrors,
-    align,
     evaluate_trajectory,
+    fit_rigid_transform,
 )
 from ldo_service.geometry import Trajectory, se3
 from ldo_service.tracking import Odometry
@@ -187,14 +187,16 @@ def test_scale_is_not_aligned_away() -> None:
 
 def test_mirrored_points_are_not_aligned_by_a_reflection() -> None:
     points = np.random.default_rng(3).normal(size=(30, 3))
-    T = align(points, points * [1, 1, -1])
+    T = fit_rigid_transform(points, points * [1, 1, -1])
     assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
 
 
 def test_points_on_a_line_still_align() -> None:
     points = np.outer(np.arange(10.0), [1, 2, 3])
     target = se3.transform(se3.exp(np.array([0.3, 0.2, 0.1, 1, 2, 3])), points)
-    np.testing.assert_allclose(se3.transform(align(points, target), points), target, atol=1e-12)
+    np.testing.assert_allclose(
+        se3.transform(fit_rigid_transform(points, target), points), target, atol=1e-12
+    )
 
 
 def test_a_camera_that_stands_still_has_errors_too() -> None:

@@ -7,12 +7,12 @@ import pytest
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.finished_run import Exposures, FinishedRun, PosedMap
 from ldo_service.evaluation.views import (
-    Judged,
+    EvaluatedFrames,
     RenderingErrors,
     ViewErrors,
     evaluate_rendering,
+    evaluate_view,
     exposure_fitted,
-    judge,
     map_as_it_is,
     measured_pixels,
     view_of,
@@ -37,7 +37,7 @@ def run(finished_run: Path) -> FinishedRun:
 def evaluate(
     sequence: Sequence, run: FinishedRun, *maps: PosedMap
 ) -> dict[tuple[str, str], RenderingErrors]:
-    judged = Judged.of(run.frames)
+    judged = EvaluatedFrames.of(run.frames)
     rows = evaluate_rendering(sequence, judged, maps or run.maps, lambda _done: None)
     return {(row.map, row.protocol): row for row in rows}
 
@@ -76,7 +76,7 @@ def test_a_lost_frame_is_counted_and_not_judged(sequence: Sequence, run: Finishe
     rows = evaluate(sequence, replace(run, frames=frames))
     assert [view.frame for view in rows["online", A].views] == [4, 14]
     assert [view.frame for view in rows["online", B].views] == [0, 12]
-    assert Judged.of(frames).counts() == (
+    assert EvaluatedFrames.of(frames).counts() == (
         "A: 2 of 3 frames, 1 LOST, 1 WEAK. B: 2 of 3 frames, 1 LOST, 0 WEAK."
     )
 
@@ -88,7 +88,7 @@ def test_without_held_out_frames_the_counts_say_how_to_get_some(
     rows = evaluate(sequence, replace(run, frames=frames))
     assert list(rows) == [("online", B)]
     assert [view.frame for view in rows["online", B].views] == [0, 5, 10, 15]
-    assert "--hold-out 5" in Judged.of(frames).counts()
+    assert "--hold-out 5" in EvaluatedFrames.of(frames).counts()
 
 
 def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
@@ -97,7 +97,7 @@ def test_a_darker_camera_costs_unless_its_exposure_is_fitted(
     posed, frame = run.maps[0], sequence[4]
     dark = replace(frame, color=(frame.color * 0.6 + 20).astype(np.uint8))
     as_seen, darkened = (
-        dict(judge(view_of(image, posed, run.frame(4)), True)) for image in (frame, dark)
+        dict(evaluate_view(view_of(image, posed, run.frame(4)), True)) for image in (frame, dark)
     )
     assert darkened[A].psnr_db < as_seen[A].psnr_db - 3
     assert darkened[FITTED].psnr_db > as_seen[FITTED].psnr_db
@@ -151,7 +151,7 @@ def test_lpips_is_asked_for_the_images_of_each_protocol(
         return float(len(asked))
 
     view = view_of(sequence[4], run.maps[0], run.frame(4))
-    errors = dict(judge(view, True, distance))
+    errors = dict(evaluate_view(view, True, distance))
     assert [errors[A].lpips, errors[FITTED].lpips, errors[PLAIN].lpips] == [1, 2, 3]
     np.testing.assert_array_equal(asked[0], (view.seen, view.shown))
     np.testing.assert_array_equal(asked[1], exposure_fitted(view))

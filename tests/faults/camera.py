@@ -10,7 +10,7 @@ import numpy as np
 import zenoh
 
 from ldo_service.client import Client
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import Camera
 from ldo_service.geometry.frames import RawFrame
@@ -22,7 +22,7 @@ STRIDE, PERIOD_NS, FIRST_NS = 2, 100_000_000, 1_000_000_000
 def frames() -> list[CameraRgbd]:
     """There and back, without a jump where it begins again."""
     room = open_sequence("synthetic:room")
-    return _and_back([camera_rgbd_message(_smaller(room.read(i))) for i in _indices(room)])
+    return _and_back([raw_frame_to_message(_smaller(room.read(i))) for i in _indices(room)])
 
 
 def true_poses() -> list[np.ndarray]:

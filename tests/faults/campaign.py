@@ -25,7 +25,7 @@ from typing import Any, TextIO
 import msgspec
 import numpy as np
 
-from ldo_service.conversions.poses import transform
+from ldo_service.conversions.poses import pose_from_message
 from ldo_service.geometry import se3
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import CameraRgbd, Correction, Health, encode
@@ -334,7 +334,7 @@ class Batch:
         self._same_objects(saved)
         self._same_map("a follower", saved, witness.follower)
         self._same_map("who joined late", saved, witness.late)
-        witness.join_late(life.client.last(MAP_SNAPSHOT, 10))
+        witness.join_late(life.client.latest(MAP_SNAPSHOT, 10))
         self.camera.start(life.client)
 
     def _is_where_it_is(self) -> None:
@@ -350,7 +350,7 @@ class Batch:
             se3.inverse(self.truth[number_of(first_ns) % count])
             @ self.truth[number_of(pose.stamp_ns) % count]
         )
-        T_map_camera = transform(pose.T_map_odom) @ transform(pose.T_odom_camera)
+        T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
         T_off = se3.inverse(T_true) @ T_map_camera
         off_m, off_rad = float(se3.distances(T_off)), se3.rotation_angle(T_off)
         if off_m > OFF_MOST_M or off_rad > OFF_MOST_RAD:

@@ -25,12 +25,12 @@ from ldo_service.conversions.objects import map_objects
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.maps.replica import MapReplica
-from ldo_service.runtime.delivery_state import Past, successor
+from ldo_service.runtime.delivery_state import RestoredState, restore_actor
 from ldo_service.schemas import Correction, MapObject, MapObjects, MapSnapshot
 from ldo_service.schemas.topics import GRAPH_CORRECTION, MAP_OBJECTS, MAP_SNAPSHOT
 from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.storage.state_store import FolderStore
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_endpoint
 
@@ -98,7 +98,7 @@ class Life:
 
     # --- life and death ---------------------------------------------------------------------------
     def start(self) -> None:
-        network = Network("robot", free_endpoint())
+        network = Endpoint("robot", free_endpoint())
         settings = [word for setting in self.settings for word in ("--set", setting)]
         self.process = subprocess.Popen(
             [
@@ -121,7 +121,7 @@ class Life:
         with process.stderr as log:
             self.log.extend(iter(log.readline, ""))
 
-    def _connect(self, network: Network) -> Client:
+    def _connect(self, network: Endpoint) -> Client:
         until_s = time.monotonic() + PATIENCE_S
         while time.monotonic() < until_s and self.process.poll() is None:
             try:
@@ -177,13 +177,16 @@ class Life:
     def told(self) -> Shown | None:
         """What who joins now is told."""
         topics = MAP_SNAPSHOT, MAP_OBJECTS, GRAPH_CORRECTION
-        return Shown.of(message for topic in topics for message in self.client.last(topic, 10))
+        return Shown.of(message for topic in topics for message in self.client.latest(topic, 10))
 
     def expected(self) -> Shown | None:
         """What a service must show that goes on from the state on the disk: its checkpoint, with
         what was taken since handled again in this process. None before the first keyframe."""
         store = FolderStore(self.state / "state")
-        past, of_graph = Past.of(store.load("mapper")), Past.of(store.load("optimizer"))
+        past, of_graph = (
+            RestoredState.of(store.load("mapper")),
+            RestoredState.of(store.load("optimizer")),
+        )
         if not past.of_actor:
             return None
         copy = self.folder / "copy"
@@ -199,8 +202,8 @@ class Life:
             return Optimizer(parameters.optimizer)
 
         said = [
-            *successor(mapper(), past, mapper).resumed(),
-            *successor(optimizer(), of_graph, optimizer).resumed(),
+            *restore_actor(mapper(), past, mapper).on_restored(),
+            *restore_actor(optimizer(), of_graph, optimizer).on_restored(),
         ]
         return Shown.of(m for m in said if isinstance(m, MapSnapshot | MapObjects | Correction))
 

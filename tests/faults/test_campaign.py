@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.conversions.poses import correction_message
+from ldo_service.conversions.poses import correction_to_message
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
-from ldo_service.transport.flow_control import Grant, Header, encode_link
+from ldo_service.transport.flow_control import Credit, Header, encode_link
 from tests.faults.camera import frames
 from tests.faults.campaign import Batch, Outcome, table, whole_batches
 from tests.faults.witness import GRANTS, TAKERS, Witness
@@ -41,9 +41,9 @@ KEYFRAMES = [msgspec.structs.replace(KEYFRAME, keyframe=k, reference=None) for k
 
 
 def hear(
-    witness: Witness, topic: str, message: Message | Grant, seq: int = 0, epoch: int = 1
+    witness: Witness, topic: str, message: Message | Credit, seq: int = 0, epoch: int = 1
 ) -> None:
-    body = encode_link(message) if isinstance(message, Grant) else encode_message(message)
+    body = encode_link(message) if isinstance(message, Credit) else encode_message(message)
     witness._heard.append((topic, encode_link(Header("somebody", epoch, seq, 0)), body))
     witness.update()
 
@@ -64,16 +64,16 @@ def test_a_witness_knows_what_everybody_has_handled() -> None:
         hear(witness, "keyframe/new", keyframe, seq)
     for taker in TAKERS:
         assert not witness.is_caught_up()
-        hear(witness, GRANTS, Grant(taker, 1, handled=3, arrived=3, limit=11))
+        hear(witness, GRANTS, Credit(taker, 1, handled=3, arrived=3, limit=11))
     assert witness.is_caught_up()
-    hear(witness, GRANTS, Grant("mapper", 1, handled=1, arrived=1, limit=9))
+    hear(witness, GRANTS, Credit("mapper", 1, handled=1, arrived=1, limit=9))
     assert witness.violations == ["mapper had handled 3 keyframes, and then 1"]
 
 
 def test_a_witness_sees_versions_go_back_and_keyframes_vanish() -> None:
     witness = Witness()
     poses = [(k, np.eye(4)) for k in range(2)]
-    first, second = (correction_message(0, n, dict(poses[:n])) for n in (1, 2))
+    first, second = (correction_to_message(0, n, dict(poses[:n])) for n in (1, 2))
     hear(witness, "graph/correction", second)
     assert witness.violations == []
     hear(witness, "graph/correction", first)

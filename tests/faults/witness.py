@@ -19,8 +19,8 @@ from ldo_service.schemas import (
     TrackedPose,
     decode,
 )
-from ldo_service.transport.endpoint import Network
-from ldo_service.transport.flow_control import Grant, Header, decode_request
+from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.flow_control import Credit, Header, decode_request
 
 TAKERS = ("detector", "mapper", "loop_closer", "optimizer")  # of keyframes
 KINDS: dict[str, type[Message]] = {
@@ -57,7 +57,7 @@ class Witness:
     _heard: deque[tuple[str, bytes, bytes]] = field(default_factory=lambda: deque(maxlen=20_000))
 
     # --- hearing ----------------------------------------------------------------------------------
-    def listen(self, session: zenoh.Session, network: Network) -> None:
+    def listen(self, session: zenoh.Session, network: Endpoint) -> None:
         """For as long as the session lives. Who listens now may have missed something."""
         self.follower, self.late = MapReplica(), MapReplica()
         self._subscribers.clear()
@@ -127,7 +127,7 @@ class Witness:
             self.violations.append(f"number {header.seq} was given to {number} and its successor")
 
     def _granted(self, grant: object) -> None:
-        if isinstance(grant, Grant):
+        if isinstance(grant, Credit):
             epoch, handled = self.handled.get(grant.consumer, (grant.epoch, 0))
             if epoch == grant.epoch and grant.handled < handled:
                 self.violations.append(

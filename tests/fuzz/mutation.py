@@ -11,7 +11,7 @@ WORDS = (
     *(b"[" * 5000, b"{a: " * 2000, b"\x91" * 5000),
     *(b"\0", b"\xff\xff\xff\xff", b"\x7f\xff\xff\xff", b"\xcb\x7f\xf8", b"\xc0", b"\x80", b"\xc7"),
 )
-MOST_BYTES = 1 << 16
+MAX_BYTES = 1 << 16
 
 
 @st.composite
@@ -20,7 +20,7 @@ def mutated(draw: st.DrawFn, seeds: Sequence[bytes]) -> bytes:
     body = draw(st.sampled_from(seeds) if draw(st.integers(0, 15)) else st.binary(max_size=64))
     for _ in range(draw(st.integers(1, 4))):
         body = _edited(draw, body)
-    return body[:MOST_BYTES]
+    return body[:MAX_BYTES]
 
 
 def _edited(draw: st.DrawFn, body: bytes) -> bytes:

@@ -26,7 +26,7 @@ from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.storage.state_store import FolderStore
-from ldo_service.tracking.keyframe_database import PLACES, Place, places_of
+from ldo_service.tracking.keyframe_database import DATABASE_FILE, KeyframeRecord, places_of
 from tests.schemas.examples import EXAMPLES
 
 from .of_data_sets import DEPTH, TRAJECTORY, png
@@ -84,17 +84,17 @@ def images_of_a_keyframe() -> bytes:
     color = np.arange(3 * 48, dtype=np.uint8).reshape(3, 6, 8)
     depth_m = np.linspace(0.5, 3, 48, dtype=np.float32).reshape(6, 8)
     camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
-    return training_views.packed(training_views.KeyframeImages(3, camera, color, depth_m, None))
+    return training_views.pack(training_views.KeyframeImages(3, camera, color, depth_m, None))
 
 
 def gaussians_of_a_chunk() -> bytes:
     ids = np.arange(3, dtype=np.int64)
-    return chunk.packed(chunk.Chunk(2, ids, ROWS, new_labels(3)))
+    return chunk.pack(chunk.Chunk(2, ids, ROWS, new_labels(3)))
 
 
 def places_bytes() -> bytes:
     """Of a place with two features."""
-    place = Place(
+    place = KeyframeRecord(
         id=0,
         segment=0,
         T_odom_keyframe=np.eye(4),
@@ -187,14 +187,14 @@ of_vocabulary = (LdoError, msgspec.DecodeError, ValueError, KeyError, TypeError)
 
 
 def vocabulary(body: bytes, _folder: Path) -> Any:
-    return Vocabulary.unpacked(decode_state(body))
+    return Vocabulary.unpack(decode_state(body))
 
 
 TARGETS = [
     Target("PLY", as_file("map.ply", read_ply), [MAP, as_text(MAP)]),
     Target("labels of a map", as_file("s.npz", read_semantics), [SEMANTICS]),
     Target("objects.json", in_folder(OBJECTS, read_objects, {}), [objects_bytes()]),
-    Target("places", in_folder(PLACES, places_of, {}), [places_bytes()]),
+    Target("places", in_folder(DATABASE_FILE, places_of, {}), [places_bytes()]),
     Target("summary.json", in_folder("summary.json", vlm_calls, {}), [RUN["summary.json"]]),
     Target("loops.json", in_folder("loops.json", read_loops, {}), [RUN["loops.json"]]),
     Target(
@@ -207,10 +207,10 @@ TARGETS = [
     ),
     Target(
         "images of a keyframe",
-        lambda body, _: training_views.unpacked(body),
+        lambda body, _: training_views.unpack(body),
         [images_of_a_keyframe()],
     ),
-    Target("chunk of Gaussians", lambda body, _: chunk.unpacked(body), [gaussians_of_a_chunk()]),
+    Target("chunk of Gaussians", lambda body, _: chunk.unpack(body), [gaussians_of_a_chunk()]),
     Target(
         "recording",
         in_folder("frame_source.mcap", live_again, {}),

@@ -14,10 +14,10 @@ from ldo_service.geometry import codecs
 from ldo_service.geometry.codecs import encode_jpeg
 from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, decode
 from ldo_service.transport.flow_control import (
-    Grant,
+    ConsumerHello,
+    Credit,
     Header,
-    Join,
-    Welcome,
+    ProducerHello,
     decode_request,
     encode_link,
 )
@@ -116,12 +116,12 @@ ANSWER = (
 LINKS = (
     decode_request,
     partial(decode, kind=Header),
-    partial(decode, kind=Welcome),
+    partial(decode, kind=ProducerHello),
 )
 LINK_BODIES = [
-    encode_link(Grant("mapper", 1, 3, 4, 12)),
+    encode_link(Credit("mapper", 1, 3, 4, 12)),
     encode_link(Header("camera", 1, 2, 3)),
-    encode_link(Welcome(1, {"mapper": 3})),
+    encode_link(ProducerHello(1, {"mapper": 3})),
 ]
 
 TARGETS = [
@@ -131,7 +131,7 @@ TARGETS = [
     Target(
         "links",
         chosen(*LINKS),
-        [*numbered(LINK_BODIES), b"\0" + encode_link(Join("mapper"))],
+        [*numbered(LINK_BODIES), b"\0" + encode_link(ConsumerHello("mapper"))],
         (msgspec.DecodeError,),
     ),
     Target("ROS 2", of_ros, numbered(good[topic] for _, topic, good in ROS), ()),

@@ -14,14 +14,14 @@ from safetensors.numpy import save
 
 from ldo_service.config import config_of, config_yaml, load_config
 from ldo_service.detection.detectors import OnnxDetector
-from ldo_service.detection.labellers.text_embeddings import BytePairs, CachedEmbeddings
+from ldo_service.detection.labellers.text_embeddings import BpeTokenizer, CachedEmbeddings
 from ldo_service.detection.model_registry import Models
 from ldo_service.detection.vocabulary import class_names, read_names
 from ldo_service.suites import load_suite
 from ldo_service.transport.access_control import access_control, read_access
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.endpoint import Network
-from ldo_service.transport.keys import CA, CERTIFICATE, KEY, Keys
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.keys import CA, CERTIFICATE, KEY, TlsKeys
 from tests.detection.networks import SQUARES
 
 from .of_runs import bytes_of
@@ -74,12 +74,12 @@ def registered(folder: Path) -> None:
 
 def keys(folder: Path) -> None:
     (folder / KEY).chmod(0o600)
-    Keys(folder).context()
+    TlsKeys(folder).context()
 
 
 def of_an_authority() -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as name:
-        authority = Authority.new(Path(name) / "keys", 9)
+        authority = CertificateAuthority.new(Path(name) / "keys", 9)
         made = authority.add("desk", "viewer", "*", 9)
         return {file: (made / file).read_bytes() for file in (CA, CERTIFICATE, KEY)}
 
@@ -92,8 +92,8 @@ TARGETS = [
     Target("config.yaml", as_file("config.yaml", config), [CONFIG]),
     Target("--set", setting, [b"tracker.hold_out=5", b"dataset.T_color_depth=[1, 0]"]),
     Target("suite", as_file("suite.yaml", lambda path: load_suite(str(path))), [SUITE]),
-    Target("names of robots", of_names(Network), [b"mule", b"../up"]),
-    Target("endpoints", of_names(lambda text: Network("r", text).address), [b"tcp/[::1]:7447"]),
+    Target("names of robots", of_names(Endpoint), [b"mule", b"../up"]),
+    Target("endpoints", of_names(lambda text: Endpoint("r", text).address), [b"tcp/[::1]:7447"]),
     Target(
         "access.yaml",
         as_file("access.yaml", lambda path: access_control(read_access(path))),
@@ -110,7 +110,9 @@ TARGETS = [
         of_names(lambda text: class_names(2, metadata=text)),
         [b"{0: 'chair', 1: 'sofa'}", b"['a', 'b']"],
     ),
-    Target("byte pairs", as_file("bpe", BytePairs.read), [MERGES, gzip.compress(MERGES, mtime=0)]),
+    Target(
+        "byte pairs", as_file("bpe", BpeTokenizer.read), [MERGES, gzip.compress(MERGES, mtime=0)]
+    ),
     Target("embeddings", as_file("e.npz", CachedEmbeddings), [npz()]),
     Target(
         "embeddings in safetensors",

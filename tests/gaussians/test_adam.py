@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians import Adam, AdamConfig, GaussianMap, Rasteriser, RowGradients
+from ldo_service.gaussians import Adam, AdamConfig, GaussianMap, Rasterizer, RowGradients
 from ldo_service.geometry import Camera
 
 
@@ -39,10 +39,10 @@ def test_gaussians_that_come_back_begin_anew_and_the_others_go_on() -> None:
     adams = Adam(), Adam()
     for adam, gaussians in zip(adams, (changed, still), strict=True):
         adam.step(gaussians, gradients(gaussians, [0, 1, 2, 3, 5]))
-    away = changed.take_out(np.array([0, 1, 1, 0, 0, 0], bool))
+    away = changed.extract(np.array([0, 1, 1, 0, 0, 0], bool))
     adams[0].step(changed, gradients(changed, [0], seed=1))
     adams[1].step(still, gradients(still, [0], seed=1))
-    changed.bring_back(*away)
+    changed.reinsert(*away)
     changed.add(map_of(2).rows.copy(), 1)
     adams[0].step(changed, gradients(changed, [3, 5], seed=2))
     adams[1].step(still, gradients(still, [3, 5], seed=2))
@@ -62,9 +62,9 @@ def test_moments_of_any_set_of_gaussians_are_found_by_their_ids(present) -> None
     rows, anchors = gaussians.rows.copy(), gaussians.anchors.copy()
     taken: dict[int, int] = {}  # steps since the Gaussian last came
     for ids in present:
-        gaussians.take_out(np.ones(len(gaussians), bool))
+        gaussians.extract(np.ones(len(gaussians), bool))
         where = np.array(sorted(ids), int)
-        gaussians.bring_back(where, rows[where], anchors[where])
+        gaussians.reinsert(where, rows[where], anchors[where])
         adam.step(gaussians, gradients(gaussians, sorted(ids)))
         taken = {i: taken.get(i, 0) + 1 for i in ids}
         steps = np.array([taken[i] for i in where])
@@ -89,10 +89,10 @@ def test_descent_is_the_step_against_the_gradients_to_the_bit(threads: int) -> N
     maps, adams = (seen_map(9_000), seen_map(9_000)), (Adam(), Adam())
     needles = {"needle_weight": 0.1, "needle_ratio": 1.5}
     for rate in (1.0, 0.5):
-        at_once, in_two = Rasteriser(threads=threads), Rasteriser()
-        for rasteriser, gaussians in zip((at_once, in_two), maps, strict=True):
-            rasteriser.render(gaussians.rows, camera, np.eye(4), bounds=gaussians.bounds)
-        reached = adams[0].descend(maps[0], at_once, by_planes, rate=rate, **needles)
+        at_once, in_two = Rasterizer(threads=threads), Rasterizer()
+        for rasterizer, gaussians in zip((at_once, in_two), maps, strict=True):
+            rasterizer.render(gaussians.rows, camera, np.eye(4), bounds=gaussians.bounds)
+        reached = adams[0].step_fused(maps[0], at_once, by_planes, rate=rate, **needles)
         derivatives = in_two.gradients(by_planes, **needles)
         adams[1].step(maps[1], derivatives, rate=rate)
         assert reached.indices.tobytes() == derivatives.indices.tobytes()
@@ -107,9 +107,9 @@ def test_descent_is_the_step_against_the_gradients_to_the_bit(threads: int) -> N
 def stepped(gaussians: GaussianMap, max_sigma_px: float) -> np.ndarray:
     """Mask [N] of those that one step moved."""
     camera, by_planes = Camera(40, 32, 40.0, 40.0, 20.0, 16.0), np.ones((5, 32, 40), np.float32)
-    rasteriser, adam = Rasteriser(), Adam()
-    rasteriser.render(gaussians.rows, camera, np.eye(4))
-    adam.descend(gaussians, rasteriser, by_planes, max_sigma_px=max_sigma_px)
+    rasterizer, adam = Rasterizer(), Adam()
+    rasterizer.render(gaussians.rows, camera, np.eye(4))
+    adam.step_fused(gaussians, rasterizer, by_planes, max_sigma_px=max_sigma_px)
     return adam.steps(gaussians) > 0
 
 
@@ -130,13 +130,13 @@ def test_what_moves_is_cut_to_the_size_that_the_view_allows() -> None:
 
 def test_descent_of_another_map_than_was_rendered_is_refused() -> None:
     camera, by_planes = Camera(8, 8, 8.0, 8.0, 4.0, 4.0), np.ones((5, 8, 8), np.float32)
-    rendered, other, rasteriser = seen_map(50), seen_map(50), Rasteriser()
-    rasteriser.render(rendered.rows, camera, np.eye(4))
+    rendered, other, rasterizer = seen_map(50), seen_map(50), Rasterizer()
+    rasterizer.render(rendered.rows, camera, np.eye(4))
     with pytest.raises(ValueError, match="not those that were rendered"):
-        Adam().descend(other, rasteriser, by_planes)
-    Adam().descend(rendered, rasteriser, by_planes)
+        Adam().step_fused(other, rasterizer, by_planes)
+    Adam().step_fused(rendered, rasterizer, by_planes)
     with pytest.raises(ValueError, match="holds no rendering"):
-        Adam().descend(rendered, rasteriser, by_planes)
+        Adam().step_fused(rendered, rasterizer, by_planes)
 
 
 def test_moments_go_with_the_map_that_is_stepped_on() -> None:

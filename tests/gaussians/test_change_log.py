@@ -56,44 +56,44 @@ def test_a_follower_ends_with_the_same_rows_whatever_happens(steps: list[tuple[s
         match what:
             case "add":
                 gaussians.add(rows(int(rng.integers(1, 5)), float(seed)), 0)
-                log.grown(gaussians)
+                log.mark_added(gaussians)
             case "write":
                 gaussians.rows[mask] += 1
                 log.changed(mask)
             case "remove":
-                log.removing(gaussians, mask)
+                log.mark_removed(gaussians, mask)
                 gaussians.remove(mask)
             case "tell":
-                follower.take(log.take(gaussians, with_changed=False), gaussians)
+                follower.take(log.drain(gaussians, with_changed=False), gaussians)
             case "tell all":
-                follower.take(log.take(gaussians, with_changed=True), gaussians)
+                follower.take(log.drain(gaussians, with_changed=True), gaussians)
                 assert {i: r for i, r in follower.rows.items() if i in truth(gaussians)} == truth(
                     gaussians
                 )
             case "sleep":
-                follower.take(log.take(gaussians, with_changed=True), gaussians)
-                asleep.append(gaussians.take_out(mask))
-                log.all_told(gaussians)
+                follower.take(log.drain(gaussians, with_changed=True), gaussians)
+                asleep.append(gaussians.extract(mask))
+                log.mark_all_published(gaussians)
             case "wake" if asleep:
                 woken = asleep.pop()
-                gaussians.bring_back(*woken)
-                log.woken(gaussians, woken.ids)
+                gaussians.reinsert(*woken)
+                log.mark_loaded(gaussians, woken.ids)
     while asleep:
         woken = asleep.pop()
-        gaussians.bring_back(*woken)
-        log.woken(gaussians, woken.ids)
-    follower.take(log.take(gaussians, with_changed=True), gaussians)
+        gaussians.reinsert(*woken)
+        log.mark_loaded(gaussians, woken.ids)
+    follower.take(log.drain(gaussians, with_changed=True), gaussians)
     assert follower.rows == truth(gaussians)
 
 
 def test_what_came_and_went_untold_is_never_told() -> None:
     gaussians, log = GaussianMap(), ChangeLog()
     gaussians.add(rows(3), 0)
-    log.grown(gaussians)
+    log.mark_added(gaussians)
     mask = np.array([False, True, False])
-    log.removing(gaussians, mask)
+    log.mark_removed(gaussians, mask)
     gaussians.remove(mask)
-    changes = log.take(gaussians, with_changed=True)
+    changes = log.drain(gaussians, with_changed=True)
     assert changes.removed.tolist() == []
     assert gaussians.ids[changes.added].tolist() == [0, 2]
 
@@ -102,7 +102,7 @@ def test_what_came_and_went_untold_is_never_told() -> None:
 def test_nothing_is_told_twice(with_changed: bool) -> None:
     gaussians, log = GaussianMap(), ChangeLog()
     gaussians.add(rows(3), 0)
-    log.grown(gaussians)
-    log.take(gaussians, with_changed=with_changed)
-    again = log.take(gaussians, with_changed=with_changed)
+    log.mark_added(gaussians)
+    log.drain(gaussians, with_changed=with_changed)
+    again = log.drain(gaussians, with_changed=with_changed)
     assert len(again.removed) == len(again.changed) == len(again.added) == 0

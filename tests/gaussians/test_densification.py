@@ -6,7 +6,7 @@ import pytest
 from ldo_service.datasets import open_sequence
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation import views
-from ldo_service.gaussians import GaussianMap, InsertionConfig, insert, render
+from ldo_service.gaussians import DensificationConfig, GaussianMap, densify, render
 from ldo_service.gaussians.densification import with_small_holes_filled
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
@@ -52,7 +52,7 @@ def with_box(frame: RgbdFrame, columns: slice) -> RgbdFrame:
 
 def test_inserted_frame_is_rendered_as_it_was_seen() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
-    ids = insert(gaussians, frame, T_MAP_CAMERA, keyframe=7)
+    ids = densify(gaussians, frame, T_MAP_CAMERA, keyframe=7)
     seen = view(gaussians, T_MAP_CAMERA)
     assert psnr(seen.color, frame.color) > 28
     assert np.mean(seen.opacity > 0.8) > 0.99
@@ -64,7 +64,7 @@ def test_inserted_frame_is_rendered_as_it_was_seen() -> None:
 
 def test_view_from_elsewhere_has_no_cracks() -> None:
     gaussians = GaussianMap()
-    insert(gaussians, corner_of_a_room(), np.eye(4), 0)
+    densify(gaussians, corner_of_a_room(), np.eye(4), 0)
     T = se3.exp(np.array([0.05, 0.06, 0.02, 0.1, -0.05, 0.3]))
     seen, truth = view(gaussians, T), corner_of_a_room(T)
     inside = np.s_[12:-12, 12:-12]
@@ -76,16 +76,16 @@ def test_edges_get_more_gaussians_than_flats() -> None:
     frame = corner_of_a_room()
     flat = RgbdFrame(np.full_like(frame.color, 128), np.full_like(frame.depth_m, 2), CAMERA)
     sparse, dense = GaussianMap(), GaussianMap()
-    insert(sparse, flat, np.eye(4), 0)
-    insert(dense, frame, np.eye(4), 0)
+    densify(sparse, flat, np.eye(4), 0)
+    densify(dense, frame, np.eye(4), 0)
     assert len(sparse) == CAMERA.width * CAMERA.height // 16
     assert len(dense) > 1.5 * len(sparse)
 
 
 def test_frame_that_the_map_explains_adds_almost_nothing() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
-    first = len(insert(gaussians, frame, T_MAP_CAMERA, 0))
-    again = len(insert(gaussians, frame, T_MAP_CAMERA, 1))
+    first = len(densify(gaussians, frame, T_MAP_CAMERA, 0))
+    again = len(densify(gaussians, frame, T_MAP_CAMERA, 1))
     assert again < 0.02 * first
 
 
@@ -94,11 +94,11 @@ def test_pixels_without_depth_get_nothing() -> None:
     missing = np.zeros(frame.depth_m.shape, bool)
     missing[:, 50:] = True
     gaussians = GaussianMap()
-    insert(gaussians, without_depth(frame, missing), np.eye(4), 0, InsertionConfig(hole_px=0))
+    densify(gaussians, without_depth(frame, missing), np.eye(4), 0, DensificationConfig(hole_px=0))
     u = CAMERA.project(gaussians.means)[:, 0]
     assert len(gaussians) > 100
     assert u.max() < 49.6
-    assert len(insert(GaussianMap(), without_depth(frame, ~missing | missing), np.eye(4), 0)) == 0
+    assert len(densify(GaussianMap(), without_depth(frame, ~missing | missing), np.eye(4), 0)) == 0
 
 
 def test_small_holes_are_filled_with_the_depth_behind_and_large_ones_stay() -> None:
@@ -114,8 +114,8 @@ def test_small_holes_are_filled_with_the_depth_behind_and_large_ones_stay() -> N
 
 def test_surface_in_front_of_the_map_is_added() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
-    insert(gaussians, frame, np.eye(4), 0)
-    ids = insert(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 1)
+    densify(gaussians, frame, np.eye(4), 0)
+    ids = densify(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 1)
     assert 30 < len(ids) < 1000
     seen = view(gaussians, np.eye(4))
     np.testing.assert_allclose(seen.median_depth_m[34:46, 44:66], 1.0, atol=0.02)
@@ -125,24 +125,24 @@ def test_surface_in_front_of_the_map_is_added() -> None:
 
 def test_an_edge_that_noise_or_drift_displaces_adds_nothing() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
-    insert(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 0)
+    densify(gaussians, with_box(frame, slice(40, 70)), np.eye(4), 0)
     displaced = with_box(frame, slice(41, 72))
     strict = GaussianMap.restore(gaussians.snapshot())
-    assert len(insert(strict, displaced, np.eye(4), 1, InsertionConfig(edge_px=0))) > 50
-    assert len(insert(gaussians, displaced, np.eye(4), 1)) == 0
+    assert len(densify(strict, displaced, np.eye(4), 1, DensificationConfig(edge_px=0))) > 50
+    assert len(densify(gaussians, displaced, np.eye(4), 1)) == 0
 
 
 def test_a_thin_surface_in_front_of_the_map_is_added() -> None:
     frame, gaussians = corner_of_a_room(), GaussianMap()
-    insert(gaussians, frame, np.eye(4), 0)
+    densify(gaussians, frame, np.eye(4), 0)
     pole = with_box(frame, slice(40, 42))
-    assert len(insert(gaussians, pole, np.eye(4), 1)) > 30
+    assert len(densify(gaussians, pole, np.eye(4), 1)) > 30
     assert view(gaussians, np.eye(4)).color[32:48, 40:42, 1].max() < 0.3
 
 
 def test_gaussians_are_flat_and_lie_in_the_surface() -> None:
     gaussians = GaussianMap()
-    insert(gaussians, corner_of_a_room(), np.eye(4), 0)
+    densify(gaussians, corner_of_a_room(), np.eye(4), 0)
     R, scales = se3.rotation(gaussians.quats.astype(float)), np.exp(gaussians.log_scales)
     thinnest = np.take_along_axis(R, scales.argmin(1)[:, None, None], axis=2)[..., 0]
     _, y, z = gaussians.means.T
@@ -155,19 +155,19 @@ def test_gaussians_are_flat_and_lie_in_the_surface() -> None:
 
 
 def test_color_criterion_reinserts_what_changed_its_color() -> None:
-    frame, config = corner_of_a_room(), InsertionConfig(max_color_error=0.1)
+    frame, config = corner_of_a_room(), DensificationConfig(max_color_error=0.1)
     plain, strict = GaussianMap(), GaussianMap()
     for gaussians in (plain, strict):
-        insert(gaussians, frame, np.eye(4), 0)
+        densify(gaussians, frame, np.eye(4), 0)
     repainted = RgbdFrame(255 - frame.color, frame.depth_m, CAMERA)
-    assert len(insert(plain, repainted, np.eye(4), 1)) < 20
-    assert len(insert(strict, repainted, np.eye(4), 1, config)) > 300
+    assert len(densify(plain, repainted, np.eye(4), 1)) < 20
+    assert len(densify(strict, repainted, np.eye(4), 1, config)) > 300
 
 
 def test_number_of_threads_changes_no_bit() -> None:
     maps = [GaussianMap(), GaussianMap()]
     for gaussians, threads in zip(maps, (1, 3), strict=True):
-        insert(gaussians, corner_of_a_room(), T_MAP_CAMERA, 0, threads=threads)
+        densify(gaussians, corner_of_a_room(), T_MAP_CAMERA, 0, threads=threads)
     assert maps[0].rows.tobytes() == maps[1].rows.tobytes()
 
 
@@ -178,7 +178,7 @@ def test_image_whose_sides_are_not_multiples_of_a_cell_is_covered() -> None:
         np.ascontiguousarray(frame.color[:86, :117]), frame.depth_m[:86, :117].copy(), camera
     )
     gaussians = GaussianMap()
-    insert(gaussians, cropped, np.eye(4), 0)
+    densify(gaussians, cropped, np.eye(4), 0)
     seen = render(gaussians.rows, camera, np.eye(4))
     assert np.mean(seen.opacity > 0.5) > 0.99
 
@@ -187,7 +187,7 @@ def test_image_of_one_pixel_gives_one_gaussian() -> None:
     camera = Camera(1, 1, 2.0, 2.0, 0.0, 0.0)
     frame = RgbdFrame(np.full((1, 1, 3), 99, np.uint8), np.ones((1, 1), np.float32), camera)
     gaussians = GaussianMap()
-    insert(gaussians, frame, np.eye(4), 0)
+    densify(gaussians, frame, np.eye(4), 0)
     np.testing.assert_allclose(gaussians.means, [[0, 0, 1]])
 
 
@@ -205,7 +205,7 @@ def test_image_of_one_pixel_gives_one_gaussian() -> None:
 )
 def test_config_refuses_senseless_values(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        InsertionConfig(**wrong)
+        DensificationConfig(**wrong)
 
 
 def test_real_room_is_rendered_between_its_keyframes(data: Path) -> None:
@@ -215,7 +215,7 @@ def test_real_room_is_rendered_between_its_keyframes(data: Path) -> None:
     T_map_camera = truth.T_world_camera
     gaussians = GaussianMap()
     for i in (0, 5, 20, 25):
-        insert(gaussians, apartment[i], T_map_camera[i], i)
+        densify(gaussians, apartment[i], T_map_camera[i], i)
     for i in (2, 22):
         seen = render(gaussians.rows, apartment.camera, se3.inverse(T_map_camera[i]))
         covered = seen.opacity > 0.5

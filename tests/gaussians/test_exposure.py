@@ -1,6 +1,6 @@
 import numpy as np
 
-from ldo_service.gaussians import Exposure, estimated_exposure, fitted_exposure
+from ldo_service.gaussians import Exposure, estimate_exposure, fit_exposure
 
 
 def test_exposure_starts_by_changing_nothing() -> None:
@@ -18,12 +18,12 @@ def test_matrix_and_exposure_say_the_same() -> None:
 def test_fit_finds_the_exposure_that_was_applied() -> None:
     color = np.random.default_rng(0).uniform(0.2, 0.6, (20, 20, 3))
     truth = Exposure.of(np.array([[1.3, 0.8, 1.0], [-0.1, 0.2, 0.05]]))
-    found = fitted_exposure(color, truth.applied(color))
+    found = fit_exposure(color, truth.applied(color))
     np.testing.assert_allclose(found.matrix, truth.matrix, atol=1e-5)
 
 
 def test_fit_of_an_image_without_contrast_changes_the_bias_only() -> None:
-    found = fitted_exposure(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.7))
+    found = fit_exposure(np.full((4, 4, 3), 0.5), np.full((4, 4, 3), 0.7))
     np.testing.assert_allclose(found.matrix, [[1, 1, 1], [0.2, 0.2, 0.2]], atol=1e-6)
 
 
@@ -32,9 +32,7 @@ def estimated(
 ) -> Exposure | None:
     """Of images [H, W, 3] in 0..1, as a camera tells them."""
     bytes_seen = (255 * seen.clip(0, 1) + 0.5).astype(np.uint8)
-    return estimated_exposure(
-        shown.transpose(2, 0, 1), opacity, bytes_seen.transpose(2, 0, 1), mask
-    )
+    return estimate_exposure(shown.transpose(2, 0, 1), opacity, bytes_seen.transpose(2, 0, 1), mask)
 
 
 def shown_and_seen(gain: float, bias: float) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +78,7 @@ def test_without_a_map_behind_it_no_exposure_is_estimated() -> None:
     assert estimated(shown, opacity, seen) is None
 
 
-def test_one_colour_alone_says_how_the_gain_changed() -> None:
+def test_one_color_alone_says_how_the_gain_changed() -> None:
     """Gain and bias cannot be told apart there, and cameras change their gain."""
     flat = np.full((160, 160, 3), 0.5, np.float32)
     found = estimated(flat, np.ones((160, 160), np.float32), flat * np.float32(0.8))

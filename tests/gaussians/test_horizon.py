@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians import render
-from ldo_service.gaussians.visibility import BEHIND, AnchorSpheres, Horizon, PlacedCamera
+from ldo_service.gaussians.visibility import BEHIND, BoundingSpheres, MaxDepthGrid, PlacedCamera
 from ldo_service.geometry import Camera, se3
 
 CAMERA = Camera(160, 120, 120.0, 110.0, 75.0, 62.0)
@@ -10,7 +10,7 @@ CAMERA = Camera(160, 120, 120.0, 110.0, 75.0, 62.0)
 
 def hidden_behind(depth_m: np.ndarray, centers: list, radius_m: float = 0.1) -> list[bool]:
     radii_m = np.full(len(centers), radius_m)
-    return Horizon.of(depth_m).hides(CAMERA, np.array(centers, float), radii_m).tolist()
+    return MaxDepthGrid.of(depth_m).occludes(CAMERA, np.array(centers, float), radii_m).tolist()
 
 
 def wall(z_m: float) -> np.ndarray:
@@ -51,10 +51,10 @@ def test_the_hidden_show_in_no_pixel_in_front_of_what_was_measured(seed: int) ->
     rows[:, 0:3] = rng.uniform((-5, -4, 0.5), (5, 4, 9), (2000, 3))
     rows[:, 3:6] = rng.uniform(-5, -2.5, (2000, 3))
     rows[:, 6], rows[:, 10] = 1, 8
-    spheres = AnchorSpheres.around(rows, np.arange(2000, dtype=np.int32))
+    spheres = BoundingSpheres.around(rows, np.arange(2000, dtype=np.int32))
     T_map_camera = se3.exp(np.array([0.1, -0.2, 0.1, 0.2, -0.1, 0.3]))
     placed = PlacedCamera(CAMERA, T_map_camera)
-    with_horizon = PlacedCamera(CAMERA, T_map_camera, Horizon.of(depth_m))
+    with_horizon = PlacedCamera(CAMERA, T_map_camera, MaxDepthGrid.of(depth_m))
     in_view = placed.may_see(spheres.centers, spheres.radii_m)
     seen = with_horizon.may_see(spheres.centers, spheres.radii_m)
     assert not np.any(seen & ~in_view)

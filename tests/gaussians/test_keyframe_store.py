@@ -12,7 +12,7 @@ import pytest
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.gaussians import Exposure
 from ldo_service.gaussians.keyframe_store import KeyframeStore, KeyframeStoreConfig
-from ldo_service.gaussians.training_views import KeyframeImages, packed, unpacked
+from ldo_service.gaussians.training_views import KeyframeImages, pack, unpack
 from ldo_service.geometry import Camera
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -57,7 +57,7 @@ def file_of(folder: Path, keyframe: int) -> Path:
 @pytest.mark.parametrize("mask", [False, True])
 def test_images_come_back_bit_for_bit(step_m: float, mask: bool) -> None:
     images = images_of(3, step_m=step_m, mask=mask)
-    assert_same(unpacked(packed(images)), images)
+    assert_same(unpack(pack(images)), images)
 
 
 def test_depth_of_any_bits_comes_back_bit_for_bit() -> None:
@@ -65,13 +65,13 @@ def test_depth_of_any_bits_comes_back_bit_for_bit() -> None:
         0, 2**32, (48, 64), np.uint32
     )  # with NaN, -0, denormals
     images = KeyframeImages(0, CAMERA, images_of(0).color, bits.view(np.float32))
-    assert unpacked(packed(images)).depth_m.tobytes() == bits.tobytes()
+    assert unpack(pack(images)).depth_m.tobytes() == bits.tobytes()
 
 
 def test_a_smooth_picture_takes_less_room_than_noise() -> None:
     ramp = np.add.outer(np.arange(48), 2 * np.arange(64)).astype(np.uint8)
     smooth = KeyframeImages(0, CAMERA, np.stack([ramp] * 3), np.ones((48, 64), np.float32))
-    assert 20 * len(packed(smooth)) < smooth.nbytes < 4 * len(packed(images_of(0)))
+    assert 20 * len(pack(smooth)) < smooth.nbytes < 4 * len(pack(images_of(0)))
 
 
 def test_images_that_do_not_fit_their_camera_are_refused() -> None:
@@ -85,7 +85,7 @@ def test_images_that_do_not_fit_their_camera_are_refused() -> None:
 @pytest.mark.parametrize("body", [b"", b"\x93\x01\x02\x03", b"\xff" * 100])
 def test_other_bytes_are_refused(body: bytes) -> None:
     with pytest.raises(DataError, match="no images of a keyframe"):
-        unpacked(body)
+        unpack(body)
 
 
 def test_a_view_is_the_images_at_a_pose() -> None:
@@ -190,7 +190,7 @@ def quota_for(folder: Path, count: int) -> float:
     return (count + 0.5) * store.statistics()["keyframes_disk_mb"]
 
 
-def test_over_the_quota_the_one_with_the_nearest_neighbours_goes_first(tmp_path: Path) -> None:
+def test_over_the_quota_the_one_with_the_nearest_neighbors_goes_first(tmp_path: Path) -> None:
     quota_mb = quota_for(tmp_path / "one", 5)
     store = store_on_disk(tmp_path / "many", [0, 10, 13, 20, 30], quota_mb=quota_mb, newest_kept=2)
     store.put(images_of(31))  # gaps: 10 has 13, 13 has 10, 20 has 17, the two newest are safe

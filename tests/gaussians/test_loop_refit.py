@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from ldo_service.gaussians.loop_refit import MapRepair, RepairConfig
+from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.geometry.point_records import PoseTable
 
-CONFIG = RepairConfig(
+CONFIG = LoopRefitConfig(
     mending_min_m=0.01,
     mending_min_rad=0.01,
     mended_keyframes=0,
@@ -32,7 +32,7 @@ class Map:
         self.asleep = asleep
         self.iterations: list[int] = []
 
-    def is_awake(self, keyframe: int) -> bool:
+    def is_resident(self, keyframe: int) -> bool:
         return keyframe not in self.asleep
 
     def refine(self, iterations: int, *_: Any, **__: Any) -> int:
@@ -40,13 +40,13 @@ class Map:
         return iterations
 
 
-def torn(map_: Map) -> MapRepair:
+def torn(map_: Map) -> LoopRefit:
     """By a correction that moves keyframes 3 and 4 against the first."""
-    poses, repair = KeyframePoses(), MapRepair(map_, CONFIG)  # type: ignore[arg-type]
+    poses, repair = KeyframePoses(), LoopRefit(map_, CONFIG)  # type: ignore[arg-type]
     for keyframe in range(5):
         aside = se3.exp(np.array([0, 0, 0, 0.1 * (keyframe >= 3), 0, 0]))
-        poses.chain(keyframe, None, np.eye(4), aside)
-    repair.note(poses)
+        poses.add(keyframe, None, np.eye(4), aside)
+    repair.mark_moved(poses)
     return repair
 
 
@@ -56,7 +56,7 @@ def test_what_is_due_is_paid_and_no_more() -> None:
     for _ in range(4):
         repair.with_keyframe(is_behind=False)
     assert map_.iterations == [6, 2]
-    assert repair.due == 0
+    assert repair.pending_iterations == 0
 
 
 def test_what_is_due_where_all_sleeps_waits_and_costs_nothing() -> None:
@@ -64,9 +64,9 @@ def test_what_is_due_where_all_sleeps_waits_and_costs_nothing() -> None:
     repair = torn(map_)
     repair.with_keyframe(is_behind=False)
     assert map_.iterations == []
-    assert repair.due == 8
+    assert repair.pending_iterations == 8
     map_.asleep = {4}
     for _ in range(3):
         repair.with_keyframe(is_behind=False)
     assert map_.iterations == [4]
-    assert repair.due == 4
+    assert repair.pending_iterations == 4

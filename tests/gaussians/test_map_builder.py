@@ -9,10 +9,10 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.views import psnr
-from ldo_service.gaussians import OptimiserConfig, PruningConfig, render
+from ldo_service.gaussians import GaussianOptimizerConfig, PruningConfig, render
 from ldo_service.gaussians.keyframe_store import KeyframeStoreConfig
-from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, WindowConfig
-from ldo_service.gaussians.visibility import SleepConfig
+from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig, ViewSamplingConfig
+from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import se3
 
 from .conftest import Posed
@@ -55,7 +55,7 @@ def test_fitting_improves_views_that_it_was_not_fitted_to(posed: dict) -> None:
 @pytest.mark.parametrize("threads", [2, 3])
 def test_the_same_keyframes_give_the_same_bits(posed: dict, threads: int) -> None:
     config = MapBuilderConfig(
-        optimiser=OptimiserConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
+        optimiser=GaussianOptimizerConfig(rotation_rate_rad=1e-4, translation_rate_m=1e-4)
     )
     one, many = (
         built(posed, config, iterations=4),
@@ -129,7 +129,7 @@ def test_a_correction_moves_gaussians_and_view_together(posed: dict) -> None:
 
 def test_moved_keyframes_are_told_once(posed: dict) -> None:
     config = MapBuilderConfig(
-        optimiser=OptimiserConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
+        optimiser=GaussianOptimizerConfig(rotation_rate_rad=1e-3, translation_rate_m=1e-3)
     )
     builder = built(posed, config, iterations=10)
     refined = builder.refined()
@@ -147,7 +147,7 @@ def elsewhere(posed: dict, x_m: float) -> dict:
 
 def with_sleepers(posed: dict, **options) -> MapBuilder:
     """A map whose first half, seen from the first keyframes, sleeps for the most part."""
-    config = MapBuilderConfig(sleep=SleepConfig(max_active=2000, reach_m=20), recent_cameras=2)
+    config = MapBuilderConfig(sleep=OffloadConfig(max_active=2000, reach_m=20), recent_cameras=2)
     builder, far = MapBuilder(config, **options), elsewhere(posed, 100.0)
     for keyframe, i in enumerate(KEYFRAMES):
         builder.add(*posed[i], keyframe, 2)
@@ -155,7 +155,7 @@ def with_sleepers(posed: dict, **options) -> MapBuilder:
     for keyframe, i in enumerate(KEYFRAMES, len(KEYFRAMES)):
         builder.add(*far[i], keyframe, 2)
         builder.changes(with_changed=True)
-        builder.rest()
+        builder.offload_excess()
     return builder
 
 
@@ -164,10 +164,10 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     asleep = builder.statistics()["gaussians_asleep"]
     assert asleep > 1000
     assert builder.size() == len(builder.gaussians) + asleep
-    whole = np.concatenate([piece.ids for piece in builder.pieces()])
+    whole = np.concatenate([piece.ids for piece in builder.batches()])
     assert np.all(np.diff(whole) > 0)
     assert len(whole) == builder.size()
-    see_sleepers = [k for k in builder.views.cameras if not builder.is_awake(k)]
+    see_sleepers = [k for k in builder.views.cameras if not builder.is_resident(k)]
     assert len(see_sleepers) > 1
     assert builder.refine(12) == 12
     assert builder.refine(2, first=see_sleepers[:2]) == 0, "views of what sleeps are left out"
@@ -180,10 +180,10 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
 
 def test_followers_are_told_what_was_lost_on_disk(posed: dict, tmp_path: Path) -> None:
     builder = with_sleepers(posed, folder=tmp_path)
-    before = np.concatenate([piece.ids for piece in builder.pieces()])
+    before = np.concatenate([piece.ids for piece in builder.batches()])
     for file in sorted((tmp_path / "gaussians").iterdir())[:2]:
         file.write_bytes(file.read_bytes()[:-20])
-    after = np.concatenate([piece.ids for piece in builder.pieces()])
+    after = np.concatenate([piece.ids for piece in builder.batches()])
     assert len(after) < len(before)
     removed = builder.changes(with_changed=False).removed
     assert np.setdiff1d(before, removed).tolist() == after.tolist()
@@ -201,7 +201,7 @@ def test_followers_are_told_what_was_lost_on_disk(posed: dict, tmp_path: Path) -
 )
 def test_senseless_windows_are_refused(change: dict) -> None:
     with pytest.raises(ConfigError):
-        WindowConfig(**change)
+        ViewSamplingConfig(**change)
 
 
 def test_what_moves_is_neither_mapped_nor_fitted(posed: dict) -> None:
@@ -232,7 +232,7 @@ def test_a_keyframe_without_images_is_known_by_its_pose_alone(posed: dict, tmp_p
         first.add(*posed[i], keyframe, 5)
     assert list(first.views.cameras) == [0, 2]
     assert list(first.views.poses) == [0, 1, 2]
-    assert first.mend(1, 5) == 0
+    assert first.deduplicate_keyframe(1, 5) == 0
     shutil.copytree(tmp_path / "first", tmp_path / "second", dirs_exist_ok=True)
     second = MapBuilder(config, folder=tmp_path / "second")
     second.restore(first.snapshot())

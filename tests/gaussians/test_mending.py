@@ -32,8 +32,8 @@ def test_a_doubled_room_becomes_single_again_and_looks_no_worse(small_room) -> N
         return float(np.mean(values))
 
     doubled, before = builder.size(), quality()
-    gone = sum(builder.mend(k, 5) for k in again)
-    assert builder.mend(77, 5) == 0, "nobody knows it"
+    gone = sum(builder.deduplicate_keyframe(k, 5) for k in again)
+    assert builder.deduplicate_keyframe(77, 5) == 0, "nobody knows it"
     assert doubled - builder.size() == gone
     assert gone > 0.3 * (doubled - single)
     assert quality() > before

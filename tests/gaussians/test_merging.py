@@ -3,7 +3,7 @@
 import numpy as np
 
 from ldo_service.gaussians.model import aligned_rows
-from ldo_service.gaussians.pruning import MergingConfig, doubled
+from ldo_service.gaussians.pruning import DeduplicationConfig, find_duplicates
 from ldo_service.gaussians.renderer import render
 from ldo_service.geometry import Camera, se3
 
@@ -49,7 +49,7 @@ def test_the_newer_copy_goes_where_the_older_one_covers_it() -> None:
     second = wall(1.0, 1.0, left_m=0.5, z_m=1.512)
     second[:, :2] += 0.4 * SPACING_M
     rows, anchors = of_two(first, second)
-    mask = doubled(rows, anchors, 90)
+    mask = find_duplicates(rows, anchors, 90)
     assert not mask[: len(first)].any()
     inside = second[:, 0] < first[:, 0].max() + SPACING_M
     np.testing.assert_array_equal(mask[len(first) :][inside], True)
@@ -60,7 +60,7 @@ def test_the_newer_copy_goes_where_the_older_one_covers_it() -> None:
 def test_no_hole_is_left() -> None:
     second = wall(1.0, 1.0, left_m=0.5, z_m=1.51)
     rows, anchors = of_two(wall(1.0, 1.0), second)
-    kept = rows[~doubled(rows, anchors, 90)]
+    kept = rows[~find_duplicates(rows, anchors, 90)]
     opacity_before, opacity_after = (
         render(np.ascontiguousarray(r), CAMERA, np.eye(4)).opacity for r in (rows, kept)
     )
@@ -79,12 +79,12 @@ def test_what_only_lies_near_stays() -> None:
     }
     for name, other in others.items():
         rows, anchors = of_two(first, other)
-        mask = doubled(rows, anchors, 90)
+        mask = find_duplicates(rows, anchors, 90)
         assert mask.mean() < 0.02, name
 
 
 def test_keyframes_of_one_passage_are_left_alone() -> None:
     rows, anchors = of_two(wall(1.0, 1.0), wall(1.0, 1.0, z_m=1.51))
-    assert not doubled(rows, anchors, 90, MergingConfig(keyframes_apart=100)).any()
-    assert not doubled(rows, anchors, 4).any()
-    assert not doubled(rows[:0], anchors[:0], 4).any()
+    assert not find_duplicates(rows, anchors, 90, DeduplicationConfig(keyframes_apart=100)).any()
+    assert not find_duplicates(rows, anchors, 4).any()
+    assert not find_duplicates(rows[:0], anchors[:0], 4).any()

@@ -61,20 +61,20 @@ def test_removal_keeps_order_and_never_gives_an_id_twice() -> None:
 
 def test_what_was_taken_out_comes_back_bit_for_bit() -> None:
     gaussians, untouched = map_of(4, 5, 6), map_of(4, 5, 6)
-    taken = gaussians.take_out(gaussians.anchors == 1)
+    taken = gaussians.extract(gaussians.anchors == 1)
     np.testing.assert_array_equal(taken.ids, np.arange(4, 9))
     np.testing.assert_array_equal(taken.anchors, 1)
     assert taken.rows.tobytes() == rows_of(5, 1).tobytes()
     assert taken.labels.tobytes() == labels_of(5, 1).tobytes()
     np.testing.assert_array_equal(gaussians.ids, [*range(4), *range(9, 15)])
-    gaussians.bring_back(*taken)
+    gaussians.reinsert(*taken)
     for name in ("rows", "ids", "anchors", "labels"):
         assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
 
 
 def test_those_taken_out_are_copies() -> None:
     gaussians = map_of(3, 3)
-    taken = gaussians.take_out(np.ones(6, bool))
+    taken = gaussians.extract(np.ones(6, bool))
     gaussians.add(rows_of(6, 9), 2)
     assert taken.rows.tobytes() == np.concatenate([rows_of(3, 0), rows_of(3, 1)]).tobytes()
 
@@ -86,30 +86,30 @@ def test_any_order_of_leaving_and_returning_ends_with_the_same_map(masks, data) 
     away = []
     for bits in masks:
         mask = (bits >> gaussians.ids) & 1 == 1
-        away.append(gaussians.take_out(mask))
+        away.append(gaussians.extract(mask))
         assert np.all(np.diff(gaussians.ids) > 0)
     for each in (gaussians, untouched):
         each.add(rows_of(2, 9), 2)
     for k in data.draw(st.permutations(range(len(away)))):
         shuffled = data.draw(st.permutations(range(len(away[k][0]))))
-        gaussians.bring_back(*(part[list(shuffled)] for part in away[k]))
+        gaussians.reinsert(*(part[list(shuffled)] for part in away[k]))
     for name in ("rows", "ids", "anchors", "labels"):
         assert getattr(gaussians, name).tobytes() == getattr(untouched, name).tobytes()
 
 
 def test_only_absent_gaussians_of_this_map_come_back() -> None:
     gaussians = map_of(6)
-    ids, rows, anchors, labels = gaussians.take_out(np.array([0, 1, 1, 0, 0, 0], bool))
+    ids, rows, anchors, labels = gaussians.extract(np.array([0, 1, 1, 0, 0, 0], bool))
     before = gaussians.snapshot()
     for wrong, reason in (([1, 3], "id 3 is in"), ([1, 6], "gave 0 to 5"), ([2, 2], "twice")):
         with pytest.raises(ValueError, match=reason):
-            gaussians.bring_back(np.array(wrong), rows, anchors)
+            gaussians.reinsert(np.array(wrong), rows, anchors)
     with pytest.raises(ValueError, match="NaN"):
-        gaussians.bring_back(ids, np.full_like(rows, np.nan), anchors)
+        gaussians.reinsert(ids, np.full_like(rows, np.nan), anchors)
     with pytest.raises(ValueError, match="shape"):
-        gaussians.bring_back(ids, rows[:1], anchors)
+        gaussians.reinsert(ids, rows[:1], anchors)
     with pytest.raises(ValueError, match="labels"):
-        gaussians.bring_back(ids, rows, anchors, labels[:, :5])
+        gaussians.reinsert(ids, rows, anchors, labels[:, :5])
     after = gaussians.snapshot()
     assert all(before[name].tobytes() == after[name].tobytes() for name in before)
 
@@ -135,9 +135,9 @@ def test_version_grows_with_every_change() -> None:
     seen.append(gaussians.version)
     gaussians.remove(np.array([True, False, False]))
     seen.append(gaussians.version)
-    taken = gaussians.take_out(np.array([True, False]))
+    taken = gaussians.extract(np.array([True, False]))
     seen.append(gaussians.version)
-    gaussians.bring_back(*taken)
+    gaussians.reinsert(*taken)
     seen.append(gaussians.version)
     gaussians.move_anchors({0: se3.exp(np.full(6, 0.1))})
     seen.append(gaussians.version)

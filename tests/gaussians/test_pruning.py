@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.gaussians import GaussianMap, PruningConfig, superfluous
+from ldo_service.gaussians import GaussianMap, PruningConfig, prunable_mask
 
 
 def cloud(n: int = 50, *, sigma_m: float = 0.01) -> GaussianMap:
@@ -16,22 +16,22 @@ def cloud(n: int = 50, *, sigma_m: float = 0.01) -> GaussianMap:
 
 
 def test_ordinary_map_loses_nothing() -> None:
-    assert not superfluous(cloud().rows).any()
-    assert superfluous(GaussianMap().rows).shape == (0,)
+    assert not prunable_mask(cloud().rows).any()
+    assert prunable_mask(GaussianMap().rows).shape == (0,)
 
 
 def test_transparent_and_broken_gaussians_go() -> None:
     gaussians = cloud()
     gaussians.opacity_logits[3] = -6
     gaussians.means[7, 1] = np.nan
-    np.testing.assert_array_equal(np.flatnonzero(superfluous(gaussians.rows)), [3, 7])
+    np.testing.assert_array_equal(np.flatnonzero(prunable_mask(gaussians.rows)), [3, 7])
 
 
-def test_gaussian_far_larger_than_its_neighbours_goes() -> None:
+def test_gaussian_far_larger_than_its_neighbors_goes() -> None:
     gaussians = cloud()
     gaussians.log_scales[5, 2] = np.log(0.2)
     gaussians.log_scales[6, 2] = np.log(0.05)
-    np.testing.assert_array_equal(np.flatnonzero(superfluous(gaussians.rows)), [5])
+    np.testing.assert_array_equal(np.flatnonzero(prunable_mask(gaussians.rows)), [5])
 
 
 def test_lone_gaussian_has_nobody_to_be_compared_with() -> None:
@@ -39,7 +39,7 @@ def test_lone_gaussian_has_nobody_to_be_compared_with() -> None:
     far = gaussians.rows[:1].copy()
     far[0, :3], far[0, 3:6] = 50, np.log(3)
     gaussians.add(far, 1)
-    assert not superfluous(gaussians.rows).any()
+    assert not prunable_mask(gaussians.rows).any()
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_every_attribute_is_there_within_its_byte(tmp_path: Path, some_rows: np.
     assert np.rad2deg(angles).max() < 1.0
 
 
-def test_colours_beyond_the_range_are_clipped(tmp_path: Path, some_rows: np.ndarray) -> None:
+def test_colors_beyond_the_range_are_clipped(tmp_path: Path, some_rows: np.ndarray) -> None:
     some_rows[:, 11:14] = [-0.2, 0.5, 1.3]
     _, _, rgba, _ = written(tmp_path, some_rows)
     np.testing.assert_allclose(rgba[:, :3], np.tile([0, 0.5, 1], (200, 1)), atol=1 / 255)

@@ -1,22 +1,27 @@
 import numpy as np
 
-from ldo_service.gaussians.training_views import View, sampled_surface, schedule, shared_surface
+from ldo_service.gaussians.training_views import (
+    TrainingView,
+    covisibility_ratio,
+    sample_training_views,
+    sampled_surface,
+)
 from ldo_service.geometry import Camera, RgbdFrame, se3
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
 
 
-def view_at(x_m: float, *, turned: bool = False, depth_m: float = 2.0) -> View:
+def view_at(x_m: float, *, turned: bool = False, depth_m: float = 2.0) -> TrainingView:
     """A view of a wall, moved to the right; or of what is behind it."""
     color, depth = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), depth_m, np.float32)
     T = se3.exp(np.array([0, np.pi * 0.99 * turned, 0, 0, 0, 0]))
     T[0, 3] = x_m
-    return View.of(RgbdFrame(color, depth, CAMERA), T, round(100 * x_m))
+    return TrainingView.of(RgbdFrame(color, depth, CAMERA), T, round(100 * x_m))
 
 
-def shared(newest: View, other: View) -> float:
+def shared(newest: TrainingView, other: TrainingView) -> float:
     surface = sampled_surface(newest, step_px=4)
-    return shared_surface(surface, other.camera, other.T_map_camera)
+    return covisibility_ratio(surface, other.camera, other.T_map_camera)
 
 
 def test_view_shares_all_with_itself_and_nothing_with_what_lies_behind() -> None:
@@ -31,7 +36,7 @@ def test_shared_surface_is_the_overlap_of_the_images() -> None:
 
 
 def planned(seed: int = 0, *, iterations: int = 4000, newest: float, covisible: float, near=(2,)):
-    return schedule(
+    return sample_training_views(
         4,
         near,
         (0, 1, 2, 3),
@@ -61,10 +66,10 @@ def test_schedule_is_that_of_its_generator() -> None:
     assert one != other
 
 
-def test_colours_of_a_view_are_those_of_its_frame() -> None:
+def test_colors_of_a_view_are_those_of_its_frame() -> None:
     rng = np.random.default_rng(0)
     color = rng.integers(0, 256, (48, 64, 3), np.uint8)
     frame = RgbdFrame(color, np.ones((48, 64), np.float32), CAMERA)
-    view = View.of(frame, np.eye(4), 5)
+    view = TrainingView.of(frame, np.eye(4), 5)
     assert view.color.flags.c_contiguous
     np.testing.assert_array_equal(view.color[1], color[..., 1])

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.gaussians import render
-from ldo_service.gaussians.visibility import AnchorSpheres, PlacedCamera, clumps_of
+from ldo_service.gaussians.visibility import BoundingSpheres, PlacedCamera, chunk_numbers
 from ldo_service.geometry import Camera, se3
 
 CAMERA = Camera(64, 48, 50.0, 40.0, 28.0, 27.0)
@@ -26,7 +26,7 @@ def clusters(count: int, each: int, seed: int, *, around_m: float = 4.0) -> tupl
 def test_what_a_camera_may_not_see_changes_no_bit_of_its_picture(seed: int) -> None:
     rows, anchors = clusters(400, 3, seed)
     camera = PlacedCamera(CAMERA, se3.exp(np.array([0.2, seed, -0.1, 0.3, -0.2, 0.1])))
-    spheres = AnchorSpheres.around(rows, anchors)
+    spheres = BoundingSpheres.around(rows, anchors)
     seen = camera.may_see(spheres.centers, spheres.radii_m)
     assert 0.05 < seen.mean() < 0.7
     T_camera_map = se3.inverse(camera.T_map_camera)
@@ -51,7 +51,7 @@ def test_single_gaussians_just_outside_the_image_are_judged_as_the_renderer_does
     rows[:, 3:6] = np.log(sigma_px * z[beside, None] / 50)
     rows[:, 6], rows[:, 10] = 1, 8
     anchors = np.arange(len(rows), dtype=np.int32)
-    spheres = AnchorSpheres.around(rows, anchors)
+    spheres = BoundingSpheres.around(rows, anchors)
     seen = PlacedCamera(CAMERA, np.eye(4)).may_see(spheres.centers, spheres.radii_m)
     drawn = np.array([render(row[None], CAMERA, np.eye(4)).opacity.any() for row in rows])
     assert np.count_nonzero(drawn) > 50
@@ -62,7 +62,7 @@ def test_single_gaussians_just_outside_the_image_are_judged_as_the_renderer_does
 def test_spheres_hold_the_gaussians_of_their_anchor_in_any_order() -> None:
     rows, anchors = clusters(30, 5, 1)
     shuffled = np.random.default_rng(0).permutation(len(rows))
-    spheres = AnchorSpheres.around(rows[shuffled], anchors[shuffled])
+    spheres = BoundingSpheres.around(rows[shuffled], anchors[shuffled])
     np.testing.assert_array_equal(spheres.anchors, np.arange(30))
     np.testing.assert_array_equal(spheres.counts, 5)
     distances = np.linalg.norm(rows[:, :3] - spheres.centers[anchors], axis=1)
@@ -72,7 +72,7 @@ def test_spheres_hold_the_gaussians_of_their_anchor_in_any_order() -> None:
 
 def test_clumps_are_of_one_anchor_and_one_cube() -> None:
     rows, anchors = clusters(30, 20, 1)
-    clumps = clumps_of(rows[:, :3], anchors, 0.25)
+    clumps = chunk_numbers(rows[:, :3], anchors, 0.25)
     assert clumps.max() + 1 == len(np.unique(clumps)) > 60
     for clump in range(clumps.max() + 1):
         own = clumps == clump
@@ -84,8 +84,8 @@ def test_clumps_are_of_one_anchor_and_one_cube() -> None:
 
 def test_a_sphere_for_each_clump_holds_it() -> None:
     rows, anchors = clusters(30, 20, 1)
-    clumps = clumps_of(rows[:, :3], anchors, 0.25)
-    spheres = AnchorSpheres.around(rows, anchors, clumps)
+    clumps = chunk_numbers(rows[:, :3], anchors, 0.25)
+    spheres = BoundingSpheres.around(rows, anchors, clumps)
     assert spheres.counts.tolist() == np.bincount(clumps).tolist()
     assert np.all(anchors == spheres.anchors[clumps])
     distances = np.linalg.norm(rows[:, :3] - spheres.centers[clumps], axis=1)
@@ -106,14 +106,14 @@ def test_a_sphere_for_each_clump_holds_it() -> None:
         ((np.nan, 0, 3), True),
     ],
 )
-def test_a_sphere_of_ten_centimetres(center: tuple[float, ...], is_seen: bool) -> None:
+def test_a_sphere_of_ten_centimeters(center: tuple[float, ...], is_seen: bool) -> None:
     camera = PlacedCamera(CAMERA, np.eye(4))
     seen = camera.may_see(np.array([center], float), np.array([0.1]), reach_m=10)
     assert seen.tolist() == [is_seen]
 
 
 def test_a_map_without_gaussians_has_no_spheres() -> None:
-    spheres = AnchorSpheres.around(np.zeros((0, 16), np.float32), np.zeros(0, np.int32))
+    spheres = BoundingSpheres.around(np.zeros((0, 16), np.float32), np.zeros(0, np.int32))
     assert len(spheres) == 0
     assert PlacedCamera(CAMERA, np.eye(4)).may_see(spheres.centers, spheres.radii_m).size == 0
 
@@ -121,6 +121,6 @@ def test_a_map_without_gaussians_has_no_spheres() -> None:
 def test_a_gaussian_as_large_as_the_world_is_seen_from_everywhere() -> None:
     rows, anchors = clusters(1, 2, 1)
     rows[1, 3] = 1e4
-    spheres = AnchorSpheres.around(rows, anchors)
+    spheres = BoundingSpheres.around(rows, anchors)
     away = PlacedCamera(CAMERA, se3.exp(np.array([0, 0, 0, 0, 0, 1e6])))
     assert away.may_see(spheres.centers, spheres.radii_m, reach_m=20).all()

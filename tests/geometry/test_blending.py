@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.se3 import blended, quaternions
+from ldo_service.geometry.se3 import interpolate, quaternions
 
 RNG = np.random.default_rng(3)
 
@@ -15,7 +15,7 @@ def some(count: int) -> np.ndarray:
 
 def test_rotations_follow_the_geodesic_and_positions_a_line() -> None:
     T_a, T_b, share = some(7), some(7), RNG.random(7)
-    T = blended(T_a, T_b, share)
+    T = interpolate(T_a, T_b, share)
     for k in range(7):
         ends = Rotation.from_matrix([T_a[k, :3, :3], T_b[k, :3, :3]])
         np.testing.assert_allclose(
@@ -27,8 +27,8 @@ def test_rotations_follow_the_geodesic_and_positions_a_line() -> None:
 
 def test_the_ends_are_the_transforms_themselves() -> None:
     T_a, T_b = some(3), some(3)
-    np.testing.assert_allclose(blended(T_a, T_b, np.zeros(3)), T_a, atol=1e-12)
-    np.testing.assert_allclose(blended(T_a, T_b, np.ones(3)), T_b, atol=1e-12)
+    np.testing.assert_allclose(interpolate(T_a, T_b, np.zeros(3)), T_a, atol=1e-12)
+    np.testing.assert_allclose(interpolate(T_a, T_b, np.ones(3)), T_b, atol=1e-12)
 
 
 def test_quaternions_of_many_are_those_of_each() -> None:
@@ -36,7 +36,7 @@ def test_quaternions_of_many_are_those_of_each() -> None:
     one_by_one = [se3.quaternion(R) for R in T[:, :3, :3]]
     np.testing.assert_allclose(quaternions(T[:, :3, :3]), one_by_one, atol=1e-12)
     assert quaternions(np.zeros((0, 3, 3))).shape == (0, 4)
-    assert blended(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0)).shape == (0, 4, 4)
+    assert interpolate(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)), np.zeros(0)).shape == (0, 4, 4)
 
 
 def test_half_turns_and_no_turns_keep_their_digits() -> None:
@@ -44,11 +44,11 @@ def test_half_turns_and_no_turns_keep_their_digits() -> None:
     R = Rotation.from_rotvec(np.pi * axes).as_matrix()
     np.testing.assert_allclose(se3.rotation(quaternions(R)), R, atol=1e-12)
     tiny = np.array([se3.exp(np.r_[1e-12 * axis, 0, 0, 0]) for axis in axes])
-    halves = blended(np.tile(np.eye(4), (6, 1, 1)), tiny, np.full(6, 0.5))
+    halves = interpolate(np.tile(np.eye(4), (6, 1, 1)), tiny, np.full(6, 0.5))
     np.testing.assert_allclose(halves[:, 2, 1], 0.5e-12 * axes[:, 0], atol=1e-16)
 
 
 def test_each_is_the_same_bits_whatever_the_others_are() -> None:
     T_a, T_b, share = some(40), some(40), RNG.random(40)
-    alone = [blended(T_a[k : k + 1], T_b[k : k + 1], share[k : k + 1])[0] for k in range(40)]
-    np.testing.assert_array_equal(blended(T_a, T_b, share), alone)
+    alone = [interpolate(T_a[k : k + 1], T_b[k : k + 1], share[k : k + 1])[0] for k in range(40)]
+    np.testing.assert_array_equal(interpolate(T_a, T_b, share), alone)

@@ -12,7 +12,7 @@ COLOR = RNG.integers(0, 256, (6, 9, 3), dtype=np.uint8)
 DEPTH = RNG.integers(0, 60000, (6, 9), dtype=np.uint16)
 
 
-def test_raw_colour_is_taken_as_it_is() -> None:
+def test_raw_color_is_taken_as_it_is() -> None:
     np.testing.assert_array_equal(
         codecs.decode_color("rgb8", 9, 6, memoryview(COLOR.tobytes())), COLOR
     )
@@ -25,13 +25,13 @@ def test_bgr_is_turned_to_rgb() -> None:
     )
 
 
-def test_png_colour_keeps_every_value() -> None:
+def test_png_color_keeps_every_value() -> None:
     _, data = cv2.imencode(".png", np.ascontiguousarray(COLOR[..., ::-1]))
     decoded = codecs.decode_color("png", 9, 6, memoryview(data.tobytes()))
     np.testing.assert_array_equal(decoded, COLOR)
 
 
-def test_jpeg_colour_is_close() -> None:
+def test_jpeg_color_is_close() -> None:
     smooth = np.tile(np.arange(64, dtype=np.uint8)[:, None, None] * 3, (1, 64, 3))
     decoded = codecs.decode_color("jpeg", 64, 64, memoryview(codecs.encode_jpeg(smooth)))
     assert np.abs(decoded.astype(int) - smooth).max() <= 4

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import FrameError
-from ldo_service.geometry.codecs import announced_size, decode_color, decode_depth, encode_jpeg
+from ldo_service.geometry.codecs import decode_color, decode_depth, encode_jpeg, read_image_size
 
 COLOR = np.random.default_rng(0).integers(0, 255, (37, 53, 3)).astype(np.uint8)
 
@@ -41,7 +41,7 @@ def bomb(width: int, height: int) -> bytes:
     ],
 )
 def test_the_size_is_that_of_the_decoded_image(data: bytes) -> None:
-    assert announced_size(memoryview(data)) == (53, 37)
+    assert read_image_size(memoryview(data)) == (53, 37)
 
 
 def test_a_png_with_a_chunk_beyond_its_end_has_no_size() -> None:
@@ -49,18 +49,18 @@ def test_a_png_with_a_chunk_beyond_its_end_has_no_size() -> None:
     data = bytearray(png(COLOR))
     data[33:37] = struct.pack(">I", 4_000_000_000)
     assert data[37:41] == b"IDAT"
-    assert announced_size(memoryview(bytes(data))) is None
+    assert read_image_size(memoryview(bytes(data))) is None
 
 
 def test_every_prefix_of_a_header_is_taken_without_an_error() -> None:
     for data in (png(COLOR), jpeg()):
         for length in range(700):
-            assert announced_size(memoryview(data[:length])) in (None, (53, 37))
+            assert read_image_size(memoryview(data[:length])) in (None, (53, 37))
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a" + bytes(50), b"BM" + bytes(80), b"\xff\xd8"])
 def test_other_formats_have_no_size_and_are_refused(data: bytes) -> None:
-    assert announced_size(memoryview(data)) is None
+    assert read_image_size(memoryview(data)) is None
     with pytest.raises(FrameError, match="no readable"):
         decode_color("jpeg", 53, 37, memoryview(data))
 

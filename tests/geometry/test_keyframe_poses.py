@@ -23,7 +23,7 @@ def chained(steps: list[np.ndarray]) -> KeyframePoses:
     for keyframe, T_reference_keyframe in enumerate(steps):
         T_odom = T_odom @ T_reference_keyframe
         reference = keyframe - 1 if keyframe else None
-        poses.chain(keyframe, reference, T_reference_keyframe, T_odom)
+        poses.add(keyframe, reference, T_reference_keyframe, T_odom)
     return poses
 
 
@@ -40,7 +40,7 @@ def test_a_missed_reference_is_bridged_by_odometry(steps) -> None:
     for keyframe, T_reference_keyframe in enumerate(steps):
         T_odom = T_odom @ T_reference_keyframe
         if keyframe != 3:
-            gappy.chain(keyframe, keyframe - 1, T_reference_keyframe, T_odom)
+            gappy.add(keyframe, keyframe - 1, T_reference_keyframe, T_odom)
     for keyframe in (0, 1, 2, 4, 5):
         np.testing.assert_allclose(gappy[keyframe], whole[keyframe], atol=1e-12)
 
@@ -69,10 +69,10 @@ def test_order_of_correction_and_keyframe_does_not_matter(steps, reference: int)
     before, after = chained(steps[:5]), chained(steps[:5])
     new = {k: before[k] @ random_pose(rng, 0.05) for k in range(5)}  # each moves differently
     T_odom_5 = before[reference] @ steps[5]
-    before.chain(5, reference, steps[5], T_odom_5)
+    before.add(5, reference, steps[5], T_odom_5)
     before.correct(1, new)
     after.correct(1, new)
-    after.chain(5, reference, steps[5], T_odom_5)
+    after.add(5, reference, steps[5], T_odom_5)
     np.testing.assert_allclose(before[5], after[5], atol=1e-12)
     np.testing.assert_allclose(after[5], new[reference] @ steps[5], atol=1e-12)
 
@@ -100,8 +100,8 @@ def test_snapshot_and_restore_are_exact(steps) -> None:
 def test_a_new_segment_is_apart_until_a_correction_joins_it(steps) -> None:
     poses = chained(steps)
     T_odom = poses[len(steps) - 1]
-    poses.chain(50, None, np.eye(4), T_odom, segment=2)
-    poses.chain(51, 50, steps[1], T_odom @ steps[1], segment=2)
+    poses.add(50, None, np.eye(4), T_odom, segment=2)
+    poses.add(51, 50, steps[1], T_odom @ steps[1], segment=2)
     np.testing.assert_allclose(poses[50], T_map_segment(2) @ T_odom)
     assert min(np.linalg.norm(poses[51][:3, 3] - poses[k][:3, 3]) for k in range(len(steps))) > 100
     poses.correct(1, {0: poses[0], 50: T_odom})
@@ -111,8 +111,8 @@ def test_a_new_segment_is_apart_until_a_correction_joins_it(steps) -> None:
 def test_the_first_of_a_segment_is_joined_though_its_measurement_is_held(steps) -> None:
     poses = chained(steps)
     T_odom = poses[len(steps) - 1]
-    poses.chain(50, None, np.eye(4), T_odom, segment=2)
-    poses.chain(51, 50, steps[1], T_odom @ steps[1], segment=2)
+    poses.add(50, None, np.eye(4), T_odom, segment=2)
+    poses.add(51, 50, steps[1], T_odom @ steps[1], segment=2)
     poses.correct(1, {0: poses[0], 50: T_odom, 51: T_odom}, held=(50, 51))
     np.testing.assert_allclose(poses[50], T_odom, atol=1e-12)
     np.testing.assert_allclose(poses[51], T_odom @ steps[1], atol=1e-12)
@@ -120,8 +120,8 @@ def test_the_first_of_a_segment_is_joined_though_its_measurement_is_held(steps) 
 
 def test_a_missed_keyframe_is_bridged_within_its_segment() -> None:
     poses = KeyframePoses()
-    poses.chain(0, None, np.eye(4), np.eye(4))
-    poses.chain(1, None, np.eye(4), np.eye(4), segment=1)
+    poses.add(0, None, np.eye(4), np.eye(4))
+    poses.add(1, None, np.eye(4), np.eye(4), segment=1)
     T_odom = se3.exp(np.full(6, 0.1))
-    poses.chain(3, 2, np.eye(4), T_odom, segment=0)
+    poses.add(3, 2, np.eye(4), T_odom, segment=0)
     np.testing.assert_allclose(poses[3], T_odom)

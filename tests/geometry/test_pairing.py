@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError, FrameError
 from ldo_service.geometry import associate
-from ldo_service.geometry.stamps import Pairing
+from ldo_service.geometry.stamps import StreamPairer
 
 MS = 1_000_000
 
@@ -19,11 +19,11 @@ class Half:
     stamp_ns: int
 
 
-def pairing(max_skew_ms: int = 15, buffer: int = 8) -> Pairing[Half, Half]:
-    return Pairing(max_skew_ms * MS, buffer)
+def pairing(max_skew_ms: int = 15, buffer: int = 8) -> StreamPairer[Half, Half]:
+    return StreamPairer(max_skew_ms * MS, buffer)
 
 
-def fed(pairs: Pairing[Half, Half], *events: tuple[str, int]) -> list[tuple[int, int]]:
+def fed(pairs: StreamPairer[Half, Half], *events: tuple[str, int]) -> list[tuple[int, int]]:
     """Stamps in ms of the pairs that come out of halves ("a" or "b", stamp in ms)."""
     out = []
     for stream, stamp_ms in events:
@@ -110,7 +110,7 @@ def test_stamps_that_go_back_are_refused_and_harm_nothing() -> None:
 @pytest.mark.parametrize(("max_skew_ns", "buffer"), [(-1, 8), (1, 0)])
 def test_impossible_limits_are_refused(max_skew_ns: int, buffer: int) -> None:
     with pytest.raises(ConfigError):
-        Pairing(max_skew_ns, buffer)
+        StreamPairer(max_skew_ns, buffer)
 
 
 stamps = st.lists(st.integers(0, 500), unique=True, max_size=20).map(sorted)

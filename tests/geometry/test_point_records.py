@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from ldo_service.geometry.point_records import LEAST_ROOM, PoseTable, Records
+from ldo_service.geometry.point_records import MIN_ROOM, PoseTable, RecordTable
 
 NUMBER = np.dtype([("id", np.int64), ("value", float)])
 
 
-def records(ids: list[int]) -> Records:
-    made = Records(NUMBER)
+def records(ids: list[int]) -> RecordTable:
+    made = RecordTable(NUMBER)
     for id_ in ids:
         made.put(id_, id_ / 2)
     return made
@@ -17,7 +17,7 @@ def records(ids: list[int]) -> Records:
 
 def test_records_are_what_a_dict_would_hold() -> None:
     rng = np.random.default_rng(0)
-    ids = rng.integers(0, 1000, size=20 * LEAST_ROOM).tolist()
+    ids = rng.integers(0, 1000, size=20 * MIN_ROOM).tolist()
     made, twin = records(ids), {id_: id_ / 2 for id_ in ids}
     made.put(ids[0], -1.0)
     twin[ids[0]] = -1.0
@@ -30,7 +30,7 @@ def test_only_known_ids_have_a_row() -> None:
     made = records([5, 3, 9])
     assert made.ids[made.rows([9, 4, 3, 10, 3])].tolist() == [9, 3, 3]
     assert made.are_known([9, 4, 3, 10, 3]).tolist() == [True, False, True, False, True]
-    assert Records(NUMBER).are_known([0]).tolist() == [False]
+    assert RecordTable(NUMBER).are_known([0]).tolist() == [False]
 
 
 def test_what_is_not_kept_is_forgotten_and_can_come_again() -> None:

@@ -58,7 +58,7 @@ def test_depth_takes_the_nearest_pixel_and_never_a_mean() -> None:
     assert (frame.depth_m > 0).mean() > 0.9
 
 
-def test_integer_depth_becomes_metres_at_its_scale() -> None:
+def test_integer_depth_becomes_meters_at_its_scale() -> None:
     frame = rectify(raw_frame(np.full((3, 4), 12345, np.uint16), 5000.0), None)
     assert frame.depth_m.dtype == np.float32
     np.testing.assert_allclose(frame.depth_m, 2.469, rtol=1e-7)
@@ -92,7 +92,7 @@ def test_rectifier_follows_a_camera_that_changes() -> None:
     assert not np.array_equal(bent, straight)
 
 
-def test_colour_of_another_size_than_depth_is_an_error() -> None:
+def test_color_of_another_size_than_depth_is_an_error() -> None:
     color = np.zeros((6, 8, 3), np.uint8)
     with pytest.raises(FrameError, match=r"frame 3: colour is 8x6 and depth 4x3.*Register"):
         RawFrame(3, 0, color, np.zeros((3, 4), np.uint16), 1000, SMALL)

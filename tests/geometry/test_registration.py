@@ -147,7 +147,7 @@ def test_point_beyond_the_lens_does_not_fold_back_into_the_image() -> None:
 
 
 @pytest.mark.parametrize("z_m", [-5.0, -2.0])
-def test_points_behind_or_in_the_colour_camera_are_not_seen(z_m: float) -> None:
+def test_points_behind_or_in_the_color_camera_are_not_seen(z_m: float) -> None:
     T_color_depth = np.eye(4)
     T_color_depth[2, 3] = z_m
     depth_m = np.full((48, 64), 2.0, np.float32)

@@ -19,7 +19,7 @@ def colored_by_ray(camera: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("color_camera", OTHERS.values(), ids=OTHERS.keys())
-def test_colour_is_resampled_along_its_rays(color_camera: Camera) -> None:
+def test_color_is_resampled_along_its_rays(color_camera: Camera) -> None:
     image, is_seen = resample_color(colored_by_ray(color_camera), color_camera, CAMERA)
     assert image.shape == (48, 64, 3)
     assert np.all(is_seen[1:-1, 1:-1])
@@ -27,7 +27,7 @@ def test_colour_is_resampled_along_its_rays(color_camera: Camera) -> None:
     assert error.max() <= (3 if color_camera is COARSER else 2)
 
 
-def test_colour_of_the_same_camera_is_untouched() -> None:
+def test_color_of_the_same_camera_is_untouched() -> None:
     color = np.random.default_rng(2).integers(0, 256, (48, 64, 3), np.uint8)
     image, is_seen = resample_color(color, CAMERA, CAMERA)
     assert np.array_equal(image, color)
@@ -43,7 +43,7 @@ def test_fine_stripes_become_their_mean_and_no_moire() -> None:
     assert np.all(np.abs(image[2:-2, 2:-2].astype(int) - 100) <= 1)
 
 
-def test_pixels_outside_the_colour_image_are_told() -> None:
+def test_pixels_outside_the_color_image_are_told() -> None:
     wide = Camera(64, 48, 25.0, 25.0, 31.5, 23.5)
     narrow = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     _, is_seen = resample_color(colored_by_ray(narrow), narrow, wide)
@@ -52,6 +52,6 @@ def test_pixels_outside_the_colour_image_are_told() -> None:
     assert np.array_equal(is_seen, expected)
 
 
-def test_colour_of_another_size_than_its_camera_is_an_error() -> None:
+def test_color_of_another_size_than_its_camera_is_an_error() -> None:
     with pytest.raises(FrameError, match="colour is 64x48 pixels and its camera 130x97"):
         resample_color(colored_by_ray(CAMERA), FINER, CAMERA)

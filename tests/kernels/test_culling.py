@@ -5,19 +5,19 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ldo_service.gaussians import GaussianMap, Rasteriser, render
+from ldo_service.gaussians import GaussianMap, Rasterizer, render
 from ldo_service.geometry import Camera, se3
-from ldo_service.kernels import _rasterise
+from ldo_service.kernels import _rasterize
 
 CAMERA = Camera(52, 40, 45.0, 47.0, 22.0, 21.0)
 BLOCK = 256
 
 RENDER_BOTH = """
-from ldo_service.gaussians import Rasteriser
+from ldo_service.gaussians import Rasterizer
 from ldo_service.geometry import Camera
-from ldo_service.kernels import _rasterise
-camera, bounds = Camera(52, 40, 45.0, 47.0, 22.0, 21.0), _rasterise.Bounds()
-uncut, cut = Rasteriser(), Rasteriser(threads=2)
+from ldo_service.kernels import _rasterize
+camera, bounds = Camera(52, 40, 45.0, 47.0, 22.0, 21.0), _rasterize.Bounds()
+uncut, cut = Rasterizer(), Rasterizer(threads=2)
 for k, T in enumerate(given["poses"]):
     result[f"uncut{k}"] = uncut.render(given["rows"], camera, T).copy()
     result[f"cut{k}"] = cut.render(given["rows"], camera, T, bounds=bounds).copy()
@@ -43,7 +43,7 @@ def poses(n: int, seed: int = 1) -> np.ndarray:
     return np.stack([se3.exp(xi) for xi in rng.normal(size=(n, 6))])
 
 
-def assert_same_images(rows: np.ndarray, bounds: _rasterise.Bounds, T: np.ndarray) -> None:
+def assert_same_images(rows: np.ndarray, bounds: _rasterize.Bounds, T: np.ndarray) -> None:
     with_bounds, without = render(rows, CAMERA, T, bounds=bounds), render(rows, CAMERA, T)
     for name in ("color", "weighted_depth_m", "median_depth_m", "opacity"):
         assert getattr(with_bounds, name).tobytes() == getattr(without, name).tobytes(), name
@@ -64,7 +64,7 @@ def test_gaussian_that_slides_out_of_view_is_drawn_as_long_as_a_pixel_shows_it(e
         rows = np.zeros((BLOCK, 16), np.float32)
         rows[:, 2], rows[:, 3:6], rows[:, 6], rows[:, 10] = 2, np.log(0.5), 1, 9
         rows[:, axis] = step * (1 - 2 * sign) * 2
-        bounds = _rasterise.Bounds()
+        bounds = _rasterize.Bounds()
         render(rows, CAMERA, np.eye(4), bounds=bounds)
         drawn.append(render(rows, CAMERA, np.eye(4)).opacity.any())
         rows[:] = 0, 0, 2, *[np.log(0.05)] * 3, 1, 0, 0, 0, 9, 1, 1, 1, 0, 0  # behind its back
@@ -76,12 +76,12 @@ def test_gaussian_that_slides_out_of_view_is_drawn_as_long_as_a_pixel_shows_it(e
 def test_gradients_are_the_same_with_culling() -> None:
     rows, T = patches(6_000), poses(1)[0]
     by_planes = np.random.default_rng(2).normal(size=(5, 40, 52)).astype(np.float32)
-    bounds = _rasterise.Bounds()
+    bounds = _rasterize.Bounds()
     both = []
     for given in (None, bounds, bounds):  # the last with known bounds
-        rasteriser = Rasteriser()
-        rasteriser.render(rows, CAMERA, T, bounds=given)
-        both.append(rasteriser.gradients(by_planes))
+        rasterizer = Rasterizer()
+        rasterizer.render(rows, CAMERA, T, bounds=given)
+        both.append(rasterizer.gradients(by_planes))
     assert 0 < len(both[0].indices) < 3_000
     for other in both[1:]:
         for name in ("indices", "rows", "xi"):
@@ -122,7 +122,7 @@ def test_whatever_happens_to_the_map_is_seen(change: str) -> None:
 
 
 def test_rows_elsewhere_in_memory_are_not_taken_for_those_that_were_measured() -> None:
-    bounds, views = _rasterise.Bounds(), poses(12, 8)
+    bounds, views = _rasterize.Bounds(), poses(12, 8)
     for rows in (patches(5_000), patches(5_000, 7)):
         for T in views:
             assert_same_images(rows, bounds, T)
@@ -132,13 +132,13 @@ def test_rows_elsewhere_in_memory_are_not_taken_for_those_that_were_measured() -
 def test_senseless_rows_hide_none_of_their_block(value: float) -> None:
     rows = patches(2_000)
     rows[np.arange(0, 1400, 100), np.arange(14)] = value
-    bounds = _rasterise.Bounds()
+    bounds = _rasterize.Bounds()
     for T in [*poses(8, 8), *poses(8, 8)]:
         assert_same_images(rows, bounds, T)
 
 
 def test_blocks_out_of_view_are_not_read() -> None:
-    rows, bounds = patches(4 * BLOCK), _rasterise.Bounds()
+    rows, bounds = patches(4 * BLOCK), _rasterize.Bounds()
     rows[:BLOCK, :3], rows[:BLOCK, 3:6] = (0, 0, -5), np.log(0.01)
     before = render(rows, CAMERA, np.eye(4), bounds=bounds)
     rows[:BLOCK, :3] = (0, 0, 1)  # nobody is told
@@ -149,7 +149,7 @@ def test_blocks_out_of_view_are_not_read() -> None:
 
 
 def test_bad_arguments_raise_value_error() -> None:
-    bounds = _rasterise.Bounds()
+    bounds = _rasterize.Bounds()
     with pytest.raises(ValueError, match="negative"):
         bounds.forget(3, 2)
     with pytest.raises(ValueError, match="uint32"):

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from ldo_service.evaluation.iteration import bench_camera, walls
-from ldo_service.gaussians import Rasteriser
+from ldo_service.gaussians import Rasterizer
 from ldo_service.geometry import se3
 
 CAMERA = bench_camera(96, 64)
@@ -44,7 +44,7 @@ def run(body: str) -> None:
 
 def planes_of(threads: int, step: int) -> bytes:
     T_camera_map = se3.exp([0, 0.02 * step, 0, 0, 0, 0])
-    return Rasteriser(threads=threads).render(ROWS, CAMERA, T_camera_map).tobytes()
+    return Rasterizer(threads=threads).render(ROWS, CAMERA, T_camera_map).tobytes()
 
 
 def test_callers_at_once_with_other_numbers_of_threads_get_the_same_bits() -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ldo_service.gaussians import Exposure, LossWeights, Rasteriser, RowGradients, image_loss
+from ldo_service.gaussians import Exposure, LossWeights, Rasterizer, RowGradients, image_loss
 from ldo_service.gaussians.loss import tile_mask
 from ldo_service.geometry import Camera
 
@@ -24,10 +24,10 @@ def gaussians(n: int) -> np.ndarray:
 
 
 def test_wanted_tiles_have_the_bits_of_the_whole_image_and_the_others_are_zero() -> None:
-    rows, rasteriser = gaussians(9_000), Rasteriser()
-    whole = rasteriser.render(rows, CAMERA, np.eye(4)).copy()
+    rows, rasterizer = gaussians(9_000), Rasterizer()
+    whole = rasterizer.render(rows, CAMERA, np.eye(4)).copy()
     for threads in (1, 3):
-        some = Rasteriser(threads=threads).render(rows, CAMERA, np.eye(4), tiles=TILES)
+        some = Rasterizer(threads=threads).render(rows, CAMERA, np.eye(4), tiles=TILES)
         assert some[:, INSIDE].tobytes() == whole[:, INSIDE].tobytes()
         assert not some[:, ~INSIDE].any()
     assert whole[4, ~INSIDE].mean() > 0.3
@@ -42,7 +42,7 @@ def by_row(gradients: RowGradients, n: int) -> np.ndarray:
 def test_gradients_are_those_of_the_wanted_tiles_alone() -> None:
     rows = gaussians(9_000)
     by_planes = np.random.default_rng(0).normal(size=(5, 50, 75)).astype(np.float32)
-    whole, some = Rasteriser(), Rasteriser(threads=2)
+    whole, some = Rasterizer(), Rasterizer(threads=2)
     whole.render(rows, CAMERA, np.eye(4))
     wanted = whole.gradients(by_planes * INSIDE)
     some.render(rows, CAMERA, np.eye(4), tiles=TILES)
@@ -53,9 +53,9 @@ def test_gradients_are_those_of_the_wanted_tiles_alone() -> None:
 
 
 def test_weights_are_counted_in_the_wanted_tiles_alone() -> None:
-    rasteriser = Rasteriser()
-    planes = rasteriser.render(gaussians(9_000), CAMERA, np.eye(4), tiles=TILES)
-    gradients = rasteriser.gradients(np.zeros_like(planes))
+    rasterizer = Rasterizer()
+    planes = rasterizer.render(gaussians(9_000), CAMERA, np.eye(4), tiles=TILES)
+    gradients = rasterizer.gradients(np.zeros_like(planes))
     np.testing.assert_allclose(gradients.rows[:, 14].sum(), planes[4].sum(), rtol=1e-5)
 
 
@@ -101,4 +101,4 @@ def test_senseless_tiles_are_refused(tiles: np.ndarray, message: str) -> None:
 @pytest.mark.parametrize("tiles", [np.ones((4, 4), np.uint8), np.ones((4, 5))])
 def test_tiles_that_do_not_fit_are_refused(tiles: np.ndarray) -> None:
     with pytest.raises(ValueError, match="tiles"):
-        Rasteriser().render(gaussians(9), CAMERA, np.eye(4), tiles=tiles)
+        Rasterizer().render(gaussians(9), CAMERA, np.eye(4), tiles=tiles)

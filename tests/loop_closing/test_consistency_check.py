@@ -8,9 +8,9 @@ import pytest
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.loop_closing.consistency_check import Plausibility, PlausibilityConfig
+from ldo_service.loop_closing.consistency_check import ConsistencyCheckConfig, ConsistencyChecker
 
-CONFIG = PlausibilityConfig()
+CONFIG = ConsistencyCheckConfig()
 
 
 def view(keyframe: int, path_m: float, segment: int = 0) -> Any:
@@ -21,7 +21,7 @@ def view(keyframe: int, path_m: float, segment: int = 0) -> Any:
 def poses_of(*twists: tuple[float, ...]) -> KeyframePoses:
     poses = KeyframePoses()
     for number, xi in enumerate(twists):
-        poses.chain(number, None, np.eye(4), se3.exp(np.array(xi, float)))
+        poses.add(number, None, np.eye(4), se3.exp(np.array(xi, float)))
     return poses
 
 
@@ -35,16 +35,16 @@ def poses_of(*twists: tuple[float, ...]) -> KeyframePoses:
     ],
 )
 def test_a_place_beyond_drift_and_view_is_not_asked(xi, expected) -> None:
-    known = Plausibility(poses_of((0,) * 6, xi), {}, CONFIG)
-    assert known.may_meet([view(0, 0.0)], view(1, 10.0)).tolist() == [expected]
+    known = ConsistencyChecker(poses_of((0,) * 6, xi), {}, CONFIG)
+    assert known.possible_matches([view(0, 0.0)], view(1, 10.0)).tolist() == [expected]
 
 
 def test_where_the_map_knows_nothing_everything_may_be() -> None:
     far = (0, 3.0, 0, 100, 0, 0)
     new = view(1, 10.0)
     poses = poses_of((0,) * 6, far)
-    apart, joined = (Plausibility(poses, j, CONFIG) for j in ({}, {1: 0}))
-    assert apart.may_meet([view(0, 0.0, segment=1)], new).tolist() == [True]
-    assert joined.may_meet([view(0, 0.0, segment=1)], new).tolist() == [False]
-    assert apart.may_meet([view(7, 0.0), view(0, 0.0)], new).tolist() == [True, False]
-    assert apart.may_meet([], new).tolist() == []
+    apart, joined = (ConsistencyChecker(poses, j, CONFIG) for j in ({}, {1: 0}))
+    assert apart.possible_matches([view(0, 0.0, segment=1)], new).tolist() == [True]
+    assert joined.possible_matches([view(0, 0.0, segment=1)], new).tolist() == [False]
+    assert apart.possible_matches([view(7, 0.0), view(0, 0.0)], new).tolist() == [True, False]
+    assert apart.possible_matches([], new).tolist() == []

@@ -4,27 +4,29 @@ import numpy as np
 
 from ldo_service.geometry import Camera, se3
 from ldo_service.loop_closing.object_points import (
+    DetectionPoints,
     LandmarkConfig,
-    Landmarks,
-    Sightings,
-    landmarks_of,
-    layout_of,
-    matched_at,
+    SubgraphLandmarks,
+    cluster_landmarks,
+    compare_landmarks_at,
+    layout_histogram,
+    locate_detections,
     possible_pairs,
-    sightings_of,
 )
 
 CONFIG = LandmarkConfig()
 CHAIR, CUP, SINK = 58, 43, 73  # any labels will do
 
 
-def seen(*things: tuple[int, float, tuple[float, float, float]]) -> Sightings:
+def seen(*things: tuple[int, float, tuple[float, float, float]]) -> DetectionPoints:
     labels, scores, places = zip(*things, strict=True)
-    return Sightings(np.array(labels, np.uint8), np.array(scores, np.float32), np.float32(places))
+    return DetectionPoints(
+        np.array(labels, np.uint8), np.array(scores, np.float32), np.float32(places)
+    )
 
 
-def landmarks(*sightings: Sightings) -> Landmarks:
-    return landmarks_of(sightings, [np.eye(4)] * len(sightings), CONFIG)
+def landmarks(*sightings: DetectionPoints) -> SubgraphLandmarks:
+    return cluster_landmarks(sightings, [np.eye(4)] * len(sightings), CONFIG)
 
 
 def test_a_box_is_where_its_foreground_is() -> None:
@@ -33,7 +35,7 @@ def test_a_box_is_where_its_foreground_is() -> None:
     depth_m = np.full((120, 160), 3.0, np.float32)
     depth_m[40:80, 60:100] = 2.0
     box = np.array([[55.0, 35, 104, 84]])
-    found = sightings_of(np.array([CHAIR]), np.array([0.8]), box, depth_m, camera, CONFIG)
+    found = locate_detections(np.array([CHAIR]), np.array([0.8]), box, depth_m, camera, CONFIG)
     np.testing.assert_allclose(found.p_camera, [[0, 0, 2]], atol=0.02)
     assert found.histogram()[CHAIR] == np.float32(0.8)
     assert found.histogram().sum() == np.float32(0.8)
@@ -67,8 +69,9 @@ def test_a_pose_is_told_what_agrees_and_what_speaks_against_it() -> None:
     things = ((CHAIR, 0.8, (0, 0, 2)), (CUP, 0.9, (1, 0, 2)), (SINK, 0.7, (2, 0, 2)))
     old, T_old_new = landmarks(seen(*things)), se3.exp(np.array([0.1, 0.2, 0.3, 1, 2, 3]))
     p_new = se3.transform(se3.inverse(T_old_new), old.p_odom)
-    new = Landmarks(p_new, old.labels[[0, 1, 1]], old.weights[[0, 1, 1]])  # a cup for the sink
-    found = matched_at(old, new, T_old_new, CONFIG)
+    # a cup for the sink
+    new = SubgraphLandmarks(p_new, old.labels[[0, 1, 1]], old.weights[[0, 1, 1]])
+    found = compare_landmarks_at(old, new, T_old_new, CONFIG)
     assert (found.count, found.contradicted) == (2, 1)
     assert found.divergence < 1e-6
     expected = -np.mean(
@@ -79,18 +82,18 @@ def test_a_pose_is_told_what_agrees_and_what_speaks_against_it() -> None:
 
 def test_the_layout_is_the_same_from_every_side_and_another_for_other_distances() -> None:
     rng = np.random.default_rng(0)
-    here = Landmarks(
+    here = SubgraphLandmarks(
         rng.uniform(-2, 2, (6, 3)),
         np.tile(np.uint8([CHAIR, 1, 0, 0, 0, 0, 0, 0]), (6, 1)),
         np.tile(np.float32([0.8, 0.2, 0, 0, 0, 0, 0, 0]), (6, 1)),
     )
-    turned = Landmarks(
+    turned = SubgraphLandmarks(
         se3.transform(se3.exp(rng.normal(size=6)), here.p_odom), here.labels, here.weights
     )
-    wide = Landmarks(3 * here.p_odom, here.labels, here.weights)
-    np.testing.assert_allclose(layout_of(turned), layout_of(here), atol=1e-4)
-    assert abs(layout_of(here).sum() - 15) < 1e-4, "one for each pair"
-    assert np.minimum(layout_of(wide), layout_of(here)).sum() < 8
+    wide = SubgraphLandmarks(3 * here.p_odom, here.labels, here.weights)
+    np.testing.assert_allclose(layout_histogram(turned), layout_histogram(here), atol=1e-4)
+    assert abs(layout_histogram(here).sum() - 15) < 1e-4, "one for each pair"
+    assert np.minimum(layout_histogram(wide), layout_histogram(here)).sum() < 8
 
 
 def test_a_thing_that_was_hardly_made_out_is_the_same_thing() -> None:
@@ -101,8 +104,8 @@ def test_a_thing_that_was_hardly_made_out_is_the_same_thing() -> None:
         for score in (0.9, 0.4)
     )
     assert unsure.names.tolist() == list(things)
-    found = matched_at(sure, unsure, np.eye(4), CONFIG)
+    found = compare_landmarks_at(sure, unsure, np.eye(4), CONFIG)
     assert (found.count, found.contradicted) == (0, 0), "too vague to vouch, and no contradiction"
-    np.testing.assert_array_equal(layout_of(sure), layout_of(unsure))
+    np.testing.assert_array_equal(layout_histogram(sure), layout_histogram(unsure))
     others = landmarks(seen(*((SINK, 0.4, p) for p in places)))
-    assert matched_at(sure, others, np.eye(4), CONFIG).contradicted == 4
+    assert compare_landmarks_at(sure, others, np.eye(4), CONFIG).contradicted == 4

@@ -4,8 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.se3 import align
-from ldo_service.loop_closing.pose_estimation import rigid_among
+from ldo_service.geometry.se3 import fit_rigid_transform
+from ldo_service.loop_closing.pose_estimation import ransac_rigid
 
 
 def moved(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -21,7 +21,7 @@ def test_the_rotation_is_that_of_scipy() -> None:
         _, p_a, p_b = moved(rng)
         p_a = p_a + rng.normal(0, 0.2, p_a.shape)
         expected, _ = Rotation.align_vectors(p_a - p_a.mean(axis=0), p_b - p_b.mean(axis=0))
-        T = align(p_b, p_a)
+        T = fit_rigid_transform(p_b, p_a)
         np.testing.assert_allclose(T[:3, :3], expected.as_matrix(), atol=1e-12)
         np.testing.assert_allclose(se3.transform(T, p_b.mean(axis=0)), p_a.mean(axis=0))
 
@@ -31,11 +31,11 @@ def test_the_true_motion_is_found_among_many_more_wrong_correspondences() -> Non
     T_a_b, p_a, p_b = moved(rng)
     p_a = p_a + rng.normal(0, 0.02, p_a.shape)
     pairs = np.array([(a, b) for a in range(10) for b in (a, (a + 3) % 10, (a + 7) % 10)])
-    motion = rigid_among(p_a, p_b, pairs, 0.25, 400, np.random.default_rng(0))
+    motion = ransac_rigid(p_a, p_b, pairs, 0.25, 400, np.random.default_rng(0))
     assert motion is not None
     assert pairs[motion.inliers].tolist() == [[k, k] for k in range(10)]
     np.testing.assert_allclose(motion.T_a_b, T_a_b, atol=0.05)
-    again = rigid_among(p_a, p_b, pairs, 0.25, 400, np.random.default_rng(0))
+    again = ransac_rigid(p_a, p_b, pairs, 0.25, 400, np.random.default_rng(0))
     assert again is not None
     assert again.T_a_b.tobytes() == motion.T_a_b.tobytes()
 
@@ -43,9 +43,11 @@ def test_the_true_motion_is_found_among_many_more_wrong_correspondences() -> Non
 def test_points_on_a_line_fix_no_pose() -> None:
     p = np.outer(np.arange(5.0), [1.0, 0, 0])
     pairs = np.column_stack([np.arange(5)] * 2)
-    assert rigid_among(p, p, pairs, 0.25, 50, np.random.default_rng(0)) is None
+    assert ransac_rigid(p, p, pairs, 0.25, 50, np.random.default_rng(0)) is None
 
 
 def test_two_correspondences_are_too_few() -> None:
     p = np.eye(3)
-    assert rigid_among(p, p, np.array([[0, 0], [1, 1]]), 0.25, 50, np.random.default_rng(0)) is None
+    assert (
+        ransac_rigid(p, p, np.array([[0, 0], [1, 1]]), 0.25, 50, np.random.default_rng(0)) is None
+    )

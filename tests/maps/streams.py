@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from ldo_service.conversions.poses import pose_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.gaussians.model import GaussianMap, aligned_rows
 from ldo_service.geometry import se3
-from ldo_service.maps.messages import NO_GAUSSIANS, NO_IDS, gaussians_message, regrouped
+from ldo_service.maps.messages import NO_GAUSSIANS, NO_IDS, gaussians_message, rechunk
 from ldo_service.schemas import AnchorMotion, Array, Gaussians, MapDelta, MapSnapshot
 
 
@@ -58,7 +58,7 @@ class ChangingMap:
         )
 
     def snapshot(self, parts: int = 3) -> list[MapSnapshot]:
-        pieces = regrouped([self.map.all()], parts, -(-len(self.map) // parts))
+        pieces = rechunk([self.map.all()], parts, -(-len(self.map) // parts))
         return [
             MapSnapshot(
                 stamp_ns=0,
@@ -72,7 +72,7 @@ class ChangingMap:
         ]
 
     def _move(self, keyframe: int) -> AnchorMotion:
-        pose = pose_message(se3.exp(0.1 * self._rng.normal(size=6)))
+        pose = pose_to_message(se3.exp(0.1 * self._rng.normal(size=6)))
         T = se3.from_quaternion(np.array(pose.translation), np.array(pose.quaternion))
         self.map.move_anchors({keyframe: T})
         return AnchorMotion(keyframe=keyframe, T_new_old=pose)

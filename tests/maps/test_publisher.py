@@ -4,12 +4,12 @@ import numpy as np
 
 from ldo_service.conversions.objects import map_objects
 from ldo_service.geometry import se3
-from ldo_service.maps.publisher import ObjectsTeller
+from ldo_service.maps.publisher import ObjectPublisher
 from tests.semantics.staged import NAMES, THINGS, Stage, poses
 
 
 def test_what_is_kept_is_what_would_be_made() -> None:
-    stage, teller = Stage(), ObjectsTeller()
+    stage, teller = Stage(), ObjectPublisher()
     counts = set()
 
     def check() -> None:

@@ -6,16 +6,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.conversions.poses import matrix6_message, pose_message
+from ldo_service.conversions.poses import matrix6_to_message, pose_to_message
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses
-from ldo_service.maps.relative_measurements import KeyframeLinks
+from ldo_service.maps.relative_measurements import RelativeMeasurements
 from ldo_service.schemas import Array, Keyframe, MeasuredPose
 from ldo_service.schemas.frames import CameraModel
 
 RECENT = 4
 STEP = se3.exp(np.array([0.01, 0.02, 0.0, 0.1, 0.0, 0.02]))
-OF_REFERENCE, OF_WINDOW = matrix6_message(3.0 * np.eye(6)), matrix6_message(2.0 * np.eye(6))
+OF_REFERENCE, OF_WINDOW = matrix6_to_message(3.0 * np.eye(6)), matrix6_to_message(2.0 * np.eye(6))
 
 
 def keyframe(k: int) -> Keyframe:
@@ -24,7 +24,7 @@ def keyframe(k: int) -> Keyframe:
         MeasuredPose(
             reference=reference,
             keyframe=k,
-            T_reference_keyframe=pose_message(STEP @ STEP),
+            T_reference_keyframe=pose_to_message(STEP @ STEP),
             information=OF_WINDOW,
         )
         for reference in range(max(0, k - 2), k - 1)
@@ -37,24 +37,24 @@ def keyframe(k: int) -> Keyframe:
         color=Array.of(np.zeros((1, 1, 3), np.uint8)),
         depth_m=Array.of(np.zeros((1, 1), np.float32)),
         reference=k - 1 if k else None,
-        T_reference_keyframe=pose_message(STEP if k else np.eye(4)),
+        T_reference_keyframe=pose_to_message(STEP if k else np.eye(4)),
         information=OF_REFERENCE,
-        T_odom_keyframe=pose_message(np.eye(4)),
+        T_odom_keyframe=pose_to_message(np.eye(4)),
         overlap=1.0,
         window=tuple(window),
     )
 
 
-def followed(count: int) -> tuple[KeyframePoses, KeyframeLinks]:
+def followed(count: int) -> tuple[KeyframePoses, RelativeMeasurements]:
     poses = KeyframePoses()
-    links = KeyframeLinks(poses, RECENT)
+    links = RelativeMeasurements(poses, RECENT)
     for k in range(count):
-        poses.chain(k, k - 1 if k else None, STEP if k else np.eye(4), np.eye(4))
+        poses.add(k, k - 1 if k else None, STEP if k else np.eye(4), np.eye(4))
         links.add(keyframe(k))
     return poses, links
 
 
-def told(links: KeyframeLinks, moved: dict[int, np.ndarray]) -> Iterator[tuple]:
+def told(links: RelativeMeasurements, moved: dict[int, np.ndarray]) -> Iterator[tuple]:
     refinement = links.refined(moved, 0)
     assert refinement is not None
     return ((p.keyframe, p.reference, p.information) for p in refinement.poses)
@@ -78,7 +78,7 @@ def test_of_an_old_one_those_along_the_path_are() -> None:
 def test_a_restored_one_says_the_same(moved: int) -> None:
     poses, links = followed(10)
     links.refined({7: poses[7]}, 0)
-    twin = KeyframeLinks(poses, RECENT)
+    twin = RelativeMeasurements(poses, RECENT)
     twin.restore(links.snapshot())
     assert twin.acknowledged(0) == links.acknowledged(0) == {7}
     T_map = {moved: poses[moved] @ STEP}

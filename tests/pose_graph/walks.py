@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
-from ldo_service.pose_graph.pose_graph import KeyframeGraph, KeyframeGraphConfig
+from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
 
 ODOMETRY = np.diag([2e3**2] * 3 + [5e2**2] * 3)  # as alignment states it: 0.5 mrad, 2 mm
 REFINED = np.diag([2e2**2] * 3 + [1e2**2] * 3)  # of a closure: 5 mrad, 1 cm
@@ -107,21 +107,21 @@ def walked(
     first: np.ndarray,
     measured: Iterable[list[RelativePose]],
     *loops: dict[int, RelativePose],
-    config: KeyframeGraphConfig | None = None,
-) -> KeyframeGraph:
-    graph = KeyframeGraph(config or KeyframeGraphConfig())
+    config: PoseGraphConfig | None = None,
+) -> PoseGraph:
+    graph = PoseGraph(config or PoseGraphConfig())
     graph.add_first(0, first)
     for one in measured:
         graph.add(*one)
         for found in loops:
             if one[0].b in found:
-                graph.close(found[one[0].b])
+                graph.add_loop_closure(found[one[0].b])
     return graph
 
 
-def ate_m(graph: KeyframeGraph, truth: Sequence[np.ndarray]) -> float:
+def ate_m(graph: PoseGraph, truth: Sequence[np.ndarray]) -> float:
     """RMSE after the best rigid alignment of the positions."""
-    keyframes, T_map = graph.placed()
+    keyframes, T_map = graph.all_poses()
     estimated, true = T_map[:, :3, 3], np.array([truth[k] for k in keyframes])[:, :3, 3]
     a, b = estimated - estimated.mean(axis=0), true - true.mean(axis=0)
     U, _, Vt = np.linalg.svd(a.T @ b)

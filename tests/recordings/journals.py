@@ -8,7 +8,7 @@ from typing import Any
 from ldo_service.recordings.mcap_file import RecordConfig
 from ldo_service.recordings.recorder import Recorder
 from ldo_service.recordings.recording import JournalFile, new_path, recorded_actors
-from ldo_service.recordings.replay import Replayed, replay
+from ldo_service.recordings.replay import ReplayReport, replay
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
@@ -40,7 +40,7 @@ class Tally(Actor):
 
     name = "tally"
     inputs = (In(NUMBERS, Lossless(4)),)
-    outputs = (Out(DOUBLES), Out(PIECES, never_wait=True))
+    outputs = (Out(DOUBLES), Out(PIECES, is_nonblocking=True))
 
     def __init__(self, bias: int = 0) -> None:
         super().__init__()
@@ -53,10 +53,10 @@ class Tally(Actor):
         if message.value == UNLUCKY:
             raise ValueError("unlucky")
         yield Double(stamp_ns=message.stamp_ns, value=self._sum)
-        if self.has_room(PIECES):
+        if self.has_credit(PIECES):
             yield Piece(stamp_ns=message.stamp_ns, version=self._sum, part=0, parts=1)
 
-    def finish(self) -> Iterator[Message]:
+    def on_stop(self) -> Iterator[Message]:
         yield Double(stamp_ns=0, value=-self._sum)
 
     def snapshot(self) -> State:
@@ -113,7 +113,7 @@ def files(folder: Path, actor: str = "tally") -> list[JournalFile]:
     return [JournalFile(path) for path in recorded_actors(folder / "recording")[actor]]
 
 
-def replayed(folder: Path, make: Callable[[], Actor] = Tally) -> Replayed:
+def replayed(folder: Path, make: Callable[[], Actor] = Tally) -> ReplayReport:
     return replay("tally", files(folder), lambda _about: make())
 
 

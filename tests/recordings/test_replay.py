@@ -43,7 +43,7 @@ class Counting(Tally):
     """Says how many numbers wait."""
 
     def handle(self, message: Message) -> Iterator[Message]:
-        yield Double(stamp_ns=message.stamp_ns, value=self.situation.waiting.get(NUMBERS, -1))
+        yield Double(stamp_ns=message.stamp_ns, value=self.situation.backlog.get(NUMBERS, -1))
 
 
 def test_what_waited_at_the_time_is_what_the_actor_sees(
@@ -140,8 +140,8 @@ def test_a_state_that_cannot_be_taken_up_any_more_is_a_difference(tmp_path: Path
 
 def test_an_output_more_or_less_is_a_difference(tmp_path: Path) -> None:
     class Talkative(Tally):
-        def finish(self) -> Iterator[Message]:
-            yield from super().finish()
+        def on_stop(self) -> Iterator[Message]:
+            yield from super().on_stop()
             yield Double(stamp_ns=0, value=0)
 
     recorded(tmp_path, [1])

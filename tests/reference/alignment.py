@@ -6,10 +6,10 @@ from ldo_service.geometry import se3
 from ldo_service.tracking.alignment import (
     DEGREES_OF_FREEDOM,
     INLIER_SIGMA,
-    Appearance,
-    Equations,
+    BrightnessModel,
+    NormalEquations,
     ResidualConfig,
-    Term,
+    ResidualStatistics,
 )
 from ldo_service.tracking.pyramid import Level
 
@@ -18,9 +18,9 @@ def normal_equations(
     points: np.ndarray,
     target: Level,
     T_camera_reference: np.ndarray,
-    appearance: Appearance,
+    appearance: BrightnessModel,
     config: ResidualConfig,
-) -> Equations:
+) -> NormalEquations:
     """What `equations.normal_equations` computes, to rounding."""
     points = points.astype(float)
     R, camera = T_camera_reference[:3, :3], target.camera
@@ -37,7 +37,7 @@ def normal_equations(
     p, shade, n, u, v = p[shown], shade[shown], n[shown], u[shown], v[shown]
     column, row, depth = column[shown], row[shown], depth[shown]
 
-    told = (shade > 0) & is_told(target, u, v)
+    told = (shade > 0) & is_unclipped(target, u, v)
     r, J = photometric(target, p[told], shade[told], u[told], v[told], appearance)
     H_color, g_color, color = _weighted(r, J, np.full(len(r), appearance.intensity_sigma))
 
@@ -47,7 +47,7 @@ def normal_equations(
     r, J = geometric(p[paired], n[paired], q[paired])
     sigma_m = appearance.depth_noise_scale * config.noise.sigma_m(p[paired, 2])
     H_depth, g_depth, depths = _weighted(r, J, sigma_m)
-    return Equations(H_color + H_depth, g_color + g_depth, float(len(p)), color, depths)
+    return NormalEquations(H_color + H_depth, g_color + g_depth, float(len(p)), color, depths)
 
 
 def photometric(
@@ -56,7 +56,7 @@ def photometric(
     shade: np.ndarray,
     u: np.ndarray,
     v: np.ndarray,
-    appearance: Appearance,
+    appearance: BrightnessModel,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Residuals [N] and Jacobians [N, 8] of camera points p [N, 3] seen at pixels (u, v)."""
     intensity, gradient_u, gradient_v = bilinear(target.texels[..., :3], u, v).T
@@ -67,7 +67,7 @@ def photometric(
     return r, np.column_stack([np.cross(g, p), -g, -shade, -np.ones(len(r))])
 
 
-def is_told(target: Level, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def is_unclipped(target: Level, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Whether none of the four pixels around (u, v) [N] is clipped."""
     column, row = u.astype(int), v.astype(int)
     around = [target.texels[row + i, column + j, 0] for i in (0, 1) for j in (0, 1)]
@@ -90,9 +90,9 @@ def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def _weighted(
     r: np.ndarray, J: np.ndarray, sigma: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Term]:
+) -> tuple[np.ndarray, np.ndarray, ResidualStatistics]:
     squares = (r / sigma) ** 2
     weights = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + squares)
     scaled = J * (weights / sigma**2)[:, None]
     inliers = int(np.sum(squares < INLIER_SIGMA**2))
-    return J.T @ scaled, scaled.T @ r, Term(len(r), inliers, float(weights @ squares))
+    return J.T @ scaled, scaled.T @ r, ResidualStatistics(len(r), inliers, float(weights @ squares))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ldo_service.geometry import Camera
-from ldo_service.semantics.label_assignment import HIDDEN, UNMATCHED, Assigned, AssignmentConfig
+from ldo_service.semantics.label_assignment import HIDDEN, UNMATCHED, Assignment, AssignmentConfig
 
 from .render import project
 
@@ -19,7 +19,7 @@ def assign_reference(
     scores: np.ndarray,
     masks: Sequence[np.ndarray] | None,
     config: AssignmentConfig,
-) -> Assigned:
+) -> Assignment:
     """Of all rows; `masks` [H, W] bool, one a box, or None."""
     means, covariances, z = project(rows.astype(float), camera, T_camera_map)
     half = 2 * np.sqrt(covariances[:, [0, 1], [0, 1]])
@@ -34,7 +34,7 @@ def assign_reference(
             overlap = _overlap(low[i], high[i], means[i], box, mask, config.rule)
             if overlap > config.min_overlap and overlap * score > best[i]:
                 regions[i], overlaps[i], best[i] = j, overlap, overlap * score
-    return Assigned(regions, overlaps, z)
+    return Assignment(regions, overlaps, z)
 
 
 def _expected(

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 
 from ldo_service.semantics.gaussian_labels import (
-    MOST_LABELS,
+    MAX_LABELS,
     ConsistencyConfig,
     Disagreement,
     distribution,
@@ -21,7 +21,7 @@ def agree_reference(
 ) -> tuple[np.ndarray, Disagreement]:
     """The distributions [V, 256] after the step, dense, and the disagreement before it."""
     means = rows[indices, :3].astype(float)
-    p = distribution(labels[indices], MOST_LABELS).astype(float)
+    p = distribution(labels[indices], MAX_LABELS).astype(float)
     top = top_labels(labels[indices])
     voxels = np.floor(rows[indices, :3] * np.float32(1 / np.float32(2 * config.sigma_m)))
     members: dict[tuple[int, ...], list[int]] = {}
@@ -29,7 +29,7 @@ def agree_reference(
         members.setdefault(tuple(voxel), []).append(i)
     after, literal, expected = p.copy(), 0.0, 0.0
     for voxel, own in members.items():
-        around = np.array(neighbourhood(members, voxel))
+        around = np.array(neighborhood(members, voxel))
         for i in own:
             square = np.sum((means[around] - means[i]) ** 2, axis=1)
             near = (around != i) & (square < config.radius_m**2)
@@ -41,7 +41,7 @@ def agree_reference(
     return after, Disagreement(literal, expected)
 
 
-def neighbourhood(members: dict[tuple[int, ...], list[int]], voxel: tuple[int, ...]) -> list[int]:
+def neighborhood(members: dict[tuple[int, ...], list[int]], voxel: tuple[int, ...]) -> list[int]:
     """Up to MOST Gaussians that stand for what is around a voxel."""
     own, *others = (members.get(tuple(np.add(voxel, step)), []) for step in STEPS)
     out = own[:SAME_VOXEL]

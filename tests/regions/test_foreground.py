@@ -73,7 +73,7 @@ def test_boxes_beyond_the_image_and_between_pixels_do_no_harm(box) -> None:
     assert found(room(), box).shape == (120, 160)
 
 
-def test_a_box_has_the_pixels_whose_centres_lie_in_it() -> None:
+def test_a_box_has_the_pixels_whose_centers_lie_in_it() -> None:
     assert pixels_of(np.array([0.5, -3, 2, 1.4]), (4, 6)) == (slice(0, 2), slice(1, 3))
     assert pixels_of(np.array([9, 9, 12, 12]), (4, 6)) == (slice(4, 4), slice(6, 6))
 

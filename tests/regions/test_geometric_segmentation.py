@@ -5,8 +5,17 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
-from ldo_service.regions.geometric_segmentation import Kind, SegmentConfig, segments
-from ldo_service.regions.planes import PlaneConfig, planes, relief, structure
+from ldo_service.regions.geometric_segmentation import (
+    GeometricSegmentationConfig,
+    Kind,
+    segment_geometry,
+)
+from ldo_service.regions.planes import (
+    PlaneConfig,
+    compute_depth_features,
+    planes,
+    structural_planes,
+)
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
 SHAPE = 240, 320
@@ -50,7 +59,7 @@ def best_iou(found: list[np.ndarray], truth: np.ndarray) -> float:
 
 
 def masks(color: np.ndarray, depth_m: np.ndarray, kind: Kind) -> list[np.ndarray]:
-    found = segments(color, depth_m, CAMERA, SegmentConfig())
+    found = segment_geometry(color, depth_m, CAMERA, GeometricSegmentationConfig())
     return [segment.part.image(SHAPE) for segment in found if segment.kind == kind]
 
 
@@ -61,15 +70,20 @@ def noisy(depth_m: np.ndarray, seed: int = 0) -> np.ndarray:
 
 
 def test_a_bare_room_has_nothing_to_name() -> None:
-    bare = segments(painted(), room(), CAMERA, SegmentConfig())
+    bare = segment_geometry(painted(), room(), CAMERA, GeometricSegmentationConfig())
     assert [one.kind for one in bare] == ["room", "room"], "floor and wall"
     assert np.sum([one.part.image(SHAPE) for one in bare], axis=0).max() == 1
     assert np.mean([one.part.image(SHAPE).mean() for one in bare]) > 0.4
-    assert segments(painted(), np.zeros(SHAPE, np.float32), CAMERA, SegmentConfig()) == []
+    assert (
+        segment_geometry(
+            painted(), np.zeros(SHAPE, np.float32), CAMERA, GeometricSegmentationConfig()
+        )
+        == []
+    )
 
 
 @pytest.mark.parametrize("measured", [np.copy, noisy])
-def test_a_picture_is_set_apart_from_its_wall_by_colour_alone(measured) -> None:
+def test_a_picture_is_set_apart_from_its_wall_by_color_alone(measured) -> None:
     picture = np.zeros(SHAPE, bool)
     picture[30:90, 120:200] = True
     color = painted(picture)
@@ -92,8 +106,8 @@ def test_structure_is_the_floor_and_the_wall_and_no_front_or_top() -> None:
     depth_m, config = room(), PlaneConfig()
     truth = room()
     cabinet = box(depth_m, 2.4, (-0.9, 0.8), -0.3)
-    seen = relief(depth_m, CAMERA, config)
-    of_room = structure(seen, planes(seen, config), config) > 0
+    seen = compute_depth_features(depth_m, CAMERA, config)
+    of_room = structural_planes(seen, planes(seen, config), config) > 0
     assert np.mean(of_room[cabinet]) < 0.1
     far = ~cabinet & (np.abs(depth_m - truth) == 0)
     assert np.mean(of_room[far]) > 0.8
@@ -125,14 +139,18 @@ def test_any_size_of_image_is_taken() -> None:
     depth_m = np.full((481, 643), 3.0, np.float32)
     depth_m[200:300, 300:400] = 2.0
     color = np.full((481, 643, 3), 128, np.uint8)
-    found = [s.part for s in segments(color, depth_m, camera, SegmentConfig()) if s.kind == "apart"]
+    found = [
+        s.part
+        for s in segment_geometry(color, depth_m, camera, GeometricSegmentationConfig())
+        if s.kind == "apart"
+    ]
     assert [part.mask.shape for part in found] == [pytest.approx((98, 98), abs=6)]
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda: SegmentConfig(min_px=0),
+        lambda: GeometricSegmentationConfig(min_px=0),
         lambda: PlaneConfig(behind=2),
         lambda: PlaneConfig(gap_px=(5, 3)),
     ],

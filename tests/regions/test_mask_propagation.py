@@ -5,9 +5,9 @@ import pytest
 
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import Foreground
-from ldo_service.regions.region import sighting_of
-from ldo_service.regions.region_matching import LEAST, STRIDE_PX, carried, pixels
-from ldo_service.regions.region_proposals import Candidate
+from ldo_service.regions.region import observe_region
+from ldo_service.regions.region_matching import LEAST, STRIDE_PX, pixels, propagate_mask
+from ldo_service.regions.region_proposals import RegionProposal
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
@@ -28,14 +28,14 @@ def shown_from(x_m: float, gap_m: float = 0.1, depth_m: np.ndarray | None = None
     before_m, is_disc = scene(0.0)
     assert np.array_equal(is_disc, DISC)
     part = Foreground(26, 36, DISC[26:75, 36:85])
-    sighting = sighting_of(0, Candidate(part.box_px, part), before_m, CAMERA)
+    sighting = observe_region(0, RegionProposal(part.box_px, part), before_m, CAMERA)
     assert sighting is not None
     T = se3.exp(np.array([0, 0, 0, x_m, 0, 0]))
     now_m = scene(x_m)[0] if depth_m is None else depth_m
     rows, columns, is_inside = pixels(sighting.p_camera - [x_m, 0, 0], CAMERA, SHAPE)
     assert is_inside.sum() >= 12
     seen = rows[is_inside], columns[is_inside]
-    return carried(sighting, *seen, now_m, CAMERA, T, gap_m)
+    return propagate_mask(sighting, *seen, now_m, CAMERA, T, gap_m)
 
 
 def overlap(found: Foreground | None, is_disc: np.ndarray) -> float:
@@ -100,7 +100,7 @@ def test_a_rectangle_is_whole_whatever_its_sides(rows: int, columns: int) -> Non
     depth_m, mask = np.full(SHAPE, WALL_M, np.float32), np.zeros(SHAPE, bool)
     mask[12 : 12 + rows, 20 : 20 + columns] = True
     part = Foreground(12, 20, mask[12 : 12 + rows, 20 : 20 + columns])
-    sighting = sighting_of(0, Candidate(part.box_px, part), depth_m, CAMERA)
+    sighting = observe_region(0, RegionProposal(part.box_px, part), depth_m, CAMERA)
     assert sighting is not None
     at, to, _ = pixels(sighting.p_camera, CAMERA, SHAPE)
-    assert overlap(carried(sighting, at, to, depth_m, CAMERA, np.eye(4), 1e-3), mask) > 0.85
+    assert overlap(propagate_mask(sighting, at, to, depth_m, CAMERA, np.eye(4), 1e-3), mask) > 0.85

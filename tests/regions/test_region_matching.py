@@ -5,9 +5,9 @@ import pytest
 
 from ldo_service.geometry import Camera
 from ldo_service.regions.foreground import Foreground
-from ldo_service.regions.region import Region, sighting_of
-from ldo_service.regions.region_matching import KnownRegions
-from ldo_service.regions.region_proposals import Candidate
+from ldo_service.regions.region import Region, observe_region
+from ldo_service.regions.region_matching import RegionMatcher
+from ldo_service.regions.region_proposals import RegionProposal
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 WALL_M = np.full((120, 160), 2.0, np.float32)
@@ -19,14 +19,14 @@ def part(left: int, top: int, width: int, height: int) -> Foreground:
 
 
 def region(id_: int, of: Foreground) -> Region:
-    seen = sighting_of(0, Candidate(of.box_px, of), WALL_M, CAMERA)
+    seen = observe_region(0, RegionProposal(of.box_px, of), WALL_M, CAMERA)
     assert seen is not None
     return Region(id_, 0, seen.box_px, seen)
 
 
-def known(*regions: Region, depth_m: np.ndarray = WALL_M) -> KnownRegions:
+def known(*regions: Region, depth_m: np.ndarray = WALL_M) -> RegionMatcher:
     """Seen again from the same place."""
-    return KnownRegions(regions, 1, depth_m, CAMERA, dict.fromkeys((0, 1), np.eye(4)), 0.1, LEAST)
+    return RegionMatcher(regions, 1, depth_m, CAMERA, dict.fromkeys((0, 1), np.eye(4)), 0.1, LEAST)
 
 
 def test_regions_overlap_by_what_each_has_of_the_other() -> None:

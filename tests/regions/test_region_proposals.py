@@ -10,21 +10,21 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera
 from ldo_service.regions import region_proposals, region_views
 from ldo_service.regions.foreground import Foreground
-from ldo_service.regions.geometric_segmentation import segments
+from ldo_service.regions.geometric_segmentation import segment_geometry
 from ldo_service.regions.region_proposals import (
-    Candidate,
-    TriggerConfig,
-    candidates,
-    named_objects,
+    RegionProposal,
+    RegionProposalConfig,
+    labeled_regions,
+    propose_regions,
     regions_of_image,
-    without_room,
+    remove_structure,
 )
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 WALL_M, NEAR_M = 3.0, 2.0
-CONFIG = TriggerConfig(min_side_px=12)
-GREY = np.full((120, 160, 3), 128, np.uint8)
-LOOSE = TriggerConfig(min_side_px=22, min_fill=0.1)
+CONFIG = RegionProposalConfig(min_side_px=12)
+GRAY = np.full((120, 160, 3), 128, np.uint8)
+LOOSE = RegionProposalConfig(min_side_px=22, min_fill=0.1)
 NOBODY = np.zeros((120, 160), bool)
 
 
@@ -36,7 +36,7 @@ def wall_with(*boxes: tuple[int, int, int, int]) -> np.ndarray:
     return depth_m
 
 
-def asked(*args, **kwargs) -> list[Candidate]:
+def asked(*args, **kwargs) -> list[RegionProposal]:
     """But for what the detector is sure of, which is followed alone."""
     return [one for one in followed(*args, **kwargs) if one.score < CONFIG.sure]
 
@@ -45,11 +45,11 @@ def followed(depth_m, boxes=(), labels=(), scores=(), is_labelled=NOBODY, config
     boxes = np.reshape(np.array(boxes, float), (-1, 4))
     found = regions(depth_m, config)
     scores = np.array(scores)
-    return candidates(boxes, labels, scores, depth_m, CAMERA, is_labelled, found, [], config)
+    return propose_regions(boxes, labels, scores, depth_m, CAMERA, is_labelled, found, [], config)
 
 
-def regions(depth_m: np.ndarray, config: TriggerConfig = CONFIG) -> list[Candidate]:
-    found = segments(GREY, depth_m, CAMERA, config.segments)
+def regions(depth_m: np.ndarray, config: RegionProposalConfig = CONFIG) -> list[RegionProposal]:
+    found = segment_geometry(GRAY, depth_m, CAMERA, config.segments)
     return regions_of_image(found, depth_m.shape, config)
 
 
@@ -98,7 +98,7 @@ def test_a_wall_seen_through_a_box_s_thing_is_no_part_of_it() -> None:
     depth_m = np.where(is_bar, WALL_M - 0.3, WALL_M).astype(np.float32)
     told = np.array([(60, 30, 101, 89)], float), ["tv"], np.array([0.9]), depth_m, CAMERA, NOBODY
     wall = Foreground(0, 0, ~is_bar)
-    (whole,), (cut,) = (candidates(*told, [], room, CONFIG) for room in ([], [wall]))
+    (whole,), (cut,) = (propose_regions(*told, [], room, CONFIG) for room in ([], [wall]))
     was, now = (one.part.image(is_bar.shape) for one in (whole, cut))
     assert np.mean(was[is_bar]) > 0.95
     assert np.count_nonzero(was & ~is_bar) > 100, "or it shows nothing"
@@ -112,14 +112,14 @@ def test_a_box_of_which_the_wall_leaves_too_little_is_asked_about_with_it() -> N
     told = np.array([box], float), ["tv"], np.array([0.4]), depth_m, CAMERA, NOBODY
     wall = ~is_bar
     wall[96:] = False
-    (found,) = candidates(*told, [], [Foreground(0, 0, wall)], CONFIG)
+    (found,) = propose_regions(*told, [], [Foreground(0, 0, wall)], CONFIG)
     assert np.count_nonzero(found.part.mask) > 1.2 * CONFIG.min_fill * 59 * 79
     assert np.count_nonzero(found.part.image(wall.shape) & wall) > 100
 
 
 def test_what_hangs_flat_on_a_wall_stays_whole() -> None:
     clock, wall = Foreground(40, 60, np.ones((30, 30), bool)), np.ones((120, 160), bool)
-    assert without_room(clock, [Foreground(0, 0, wall)], 0.5) is clock
+    assert remove_structure(clock, [Foreground(0, 0, wall)], 0.5) is clock
 
 
 def test_a_hesitant_box_of_what_a_sure_one_has_is_not_asked_about() -> None:
@@ -138,14 +138,16 @@ def test_what_the_map_has_a_name_for_is_not_asked_about() -> None:
 
 def test_what_stands_on_a_named_thing_is_asked_about_all_the_same() -> None:
     """The name is that of the thing."""
-    on_it = Candidate(np.array([20, 20, 59, 59]) - 0.5, Foreground(20, 20, np.ones((39, 39), bool)))
+    on_it = RegionProposal(
+        np.array([20, 20, 59, 59]) - 0.5, Foreground(20, 20, np.ones((39, 39), bool))
+    )
     depth_m, named = wall_with(), np.ones((120, 160), bool)
     none = np.zeros((0, 4)), [], np.zeros(0), depth_m, CAMERA, named
     for kind, count in (("standing", 1), ("convex", 0), ("apart", 0), ("flat", 0)):
-        assert len(candidates(*none, [replace(on_it, kind=kind)], [], CONFIG)) == count
+        assert len(propose_regions(*none, [replace(on_it, kind=kind)], [], CONFIG)) == count
     # but not once a box is drawn about it
     box = on_it.box_px[None], ["cup"], np.array([0.9]), depth_m, CAMERA, named
-    (found,) = candidates(*box, [replace(on_it, kind="standing")], [], CONFIG)
+    (found,) = propose_regions(*box, [replace(on_it, kind="standing")], [], CONFIG)
     assert found.number == 0
 
 
@@ -156,9 +158,9 @@ def test_what_the_map_has_a_name_for_is_found_again_where_no_box_is() -> None:
     apart = regions(depth_m)
     assert len(apart) == 2
     none, box = np.zeros((0, 4)), np.array([[59.5, 39.5, 89.5, 79.5]])
-    (found,) = named_objects(none, is_labelled, apart, CONFIG)
+    (found,) = labeled_regions(none, is_labelled, apart, CONFIG)
     assert found.box_px[2] < 100
-    assert named_objects(box, is_labelled, apart, CONFIG) == []
+    assert labeled_regions(box, is_labelled, apart, CONFIG) == []
 
 
 def test_things_too_small_or_as_large_as_rooms_are_left_out() -> None:
@@ -206,4 +208,4 @@ def test_two_regions_alike_are_one() -> None:
 )
 def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
     with pytest.raises(ConfigError):
-        TriggerConfig(**fields)
+        RegionProposalConfig(**fields)

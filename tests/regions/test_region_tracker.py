@@ -5,14 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ldo_service.conversions.frames import crops_of
-from ldo_service.conversions.objects import label_request_message
+from ldo_service.conversions.frames import crops_from_request
+from ldo_service.conversions.objects import label_request_to_message
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, codecs
 from ldo_service.regions.foreground import Foreground
-from ldo_service.regions.region import Answer
-from ldo_service.regions.region_proposals import Candidate
-from ldo_service.regions.region_tracker import MOST_VIEWS, Opinion, RegionConfig, RegionsToName
+from ldo_service.regions.region import RegionLabelResult
+from ldo_service.regions.region_proposals import RegionProposal
+from ldo_service.regions.region_tracker import (
+    MAX_VIEWS,
+    RegionLabel,
+    RegionTracker,
+    RegionTrackerConfig,
+)
 from ldo_service.regions.region_views import (
     ViewConfig,
     border_factor,
@@ -20,28 +25,28 @@ from ldo_service.regions.region_views import (
     region_view,
     sharpness_factor,
 )
-from ldo_service.schemas.labels import MOST_CROPS
+from ldo_service.schemas.labels import MAX_CROPS
 from ldo_service.storage.state_codec import decode_state, encode_state
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
-CONFIG = RegionConfig(
+CONFIG = RegionTrackerConfig(
     views_first=2, views=3, most_questions=2, patience=0, per_keyframe=9, at_once=9
 )
 RNG = np.random.default_rng(3)
 COLOR = RNG.integers(0, 256, (*SHAPE, 3), np.uint8)
 
 
-def thing(left: int = 60, top: int = 40, side: int = 30, **fields) -> Candidate:
+def thing(left: int = 60, top: int = 40, side: int = 30, **fields) -> RegionProposal:
     part = Foreground(top, left, np.ones((side, side), bool))
     box = np.array([left - 0.5, top - 0.5, left + side - 0.5, top + side - 0.5])
-    return Candidate(box, part, **fields)
+    return RegionProposal(box, part, **fields)
 
 
-def piece(rows: int, **fields) -> Candidate:
+def piece(rows: int, **fields) -> RegionProposal:
     """The upper rows of the thing at 40, 40 with a side of 40."""
     part = Foreground(40, 40, np.ones((rows, 40), bool))
-    return Candidate(np.array([39.5, 39.5, 79.5, 39.5 + rows]), part, **fields)
+    return RegionProposal(np.array([39.5, 39.5, 79.5, 39.5 + rows]), part, **fields)
 
 
 def moved(x_m: float = 0.0) -> np.ndarray:
@@ -53,26 +58,28 @@ def moved(x_m: float = 0.0) -> np.ndarray:
 class Walk:
     """Keyframes one after the other, over a wall at 2 m."""
 
-    def __init__(self, config: RegionConfig = CONFIG) -> None:
-        self.regions = RegionsToName(config)
+    def __init__(self, config: RegionTrackerConfig = CONFIG) -> None:
+        self.regions = RegionTracker(config)
         self.T_map_keyframe: dict[int, np.ndarray] = {}
 
-    def see(self, *found: Candidate, at_x_m: float = 0.0, color: np.ndarray = COLOR) -> list[int]:
+    def see(
+        self, *found: RegionProposal, at_x_m: float = 0.0, color: np.ndarray = COLOR
+    ) -> list[int]:
         keyframe = len(self.T_map_keyframe)
         self.T_map_keyframe[keyframe] = moved(at_x_m)
         depth_m = np.full(SHAPE, 2.0, np.float32)
         args = keyframe, found, color, depth_m, CAMERA, self.T_map_keyframe
-        return [question.region.id for question in self.regions.see(*args).questions]
+        return [question.region.id for question in self.regions.observe_keyframe(*args).questions]
 
-    def opinions(self, *found: Candidate) -> list[Opinion]:
+    def opinions(self, *found: RegionProposal) -> list[RegionLabel]:
         """What the next keyframe, from the same place, tells."""
         keyframe = len(self.T_map_keyframe)
         self.T_map_keyframe[keyframe] = moved()
         at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, self.T_map_keyframe
-        return self.regions.see(keyframe, found, *at).opinions
+        return self.regions.observe_keyframe(keyframe, found, *at).opinions
 
     def answered(self, label: str, sure: float, region: int = 0) -> None:
-        self.regions.answered(region, Answer(label, sure))
+        self.regions.answered(region, RegionLabelResult(label, sure))
 
 
 def test_a_region_is_asked_about_when_it_was_seen_twice() -> None:
@@ -96,15 +103,15 @@ def test_it_is_the_same_where_the_camera_moved_and_another_one_elsewhere() -> No
 
 def test_it_is_asked_about_at_its_best_once_no_better_view_comes() -> None:
     walk = Walk(replace(CONFIG, patience=2))
-    grey = np.full_like(COLOR, 128)
-    grey[::7] = 140
-    assert [walk.see(thing(), color=grey) for _ in range(2)] == [[], []]
+    gray = np.full_like(COLOR, 128)
+    gray[::7] = 140
+    assert [walk.see(thing(), color=gray) for _ in range(2)] == [[], []]
     assert walk.see(thing(left=62)) == [], "far sharper: a better one may come"
-    assert walk.see(thing(), color=grey) == []
+    assert walk.see(thing(), color=gray) == []
     walk.T_map_keyframe[4] = moved()
     depth_m = np.full(SHAPE, 2.0, np.float32)
     out_of_sight = 4, [], COLOR, depth_m, CAMERA, walk.T_map_keyframe
-    (question,) = walk.regions.see(*out_of_sight).questions
+    (question,) = walk.regions.observe_keyframe(*out_of_sight).questions
     assert (question.region.keyframe, question.region.box_px[0]) == (2, 61.5)
     assert question.candidate.part.column == 62
 
@@ -152,9 +159,9 @@ def test_a_correction_moves_regions_with_their_keyframes() -> None:
 
 def test_it_is_asked_again_only_when_its_views_got_better_and_not_too_often() -> None:
     walk = Walk()
-    grey = np.full_like(COLOR, 128)
-    grey[::7] = 140
-    assert [walk.see(thing(), color=grey) for _ in range(2)] == [[], [0]]
+    gray = np.full_like(COLOR, 128)
+    gray[::7] = 140
+    assert [walk.see(thing(), color=gray) for _ in range(2)] == [[], [0]]
     assert walk.see(thing()) == [0], "far sharper"
     assert [walk.see(thing()) for _ in range(5)] == [[]] * 5, "asked twice already"
 
@@ -181,13 +188,13 @@ def test_what_was_said_of_a_region_is_told_where_it_is_seen_again() -> None:
     walk.T_map_keyframe[keyframe] = moved()
     at = COLOR, depth_m, CAMERA, walk.T_map_keyframe
     asked_about, known, other = thing(), thing(left=62), thing(left=120)
-    (opinion,) = walk.regions.see(keyframe, [asked_about], *at).opinions
+    (opinion,) = walk.regions.observe_keyframe(keyframe, [asked_about], *at).opinions
     assert (opinion.of, opinion.label) == (asked_about, "teapot")
     assert opinion.sure == pytest.approx(0.5 * 0.25 / (0.25 + 0.16))
-    seen = walk.regions.see(keyframe, [], *at, named=[known, other])
+    seen = walk.regions.observe_keyframe(keyframe, [], *at, named=[known, other])
     assert [(one.of, one.label) for one in seen.opinions] == [(known, "teapot")]
     on_it, around_it = thing(left=70, top=50, side=10), thing(left=20, top=5, side=110)
-    assert walk.regions.see(keyframe, [on_it], *at, named=[around_it]).opinions == []
+    assert walk.regions.observe_keyframe(keyframe, [on_it], *at, named=[around_it]).opinions == []
 
 
 def test_a_sure_name_is_told_where_its_region_is_seen_and_nothing_sets_it_apart() -> None:
@@ -197,8 +204,8 @@ def test_a_sure_name_is_told_where_its_region_is_seen_and_nothing_sets_it_apart(
     T, depth_m = walk.T_map_keyframe, np.full(SHAPE, 2.0, np.float32)
     T[2], T[3] = moved(0.25), moved(4.0)
 
-    def opinions(keyframe: int, *found: Candidate, depth_m: np.ndarray = depth_m):
-        return walk.regions.see(keyframe, found, COLOR, depth_m, CAMERA, T).opinions
+    def opinions(keyframe: int, *found: RegionProposal, depth_m: np.ndarray = depth_m):
+        return walk.regions.observe_keyframe(keyframe, found, COLOR, depth_m, CAMERA, T).opinions
 
     walk.answered("teapot", 0.49)
     assert opinions(2) == [], "too little is known"
@@ -225,8 +232,10 @@ def test_a_region_of_a_few_pixels_is_not_looked_for() -> None:
     walk.answered("cup", 0.9)
     walk.T_map_keyframe[2] = moved()
     at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, walk.T_map_keyframe
-    assert [one.label for one in walk.regions.see(2, [thing(side=8)], *at).opinions] == ["cup"]
-    assert walk.regions.see(2, [], *at).opinions == []
+    assert [
+        one.label for one in walk.regions.observe_keyframe(2, [thing(side=8)], *at).opinions
+    ] == ["cup"]
+    assert walk.regions.observe_keyframe(2, [], *at).opinions == []
 
 
 def test_what_the_detector_is_sure_of_is_not_asked_about() -> None:
@@ -243,23 +252,28 @@ def test_boxes_and_answers_vote_for_the_name_of_a_region() -> None:
     walk = Walk()
     for _ in range(8):
         walk.see(thing(label="refrigerator", score=0.4))
-    assert walk.regions.answered(0, Answer("door", 0.6)) == "door"
+    assert walk.regions.answered(0, RegionLabelResult("door", 0.6)) == "door"
     for _ in range(2):
         walk.see(thing(label="refrigerator", score=0.4))
     keyframe = len(walk.T_map_keyframe)
     walk.T_map_keyframe[keyframe] = moved()
     at = COLOR, np.full(SHAPE, 2.0, np.float32), CAMERA, walk.T_map_keyframe
-    (opinion,) = walk.regions.see(keyframe, [thing()], *at).opinions
+    (opinion,) = walk.regions.observe_keyframe(keyframe, [thing()], *at).opinions
     assert (opinion.label, opinion.sure) == ("refrigerator", pytest.approx(0.4 * 1.6 / 3.04))
-    assert walk.regions.answered(0, Answer("cabinet", 0.5)) == "refrigerator"
+    assert walk.regions.answered(0, RegionLabelResult("cabinet", 0.5)) == "refrigerator"
 
 
 def test_what_else_an_answer_takes_it_for_counts() -> None:
     """0.4 and 0.4 squared are 0.32, 0.5 squared is 0.25."""
     walk = Walk()
     walk.see(thing())
-    assert walk.regions.answered(0, Answer("clock", 0.5, (("radiator", 0.4),))) == "clock"
-    assert walk.regions.answered(0, Answer("speaker", 0.45, (("radiator", 0.4),))) == "radiator"
+    assert (
+        walk.regions.answered(0, RegionLabelResult("clock", 0.5, (("radiator", 0.4),))) == "clock"
+    )
+    assert (
+        walk.regions.answered(0, RegionLabelResult("speaker", 0.45, (("radiator", 0.4),)))
+        == "radiator"
+    )
 
 
 @pytest.mark.parametrize(
@@ -345,9 +359,9 @@ def test_the_region_not_seen_for_longest_is_forgotten() -> None:
 
 
 def test_what_has_no_depth_is_left_out() -> None:
-    regions = RegionsToName(CONFIG)
+    regions = RegionTracker(CONFIG)
     nothing = np.zeros(SHAPE, np.float32)
-    seen = regions.see(0, [thing()], COLOR, nothing, CAMERA, {0: moved()})
+    seen = regions.observe_keyframe(0, [thing()], COLOR, nothing, CAMERA, {0: moved()})
     assert (seen.questions, seen.opinions) == ([], [])
     assert len(regions) == 0
 
@@ -357,7 +371,7 @@ def test_a_state_is_plain_and_goes_on_where_it_was() -> None:
     walk.see(thing(label="cup", score=0.5), thing(left=110))
     packed = decode_state(encode_state(walk.regions.packed))
     successor = Walk()
-    successor.regions = RegionsToName.unpacked(packed, CONFIG)
+    successor.regions = RegionTracker.unpack(packed, CONFIG)
     successor.T_map_keyframe = dict(walk.T_map_keyframe)
     assert successor.see(thing()) == walk.see(thing()) == [0]
     one, other = successor.regions.get(0), walk.regions.get(0)
@@ -376,10 +390,10 @@ def test_a_question_shows_its_views_the_best_first() -> None:
     walk.see(thing())
     region = walk.regions.get(0)
     assert region is not None
-    question = label_request_message(region, 77)
+    question = label_request_to_message(region, 77)
     assert (question.stamp_ns, question.region, question.keyframe) == (77, 0, 1)
     assert (question.label, question.score, question.box_px) == ("cup", 0.5, region.box_px)
-    sharp, blurred = crops_of(question)
+    sharp, blurred = crops_from_request(question)
     assert sharp.shape == blurred.shape == (40, 40, 3)
     assert sharp.std() > 20 > blurred.std()
 
@@ -424,7 +438,7 @@ def test_a_surface_faced_is_better_than_one_edge_on() -> None:
     "fields",
     [
         {"views": 0},
-        {"views": MOST_VIEWS + 1},
+        {"views": MAX_VIEWS + 1},
         {"views_first": 8},
         {"gain": 1.0},
         {"overlap": 0.0},
@@ -432,8 +446,8 @@ def test_a_surface_faced_is_better_than_one_edge_on() -> None:
 )
 def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
     with pytest.raises(ConfigError):
-        RegionConfig(**fields)
+        RegionTrackerConfig(**fields)
 
 
 def test_a_request_has_room_for_all_views() -> None:
-    assert MOST_VIEWS == MOST_CROPS
+    assert MAX_VIEWS == MAX_CROPS

@@ -5,9 +5,9 @@ import pytest
 
 from ldo_service.geometry import Camera, se3
 from ldo_service.regions.foreground import Foreground
-from ldo_service.regions.region import Region, Sighting, sighting_of
-from ldo_service.regions.region_matching import projected, share_back
-from ldo_service.regions.region_proposals import Candidate
+from ldo_service.regions.region import Region, RegionObservation, observe_region
+from ldo_service.regions.region_matching import projected, reverse_overlap
+from ldo_service.regions.region_proposals import RegionProposal
 
 CAMERA = Camera(160, 120, 120.0, 120.0, 80.0, 60.0)
 SHAPE = 120, 160
@@ -15,20 +15,22 @@ FAR_M = 2.0
 WALL = np.full(SHAPE, FAR_M, np.float32)
 
 
-def at(left: int, top: int, right: int, bottom: int) -> Candidate:
+def at(left: int, top: int, right: int, bottom: int) -> RegionProposal:
     """A region of these columns and rows, cut to the image."""
     left, top, right, bottom = max(left, 0), max(top, 0), min(right, 160), min(bottom, 120)
     box = np.array([left, top, right, bottom]) - 0.5
-    return Candidate(box, Foreground(top, left, np.ones((bottom - top, right - left), bool)))
+    return RegionProposal(box, Foreground(top, left, np.ones((bottom - top, right - left), bool)))
 
 
-def seen(keyframe: int, candidate: Candidate, depth_m: np.ndarray = WALL) -> Sighting:
-    sighting = sighting_of(keyframe, candidate, depth_m, CAMERA)
+def seen(keyframe: int, candidate: RegionProposal, depth_m: np.ndarray = WALL) -> RegionObservation:
+    sighting = observe_region(keyframe, candidate, depth_m, CAMERA)
     assert sighting is not None
     return sighting
 
 
-def shares(known: Candidate, now: Candidate, *, x_m=0.0, depth_m=WALL) -> tuple[float, float]:
+def shares(
+    known: RegionProposal, now: RegionProposal, *, x_m=0.0, depth_m=WALL
+) -> tuple[float, float]:
     """Of what keyframe 1, x_m to the right of keyframe 0, sees of the region known from there, the
     share in the one seen now; and back."""
     T_map_keyframe = {0: np.eye(4), 1: se3.exp(np.array([0, 0, 0, x_m, 0, 0]))}
@@ -37,7 +39,7 @@ def shares(known: Candidate, now: Candidate, *, x_m=0.0, depth_m=WALL) -> tuple[
     T_camera_map = se3.inverse(T_map_keyframe[1])
     there = projected([region], depth_m, CAMERA, T_camera_map, T_map_keyframe, 0.1)
     second = seen(1, now, depth_m)
-    back = share_back(second, region, SHAPE, CAMERA, T_map_keyframe, 12)
+    back = reverse_overlap(second, region, SHAPE, CAMERA, T_map_keyframe, 12)
     return float(there.shares_in(now.part)[0]), back
 
 

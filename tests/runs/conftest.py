@@ -8,8 +8,8 @@ import pytest
 
 from ldo_service.actors.topology import GRAPH
 from ldo_service.config import Config, actor_parameters, load_config
-from ldo_service.conversions.frames import camera_rgbd_message
-from ldo_service.conversions.poses import pose_message
+from ldo_service.conversions.frames import raw_frame_to_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import Trajectory
 from ldo_service.runtime import Out
@@ -66,9 +66,9 @@ async def live(
         for index in range(count):
             if prior is not None:
                 stamp_ns = round(1e9 * prior.stamps_s[index])
-                pose = pose_message(prior.T_world_camera[index])
+                pose = pose_to_message(prior.T_world_camera[index])
                 await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_odom_base=pose))
-            await send(camera, camera_rgbd_message(sequence.read(index)))
+            await send(camera, raw_frame_to_message(sequence.read(index)))
             await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
         await eventually(lambda: until({stage.name: stage for stage in actors}))
         for stage, task in zip(actors, tasks, strict=True):

@@ -11,9 +11,9 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.geometry import RawFrame, Trajectory
 from ldo_service.runs.folder import prepare
-from ldo_service.runs.job import Job
+from ldo_service.runs.job import RunOptions
 from ldo_service.runs.source import Selection, Warn
-from ldo_service.tracking.submaps import SegmentConfig
+from ldo_service.tracking.submaps import SubmapConfig
 
 ROUGH = "mapper.iterations=1"  # as fast as can be, with every part of the mapper in use
 
@@ -25,11 +25,11 @@ def job(
     frames: int | None = None,
     warn: Warn = print,
     prior: Trajectory | None = None,
-) -> Job:
+) -> RunOptions:
     """Of the first frames, or all, into a new folder."""
     prepare(folder, overwrite=False)
     config = load_config(settings=(ROUGH, *settings))
-    return Job(sequence, folder, config, Selection(max_frames=frames), warn, prior=prior)
+    return RunOptions(sequence, folder, config, Selection(max_frames=frames), warn, prior=prior)
 
 
 SOON = ("tracker.submaps.start_after_lost_s=0.06",)
@@ -41,8 +41,8 @@ HERE, AWAY, BACK = range(12), range(60, 24, -2), range(24, 4, -2)
 @contextmanager
 def quick_submaps() -> Iterator[None]:
     """Let every tracker that is made from a configuration join submaps after a few frames."""
-    quick = partial(SegmentConfig, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
-    with patch("ldo_service.config.parameters.SegmentConfig", quick):
+    quick = partial(SubmapConfig, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
+    with patch("ldo_service.config.parameters.SubmapConfig", quick):
         yield
 
 

@@ -10,14 +10,14 @@ import numpy as np
 from ldo_service.actors.loop_closer import LoopCloser, LoopCloserConfig
 from ldo_service.actors.topology import ActorParameters, make_actors
 from ldo_service.actors.tracker import Tracker, TrackerConfig
-from ldo_service.conversions.poses import measured_message
+from ldo_service.conversions.poses import relative_pose_to_message
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.runtime import Actor
 from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandidate, LoopClosure
 from ldo_service.tracking.map_frame import MapCorrection, MapFrame
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
-from ldo_service.tracking.odometry_prior import Prior
+from ldo_service.tracking.odometry_prior import OdometryPriorBuffer
 from ldo_service.tracking.tracking_result import TrackedFrame, TrackingResult
 
 UP_ODOM = np.array([0.0, -1.0, 0.0])  # of a camera held level at the start
@@ -54,14 +54,14 @@ class DriftingOdometry(Odometry):
         self._told_map = MapFrame()
 
     def process(
-        self, frame: RgbdFrame, prior: Prior | None = None, *, may_map: bool = True
+        self, frame: RgbdFrame, prior: OdometryPriorBuffer | None = None, *, may_map: bool = True
     ) -> TrackingResult:
         before, right = self._right, super().process(frame, prior, may_map=may_map)
         self._right = right
         if before is not None:
             T_before_now = se3.inverse(before.T_odom_camera) @ right.T_odom_camera
             T_step = self._drift.of(before.T_odom_camera, T_before_now)
-            self._T_drifted = se3.orthonormalised(self._T_drifted @ T_step)
+            self._T_drifted = se3.orthonormalize(self._T_drifted @ T_step)
         return self._as_told(right)
 
     def correct(self, correction: MapCorrection) -> bool:
@@ -89,7 +89,7 @@ class DriftingOdometry(Odometry):
             right,
             T_odom_camera=self._T_drifted,
             T_reference_camera=T_reference_camera,
-            T_map_odom=se3.orthonormalised(self._told_map.T_map_odom(reference)),
+            T_map_odom=se3.orthonormalize(self._told_map.T_map_odom(reference)),
             keyframe=keyframe,
         )
 
@@ -122,7 +122,7 @@ class MistakenLoopCloser(LoopCloser):
         if isinstance(message, Keyframe) and message.keyframe in self._beside:
             old, T_old_keyframe = self._beside[message.keyframe]
             closure = RelativePose(old, message.keyframe, T_old_keyframe, SURE)
-            pose = measured_message(closure)
+            pose = relative_pose_to_message(closure)
             yield LoopClosure(stamp_ns=message.stamp_ns, pose=pose, overlap=0.8, rmse_m=0.005)
 
 

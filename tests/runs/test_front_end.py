@@ -12,7 +12,7 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, FrameError, StageError
 from ldo_service.geometry import RawFrame
 from ldo_service.runs.front_end import FRONT_END, FrontEnd, front_end_settings
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
 from .jobs import AND_BACK, LONG_AGO, ROUGH, Rearranged, job
@@ -42,7 +42,7 @@ def walk(room: Sequence) -> Sequence:
 @pytest.fixture(scope="module")
 def whole(walk: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("front_end") / "whole"
-    run_over_file(replace(job(walk, folder, *SETTINGS), keep_front_end=True), lambda *_: None)
+    run_offline(replace(job(walk, folder, *SETTINGS), keep_front_end=True), lambda *_: None)
     return folder
 
 
@@ -55,7 +55,7 @@ def again(room: Sequence, whole: Path, folder: Path, *settings: str) -> Path:
     """A run of the others, by what was kept."""
     asked = job(Unread(room, AND_BACK), folder, *SETTINGS, *settings)
     front_end = FrontEnd.open(whole, asked.config, asked.sequence, asked.selection)
-    run_over_file(replace(asked, front_end=front_end), lambda *_: None)
+    run_offline(replace(asked, front_end=front_end), lambda *_: None)
     return folder
 
 
@@ -142,7 +142,7 @@ def test_a_run_that_fails_leaves_none_for_others(
     monkeypatch.setattr("ldo_service.actors.loop_closer.LoopCloser.handle", fails)
     asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
     with pytest.raises(StageError, match="out of luck"):
-        run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
+        run_offline(replace(asked, keep_front_end=True), lambda *_: None)
     monkeypatch.undo()
     assert not (tmp_path / "out" / FRONT_END).exists()
 
@@ -152,7 +152,7 @@ def test_one_that_grows_too_large_is_not_whole(room: Sequence, tmp_path: Path) -
     asked = job(Rearranged(room, AND_BACK), tmp_path / "out", tight)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ldo_service.recordings.mcap_file.CHECK_EVERY_BYTES", 1000)
-        record = run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
+        record = run_offline(replace(asked, keep_front_end=True), lambda *_: None)
     assert record.summary["frames"] == len(AND_BACK)  # the run goes on
     assert not (tmp_path / "out" / FRONT_END).exists()
 
@@ -163,10 +163,10 @@ def test_it_is_whole_when_the_stream_ends(
     def fails(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ldo_service.runs.offline.FileRun.repair", fails)
+    monkeypatch.setattr("ldo_service.runs.offline.OfflineRun.repair", fails)
     asked = job(Rearranged(room, AND_BACK), tmp_path / "out")
     with pytest.raises(KeyboardInterrupt):
-        run_over_file(replace(asked, keep_front_end=True), lambda *_: None)
+        run_offline(replace(asked, keep_front_end=True), lambda *_: None)
     kept = FrontEnd.open(tmp_path / "out", asked.config, asked.sequence, asked.selection)
     assert kept.rejected == 0
 

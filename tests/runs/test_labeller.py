@@ -7,8 +7,8 @@ import pytest
 
 from ldo_service.datasets import Sequence
 from ldo_service.runs.finished import MapFolder
-from ldo_service.runs.folder import RunFolder
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.folder import RunWriter
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.records import read_objects
 from ldo_service.semantics.gaussian_labels import fields
 from tests.detection.labellers.server import Server, hangs, says, sends, serving
@@ -19,13 +19,13 @@ FRAMES = 16
 QUICK = ("timeout_s=0.2", "max_attempts=1", "max_requests_per_minute=1000000000.0")
 
 
-def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -> RunFolder:
+def run(sequence: Sequence, folder: Path, server: Server | None, latency: int) -> RunWriter:
     """With a labeller that answers so many frames late."""
     settings = [f"offline.latency_frames.vlm_labeller={latency}", "mapper.threads=1"]
     if server:
         settings += [f"vlm_labeller.http.{setting}" for setting in QUICK]
         settings += [f"vlm_labeller.url={server.url}"]
-    return run_over_file(job(sequence, folder, *settings, frames=FRAMES), lambda *_: None)
+    return run_offline(job(sequence, folder, *settings, frames=FRAMES), lambda *_: None)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.evaluation.results import Results, evaluate_run
 from ldo_service.runs.finished import read_run
 from ldo_service.runs.folder import prepare
-from ldo_service.runs.job import Job
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.job import RunOptions
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
 from .mistaken import Drift, DriftingTracker, standing_in
@@ -32,11 +32,11 @@ def judged(
 ) -> Results:
     config = load_config(settings=("tracker.hold_out=5",))
     prepare(folder, overwrite=False)
-    job = Job(sequence, folder, config, Selection(max_frames=frames), print)
+    job = RunOptions(sequence, folder, config, Selection(max_frames=frames), print)
     with standing_in(
         *([DriftingTracker(actor_parameters(config).tracker, drift)] if drift else [])
     ):
-        run_over_file(job, lambda *_: None)
+        run_offline(job, lambda *_: None)
     threads = os.cpu_count() or 1
     return evaluate_run(read_run(folder), sequence, lambda _: None, threads=threads)
 

@@ -12,12 +12,12 @@ from ldo_service.datasets import Cached, Sequence
 from ldo_service.detection.vocabulary import FIRST_NAMES
 from ldo_service.errors import DataError, FrameError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.evaluation.views import Judged, evaluate_rendering
+from ldo_service.evaluation.views import EvaluatedFrames, evaluate_rendering
 from ldo_service.gaussians.model import new_labels
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.runs.finished import MapFolder, read_run
-from ldo_service.runs.folder import RunFolder
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.folder import RunWriter
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Warn
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantics_file import write_semantics
@@ -41,10 +41,8 @@ class Spoilt(Cached):
         return super().read(index)
 
 
-def run(sequence: Sequence, folder: Path, *settings: str, warn: Warn = print) -> RunFolder:
-    return run_over_file(
-        job(sequence, folder, *settings, frames=FRAMES, warn=warn), lambda *_: None
-    )
+def run(sequence: Sequence, folder: Path, *settings: str, warn: Warn = print) -> RunWriter:
+    return run_offline(job(sequence, folder, *settings, frames=FRAMES, warn=warn), lambda *_: None)
 
 
 @pytest.fixture(scope="module")
@@ -141,17 +139,17 @@ def test_a_refined_map_lies_beside_the_runs_own_and_looks_better(
     room: Sequence, tmp_path: Path
 ) -> None:
     asked, done = replace(job(room, tmp_path / "out", frames=10), refine=30), []
-    record = run_over_file(asked, lambda count, _total=None: done.append(count))
+    record = run_offline(asked, lambda count, _total=None: done.append(count))
     assert record.summary["refine_iterations"] == 30
     assert done[-1] == asked.work
     run = read_run(tmp_path / "out")
-    judged = Judged.of(run.frames)
+    judged = EvaluatedFrames.of(run.frames)
     online, refined = evaluate_rendering(room, judged, run.maps, lambda _done: None)
     assert (online.map, refined.map) == ("online", "refined")
     assert refined.mean("psnr_db") > online.mean("psnr_db") + 1
 
 
-def test_forty_real_frames_stay_within_three_centimetres(data: Path, tmp_path: Path) -> None:
+def test_forty_real_frames_stay_within_three_centimeters(data: Path, tmp_path: Path) -> None:
     from ldo_service.datasets import open_sequence
 
     kitchen = open_sequence(str(data / "tum" / "kitchen"))

@@ -10,9 +10,9 @@ import pytest
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError
 from ldo_service.geometry import RawFrame, Trajectory
-from ldo_service.runs.offline import run_over_file
-from ldo_service.runs.realtime import run_in_real_time
-from ldo_service.runs.source import Reader, with_prior
+from ldo_service.runs.offline import run_offline
+from ldo_service.runs.realtime import run_realtime
+from ldo_service.runs.source import FrameReader, interleave_prior
 from ldo_service.schemas import CameraRgbd, OdometryPrior
 
 from .jobs import job
@@ -52,7 +52,7 @@ def test_frames_come_behind_the_poses_that_reach_them(room: Sequence) -> None:
     stamps_s = np.arange(12) * 0.02 + float(room.stamps_ns[0]) * 1e-9
     poses = Trajectory(stamps_s, np.tile(np.eye(4), (12, 1, 1)))
     told: list[int] = []
-    for *news, frame in with_prior(Reader(room, range(4), print), poses):
+    for *news, frame in interleave_prior(FrameReader(room, range(4), print), poses):
         assert isinstance(frame, CameraRgbd)
         assert all(isinstance(pose, OdometryPrior) for pose in news)
         told += [pose.stamp_ns for pose in news]
@@ -66,7 +66,7 @@ def test_a_covered_camera_is_found_at_once_and_the_run_repeats(
 ) -> None:
     for name in ("first", "second"):
         of_run = job(hurried, tmp_path / name, frames=FRAMES, prior=prior)
-        run_over_file(of_run, lambda *_: None)
+        run_offline(of_run, lambda *_: None)
     expected = ["LOST" if index in COVERED else "OK" for index in range(FRAMES)]
     assert statuses(tmp_path / "first") == expected
     first, second = (
@@ -79,7 +79,7 @@ def test_a_run_in_real_time_takes_a_prior_too(
     hurried: Sequence, prior: Trajectory, tmp_path: Path
 ) -> None:
     of_run = job(hurried, tmp_path / "out", frames=4, prior=prior)
-    record = run_in_real_time(of_run, lambda _done: None)
+    record = run_realtime(of_run, lambda _done: None)
     assert record.summary["status"]["OK"] > 0
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.runs.realtime import run_in_real_time
+from ldo_service.runs.realtime import run_realtime
 
 from .jobs import job
 
@@ -16,7 +16,7 @@ def test_a_paced_run_takes_as_long_as_the_sequence_and_accounts_for_every_frame(
     frames = 45
     for index in range(frames):
         room.read(index)
-    record = run_in_real_time(job(room, tmp_path / "out", frames=frames), lambda _done: None)
+    record = run_realtime(job(room, tmp_path / "out", frames=frames), lambda _done: None)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["wall_s"] >= (frames - 1) / 30
     tracked = sum(summary["status"].values())

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.recordings.mcap_file import RecordConfig, RecordingFile
@@ -92,7 +92,7 @@ def test_halves_are_frames_too(room: Sequence, tmp_path: Path) -> None:
     """Of a camera that sends colour and depth apart, 4 ms off, and one colour without depth."""
     file = RecordingFile(tmp_path / "frame_source.mcap", {}, RecordConfig())
     for index in range(4):
-        frame = camera_rgbd_message(room.read(index))
+        frame = raw_frame_to_message(room.read(index))
         color = CameraColor(
             stamp_ns=frame.stamp_ns, frame=index, camera=frame.camera, image=frame.color
         )

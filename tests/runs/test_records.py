@@ -14,9 +14,9 @@ from ldo_service.datasets import Sequence
 from ldo_service.errors import DataError
 from ldo_service.evaluation.results import judge_loops
 from ldo_service.runs.finished import read_run
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.records import LoopRecord, read_loops
-from ldo_service.runs.simulation import Made, simulate_graph
+from ldo_service.runs.simulation import ActorDigest, simulate_graph
 from ldo_service.runs.source import Selection
 from tests.schemas.examples import EXAMPLES
 
@@ -32,7 +32,7 @@ def returning(room: Sequence) -> Rearranged:
 def finished(returning: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A short walk, whose first frames count as long ago."""
     folder = tmp_path_factory.mktemp("loops") / "out"
-    run_over_file(job(returning, folder, LONG_AGO), print)
+    run_offline(job(returning, folder, LONG_AGO), print)
     return folder
 
 
@@ -101,7 +101,7 @@ def test_a_file_of_something_else_is_refused(tmp_path: Path) -> None:
 def test_a_run_that_meets_nothing_again_is_what_it_is_without_a_loop_closer(
     room: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def simulated() -> dict[str, Made]:
+    def simulated() -> dict[str, ActorDigest]:
         config, first = load_config(settings=(ROUGH,)), Selection(max_frames=20)
         return simulate_graph(room, config, first, print, lambda _done: None)
 

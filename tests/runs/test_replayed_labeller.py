@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
-from ldo_service.regions.region_tracker import RegionConfig
+from ldo_service.regions.region_tracker import RegionTrackerConfig
 from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime.journal import Step
 from ldo_service.runtime.stage import Stage
@@ -19,7 +19,7 @@ from tests.runs.jobs import ROUGH
 
 FRAMES = 12
 SOON = (ROUGH, "mapper.open_vocabulary.requests_per_keyframe=4")  # The stream is short.
-IMPATIENT = partial(RegionConfig, patience=0)
+IMPATIENT = partial(RegionTrackerConfig, patience=0)
 
 
 def has_answers(stages: dict[str, Stage]) -> bool:
@@ -39,7 +39,7 @@ def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_pat
     with serving(says("samovar", 0.9)) as server:
         settings = (*SOON, f"vlm_labeller.url={server.url}")
         config = load_config(settings=settings)
-        with patch("ldo_service.config.parameters.RegionConfig", IMPATIENT):
+        with patch("ldo_service.config.parameters.RegionTrackerConfig", IMPATIENT):
             asyncio.run(live(tmp_path / "recording", room, config, FRAMES, until=has_answers))
             replayed = replay_recording(tmp_path / "recording", "mapper", "vlm_labeller")
     assert "samovar" in names_taken(tmp_path / "recording")

@@ -8,7 +8,7 @@ import pytest
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.offline import run_offline
 
 from .jobs import Rearranged, job
 
@@ -25,7 +25,7 @@ def rounds(room: Sequence) -> Rearranged:
 @pytest.fixture(scope="module")
 def finished(rounds: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rounds") / "out"
-    run_over_file(job(rounds, folder, "tracker.keyframes.reuse_after=8"), lambda *_: None)
+    run_offline(job(rounds, folder, "tracker.keyframes.reuse_after=8"), lambda *_: None)
     return folder
 
 

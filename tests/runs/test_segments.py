@@ -11,10 +11,10 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.evaluation.trajectory import evaluate_trajectory
-from ldo_service.evaluation.views import Judged, evaluate_rendering
+from ldo_service.evaluation.views import EvaluatedFrames, evaluate_rendering
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.finished import MapFolder, read_run
-from ldo_service.runs.offline import run_over_file
+from ldo_service.runs.offline import run_offline
 from ldo_service.runs.simulation import simulate_graph
 from ldo_service.runs.source import Selection
 
@@ -35,7 +35,7 @@ def returning(room: Sequence) -> Rearranged:
 @pytest.fixture(scope="module")
 def finished(returning: Rearranged, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("segments") / "out"
-    run_over_file(job(returning, folder, *SOON), lambda *_: None)
+    run_offline(job(returning, folder, *SOON), lambda *_: None)
     return folder
 
 
@@ -82,15 +82,15 @@ def test_what_was_joined_is_fitted_again_at_the_end(
 ) -> None:
     paid, due = "mapper.refit.iterations_per_keyframe=0", "mapper.refit.iterations=0"
     left, never = tmp_path / "left", tmp_path / "never"
-    run_over_file(job(returning, left, *SOON, paid), lambda *_: None)
-    run_over_file(job(returning, never, *SOON, due), lambda *_: None)
+    run_offline(job(returning, left, *SOON, paid), lambda *_: None)
+    run_offline(job(returning, never, *SOON, due), lambda *_: None)
     with_keyframes, at_end, without = (
         json.loads((folder / "summary.json").read_text()) for folder in (finished, left, never)
     )
     assert with_keyframes["iterations_due"] == at_end["iterations_due"] == 0
     assert at_end["iterations"] >= without["iterations"] + 12
     quality = [
-        evaluate_rendering(returning, Judged.of(run.frames), run.maps, lambda _: None)[0]
+        evaluate_rendering(returning, EvaluatedFrames.of(run.frames), run.maps, lambda _: None)[0]
         for run in (read_run(left), read_run(never))
     ]
     assert quality[0].mean("psnr_db") > quality[1].mean("psnr_db") + 0.5
@@ -98,7 +98,7 @@ def test_what_was_joined_is_fitted_again_at_the_end(
 
 def test_a_segment_that_never_came_back_stays_apart(room: Sequence, tmp_path: Path) -> None:
     gone = Rearranged(room, [*HERE, *AWAY])
-    run_over_file(job(gone, tmp_path / "out", *SOON), lambda *_: None)
+    run_offline(job(gone, tmp_path / "out", *SOON), lambda *_: None)
     final = Trajectory.load(tmp_path / "out/trajectory.txt")
     assert len(final) == len(HERE)
     keyframes = json.loads((tmp_path / "out/keyframes.json").read_text())

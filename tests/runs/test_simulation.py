@@ -14,7 +14,7 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Cached, Sequence
 from ldo_service.errors import DataError, FrameError
 from ldo_service.geometry import RawFrame
-from ldo_service.runs.simulation import Made, simulate_graph
+from ldo_service.runs.simulation import ActorDigest, simulate_graph
 from ldo_service.runs.source import Selection
 from ldo_service.schemas import Keyframe
 from tests.actors.conftest import frames, keyframes, tracked  # noqa: F401
@@ -26,17 +26,17 @@ from .jobs import ROUGH
 FRAMES = 30
 
 
-def simulated(sequence: Sequence, *settings: str) -> dict[str, Made]:
+def simulated(sequence: Sequence, *settings: str) -> dict[str, ActorDigest]:
     config = load_config(settings=(ROUGH, *settings))
     return simulate_graph(sequence, config, Selection(max_frames=FRAMES), print, lambda _done: None)
 
 
 @pytest.fixture(scope="module")
-def made(room: Sequence) -> dict[str, Made]:
+def made(room: Sequence) -> dict[str, ActorDigest]:
     return simulated(room)
 
 
-def test_every_actor_has_a_digest(made: dict[str, Made]) -> None:
+def test_every_actor_has_a_digest(made: dict[str, ActorDigest]) -> None:
     assert list(made) == [box.name for box in GRAPH]
     assert made["frame_source"].messages == FRAMES
     talking = [entry.digest for entry in made.values() if entry.messages]
@@ -46,7 +46,7 @@ def test_every_actor_has_a_digest(made: dict[str, Made]) -> None:
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
 def test_digests_do_not_depend_on_threads(
-    room: Sequence, made: dict[str, Made], threads: int
+    room: Sequence, made: dict[str, ActorDigest], threads: int
 ) -> None:
     assert simulated(room, f"mapper.threads={threads}") == made
 
@@ -67,21 +67,21 @@ class OnePixel(Cached):
         return replace(raw, color=color)
 
 
-def test_one_pixel_changes_the_digests(room: Sequence, made: dict[str, Made]) -> None:
+def test_one_pixel_changes_the_digests(room: Sequence, made: dict[str, ActorDigest]) -> None:
     changed = simulated(OnePixel(room))
     assert changed["frame_source"].digest != made["frame_source"].digest
     assert changed["frame_source"].messages == made["frame_source"].messages
 
 
 def test_one_inverted_pixel_of_a_keyframe_reaches_tracker_and_map(
-    room: Sequence, made: dict[str, Made]
+    room: Sequence, made: dict[str, ActorDigest]
 ) -> None:
     changed = simulated(OnePixel(room, frame=0, bits=255))
     for actor in ("frame_source", "tracker", "mapper"):
         assert changed[actor].digest != made[actor].digest, actor
 
 
-def test_the_latency_is_an_input(room: Sequence, made: dict[str, Made]) -> None:
+def test_the_latency_is_an_input(room: Sequence, made: dict[str, ActorDigest]) -> None:
     later = simulated(room, "offline.latency_frames.optimizer=6")
     assert later["frame_source"] == made["frame_source"]
     assert later["tracker"] != made["tracker"]
@@ -138,7 +138,7 @@ def squares(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
 
 
 def test_a_labelled_map_does_not_depend_on_threads(
-    room: Sequence, squares: tuple[str, ...], made: dict[str, Made]
+    room: Sequence, squares: tuple[str, ...], made: dict[str, ActorDigest]
 ) -> None:
     one, two = (simulated(room, *squares, f"mapper.threads={threads}") for threads in (1, 2))
     assert one == two

@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.schemas import CameraRgbd, TrackedPose
-from ldo_service.service.diagnostics import Seen, remarks, troubles
+from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 from ldo_service.synthetic.flat import FlatSequence
 from tests.detection.labellers.server import serving
 from tests.service.conftest import PATIENCE, live_service, wait_until
@@ -43,7 +43,7 @@ class Walk:
         self._sent = self._lost = 0
 
     def go(self, frame: int) -> None:
-        message = camera_rgbd_message(self._sequence.read(frame))
+        message = raw_frame_to_message(self._sequence.read(frame))
         self._send(message)
         until_s = time.monotonic() + 20 * PATIENCE
         while not self._is_done_soon(frame):
@@ -105,9 +105,9 @@ def placed_keyframes(heard: Heard) -> dict[int, np.ndarray]:
 
 def is_called_late(heard: Heard) -> bool:
     """By `ldo doctor`, which takes it for no trouble."""
-    seen = Seen("vlm_labeller", True, heard.service.update_health()["vlm_labeller"], 1.5)
-    assert list(troubles(seen)) == []
-    return any("late" in remark for remark in remarks(seen))
+    seen = ActorStatus("vlm_labeller", True, heard.service.update_health()["vlm_labeller"], 1.5)
+    assert list(diagnose(seen)) == []
+    return any("late" in remark for remark in notes(seen))
 
 
 @pytest.mark.slow

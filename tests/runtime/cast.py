@@ -9,7 +9,7 @@ from typing import Any, Protocol
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.runtime.actor import Policy
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.stage import Stage, StageConfig
+from ldo_service.runtime.stage import Stage, SupervisionConfig
 from ldo_service.schemas import Message, encode
 from ldo_service.schemas.topics import Topic
 from ldo_service.transport.interface import Transport
@@ -39,7 +39,7 @@ DOUBLES = Topic("test/double", Double, "twice the number")
 PIECES = Topic("test/piece", Piece, "a value in parts", is_state=True)
 
 WINDOW_OF_FOUR = Lossless(4)
-QUICK = StageConfig(heartbeat_s=0.02, restart_delay_s=0.001)
+QUICK = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001)
 
 
 def number(value: int, **fields: Any) -> Number:
@@ -81,7 +81,7 @@ def collector(
     *,
     policy: Policy = WINDOW_OF_FOUR,
     name: str = "collector",
-    config: StageConfig = QUICK,
+    config: SupervisionConfig = QUICK,
 ) -> Stage:
     members = {"name": name, "inputs": (In(NUMBERS, policy),)}
     kind = type("NamedCollector", (Collector,), members)

@@ -9,12 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from ldo_service.runtime import Actor, In, Lossless
-from ldo_service.runtime.process import leave_with_parent
-from ldo_service.runtime.stage import Stage, StageConfig
-from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.process import exit_with_parent
+from ldo_service.runtime.stage import Stage, SupervisionConfig
+from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.schemas import Message
 from ldo_service.schemas.topics import Topic
-from ldo_service.transport.zenoh_transport import Network, ZenohTransport, open_session
+from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport, open_session
 
 
 class Number(Message, frozen=True, kw_only=True):
@@ -38,17 +38,17 @@ class Collector(Actor):
 
 
 async def main(endpoint: str, path: str, step_s: str) -> None:
-    network, stop = Network("test", endpoint), Stop()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.ask)
+    network, stop = Endpoint("test", endpoint), StopRequest()
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.request)
     with open_session(network) as session:
         transport = ZenohTransport(session, network)
         stage = Stage(
             lambda: Collector(Path(path), float(step_s)),
             transport,
-            config=StageConfig(heartbeat_s=0.1),
+            config=SupervisionConfig(heartbeat_s=0.1),
         )
-        leaving = asyncio.create_task(leave_with_parent())
-        leaving.add_done_callback(lambda task: None if task.cancelled() else stop.ask())
+        leaving = asyncio.create_task(exit_with_parent())
+        leaving.add_done_callback(lambda task: None if task.cancelled() else stop.request())
         await supervise([stage], stop, drain_s=2)
         leaving.cancel()
         transport.close()

@@ -9,13 +9,23 @@ from typing import cast
 import pytest
 
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
-from ldo_service.runtime.actor import Situation
-from ldo_service.runtime.delivery_state import MOST_TAKEN, Past, Taken, successor
+from ldo_service.runtime.actor import FlowStatus
+from ldo_service.runtime.delivery_state import (
+    MAX_WAL_ENTRIES,
+    LoggedInput,
+    RestoredState,
+    restore_actor,
+)
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage, new_epoch
 from ldo_service.schemas import Message, encode
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
-from ldo_service.transport.flow_control import InletPast, OutletPast, Sent, grant_key
+from ldo_service.transport.flow_control import (
+    InletPosition,
+    OutletPosition,
+    UnackedMessage,
+    credit_key,
+)
 from ldo_service.transport.interface import MemoryTransport
 
 from .cast import (
@@ -37,7 +47,7 @@ class Giver(Actor):
 
     name = "giver"
     inputs = (In(LATEST_NUMBER, Latest(64)),)
-    outputs = (Out(NUMBERS, never_wait=True),)
+    outputs = (Out(NUMBERS, is_nonblocking=True),)
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,7 +55,7 @@ class Giver(Actor):
 
     def handle(self, message: Message) -> Iterator[Message]:
         assert isinstance(message, Number)
-        if self.has_room(NUMBERS):
+        if self.has_credit(NUMBERS):
             self.given += 1
             yield number(self.given)
 
@@ -138,12 +148,12 @@ class Company:
         """Nothing waits or is under way, and all that was made is handled and saved."""
         healths = [stage.health() for stage in self.stages.values()]
         outlets = self.stages["giver"]._outlets[Number], self.stages["adder"]._outlets[Double]
-        unhandled = [past.unhandled for outlet in outlets if (past := outlet.past())]
+        unhandled = [past.unhandled for outlet in outlets if (past := outlet.position())]
         waiting = [count.waiting for health in healths for count in health.inputs]
         return not any((*unhandled, *waiting, *(health.busy_s for health in healths)))
 
     def saved(self, name: str) -> State:
-        return Past.of(FolderStore(self.folder).load(name)).own
+        return RestoredState.of(FolderStore(self.folder).load(name)).own
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -190,18 +200,18 @@ async def test_a_step_that_is_not_saved_is_neither_acknowledged_nor_told() -> No
     keeper = Stage(Keeper, transport, config=QUICK)
     numbers = Outlet(Out(NUMBERS), "source", new_epoch(), transport, ("adder",))
     async with running(adder, keeper):
-        await eventually(lambda: numbers.room() == 4)
+        await eventually(lambda: numbers.credits() == 4)
         store.is_full = True
         await send(numbers, number(1))
         await eventually(lambda: adder.health().failures == 1)
         await asyncio.sleep(0.05)  # heartbeats, and grants with them
-        assert [sent.seq for sent in (numbers.past() or OutletPast(0, 0)).unhandled] == [0]
+        assert [sent.seq for sent in (numbers.position() or OutletPosition(0, 0)).unhandled] == [0]
         assert keeper.health().steps == 0
         store.is_full = False
         await eventually(lambda: keeper.health().steps == 2)
         assert adder.health().steps == 1
         assert adder.health().facts["saves_failed"] >= 1
-    assert Past.of(store.load("adder")).inputs[NUMBERS.name].handled == 1
+    assert RestoredState.of(store.load("adder")).inputs[NUMBERS.name].handled == 1
 
 
 async def test_who_never_waits_goes_on_without_a_disk_and_makes_nothing_to_lose() -> None:
@@ -210,7 +220,7 @@ async def test_who_never_waits_goes_on_without_a_disk_and_makes_nothing_to_lose(
     adder = Stage(Adder, transport, config=QUICK)
     feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), transport)
     async with running(giver, adder):
-        await eventually(lambda: giver._outlets[Number].room() == 4)
+        await eventually(lambda: giver._outlets[Number].credits() == 4)
         store.is_full = True
         for value in range(5):
             await send(feed, number(value))
@@ -232,14 +242,14 @@ async def test_a_soft_stop_does_not_wait_for_a_disk(kind: str, caplog) -> None:
     feed = Outlet(Out(LATEST_NUMBER), "feed", new_epoch(), transport)
     ending = {"giver": giver, "adder": adder}[kind]
     async with running(giver, adder) as tasks:
-        await eventually(lambda: giver._outlets[Number].room() == 4)
+        await eventually(lambda: giver._outlets[Number].credits() == 4)
         store.fails = kind
         await send(feed, number(1))
         await eventually(lambda: ending.health().failures == 1)
         ending.drain()
         await eventually(tasks[kind == "adder"].done)
     assert f"{kind} ends and its last step is not saved" in caplog.text
-    past = Past.of(store.load(kind))
+    past = RestoredState.of(store.load(kind))
     assert past.own.get("given", 0) == 0
     assert past.own.get("values", []) == []
 
@@ -252,7 +262,7 @@ async def test_a_stage_that_waits_for_its_disk_says_so_to_its_producers() -> Non
         Out(NUMBERS), "source", new_epoch(), transport, ("adder",), 0.1, evicted.append
     )
     async with running(adder):
-        await eventually(lambda: numbers.room() == 4)
+        await eventually(lambda: numbers.credits() == 4)
         store.fails = "adder"
         for value in range(4):
             await send(numbers, number(value))
@@ -261,11 +271,11 @@ async def test_a_stage_that_waits_for_its_disk_says_so_to_its_producers() -> Non
 
         def on_grant(_header: bytes, _body: memoryview) -> None:
             """Check after each grant: a pause of the whole process is no silence of the adder."""
-            loop.call_soon_threadsafe(numbers.check_windows)
+            loop.call_soon_threadsafe(numbers.evict_stalled)
 
-        transport.subscribe(grant_key(NUMBERS.name), on_grant)
+        transport.subscribe(credit_key(NUMBERS.name), on_grant)
         await asyncio.sleep(0.3)  # three times the patience
-        assert numbers.room() == 0
+        assert numbers.credits() == 0
         store.fails = ""
         await eventually(lambda: adder.health().steps == 4)
     assert evicted == []
@@ -294,13 +304,13 @@ async def test_a_state_that_cannot_be_made_is_no_full_disk(caplog) -> None:
 
 
 # --- what a lagging actor took --------------------------------------------------------------------
-def taken(value: int) -> Taken:
-    return Taken.of(NUMBERS.name, encode(number(value)), Situation())
+def taken(value: int) -> LoggedInput:
+    return LoggedInput.of(NUMBERS.name, encode(number(value)), FlowStatus())
 
 
 def test_a_successor_handles_again_what_the_state_does_not_know() -> None:
-    past = Past(own={"values": [1, 2]}, taken=(taken(3), taken(4)))
-    actor = successor(Adder(), past, Adder)
+    past = RestoredState(own={"values": [1, 2]}, taken=(taken(3), taken(4)))
+    actor = restore_actor(Adder(), past, Adder)
     assert actor.values == [1, 2, 3, 4]
 
 
@@ -308,8 +318,8 @@ def test_what_fails_then_is_left_out_without_a_trace(caplog: pytest.LogCaptureFi
     class Unlucky(Adder):
         unlucky = 3
 
-    past = Past(own={"values": [1, 2]}, taken=(taken(3), taken(4)))
-    assert successor(Unlucky(), past, Unlucky).values == [1, 2, 4]
+    past = RestoredState(own={"values": [1, 2]}, taken=(taken(3), taken(4)))
+    assert restore_actor(Unlucky(), past, Unlucky).values == [1, 2, 4]
     assert "test/number fails now and is left out" in caplog.text
 
 
@@ -324,27 +334,27 @@ async def test_what_was_taken_is_bounded() -> None:
     slow = Stage(Slow, transport, config=QUICK, store=store)
     numbers = Outlet(Out(NUMBERS), "source", new_epoch(), transport, ("adder",))
     async with running(slow):
-        for value in range(MOST_TAKEN + 3):
+        for value in range(MAX_WAL_ENTRIES + 3):
             await send(numbers, number(value))
-        await eventually(lambda: slow.health().steps == MOST_TAKEN + 3)
-    past = Past.of(store.load("adder"))
-    assert past.own["values"] == list(range(MOST_TAKEN + 1))
+        await eventually(lambda: slow.health().steps == MAX_WAL_ENTRIES + 3)
+    past = RestoredState.of(store.load("adder"))
+    assert past.own["values"] == list(range(MAX_WAL_ENTRIES + 1))
     assert len(past.taken) == 2
 
 
 def test_a_state_is_taken_apart_as_it_was_put_together() -> None:
-    sent = tuple(Sent(seq, b"header", b"body %d" % seq) for seq in (9, 10, 11))
+    sent = tuple(UnackedMessage(seq, b"header", b"body %d" % seq) for seq in (9, 10, 11))
     state = {
         "values": [1],
         "stage.links": {"in": {NUMBERS.name: (5, 3)}, "out": {DOUBLES.name: (7, 12)}},
         **{f"stage.sent test.double {one.seq}": one for one in reversed(sent)},
         "stage.taken 4": taken(8),
     }
-    past = Past.of(state)
+    past = RestoredState.of(state)
     assert past.own == {"values": [1]}
-    assert past.inputs == {NUMBERS.name: InletPast(5, 3)}
-    assert past.outputs == {DOUBLES.name: OutletPast(7, 12, sent)}
+    assert past.inputs == {NUMBERS.name: InletPosition(5, 3)}
+    assert past.outputs == {DOUBLES.name: OutletPosition(7, 12, sent)}
     assert past.outputs[DOUBLES.name].handled == 9
     assert past.taken == (taken(8),)
     assert past.has_passed
-    assert Past.of(None).is_none
+    assert RestoredState.of(None).is_none

@@ -106,14 +106,14 @@ def test_nothing_is_dropped_not_even_by_latest() -> None:
 
 
 class Talker(Doubler):
-    def finish(self) -> Iterator[Message]:
+    def on_stop(self) -> Iterator[Message]:
         yield Double(stamp_ns=9, value=-1)
 
 
 class Counter(Mixer):
     outputs = (Out(PIECES),)
 
-    def finish(self) -> Iterator[Message]:
+    def on_stop(self) -> Iterator[Message]:
         yield Piece(stamp_ns=0, version=len(self.seen), part=0, parts=1)
 
 

@@ -46,7 +46,7 @@ async def test_latest_drops_the_oldest_and_counts() -> None:
 
 async def test_what_goes_first_is_taken_before_all_that_waits_and_in_its_own_order() -> None:
     transport = MemoryTransport()
-    ports = In(NUMBERS, Latest(8)), In(DOUBLES, Latest(8), goes_first=True)
+    ports = In(NUMBERS, Latest(8)), In(DOUBLES, Latest(8), has_priority=True)
     mailbox = Mailbox("me", ports, transport)
     patient, hasty = Feed(transport), Feed(transport, DOUBLES.name)
     for value in range(3):

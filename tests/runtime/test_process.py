@@ -20,20 +20,20 @@ from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.process import (
     PARENT_VARIABLE,
     ChildProcess,
-    give_back_free_memory,
-    leave_with_parent,
+    exit_with_parent,
     resident_mb,
+    trim_memory,
 )
-from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.transport.interface import MemoryTransport
-from ldo_service.transport.zenoh_transport import Network, ZenohTransport
+from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport
 
 from .cast import NUMBERS, eventually, number, running, send
 
 PROGRAM = Path(__file__).with_name("collector_process.py")
 
 
-def command(network: Network, numbers: Path, step_s: float = 0.0) -> list[str]:
+def command(network: Endpoint, numbers: Path, step_s: float = 0.0) -> list[str]:
     return [sys.executable, str(PROGRAM), network.endpoint, str(numbers), str(step_s)]
 
 
@@ -53,13 +53,13 @@ def pid_of(process: ChildProcess) -> int:
 
 
 async def test_a_killed_consumer_nobody_expects_releases_the_window(
-    network: Network, client: Callable[[], zenoh.Session], tmp_path: Path
+    network: Endpoint, client: Callable[[], zenoh.Session], tmp_path: Path
 ) -> None:
     source = Outlet(Out(NUMBERS), "producer", 1, ZenohTransport(client(), network))
     numbers = tmp_path / "numbers"
     process = subprocess.Popen(command(network, numbers, step_s=100))
     try:
-        await eventually(lambda: source.room() == 4)
+        await eventually(lambda: source.credits() == 4)
         for value in range(4):
             await send(source, number(value))
         await eventually(lambda: read(numbers) == [0])
@@ -74,7 +74,7 @@ async def test_a_killed_consumer_nobody_expects_releases_the_window(
 
 
 async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
-    network: Network, client: Callable[[], zenoh.Session], tmp_path: Path
+    network: Endpoint, client: Callable[[], zenoh.Session], tmp_path: Path
 ) -> None:
     numbers, transport = tmp_path / "numbers", ZenohTransport(client(), network)
     source = Outlet(Out(NUMBERS), "producer", 1, transport, ["collector"])
@@ -85,7 +85,7 @@ async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
         silent_after_s=1.0,
         max_restarts=100,
     )
-    stop = Stop()
+    stop = StopRequest()
     service = asyncio.create_task(supervise([process], stop))
     for value in range(60):
         await send(source, number(value))
@@ -95,7 +95,7 @@ async def test_a_killed_and_a_stopped_process_are_replaced_and_nothing_is_lost(
             os.kill(pid_of(process), signal.SIGSTOP)
     await source.flush()
     assert process.restarts >= 2
-    stop.ask()
+    stop.request()
     await service
     handled = read(numbers)
     assert set(handled) == set(range(60))
@@ -144,7 +144,7 @@ async def test_a_child_that_is_drained_while_it_starts_ends() -> None:
 async def test_a_process_leaves_when_its_parent_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PARENT_VARIABLE, "12345")
     monkeypatch.setattr(os, "getppid", lambda: 12345)
-    waiting = asyncio.create_task(leave_with_parent(0.001))
+    waiting = asyncio.create_task(exit_with_parent(0.001))
     await asyncio.sleep(0.02)
     assert not waiting.done()
     monkeypatch.setattr(os, "getppid", lambda: 1)
@@ -153,13 +153,13 @@ async def test_a_process_leaves_when_its_parent_is_gone(monkeypatch: pytest.Monk
 
 async def test_a_process_started_by_hand_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(PARENT_VARIABLE, raising=False)
-    waiting = asyncio.create_task(leave_with_parent(0.001))
+    waiting = asyncio.create_task(exit_with_parent(0.001))
     await asyncio.sleep(0.02)
     assert not waiting.done()
     waiting.cancel()
 
 
-def test_a_child_of_a_killed_parent_does_not_outlive_it(network: Network, tmp_path: Path) -> None:
+def test_a_child_of_a_killed_parent_does_not_outlive_it(network: Endpoint, tmp_path: Path) -> None:
     """The whole chain: parent killed, child sees it, drains and goes."""
     numbers = tmp_path / "numbers"
     parent = subprocess.Popen(
@@ -198,6 +198,6 @@ def test_memory_that_was_let_go_goes_back_to_the_system() -> None:
     kept = blocks[::20]  # which lie between those that go
     del blocks
     before_mb = resident_mb()
-    give_back_free_memory()
+    trim_memory()
     assert resident_mb() < before_mb - 60
     assert len(kept) == 100

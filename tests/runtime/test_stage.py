@@ -11,7 +11,7 @@ import pytest
 from ldo_service.errors import ConfigError, RestartsExhausted, StageStalled
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.stage import Stage, StageConfig, new_epoch
+from ldo_service.runtime.stage import Stage, SupervisionConfig, new_epoch
 from ldo_service.schemas import Health, Message, decode
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 from ldo_service.transport.interface import MemoryTransport
@@ -56,20 +56,20 @@ class Adder(Actor):
         self._trouble(message.value)
         yield Double(stamp_ns=message.stamp_ns, value=self._sum)
 
-    def finish(self) -> Iterator[Message]:
+    def on_stop(self) -> Iterator[Message]:
         yield Double(stamp_ns=0, value=-self._sum)
 
     def snapshot(self) -> State:
         return {"sum": self._sum}
 
-    def saved(self) -> None:
+    def on_saved(self) -> None:
         if isinstance(self._trouble, Trouble):
             self._trouble.saved.append(self._sum)
 
     def restore(self, state: State) -> None:
         self._sum = state["sum"]
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"sum": float(self._sum)}
 
 
@@ -163,7 +163,7 @@ async def test_a_message_that_is_none_of_the_outputs_is_a_failure_of_the_actor()
 
 async def test_too_many_failures_exhaust_the_restarts() -> None:
     transport = MemoryTransport()
-    config = StageConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=3)
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=3)
     stage = Stage(lambda: Adder(_always_fail), transport, config=config)
     numbers = source(transport, "adder")
     running_stage = asyncio.create_task(stage.run())
@@ -183,7 +183,7 @@ async def test_a_state_that_cannot_be_restored_exhausts_the_restarts() -> None:
             raise KeyError(f"what is {state}?")
 
     transport, store = MemoryTransport(), MemoryStore()
-    config = StageConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=2)
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=2)
     stage = Stage(lambda: Picky(Trouble(2, 1)), transport, config=config, store=store)
     numbers = source(transport, "adder")
     running_stage = asyncio.create_task(stage.run())
@@ -196,7 +196,7 @@ async def test_a_state_that_cannot_be_restored_exhausts_the_restarts() -> None:
 
 async def test_a_handler_that_does_not_return_is_a_stall() -> None:
     transport, stuck = MemoryTransport(), Event()
-    config = StageConfig(heartbeat_s=0.01, stall_after_s=0.05)
+    config = SupervisionConfig(heartbeat_s=0.01, stall_after_s=0.05)
     stage = collector(transport, [], lambda _value: stuck.wait(60) and None, config=config)
     numbers = source(transport, "collector")
     running_stage = asyncio.create_task(stage.run())
@@ -233,7 +233,7 @@ async def test_a_soft_stop_before_the_start_ends_at_once() -> None:
 
 async def test_last_words_that_fail_do_not_hinder_the_stop() -> None:
     class Speechless(Doubler):
-        def finish(self) -> Iterator[Message]:
+        def on_stop(self) -> Iterator[Message]:
             raise RuntimeError("no words")
 
     stage = Stage(Speechless, MemoryTransport(), config=QUICK)
@@ -281,11 +281,11 @@ class Sometimes(Actor):
 
     name = "sometimes"
     inputs = (In(LATEST_NUMBER, Latest(64)),)
-    outputs = (Out(NUMBERS, never_wait=True),)
+    outputs = (Out(NUMBERS, is_nonblocking=True),)
 
     def handle(self, message: Message) -> Iterator[Message]:
         assert isinstance(message, Number)
-        if self.has_room(NUMBERS):
+        if self.has_credit(NUMBERS):
             yield message
 
 
@@ -298,7 +298,7 @@ async def test_an_output_that_never_waits_is_made_only_where_there_is_room() -> 
         await send(feed, number(0))  # nobody there yet: no room
         await eventually(lambda: stage.health().steps == 1)
         async with running(collector(transport, seen, lambda _value: stuck.wait(60) and None)):
-            await eventually(lambda: stage._outlets[Number].room() == 4)
+            await eventually(lambda: stage._outlets[Number].credits() == 4)
             for value in range(1, 21):
                 await send(feed, number(value))
             await eventually(lambda: stage.health().steps == 21)  # it never waited
@@ -362,7 +362,7 @@ async def test_a_state_topic_of_one_part_answers_with_the_newest() -> None:
 )
 def test_an_impossible_configuration_is_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
-        StageConfig(**options)
+        SupervisionConfig(**options)
 
 
 class Queued(Actor):
@@ -377,7 +377,7 @@ class Queued(Actor):
         self._stuck, self.seen = stuck, []
 
     def handle(self, message: Message) -> Iterator[Message]:
-        self.seen.append(self.situation.waiting[NUMBERS])
+        self.seen.append(self.situation.backlog[NUMBERS])
         self._stuck.wait(60)
         yield Double(stamp_ns=message.stamp_ns, value=0)
 

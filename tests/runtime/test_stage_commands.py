@@ -9,14 +9,14 @@ import pytest
 
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime import stage_commands as orders_module
-from ldo_service.runtime.delivery_state import Past
+from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.stage_commands import ORDER_KEY, Commander, Order
+from ldo_service.runtime.stage_commands import ORDER_KEY, CommandSender, StageCommand
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
-from ldo_service.transport.flow_control import OUTSIDE, encode_link
+from ldo_service.transport.flow_control import EXTERNAL_HEADER, encode_link
 from ldo_service.transport.interface import MemoryTransport
 
 from .cast import (
@@ -63,17 +63,21 @@ class Counter(Actor):
 
 def feed(transport: MemoryTransport, *values: int) -> None:
     for value in values:
-        transport.deliver(LATEST_NUMBER.name, encode_link(OUTSIDE), encode_message(number(value)))
+        transport.deliver(
+            LATEST_NUMBER.name, encode_link(EXTERNAL_HEADER), encode_message(number(value))
+        )
 
 
 async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
     transport, seen = MemoryTransport(), []
     stage = collector(transport, seen, policy=Latest(2))
-    commander = Commander(transport)
+    commander = CommandSender(transport)
 
     def arrive(*values: int) -> None:
         for value in values:
-            transport.deliver(NUMBERS.name, encode_link(OUTSIDE), encode_message(number(value)))
+            transport.deliver(
+                NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(value))
+            )
 
     async with running(stage):
         arrive(1)
@@ -91,7 +95,7 @@ async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
 
 async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), Commander(transport)
+    stage, commander = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
     async with running(stage):
         await commander.order("hold", "collector", 60)
@@ -108,9 +112,9 @@ async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
 async def test_a_hold_waits_for_the_step_under_way() -> None:
     transport, seen, go = MemoryTransport(), [], Event()
     stage = collector(transport, seen, lambda _value: go.wait(60) and None, policy=Latest(1))
-    commander = Commander(transport)
+    commander = CommandSender(transport)
     async with running(stage):
-        transport.deliver(NUMBERS.name, encode_link(OUTSIDE), encode_message(number(1)))
+        transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
         holding = asyncio.create_task(commander.order("hold", "collector", 60))
         await asyncio.sleep(0.05)
@@ -122,7 +126,7 @@ async def test_a_hold_waits_for_the_step_under_way() -> None:
 
 async def test_a_soft_stop_ends_a_held_stage() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), Commander(transport)
+    stage, commander = collector(transport, seen), CommandSender(transport)
     async with running(stage) as (task,):
         await commander.order("hold", "collector", 60)
         stage.drain()
@@ -133,7 +137,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
     transport, seen, store = MemoryTransport(), [], MemoryStore()
     expected = {NUMBERS.name: frozenset({"collector"})}
     counter = Stage(Counter, transport, config=QUICK, store=store, expected=expected)
-    commander = Commander(transport)
+    commander = CommandSender(transport)
     async with running(counter, collector(transport, seen)):
         feed(transport, 10)
         await eventually(lambda: seen == [1])
@@ -144,7 +148,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
         for what in ("hold", "renew", "release"):
             assert await commander.order(what, "counter", 5) == ""
         assert counter.health().epoch != epoch
-        assert Past.of(store.load("counter")).own == {}
+        assert RestoredState.of(store.load("counter")).own == {}
         feed(transport, 12)
         await eventually(lambda: seen == [1, 2, 1])
         feed(transport, 13)
@@ -153,7 +157,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
 
 async def test_a_renewed_consumer_joins_its_producer_again() -> None:
     transport, seen = MemoryTransport(), []
-    stage, commander = collector(transport, seen), Commander(transport)
+    stage, commander = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
     async with running(stage):
         await send(numbers, number(0))
@@ -167,16 +171,16 @@ async def test_a_renewed_consumer_joins_its_producer_again() -> None:
 async def test_nothing_of_the_time_before_is_handled_after_a_renewal() -> None:
     transport, seen = MemoryTransport(), []
     doubles = DoubleCollector(seen)
-    stage, commander = Stage(lambda: doubles, transport, config=QUICK), Commander(transport)
+    stage, commander = Stage(lambda: doubles, transport, config=QUICK), CommandSender(transport)
     old = Outlet(Out(DOUBLES), "source", 7, transport)
     async with running(stage):
         await eventually(lambda: "double_collector" in old._consumers)
         await commander.order("hold", "double_collector", 60)
         await send(old, Double(stamp_ns=1, value=1))
-        old.renew(8)
+        old.reset(8)
         await commander.order("renew", "double_collector", 60)
         await commander.order("release", "double_collector", 60)
-        await eventually(lambda: old.room() == 2)
+        await eventually(lambda: old.credits() == 2)
         await send(old, Double(stamp_ns=2, value=2))
         await eventually(lambda: seen == [2])
 
@@ -186,21 +190,21 @@ async def test_a_last_value_of_the_time_before_is_not_given_to_who_asks() -> Non
     outlet = Outlet(Out(LATEST_NUMBER), "me", 1, transport)
     await send(outlet, number(1))
     assert transport.query(LATEST_NUMBER.name)
-    outlet.renew(2)
+    outlet.reset(2)
     assert not transport.query(LATEST_NUMBER.name)
 
 
 async def test_a_save_writes_what_the_actor_had_left_for_later(tmp_path: Path) -> None:
     transport, store = MemoryTransport(), FolderStore(tmp_path)
     counter = Stage(Counter, transport, config=QUICK, store=store)
-    commander = Commander(transport)
+    commander = CommandSender(transport)
     async with running(counter):
         feed(transport, 1)
         await eventually(lambda: counter.health().steps == 1)
         assert FolderStore(tmp_path).load("counter") is None
         assert await commander.order("save", "counter", 60) == ""
         assert FolderStore(tmp_path).load("counter") == {"count": 1}
-        store.forget("counter")
+        store.delete("counter")
         assert FolderStore(tmp_path).load("counter") is None
         assert list((tmp_path / "counter").iterdir()) == []
         assert await commander.order("save", "counter", 60) == ""
@@ -212,7 +216,7 @@ async def test_a_save_that_fails_is_reported_and_the_stage_goes_on(tmp_path: Pat
     counter = Stage(Counter, transport, config=QUICK, store=FolderStore(tmp_path))
     (tmp_path / "counter").write_text("a file where the folder should be")
     async with running(counter):
-        assert "FileExistsError" in await Commander(transport).order("save", "counter", 60)
+        assert "FileExistsError" in await CommandSender(transport).order("save", "counter", 60)
         feed(transport, 1)
         await eventually(lambda: counter.health().steps == 1)
 
@@ -223,7 +227,7 @@ async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
     monkeypatch.setattr(orders_module, "REPEAT_AFTER_S", 0.01)
     losses = iter([True, True, False, True, True, False, True] + [False] * 1000)
     transport = MemoryTransport(lose=lambda key: "link/" in key and next(losses))
-    counter, commander = Stage(Counter, transport, config=QUICK), Commander(transport)
+    counter, commander = Stage(Counter, transport, config=QUICK), CommandSender(transport)
     epochs = [counter.health().epoch]
     async with running(counter):
         assert await commander.order("renew", "counter", 60) == ""
@@ -233,13 +237,18 @@ async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
 
 
 async def test_who_does_not_answer_is_said() -> None:
-    commander = Commander(MemoryTransport())
+    commander = CommandSender(MemoryTransport())
     assert await commander.order("hold", "nobody", 0.01) == "did not answer within 0 s"
 
 
 async def test_bytes_that_are_no_order_are_left_alone() -> None:
     transport, seen = MemoryTransport(), []
     async with running(collector(transport, seen, policy=Lossless(4))):
-        for body in (b"", b"\xc1", encode_link(("x", 1)), encode_link(Order(1, "hold", "another"))):
+        for body in (
+            b"",
+            b"\xc1",
+            encode_link(("x", 1)),
+            encode_link(StageCommand(1, "hold", "another")),
+        ):
             transport.deliver(ORDER_KEY, b"", body)
         await asyncio.sleep(0.01)

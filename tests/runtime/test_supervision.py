@@ -10,8 +10,8 @@ import pytest
 from ldo_service.errors import RestartsExhausted
 from ldo_service.runtime.actor import Out
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.stage import Stage, StageConfig
-from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.stage import Stage, SupervisionConfig
+from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.transport.flow_control import data_key
 from ldo_service.transport.interface import MemoryTransport
 
@@ -29,7 +29,7 @@ from .cast import (
 
 
 async def test_a_soft_stop_loses_nothing_that_is_under_way() -> None:
-    transport, seen, stop = MemoryTransport(), [], Stop()
+    transport, seen, stop = MemoryTransport(), [], StopRequest()
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["doubler"])
     expected = {DOUBLES.name: frozenset({"double_collector"})}
     doubler = Stage(Doubler, transport, config=QUICK, expected=expected)
@@ -38,7 +38,7 @@ async def test_a_soft_stop_loses_nothing_that_is_under_way() -> None:
     for value in range(20):
         await send(numbers, number(value))
     await numbers.flush()
-    stop.ask()
+    stop.request()
     assert stop.is_asked
     await service
     assert seen == [2 * value for value in range(20)]
@@ -49,7 +49,7 @@ async def test_a_soft_stop_waits_for_what_must_be_sent_again(
 ) -> None:
     monkeypatch.setattr(Outlet, "REPEAT_AFTER_S", 0.01)
     transport = MemoryTransport(lose=lambda key: key == data_key(DOUBLES.name))
-    seen, stop = [], Stop()
+    seen, stop = [], StopRequest()
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["doubler"])
     expected = {DOUBLES.name: frozenset({"double_collector"})}
     doubler = Stage(Doubler, transport, config=QUICK, expected=expected)
@@ -58,31 +58,31 @@ async def test_a_soft_stop_waits_for_what_must_be_sent_again(
     for value in range(7):
         await send(numbers, number(value))
     await numbers.flush()
-    stop.ask()
+    stop.request()
     await service
     assert seen == [2 * value for value in range(7)]
 
 
 async def test_a_hard_stop_ends_at_once() -> None:
-    transport, stop, stuck = MemoryTransport(), Stop(), Event()
+    transport, stop, stuck = MemoryTransport(), StopRequest(), Event()
     stage = collector(transport, [], lambda _value: stuck.wait(60) and None)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["collector"])
     service = asyncio.create_task(supervise([stage], stop, drain_s=1000))
     await send(numbers, number(0))
     await eventually(lambda: stage.health().state == "busy")
-    stop.ask()
+    stop.request()
     await asyncio.sleep(0.01)
     assert not service.done()
-    stop.ask()
+    stop.request()
     await asyncio.wait_for(service, 60)
     stuck.set()
 
 
 async def test_a_stage_that_does_not_drain_in_time_is_cancelled() -> None:
-    transport, stop = MemoryTransport(), Stop()
+    transport, stop = MemoryTransport(), StopRequest()
     stage = collector(transport, [])
     stage.drain = lambda: None  # type: ignore[method-assign]
-    stop.ask()
+    stop.request()
     await asyncio.wait_for(supervise([stage], stop, drain_s=0.01), 60)
 
 
@@ -90,8 +90,8 @@ async def test_an_exhausted_restart_budget_ends_all_stages_with_that_error() -> 
     def fail(_value: int) -> None:
         raise RuntimeError("always")
 
-    transport, stop = MemoryTransport(), Stop()
-    config = StageConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=1)
+    transport, stop = MemoryTransport(), StopRequest()
+    config = SupervisionConfig(heartbeat_s=0.02, restart_delay_s=0.001, max_restarts=1)
     bad, good = collector(transport, [], fail, config=config), Stage(Doubler, transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, ["collector"])
     service = asyncio.create_task(supervise([good, bad], stop))
@@ -116,8 +116,8 @@ async def test_a_second_error_during_a_soft_stop_leaves_no_task_behind() -> None
         def drain(self) -> None:
             self._asked.set()
 
-    stop = Stop()
-    stop.ask()
+    stop = StopRequest()
+    stop.request()
     with pytest.raises(RestartsExhausted):
         await supervise([Failing(), Failing()], stop)
     await asyncio.sleep(0)
@@ -128,8 +128,8 @@ STUCK = """
 import asyncio, time
 from ldo_service.errors import StageStalled
 from ldo_service.runtime import Actor, In, Latest
-from ldo_service.runtime.stage import Stage, StageConfig
-from ldo_service.runtime.supervision import Stop, supervise
+from ldo_service.runtime.stage import Stage, SupervisionConfig
+from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.transport.interface import MemoryTransport
 from ldo_service.schemas import Health, encode
 from ldo_service.schemas.topics import Topic
@@ -145,8 +145,8 @@ class Stuck(Actor):
 
 async def main():
     transport = MemoryTransport()
-    stage = Stage(Stuck, transport, config=StageConfig(heartbeat_s=0.02, stall_after_s=0.1))
-    service = asyncio.create_task(supervise([stage], Stop()))
+    stage = Stage(Stuck, transport, config=SupervisionConfig(heartbeat_s=0.02, stall_after_s=0.1))
+    service = asyncio.create_task(supervise([stage], StopRequest()))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     transport.deliver("any", b"", encode(stage.health()))

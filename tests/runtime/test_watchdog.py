@@ -39,7 +39,7 @@ async def test_pings_come_while_the_loop_turns_and_not_while_it_hangs(
     systemd: socket.socket,
 ) -> None:
     watchdog = Watchdog(environment(systemd, WATCHDOG_USEC="30000", WATCHDOG_PID=str(os.getpid())))
-    watchdog.tell("READY=1")
+    watchdog.notify("READY=1")
     pinging = asyncio.create_task(watchdog.ping())
     words: list[bytes] = []
     await eventually(lambda: words.extend(heard(systemd)) or len(words) > 3)
@@ -60,7 +60,7 @@ async def test_who_is_not_watched_does_not_ping(systemd: socket.socket, more) ->
 
 async def test_without_systemd_nothing_happens(tmp_path: Path) -> None:
     for words in ({}, {"NOTIFY_SOCKET": str(tmp_path / "absent")}):
-        Watchdog(words).tell("READY=1")
+        Watchdog(words).notify("READY=1")
         await asyncio.wait_for(Watchdog(words).ping(), 60)
 
 
@@ -68,5 +68,5 @@ def test_a_socket_in_the_abstract_namespace_is_reached() -> None:
     name = f"ldo-test-{os.getpid()}-{time.monotonic_ns()}"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
         listening.bind("\0" + name)
-        Watchdog({"NOTIFY_SOCKET": "@" + name}).tell("STOPPING=1")
+        Watchdog({"NOTIFY_SOCKET": "@" + name}).notify("STOPPING=1")
         assert listening.recv(100) == b"STOPPING=1"

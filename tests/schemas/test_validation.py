@@ -82,7 +82,7 @@ def test_an_impossible_pose_is_refused(translation: Any, quaternion: Any, compla
         )
 
 
-def test_a_quaternion_normalised_in_float32_is_taken() -> None:
+def test_a_quaternion_normalized_in_float32_is_taken() -> None:
     q = np.array([0.1, 0.7, -0.3, 0.2], np.float32)
     q /= np.linalg.norm(q)
     assert Pose((0, 0, 0), tuple(q.tolist())).quaternion[0] > 0

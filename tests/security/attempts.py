@@ -15,10 +15,10 @@ from ldo_service.runtime.actor import Latest
 from ldo_service.schemas import encode
 from ldo_service.schemas.topics import CAMERA_RGBD, CONTROL, TOPICS
 from ldo_service.transport import zenoh_transport
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.flow_control import ALIVE
-from ldo_service.transport.keys import Keys
+from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import ZenohTransport, open_session
 from tests.runtime import cast
 
@@ -26,8 +26,8 @@ from .attempt import Attempt, kept_in
 from .lab import (
     EXPIRED,
     INSIDE,
-    LARGEST_MB,
     LOST,
+    MAX_MB,
     NAMES,
     OTHER_ROBOT,
     ROBOT,
@@ -53,7 +53,7 @@ def topics(found: list[str]) -> str:
     return ALL_BUT_CONTROL if found == READABLE else ", ".join(found) or NOTHING
 
 
-def connecting(network: Network) -> str:
+def connecting(network: Endpoint) -> str:
     """Whether one is let in, or what is said to it."""
     try:
         with patch.object(zenoh_transport, "CONNECT_WITHIN_MS", 500), open_session(network):
@@ -66,7 +66,7 @@ def connecting(network: Network) -> str:
 # --- who is let in --------------------------------------------------------------------------------
 @attempt("connect without TLS", NO_CONNECTION)
 def without_tls(lab: Lab) -> str:
-    return connecting(Network(ROBOT, lab.network.endpoint.replace("tls/", "tcp/")))
+    return connecting(Endpoint(ROBOT, lab.network.endpoint.replace("tls/", "tcp/")))
 
 
 @attempt("connect without a certificate", NO_CONNECTION)
@@ -115,14 +115,14 @@ def made_again(lab: Lab) -> str:
     return topics(lab.through(puts(lab.keys(LOST), CAMERA_RGBD.name), CAMERA_RGBD.name))
 
 
-def stranger(lab: Lab, trusts_ours: bool) -> Network:
+def stranger(lab: Lab, trusts_ours: bool) -> Endpoint:
     """A camera of another authority."""
     folder = lab.folder.with_name(f"strangers {trusts_ours}")
     if not folder.exists():
-        Authority.new(folder, days=2).add("camera", "camera", ROBOT, days=1)
+        CertificateAuthority.new(folder, days=2).add("camera", "camera", ROBOT, days=1)
     if trusts_ours:
         (folder / "camera" / "ca.crt").write_bytes((lab.folder / "ca.crt").read_bytes())
-    return Network(ROBOT, lab.network.endpoint, Keys(folder / "camera"))
+    return Endpoint(ROBOT, lab.network.endpoint, TlsKeys(folder / "camera"))
 
 
 # --- what each may do -----------------------------------------------------------------------------
@@ -224,11 +224,11 @@ def answers(found: list[bytes]) -> str:
 
 
 # --- too much -------------------------------------------------------------------------------------
-@attempt(f"a camera puts {2 * LARGEST_MB} MB where {LARGEST_MB} MB is the most", "the next arrives")
+@attempt(f"a camera puts {2 * MAX_MB} MB where {MAX_MB} MB is the most", "the next arrives")
 def oversized(lab: Lab) -> str:
     lab.got.clear()
     with open_session(lab.keys("camera")) as session:
-        session.put(f"ldo/{ROBOT}/{CAMERA_RGBD.name}", bytes(2_000_000 * LARGEST_MB))
+        session.put(f"ldo/{ROBOT}/{CAMERA_RGBD.name}", bytes(2_000_000 * MAX_MB))
 
         def next_has_come() -> bool:
             session.put(f"ldo/{ROBOT}/{CAMERA_RGBD.name}", b"small")

@@ -14,14 +14,14 @@ import zenoh
 
 from ldo_service.schemas.topics import CONTROL, TOPICS
 from ldo_service.transport.access_control import Role
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.endpoint import Network
-from ldo_service.transport.keys import Keys
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_port
 
 ROBOT, OTHER_ROBOT = "mule", "goat"
-LARGEST_MB = 1
+MAX_MB = 1
 STEP_S, PATIENCE_S = 0.01, 60.0
 SETTLED = "settled"
 LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"  # a camera's keys that were made again; others
@@ -33,12 +33,12 @@ NAMES = (*(f"{t.name}/mapper" if t.is_per_actor else t.name for t in TOPICS), *I
 @dataclass
 class Lab:
     folder: Path
-    network: Network
+    network: Endpoint
     session: zenoh.Session
     got: list[tuple[str, int]] = field(default_factory=list)  # topic and bytes of what came through
 
-    def keys(self, name: str) -> Network:
-        return Network(ROBOT, self.network.endpoint, Keys(self.folder / name))
+    def keys(self, name: str) -> Endpoint:
+        return Endpoint(ROBOT, self.network.endpoint, TlsKeys(self.folder / name))
 
     def through(self, act: Callable[[], None], *expected: str) -> list[str]:
         """Topics on which something of what `act` puts came through, when all expected have, and
@@ -59,7 +59,7 @@ class Lab:
 @contextmanager
 def lab(folder: Path) -> Iterator[Lab]:
     """`folder` becomes an authority with keys of each role, named as the role."""
-    authority = Authority.new(folder, days=2)
+    authority = CertificateAuthority.new(folder, days=2)
     for role in (*ROLES, LOST):
         authority.add(role, role if role in ROLES else "camera", ROBOT, days=1)
     shutil.copytree(folder / LOST, folder / STOLEN)
@@ -67,7 +67,7 @@ def lab(folder: Path) -> Iterator[Lab]:
     authority.add(LOST, "camera", ROBOT, days=1)
     authority.add(EXPIRED, "camera", ROBOT, days=1, now=datetime.now(UTC) - timedelta(days=2))
     endpoint = f"tls/127.0.0.1:{free_port()}"
-    network = Network(ROBOT, endpoint, Keys(folder / "service"), LARGEST_MB)
+    network = Endpoint(ROBOT, endpoint, TlsKeys(folder / "service"), MAX_MB)
     with open_session(network, router=True) as session:
         here = Lab(folder, network, session)
 
@@ -89,7 +89,7 @@ def direct(call: Callable[[Any], None]) -> Any:
     return zenoh.handlers.Callback(call, indirect=False)
 
 
-def puts(network: Network, *topics: str, robot: str = ROBOT, size: int = 3) -> Callable[[], None]:
+def puts(network: Endpoint, *topics: str, robot: str = ROBOT, size: int = 3) -> Callable[[], None]:
     """Connect and put on each topic, without asking whether anybody listens."""
 
     def act() -> None:
@@ -100,7 +100,7 @@ def puts(network: Network, *topics: str, robot: str = ROBOT, size: int = 3) -> C
     return act
 
 
-def heard(there: Lab, network: Network, expressions: Sequence[str], *expected: str) -> list[str]:
+def heard(there: Lab, network: Endpoint, expressions: Sequence[str], *expected: str) -> list[str]:
     """The topics that one hears who subscribes, while messages are put on every one of them, until
     all expected were heard and a service heard the last."""
     seen: set[str] = set()
@@ -128,7 +128,7 @@ def eventually(true: Callable[[], bool]) -> None:
         time.sleep(STEP_S)
 
 
-def asked(network: Network, expression: str) -> list[bytes]:
+def asked(network: Endpoint, expression: str) -> list[bytes]:
     """What a query is answered."""
     with open_session(network) as session:
         replies = session.get(f"ldo/{ROBOT}/{expression}", timeout=PATIENCE_S)

@@ -15,19 +15,19 @@ import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
-from ldo_service.actors.topology import box_named
+from ldo_service.actors.topology import actor_spec
 from ldo_service.datasets import open_sequence
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers import text_embeddings
-from ldo_service.detection.labellers.text_embeddings import BytePairs, CachedEmbeddings
+from ldo_service.detection.labellers.text_embeddings import BpeTokenizer, CachedEmbeddings
 from ldo_service.detection.model_registry import Models
 from ldo_service.errors import LdoError
 from ldo_service.gaussians.file_formats import read_ply
 from ldo_service.geometry import codecs
 from ldo_service.recordings.mcap_file import McapIndex
 from ldo_service.semantics.semantics_file import read_semantics
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.endpoint import Network
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.endpoint import Endpoint
 from tests.detection.networks import SQUARES
 
 from .attempt import Attempt, kept_in
@@ -58,7 +58,7 @@ def told(*calls: Callable[[], object]) -> str:
 @attempt("robots named `../up`, `a/b`, `*`, `**`, `$*`", REFUSED)
 def robots(_folder: Path) -> str:
     names = ("../up", "a/b", "*", "**", "$*")
-    return told(*(lambda name=name: Network(name) for name in names))
+    return told(*(lambda name=name: Endpoint(name) for name in names))
 
 
 @attempt("models named `../up`, `/tmp/up`, `.hidden`", REFUSED)
@@ -79,7 +79,7 @@ def removed_models(folder: Path) -> str:
 
 @attempt("keys named `../up`, `a/b`, `.x`, removing keys named `..`", REFUSED)
 def keys(folder: Path) -> str:
-    authority = Authority.new(folder / "keys", days=1)
+    authority = CertificateAuthority.new(folder / "keys", days=1)
     names = ("../up", "a/b", ".x")
     adds = [lambda name=name: authority.add(name, "viewer", "*", 1) for name in names]
     return told(*adds, lambda: authority.remove(".."))
@@ -87,7 +87,7 @@ def keys(folder: Path) -> str:
 
 @attempt("an actor named `../../bin/sh` for a process of its own", REFUSED)
 def actors(_folder: Path) -> str:
-    return told(lambda: box_named("../../bin/sh"))
+    return told(lambda: actor_spec("../../bin/sh"))
 
 
 @attempt("a data set that lists `../secret.png`, `/dev/zero`, `a/../../secret.png`", REFUSED)
@@ -137,7 +137,7 @@ def exchanged(folder: Path) -> str:
 @attempt("byte pairs that unpack from 66 kB to 67 MB and more", REFUSED)
 def byte_pairs(folder: Path) -> str:
     (folder / "bpe.txt.gz").write_bytes(gzip.compress(bytes(80_000_000)))
-    return told(lambda: BytePairs.read(folder / "bpe.txt.gz"))
+    return told(lambda: BpeTokenizer.read(folder / "bpe.txt.gz"))
 
 
 @attempt("embeddings with a pickle inside", "refused, not run")
@@ -168,7 +168,7 @@ def large_arrays(folder: Path) -> str:
         archive.writestr("names.npy", names)
         archive.writestr("embeddings.npy", npy_header((1 << 39,)))
     np.savez_compressed(packed, names=np.array(["a"]), embeddings=np.ones((1, 1 << 22), "f4"))
-    with patch.object(text_embeddings, "LARGEST_BYTES", 1_000_000):
+    with patch.object(text_embeddings, "MAX_BYTES", 1_000_000):
         of_embeddings = told(lambda: CachedEmbeddings(lying), lambda: CachedEmbeddings(packed))
     return of_embeddings if of_embeddings != REFUSED else told(lambda: read_semantics(lying))
 

@@ -12,13 +12,13 @@ import numpy as np
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.regions.foreground import Claims
+from ldo_service.regions.foreground import RegionDetections
 from ldo_service.semantics.data_association import MapView
 from ldo_service.semantics.gaussian_labels import new_labels
-from ldo_service.semantics.objects import Objects, Observed
-from ldo_service.semantics.semantic_fusion import LabellingConfig, label_keyframe
+from ldo_service.semantics.objects import Objects, ObjectUpdate
+from ldo_service.semantics.semantic_fusion import SemanticFusionConfig, label_keyframe
 from ldo_service.synthetic.path import look_at
-from ldo_service.synthetic.ray_casting import View
+from ldo_service.synthetic.ray_casting import RayCaster
 from ldo_service.synthetic.solids import Solid
 
 CAMERA = Camera(128, 96, 104.0, 104.0, 63.5, 47.5)
@@ -64,7 +64,7 @@ class Shot:
     T_map_camera: np.ndarray
     instances: np.ndarray
 
-    def claims(self, things: Sequence[Thing]) -> Claims:
+    def claims(self, things: Sequence[Thing]) -> RegionDetections:
         """True boxes and names of what shows enough pixels."""
         boxes, labels = [], []
         for number, thing in enumerate(things, 1):
@@ -73,13 +73,15 @@ class Shot:
                 boxes.append([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
                 labels.append(thing.label)
         scores = np.full(len(boxes), 0.9, np.float32)
-        return Claims.of_detector(np.array(boxes).reshape(-1, 4), np.array(labels, int), scores)
+        return RegionDetections.of_detector(
+            np.array(boxes).reshape(-1, 4), np.array(labels, int), scores
+        )
 
 
 def shoot(things: Sequence[Thing], T_world_camera: np.ndarray, index: int = 0) -> Shot:
     """The map's frame is the world's."""
     v, u = np.divmod(np.arange(CAMERA.width * CAMERA.height), CAMERA.width)
-    view = View(SHELL, tuple(thing.solid for thing in things), CAMERA, T_world_camera)
+    view = RayCaster(SHELL, tuple(thing.solid for thing in things), CAMERA, T_world_camera)
     hits = view.cast(u, v)
     point = np.stack(view.points(u, v, hits.depth_m))
     paint = np.random.default_rng(5).uniform(60, 200, (6 + 40, 3))[hits.surface]
@@ -113,7 +115,7 @@ class Stage:
     """The map, its labels and its objects, fed keyframe by keyframe."""
 
     objects: Objects = field(default_factory=Objects)
-    labelling: LabellingConfig = field(default_factory=LabellingConfig)
+    labelling: SemanticFusionConfig = field(default_factory=SemanticFusionConfig)
     iterations: int = 3
 
     def __post_init__(self) -> None:
@@ -130,7 +132,7 @@ class Stage:
         self._labels, self._ids = now, ids.copy()
         return now
 
-    def show(self, shot: Shot, claims: Claims) -> tuple[MapView, Observed]:
+    def show(self, shot: Shot, claims: RegionDetections) -> tuple[MapView, ObjectUpdate]:
         """Map, label and observe one keyframe."""
         self.builder.add(shot.frame, shot.T_map_camera, self.keyframe, self.iterations)
         view = self.view(shot, claims)
@@ -138,8 +140,10 @@ class Stage:
         self.keyframe += 1
         return view, observed
 
-    def view(self, shot: Shot, claims: Claims) -> MapView:
-        shown = self.builder.seen_from(CAMERA, shot.T_map_camera, contributions=True).contributions
+    def view(self, shot: Shot, claims: RegionDetections) -> MapView:
+        shown = self.builder.render_from(
+            CAMERA, shot.T_map_camera, contributions=True
+        ).contributions
         assert shown is not None
         gaussians, depth_m = self.builder.gaussians, shot.frame.depth_m
         labels, at = self.labels(), (CAMERA, shot.T_map_camera)
@@ -154,7 +158,7 @@ class Stage:
             *(claims.boxes, claims.classes(), depth_m),
         )
 
-    def walk(self, things: Sequence[Thing], T_world_camera: np.ndarray) -> Iterator[Observed]:
+    def walk(self, things: Sequence[Thing], T_world_camera: np.ndarray) -> Iterator[ObjectUpdate]:
         for T in T_world_camera:
             shot = shoot(things, T, self.keyframe)
             yield self.show(shot, shot.claims(things))[1]

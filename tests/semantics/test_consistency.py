@@ -9,11 +9,11 @@ from ldo_service.semantics.gaussian_labels import (
     ConsistencyConfig,
     LabelConfig,
     Observations,
-    agree,
     background,
     distribution,
     new_labels,
     observe,
+    smooth_labels,
 )
 from tests.reference.consistency import agree_reference
 
@@ -43,16 +43,16 @@ def test_kernel_does_what_its_twin_does(side_m: float) -> None:
     indices = np.flatnonzero(np.arange(600) % 5).astype(np.uint32)
     before = labels.copy()
     p, twin = agree_reference(rows, labels, indices, CONFIG)
-    loss = agree(rows, labels, indices, CONFIG)
+    loss = smooth_labels(rows, labels, indices, CONFIG)
     np.testing.assert_allclose(distribution(labels[indices]), p, atol=2e-6)
     assert (loss.literal, loss.expected) == pytest.approx((twin.literal, twin.expected), rel=1e-4)
     np.testing.assert_array_equal(labels[::5], before[::5])  # not touched
 
 
-def test_steps_make_neighbours_agree_and_keep_distributions() -> None:
+def test_steps_make_neighbors_agree_and_keep_distributions() -> None:
     rows, labels = crowd(600, 0.15, classes=20)
     indices = np.arange(600, dtype=np.uint32)
-    losses = [agree(rows, labels, indices, CONFIG).expected for _ in range(20)]
+    losses = [smooth_labels(rows, labels, indices, CONFIG).expected for _ in range(20)]
     assert np.all(np.diff(losses) < 0)
     np.testing.assert_allclose(distribution(labels).sum(axis=1), 1, atol=1e-5)
 
@@ -67,7 +67,7 @@ def test_a_lonely_gaussian_and_an_unlabelled_crowd_stay_as_they_are() -> None:
         LabelConfig(),
     )
     before = labels.copy()
-    loss = agree(rows, labels, np.arange(300, dtype=np.uint32), CONFIG)
+    loss = smooth_labels(rows, labels, np.arange(300, dtype=np.uint32), CONFIG)
     assert (loss.literal, loss.expected) == (0, 0)
     assert labels.tobytes() == before.tobytes()
 
@@ -76,7 +76,7 @@ def test_rows_far_away_or_not_finite_are_left_out() -> None:
     rows, labels = crowd(300, 0.2)
     rows[::3, 1], rows[1::3, 0] = np.nan, 1e9
     before = labels.copy()
-    agree(rows, labels, np.arange(300, dtype=np.uint32), CONFIG)
+    smooth_labels(rows, labels, np.arange(300, dtype=np.uint32), CONFIG)
     np.testing.assert_array_equal(labels[::3], before[::3])
     np.testing.assert_array_equal(labels[1::3], before[1::3])
     assert np.all(np.isfinite(background(labels)))
@@ -85,7 +85,10 @@ def test_rows_far_away_or_not_finite_are_left_out() -> None:
 def test_bits_do_not_depend_on_the_number_of_threads() -> None:
     rows, alone = crowd(20_000, 0.6)
     many, indices = alone.copy(), np.arange(20_000, dtype=np.uint32)
-    losses = agree(rows, alone, indices, CONFIG), agree(rows, many, indices, CONFIG, threads=3)
+    losses = (
+        smooth_labels(rows, alone, indices, CONFIG),
+        smooth_labels(rows, many, indices, CONFIG, threads=3),
+    )
     assert losses[0] == losses[1]
     assert alone.tobytes() == many.tobytes()
 
@@ -93,8 +96,8 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
 def test_arrays_and_settings_that_do_not_fit_are_refused() -> None:
     rows, labels = crowd(10, 0.2)
     with pytest.raises(ValueError, match="shape"):
-        agree(rows[:5], labels, np.arange(5, dtype=np.uint32), CONFIG)
+        smooth_labels(rows[:5], labels, np.arange(5, dtype=np.uint32), CONFIG)
     with pytest.raises(ValueError, match="ascend"):
-        agree(rows, labels, np.array([3, 3], np.uint32), CONFIG)
+        smooth_labels(rows, labels, np.array([3, 3], np.uint32), CONFIG)
     with pytest.raises(ConfigError):
         ConsistencyConfig(rate=2.0)

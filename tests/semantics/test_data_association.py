@@ -14,10 +14,10 @@ from ldo_service.semantics import data_association
 from ldo_service.semantics.data_association import (
     AssociationConfig,
     associate,
-    found,
+    compute_region_statistics,
+    find_containing_regions,
+    merge_parts,
     overlaps,
-    whole_of,
-    with_whole_things,
 )
 from ldo_service.semantics.gaussian_labels import distribution
 from ldo_service.semantics.object_landmarks import MEMBERS, shuffled
@@ -94,7 +94,9 @@ def test_regions_are_samples_of_their_gaussians() -> None:
     boxes, classes = np.zeros((3, 4)), np.zeros((3, 2), int)
     view = replace(view, regions=regions.astype(np.int32), boxes=boxes, classes=classes)
     assert np.count_nonzero(regions == 0) > 3 * MEMBERS
-    got = found(view, np.linalg.inv(view.T_map_camera), AssociationConfig(min_gaussians=30))
+    got = compute_region_statistics(
+        view, np.linalg.inv(view.T_map_camera), AssociationConfig(min_gaussians=30)
+    )
     counts = np.bincount(regions[regions >= 0], minlength=3)
     assert got.numbers.tolist() == np.flatnonzero(counts >= 30).tolist()
     for number, members, p in zip(got.numbers, got.members, got.distributions, strict=True):
@@ -116,7 +118,9 @@ Seen = tuple[tuple[int, int, int, int], float, float]
 def wholes(regions: list[Seen], classes: list[tuple[int, int]]) -> list[int]:
     """Of regions with their boxes, near and far ends."""
     boxes, near_m, far_m = (np.array(values, float) for values in zip(*regions, strict=True))
-    return whole_of(boxes, np.array(classes), near_m, far_m, AssociationConfig()).tolist()
+    return find_containing_regions(
+        boxes, np.array(classes), near_m, far_m, AssociationConfig()
+    ).tolist()
 
 
 @pytest.mark.parametrize(
@@ -177,9 +181,11 @@ def test_gaussians_of_parts_are_those_of_the_whole() -> None:
     regions = np.random.default_rng(1).integers(-2, 3, len(view.regions)).astype(np.int32)
     view = replace(view, regions=regions, boxes=boxes, classes=np.full((3, 2), PLANT))
     config = AssociationConfig()
-    whole = with_whole_things(view, found(view, np.linalg.inv(view.T_map_camera), config), config)
+    whole = merge_parts(
+        view, compute_region_statistics(view, np.linalg.inv(view.T_map_camera), config), config
+    )
     np.testing.assert_array_equal(whole.regions, np.where(regions == 0, 2, regions))
     # nobody's part, nothing new
     apart = replace(view, classes=np.array([[PLANT, -1], [PLANT, -1], [TABLE, -1]]))
-    regions_apart = found(apart, np.linalg.inv(view.T_map_camera), config)
-    assert with_whole_things(apart, regions_apart, config) is apart
+    regions_apart = compute_region_statistics(apart, np.linalg.inv(view.T_map_camera), config)
+    assert merge_parts(apart, regions_apart, config) is apart

@@ -9,16 +9,16 @@ from scipy.stats import entropy as kl_of
 
 from ldo_service.semantics import distributions
 from ldo_service.semantics.distributions import (
+    common_mass,
     dense,
     divergence,
     entropy,
+    mean_distributions,
     names,
-    pooled,
-    shared,
     sparse,
 )
 from ldo_service.semantics.gaussian_labels import (
-    MOST_LABELS,
+    MAX_LABELS,
     OTHER,
     distribution,
     fields,
@@ -30,9 +30,9 @@ CHAIR, LAMP = 58, 90
 
 def some(rng: np.random.Generator, count: int, used: int = 4) -> np.ndarray:
     """Distributions [count, C] over a few labels each."""
-    p = np.zeros((count, MOST_LABELS))
+    p = np.zeros((count, MAX_LABELS))
     for row in p:
-        row[rng.choice(MOST_LABELS, used, replace=False)] = rng.random(used) + 1e-3
+        row[rng.choice(MAX_LABELS, used, replace=False)] = rng.random(used) + 1e-3
     return p / p.sum(axis=1, keepdims=True)
 
 
@@ -75,7 +75,7 @@ def test_pooled_is_the_weighted_mean(weights: np.ndarray) -> None:
     rows = fields(labels)
     rows["ids"][:, 0], rows["weights"][:, 0] = rng.integers(2, 5, 10), rng.random(10)
     each = distribution(labels).reshape(2, 5, -1)
-    got = pooled(labels.reshape(2, 5, 32), weights)
+    got = mean_distributions(labels.reshape(2, 5, 32), weights)
     np.testing.assert_allclose(got.sum(axis=1), 1)
     for k in range(2):
         if weights[k].sum() > 1e-6:
@@ -84,8 +84,11 @@ def test_pooled_is_the_weighted_mean(weights: np.ndarray) -> None:
 
 
 def test_nothing_is_background() -> None:
-    assert pooled(new_labels(4)[None], np.zeros((1, 4)))[0, 0] == 1
-    assert pooled(np.zeros((0, 4, 32), np.uint8), np.zeros((0, 4))).shape == (0, MOST_LABELS)
+    assert mean_distributions(new_labels(4)[None], np.zeros((1, 4)))[0, 0] == 1
+    assert mean_distributions(np.zeros((0, 4, 32), np.uint8), np.zeros((0, 4))).shape == (
+        0,
+        MAX_LABELS,
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,15 +102,15 @@ def test_nothing_is_background() -> None:
     ],
 )
 def test_classes_in_common(p: dict, q: dict, expected: float) -> None:
-    one, other = (np.zeros(MOST_LABELS) for _ in range(2))
+    one, other = (np.zeros(MAX_LABELS) for _ in range(2))
     for row, weights in ((one, p), (other, q)):
         row[list(weights)] = list(weights.values())
     before = one.copy()
-    assert shared(one, other) == pytest.approx(expected)
+    assert common_mass(one, other) == pytest.approx(expected)
     np.testing.assert_array_equal(one, before)
 
 
 def test_the_name_is_the_heaviest_label_but_background() -> None:
-    p = np.zeros(MOST_LABELS)
+    p = np.zeros(MAX_LABELS)
     p[[0, LAMP, CHAIR]] = 0.6, 0.3, 0.1
     assert names(p) == LAMP

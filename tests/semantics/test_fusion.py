@@ -7,15 +7,15 @@ from hypothesis import strategies as st
 
 from ldo_service.errors import ConfigError
 from ldo_service.semantics import semantic_fusion
-from ldo_service.semantics.semantic_fusion import Fused, FusionConfig, fused
+from ldo_service.semantics.semantic_fusion import FusedLabels, FusionConfig, fuse_confidences
 
 SHARES = st.floats(0, 1, width=32)
 
 
-def of(overlap: float, detector: float, labeller: float, rule: str = "adaptive") -> Fused:
+def of(overlap: float, detector: float, labeller: float, rule: str = "adaptive") -> FusedLabels:
     """Of label 3 by the detector, 4 by the labeller."""
     columns = np.array([[3], [detector], [overlap], [4], [labeller]])
-    return fused(*columns, FusionConfig(rule=rule))  # type: ignore[arg-type]
+    return fuse_confidences(*columns, FusionConfig(rule=rule))  # type: ignore[arg-type]
 
 
 def test_examples_in_the_docstring_hold() -> None:

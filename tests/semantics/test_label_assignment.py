@@ -10,10 +10,10 @@ from ldo_service.semantics import label_assignment
 from ldo_service.semantics.label_assignment import (
     HIDDEN,
     UNMATCHED,
-    Assigned,
+    Assignment,
     AssignmentConfig,
     Regions,
-    assign,
+    assign_gaussians,
 )
 from tests.reference.assignment import assign_reference
 
@@ -49,10 +49,10 @@ def parts() -> list[Foreground]:
 
 def ours(
     rows: np.ndarray, regions: Regions, config: AssignmentConfig, threads: int = 1
-) -> Assigned:
+) -> Assignment:
     indices = np.arange(len(rows), dtype=np.uint32)
     where = indices, CAMERA, T_CAMERA_MAP, depth_image(), regions, config
-    return assign(rows, *where, threads=threads)
+    return assign_gaussians(rows, *where, threads=threads)
 
 
 def test_examples_in_the_docstring_hold() -> None:
@@ -119,7 +119,7 @@ def test_a_gaussian_behind_the_surface_is_hidden() -> None:
     rows[:, 2], rows[:, 3:6], rows[:, 6] = [1.0, 1.2], -4, 1
     regions = Regions.of_boxes(np.array([[0, 0, 63, 47]], float), np.ones(1))
     indices, depth_m = np.arange(2, dtype=np.uint32), np.ones((48, 64), np.float32)
-    seen = assign(rows, indices, CAMERA, np.eye(4), depth_m, regions, AssignmentConfig())
+    seen = assign_gaussians(rows, indices, CAMERA, np.eye(4), depth_m, regions, AssignmentConfig())
     assert seen.regions.tolist() == [0, HIDDEN]
 
 
@@ -145,7 +145,7 @@ def test_a_point_that_rounds_to_behind_the_image_is_its_last_pixel() -> None:
     camera = Camera(1, 1, 50.0, 50.0, just_short, 0.0)
     regions = Regions.of_boxes(np.array([[0.0, 0.0, 0.0, 0.0]]), np.ones(1))
     look = rows, np.zeros(1, np.uint32), camera, np.eye(4), memory.ravel()[:1].reshape(1, 1)
-    assert assign(*look, regions, AssignmentConfig()).regions.tolist() != [HIDDEN]
+    assert assign_gaussians(*look, regions, AssignmentConfig()).regions.tolist() != [HIDDEN]
 
 
 def test_bits_do_not_depend_on_the_number_of_threads() -> None:

@@ -10,13 +10,13 @@ from ldo_service.semantics.gaussian_labels import fields, new_labels
 from ldo_service.semantics.object_landmarks import (
     MEMBERS,
     NO_MEMBER,
-    believed,
     boxes,
     derive,
     joined,
     moments,
     moved,
     new_landmarks,
+    reliable_members,
     rows_of,
     shuffled,
     trimmed,
@@ -158,7 +158,7 @@ def test_a_landmark_too_few_of_whose_gaussians_are_awake_stays() -> None:
 def test_members_with_few_votes_are_not_believed() -> None:
     table = new_landmarks(1, 0)
     table["votes"][0, :4] = 8, 3, 2, 0
-    assert believed(table)[0, :5].tolist() == [True, True, False, False, False]
+    assert reliable_members(table)[0, :5].tolist() == [True, True, False, False, False]
 
 
 def test_a_moved_landmark_is_one_of_moved_gaussians() -> None:

@@ -9,7 +9,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.semantics.data_association import AssociationConfig
 from ldo_service.semantics.gaussian_labels import fields
-from ldo_service.semantics.object_landmarks import believed, entropies, rows_of
+from ldo_service.semantics.object_landmarks import entropies, reliable_members, rows_of
 from ldo_service.semantics.objects import Objects, ObjectsConfig
 
 from .staged import (
@@ -17,7 +17,7 @@ from .staged import (
     NAMES,
     SHELL,
     THINGS,
-    Claims,
+    RegionDetections,
     Shot,
     Stage,
     Thing,
@@ -87,7 +87,7 @@ def test_an_object_knows_in_how_many_keyframes_it_was_seen(walked: Stage) -> Non
 def test_members_are_gaussians_of_the_object(walked: Stage) -> None:
     gaussians = walked.builder.gaussians
     for landmark in walked.objects.landmarks[:, None]:
-        rows = rows_of(landmark["members"][believed(landmark)], gaussians.ids)
+        rows = rows_of(landmark["members"][reliable_members(landmark)], gaussians.ids)
         ids = fields(walked.labels())["ids"][rows[rows >= 0], 0]
         assert np.mean(ids == landmark["labels"][0, 0]) > 0.97
 
@@ -97,7 +97,7 @@ def test_the_same_keyframes_give_the_same_bits_also_after_a_restart() -> None:
     way = poses(10)
     told = list(whole.walk(THINGS, way))
     also = list(halves.walk(THINGS, way[:5]))
-    halves.objects = Objects.unpacked(halves.objects.packed)
+    halves.objects = Objects.unpack(halves.objects.packed)
     also += list(halves.walk(THINGS, way[5:]))
     for name in ("landmarks", "counts"):
         np.testing.assert_array_equal(whole.objects.packed[name], halves.objects.packed[name])
@@ -111,7 +111,7 @@ def test_the_same_keyframes_give_the_same_bits_also_after_a_restart() -> None:
 def test_state_of_another_version_is_refused() -> None:
     packed = Objects().packed
     with pytest.raises(ValueError, match="not of this version"):
-        Objects.unpacked({**packed, "landmarks": np.zeros((1, 8), np.uint8)})
+        Objects.unpack({**packed, "landmarks": np.zeros((1, 8), np.uint8)})
 
 
 # --- birth ----------------------------------------------------------------------------------------
@@ -179,7 +179,9 @@ def test_an_uncertain_object_is_retired_earlier() -> None:
 def test_a_detector_that_says_nothing_for_nine_keyframes_is_forgiven() -> None:
     stage = Stage()
     stand(stage, (COUCH,), 4)
-    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    nothing = RegionDetections.of_detector(
+        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
+    )
     for _ in range(9):
         shot = shoot((COUCH,), AHEAD, stage.keyframe)
         assert stage.show(shot, nothing)[1].retired == ()
@@ -191,7 +193,9 @@ def test_a_detector_that_says_nothing_for_nine_keyframes_is_forgiven() -> None:
 def test_what_looks_too_small_to_be_detected_is_not_missed() -> None:
     stage = Stage(Objects(ObjectsConfig(min_side_px=40)))
     stand(stage, (BALL,), 4)
-    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    nothing = RegionDetections.of_detector(
+        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
+    )
     stage.show(shoot((BALL,), AHEAD, stage.keyframe), nothing)
     assert stage.objects.landmarks["missed"].tolist() == [0]
 
@@ -207,13 +211,13 @@ def test_what_is_out_of_view_or_hidden_is_not_missed() -> None:
 
 
 # --- merging --------------------------------------------------------------------------------------
-def halves(shot: Shot, left: bool) -> Claims:
+def halves(shot: Shot, left: bool) -> RegionDetections:
     """A box of one half of the ball."""
     v, u = np.nonzero(shot.instances)
     middle = (u.min() + u.max()) / 2
     ends = (u.min() - 0.5, middle) if left else (middle, u.max() + 0.5)
     box = np.array([[ends[0], v.min() - 0.5, ends[1], v.max() + 0.5]])
-    return Claims.of_detector(box, np.array([BALL.label]), np.array([0.9], np.float32))
+    return RegionDetections.of_detector(box, np.array([BALL.label]), np.array([0.9], np.float32))
 
 
 def test_two_halves_become_one_when_the_whole_is_seen() -> None:
@@ -232,14 +236,16 @@ def test_two_halves_become_one_when_the_whole_is_seen() -> None:
     assert np.linalg.norm(landmark["centroid"] - true.mean(axis=0)) < 0.05
 
 
-def with_parts(shot: Shot, scores: tuple[float, ...]) -> Claims:
+def with_parts(shot: Shot, scores: tuple[float, ...]) -> RegionDetections:
     """The box of a thing, and of its upper half, and of its lower half where that has a score."""
     v, u = np.nonzero(shot.instances)
     x0, y0, x1, y1 = u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5
     middle = (y0 + y1) / 2
     boxes = np.array([[x0, y0, x1, y1], [x0, y0, x1, middle], [x0, middle, x1, y1]])
     n = len(scores)
-    return Claims.of_detector(boxes[:n], np.full(n, BALL.label), np.array(scores, np.float32))
+    return RegionDetections.of_detector(
+        boxes[:n], np.full(n, BALL.label), np.array(scores, np.float32)
+    )
 
 
 @pytest.mark.parametrize("scores", [(0.6, 0.9), (0.95, 0.9, 0.8), (0.6, 0.9, 0.8)])
@@ -261,7 +267,7 @@ def test_a_thing_that_is_detected_in_parts_is_one_object(scores: tuple[float, ..
     assert heights.min() < 0.15 < 0.25 < heights.max()  # of both halves
 
 
-def test_two_neighbours_of_one_class_stay_two() -> None:
+def test_two_neighbors_of_one_class_stay_two() -> None:
     other = replace(BALL, solid=replace(BALL.solid, center_m=(0.42, 0.9, 0.2)))
     stage = Stage()
     told = stand(stage, (BALL, other), 8)
@@ -307,7 +313,9 @@ def test_what_the_detector_does_not_know_is_missed_only_where_its_place_is_empty
     stage, spared = Stage(Objects(ObjectsConfig(min_side_px=10))), np.zeros(256, bool)
     stand(stage, (BALL,), 4)
     spared[BALL.label] = True
-    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    nothing = RegionDetections.of_detector(
+        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
+    )
     for there, missed in (((BALL,), 0), ((), 1)):
         shot = shoot(there, AHEAD, stage.keyframe)
         stage.builder.add(shot.frame, shot.T_map_camera, stage.keyframe, 0)

@@ -8,16 +8,16 @@ import pytest
 from ldo_service.gaussians import render
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
-from ldo_service.regions.foreground import Claims, Foreground
+from ldo_service.regions.foreground import Foreground, RegionDetections
 from ldo_service.semantics.gaussian_labels import LabelConfig, fields, new_labels, top_labels
 from ldo_service.semantics.label_assignment import AssignmentConfig, Regions
 from ldo_service.semantics.semantic_fusion import (
     FusionConfig,
-    LabellingConfig,
+    SemanticFusionConfig,
     label_image,
     label_keyframe,
     regions_of,
-    reliable_image,
+    reliable_label_mask,
 )
 
 CAMERA = Camera(96, 64, 80.0, 80.0, 47.5, 31.5)
@@ -49,13 +49,13 @@ def thing() -> np.ndarray:
     return out
 
 
-def claims(detector: float = 0.8, labeller: float = 0.0) -> Claims:
+def claims(detector: float = 0.8, labeller: float = 0.0) -> RegionDetections:
     labels = np.array([CHAIR]), np.array([detector], np.float32)
-    return Claims(BOX, *labels, np.array([LAMP]), np.array([labeller], np.float32))
+    return RegionDetections(BOX, *labels, np.array([LAMP]), np.array([labeller], np.float32))
 
 
 def labelled(
-    config: LabellingConfig, *what: Claims, late: Claims | None = None
+    config: SemanticFusionConfig, *what: RegionDetections, late: RegionDetections | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     rows = surfels()
     labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
@@ -68,7 +68,7 @@ def labelled(
 
 
 def test_the_thing_gets_the_label_and_the_wall_in_its_box_does_not() -> None:
-    _, labels = labelled(LabellingConfig(), claims())
+    _, labels = labelled(SemanticFusionConfig(), claims())
     got = (top_labels(labels) == CHAIR).reshape(64, 96)
     assert np.mean(got[thing()]) > 0.95
     assert np.count_nonzero(got & ~thing()) < 0.02 * np.count_nonzero(thing())
@@ -79,8 +79,10 @@ def test_what_is_said_anew_stands_alone() -> None:
     before = [claims()] * 10
     late = claims(0, 0.9)
     for anew, label, share in ((False, CHAIR, 0.15), (True, LAMP, 1.0)):
-        _, labels = labelled(LabellingConfig(), *before, late=replace(late, anew=anew))
-        was = fields(labelled(LabellingConfig(), *before)[1])
+        _, labels = labelled(
+            SemanticFusionConfig(), *before, late=replace(late, replaces_labels=anew)
+        )
+        was = fields(labelled(SemanticFusionConfig(), *before)[1])
         of_thing = fields(labels)[thing().ravel()]
         assert np.mean(top_labels(labels)[thing().ravel()] == label) > 0.95
         shares = np.where(of_thing["ids"] == LAMP, of_thing["weights"], 0).sum(axis=1)
@@ -91,28 +93,28 @@ def test_what_is_said_anew_stands_alone() -> None:
 
 
 def test_by_box_the_wall_becomes_chair_too() -> None:
-    _, labels = labelled(LabellingConfig(region="box"), claims())
+    _, labels = labelled(SemanticFusionConfig(region="box"), claims())
     got = (top_labels(labels) == CHAIR).reshape(64, 96)
     assert np.count_nonzero(got) > 2 * np.count_nonzero(thing())
 
 
 def test_the_literal_rule_labels_nothing_here() -> None:
-    config = LabellingConfig(assignment=AssignmentConfig("iou"))
+    config = SemanticFusionConfig(assignment=AssignmentConfig("iou"))
     _, labels = labelled(config, claims())
     assert not top_labels(labels).any()
 
 
 @pytest.mark.parametrize(("rule", "wins"), [("adaptive", LAMP), ("detector", CHAIR)])
 def test_a_surer_labeller_overrules_the_detector_where_it_is_heard(rule, wins) -> None:
-    config = LabellingConfig(fusion=FusionConfig(rule=rule))
+    config = SemanticFusionConfig(fusion=FusionConfig(rule=rule))
     _, labels = labelled(config, claims(detector=0.3, labeller=0.9))
     assert np.median(top_labels(labels).reshape(64, 96)[THING]) == wins
 
 
 def test_a_late_answer_lands_on_the_thing_and_misses_nothing_else() -> None:
-    _, once = labelled(LabellingConfig(), claims(detector=0.3))
+    _, once = labelled(SemanticFusionConfig(), claims(detector=0.3))
     _, labels = labelled(
-        LabellingConfig(), claims(detector=0.3), late=claims(detector=0.0, labeller=0.9)
+        SemanticFusionConfig(), claims(detector=0.3), late=claims(detector=0.0, labeller=0.9)
     )
     assert np.median(top_labels(labels).reshape(64, 96)[THING]) == LAMP
     outside = ~thing().ravel()
@@ -123,14 +125,14 @@ def test_a_late_answer_lands_on_the_thing_and_misses_nothing_else() -> None:
 
 def test_a_late_answer_that_the_detector_outweighs_is_not_counted_again() -> None:
     sure, doubt = claims(detector=0.9), claims(detector=0.9, labeller=0.3)
-    _, once = labelled(LabellingConfig(), sure)
-    _, labels = labelled(LabellingConfig(), sure, late=doubt)
+    _, once = labelled(SemanticFusionConfig(), sure)
+    _, labels = labelled(SemanticFusionConfig(), sure, late=doubt)
     np.testing.assert_array_equal(labels, once)
 
 
 def test_pixels_that_were_asked_about_are_labelled_whatever_else_is_in_the_box() -> None:
     upper = Foreground(20, 36, np.ones((10, 24), bool))
-    _, labels = labelled(LabellingConfig(), replace(claims(0, 0.9), parts=(upper,)))
+    _, labels = labelled(SemanticFusionConfig(), replace(claims(0, 0.9), parts=(upper,)))
     got = (top_labels(labels) == LAMP).reshape(64, 96)
     assert np.mean(got[20:30, 36:60]) > 0.9
     assert not got[32:].any()
@@ -138,15 +140,17 @@ def test_pixels_that_were_asked_about_are_labelled_whatever_else_is_in_the_box()
 
 def test_by_the_detector_alone_what_only_the_labeller_says_is_not_heard() -> None:
     rule, ema = FusionConfig(rule="detector"), LabelConfig(ema="paper")
-    _, labels = labelled(LabellingConfig(fusion=rule, labels=ema), claims(0, 0.9))
+    _, labels = labelled(SemanticFusionConfig(fusion=rule, labels=ema), claims(0, 0.9))
     assert not labels[thing().ravel()].any()
 
 
 def test_a_detector_cannot_miss_what_it_does_not_know() -> None:
-    config = LabellingConfig(labels=LabelConfig(least_px=20))
+    config = SemanticFusionConfig(labels=LabelConfig(least_px=20))
     rows, labels = labelled(config, late=claims(0, 0.9))
     at = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
-    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    nothing = RegionDetections.of_detector(
+        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
+    )
     lamps, spared = labels.copy(), np.zeros(256, bool)
     spared[LAMP] = True
     for _ in range(9):
@@ -159,17 +163,17 @@ def test_a_detector_cannot_miss_what_it_does_not_know() -> None:
 def test_a_pixel_has_a_reliable_name_where_its_gaussian_has() -> None:
     labels, top = new_labels(3), np.array([[0, 1], [2, -1]])
     fields(labels)["weights"][:2, 0], fields(labels)["ids"][:2, 0] = [0.7, 0.5], CHAIR
-    assert reliable_image(labels, top, 0.6).tolist() == [[True, False], [False, False]]
+    assert reliable_label_mask(labels, top, 0.6).tolist() == [[True, False], [False, False]]
 
 
 def test_a_keyframe_without_claims_counts_misses_of_what_is_in_view() -> None:
-    none = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
-    _, labels = labelled(LabellingConfig(), none)
+    none = RegionDetections.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
+    _, labels = labelled(SemanticFusionConfig(), none)
     assert np.all(fields(labels)["misses"] == 1)
 
 
 def test_gaussians_that_are_not_finite_stay_without_a_label() -> None:
-    rows, config = surfels(), LabellingConfig()
+    rows, config = surfels(), SemanticFusionConfig()
     broken = np.flatnonzero(thing())[::7]
     rows[broken, 2] = np.nan
     labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
@@ -180,7 +184,7 @@ def test_gaussians_that_are_not_finite_stay_without_a_label() -> None:
 
 
 def test_an_image_of_labels_shows_the_thing() -> None:
-    rows, labels = labelled(LabellingConfig(), claims())
+    rows, labels = labelled(SemanticFusionConfig(), claims())
     shown = render(rows, CAMERA, np.eye(4), contributions=True)
     image = label_image(rows, labels, shown, CAMERA, np.eye(4))
     agreement = np.count_nonzero((image == CHAIR) & thing())
@@ -204,8 +208,10 @@ def test_an_image_of_labels_is_of_the_largest_sum_not_of_the_nearest_gaussian() 
 
 def test_a_name_the_detector_cannot_know_is_not_held_back_by_what_it_missed() -> None:
     """Ten keyframes of misses are worth 2 answers of 0.9."""
-    nothing = Claims.of_detector(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32))
-    config = LabellingConfig(labels=LabelConfig(least_px=1))
+    nothing = RegionDetections.of_detector(
+        np.zeros((0, 4)), np.zeros(0, int), np.zeros(0, np.float32)
+    )
+    config = SemanticFusionConfig(labels=LabelConfig(least_px=1))
     rows, labels = labelled(config, *[nothing] * 10)
     view = np.arange(len(rows), dtype=np.uint32), CAMERA, np.eye(4), depth_image()
     spared, known = np.zeros(256, bool), labels.copy()
@@ -220,9 +226,11 @@ def test_a_name_the_detector_cannot_know_is_not_held_back_by_what_it_missed() ->
 def test_what_lies_on_a_thing_is_no_part_of_its_region() -> None:
     table, cup = (Foreground(20, 36, np.ones(shape, bool)) for shape in ((24, 24), (6, 6)))
     boxes = np.array([[35.5, 19.5, 59.5, 43.5], [35.5, 19.5, 41.5, 25.5]])
-    told = Claims.of_detector(boxes, np.array([CHAIR, LAMP]), np.array([0.9, 0.7], np.float32))
+    told = RegionDetections.of_detector(
+        boxes, np.array([CHAIR, LAMP]), np.array([0.9, 0.7], np.float32)
+    )
     regions = regions_of(
-        replace(told, parts=(table, cup)), depth_image(), CAMERA, LabellingConfig()
+        replace(told, parts=(table, cup)), depth_image(), CAMERA, SemanticFusionConfig()
     )
     table.mask[:6, :6] = False
     expected = Regions.of_foregrounds(boxes, told.scores(), (table, cup))

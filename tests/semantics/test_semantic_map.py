@@ -10,17 +10,17 @@ import pytest
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
-from ldo_service.gaussians.visibility import SleepConfig
+from ldo_service.gaussians.visibility import OffloadConfig
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.regions.foreground import Claims
+from ldo_service.regions.foreground import RegionDetections
 from ldo_service.semantics.gaussian_labels import top_labels
-from ldo_service.semantics.semantic_fusion import LabellingConfig
+from ldo_service.semantics.semantic_fusion import SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMap, SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 from tests.gaussians.conftest import halved
 
 FRAMES = (0, 6, 12, 18)
-BY_BOX = SemanticMapConfig(LabellingConfig(region="box"))
+BY_BOX = SemanticMapConfig(SemanticFusionConfig(region="box"))
 CHAIR, TABLE = 58, 62
 
 
@@ -38,10 +38,10 @@ def built(posed, **options) -> MapBuilder:
     return builder
 
 
-def claims(label: int = CHAIR) -> Claims:
+def claims(label: int = CHAIR) -> RegionDetections:
     """In the left half of an image of 80x60."""
     box, sure = np.array([[5.0, 5, 40, 55]], np.float32), np.array([0.8], np.float32)
-    return Claims.of_detector(box, np.array([label]), sure)
+    return RegionDetections.of_detector(box, np.array([label]), sure)
 
 
 def labels_after(posed, order: Iterable[tuple[str, int]]) -> bytes:
@@ -51,16 +51,16 @@ def labels_after(posed, order: Iterable[tuple[str, int]]) -> bytes:
     for what, keyframe in order:
         if what == "map":
             builder.add(*posed[keyframe], keyframe, 0)
-            semantics.mapped(keyframe)
+            semantics.on_keyframe_mapped(keyframe)
         else:
-            semantics.claim(keyframe, claims())
+            semantics.add_detections(keyframe, claims())
     return builder.gaussians.labels.tobytes()
 
 
 def test_what_is_in_a_box_gets_its_label_and_the_rest_does_not(posed) -> None:
     builder = built(posed[:1])
     semantics = SemanticMap(builder, BY_BOX)
-    semantics.claim(0, claims())
+    semantics.add_detections(0, claims())
     frame, T_map_camera = posed[0]
     p_camera = se3.transform(se3.inverse(T_map_camera), builder.gaussians.means)
     u, v = frame.camera.project(p_camera).T
@@ -80,7 +80,7 @@ def test_where_depth_is_missing_the_map_knows_it(posed) -> None:
     dark[5:56, 5:41] = 0
     builder = built([posed[0], (replace(frame, depth_m=dark), T_map_camera)])
     semantics = SemanticMap(builder, BY_BOX)
-    semantics.claim(1, claims())
+    semantics.add_detections(1, claims())
     p_camera = se3.transform(se3.inverse(T_map_camera), builder.gaussians.means)
     u, v = frame.camera.project(p_camera).T
     inside = (u > 7) & (u < 38) & (v > 7) & (v < 53)
@@ -104,7 +104,7 @@ def test_few_boxes_wait_for_keyframes_that_never_come(posed) -> None:
     builder = built(posed[:1])
     semantics = SemanticMap(builder, replace(BY_BOX, most_waiting=2))
     for keyframe in (7, 8, 9):
-        semantics.claim(keyframe, claims())
+        semantics.add_detections(keyframe, claims())
     assert semantics.statistics()["boxes_too_early"] == 1
     assert [keyframe for keyframe, _ in semantics.snapshot()["waiting"]] == [8, 9]
 
@@ -113,7 +113,7 @@ def test_boxes_of_a_forgotten_keyframe_are_counted_and_left_out(posed) -> None:
     builder = built(posed[:2])
     semantics = SemanticMap(builder, BY_BOX)
     builder.views.store.keep_only([1])
-    semantics.claim(0, claims())
+    semantics.add_detections(0, claims())
     assert semantics.statistics()["boxes_without_images"] == 1
     assert not builder.gaussians.labels.any()
 
@@ -121,16 +121,16 @@ def test_boxes_of_a_forgotten_keyframe_are_counted_and_left_out(posed) -> None:
 def test_late_boxes_find_gaussians_that_sleep(posed) -> None:
     frame, T_map_camera = posed[0]
     far = se3.exp(np.array([0, 0, 0, 50.0, 0, 0])) @ T_map_camera
-    sleep = SleepConfig(max_active=100, reach_m=8.0)
+    sleep = OffloadConfig(max_active=100, reach_m=8.0)
     builder = MapBuilder(MapBuilderConfig(sleep=sleep, recent_cameras=1))
     awake, semantics = built([(frame, T_map_camera), (frame, far)]), SemanticMap(builder, BY_BOX)
     for keyframe, T in enumerate((T_map_camera, far)):
         builder.add(frame, T, keyframe, 0)
     builder.changes(with_changed=True)
-    builder.rest()
+    builder.offload_excess()
     assert builder.statistics()["gaussians_asleep"] > 100
-    semantics.claim(0, claims())
-    SemanticMap(awake, BY_BOX).claim(0, claims())
+    semantics.add_detections(0, claims())
+    SemanticMap(awake, BY_BOX).add_detections(0, claims())
     assert builder.gaussians.labels.any()
     assert builder.gaussians.labels.tobytes() == awake.gaussians.labels.tobytes()
 
@@ -140,7 +140,7 @@ def test_only_gaussians_with_other_labels_are_told_again(posed) -> None:
     semantics = SemanticMap(builder, BY_BOX)
     builder.changes(with_changed=True)
     before = builder.gaussians.labels.copy()
-    semantics.claim(0, claims())
+    semantics.add_detections(0, claims())
     is_new = np.any(builder.gaussians.labels != before, axis=1)
     assert np.count_nonzero(is_new) > 100
     changed = builder.changes(with_changed=True).changed
@@ -153,7 +153,7 @@ def test_labels_leave_what_the_map_looks_like(posed) -> None:
     for keyframe, (frame, T_map_camera) in enumerate(posed):
         for builder in (plain, labelled):
             builder.add(frame, T_map_camera, keyframe, 3)
-        semantics.claim(keyframe, claims())
+        semantics.add_detections(keyframe, claims())
     assert labelled.gaussians.labels.any()
     assert labelled.gaussians.rows.tobytes() == plain.gaussians.rows.tobytes()
 
@@ -164,7 +164,7 @@ def test_any_number_of_threads_gives_the_same_bits(posed, threads: int) -> None:
     for builder, count in ((one, 1), (many, threads)):
         semantics = SemanticMap(builder, threads=count)
         for keyframe in range(len(posed)):
-            semantics.claim(keyframe, claims())
+            semantics.add_detections(keyframe, claims())
     assert one.gaussians.labels.any()
     assert one.gaussians.labels.tobytes() == many.gaussians.labels.tobytes()
 
@@ -173,8 +173,8 @@ def test_a_successor_goes_on_with_labels_names_and_what_waits(posed, tmp_path: P
     builder = built(posed[:2], folder=tmp_path)
     semantics = SemanticMap(builder, BY_BOX)
     lamp = semantics.vocabulary.index("lava lamp")
-    semantics.claim(0, claims(lamp))
-    semantics.claim(2, claims(TABLE))
+    semantics.add_detections(0, claims(lamp))
+    semantics.add_detections(2, claims(TABLE))
     state = decode_state(encode_state([builder.snapshot(), semantics.snapshot()]))
     successor = MapBuilder(folder=tmp_path)
     its_semantics = SemanticMap(successor, BY_BOX)
@@ -182,8 +182,8 @@ def test_a_successor_goes_on_with_labels_names_and_what_waits(posed, tmp_path: P
     its_semantics.restore(state[1])
     for one, labels in ((builder, semantics), (successor, its_semantics)):
         one.add(*posed[2], 2, 0)
-        labels.mapped(2)
-        labels.claim(0, claims())
+        labels.on_keyframe_mapped(2)
+        labels.add_detections(0, claims())
     assert its_semantics.vocabulary.find("lava lamp") == lamp
     assert set(top_labels(builder.gaussians.labels)) == {0, lamp, TABLE}
     assert builder.gaussians.labels.tobytes() == successor.gaussians.labels.tobytes()

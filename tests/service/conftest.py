@@ -18,7 +18,7 @@ import pytest
 
 from ldo_service.actors.topology import GRAPH
 from ldo_service.client import Client, connect
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.errors import ConfigError
 from ldo_service.geometry.sequence import Sequence as FrameSequence
 from ldo_service.schemas import CameraRgbd, Health, TrackedPose
@@ -63,9 +63,9 @@ class LiveService:
         self.health: dict[str, Health] = {}
         try:
             self.client = self._connect()
-            self._health = self._stack.enter_context(self.client.listen("health/*", Health))
+            self._health = self._stack.enter_context(self.client.poller("health/*", Health))
             self._poses = self._stack.enter_context(
-                self.client.listen("pose/tracked", TrackedPose, keep=4096)
+                self.client.poller("pose/tracked", TrackedPose, keep=4096)
             )
         except BaseException:
             self.close()
@@ -186,7 +186,7 @@ class LiveService:
             for index in cycle(range(len(frames))):
                 if is_over.wait(1 / rate_hz):
                     return
-                frame = camera_rgbd_message(frames.read(index))
+                frame = raw_frame_to_message(frames.read(index))
                 self.client.send(msgspec.structs.replace(frame, stamp_ns=time.time_ns()))
 
         with ThreadPoolExecutor(1) as thread:

@@ -13,7 +13,7 @@ from threading import Semaphore
 
 import numpy as np
 
-from ldo_service.conversions.frames import crops_of
+from ldo_service.conversions.frames import crops_from_request
 from ldo_service.detection.labellers.chat_completion import HttpConfig
 from ldo_service.gaussians.model import GaussianMap
 from ldo_service.geometry import codecs, se3
@@ -66,7 +66,7 @@ class Guide:
         """Of a region that the frame with this number shows."""
         index = self.frames[frame % len(self.frames)]
         name = thing_in(self.sequence, index, request.box_px)
-        self.names |= {_picture(crop): name for crop in crops_of(request)}
+        self.names |= {_picture(crop): name for crop in crops_from_request(request)}
 
     def allow(self, answers: int) -> None:
         self._allowed.release(answers)

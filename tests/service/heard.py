@@ -4,7 +4,7 @@ from contextlib import ExitStack
 
 import numpy as np
 
-from ldo_service.conversions.poses import keyframe_poses_of
+from ldo_service.conversions.poses import keyframe_poses_from_correction
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.gaussians.model import GaussianMap
 from ldo_service.schemas import Correction, InputCount, LabelOpen, LabelRequest, TrackedPose
@@ -24,7 +24,7 @@ class Heard:
         self.requests: list[LabelRequest] = []
         self.answers: list[LabelOpen] = []
         self.late: list[int] = []  # keyframes that were made until each answer came
-        listen = service.client.listen
+        listen = service.client.poller
         self._requests = stack.enter_context(listen("label/request", LabelRequest))
         self._answers = stack.enter_context(listen("label/open", LabelOpen))
 
@@ -47,7 +47,7 @@ class Heard:
 
     def ask_again(self) -> None:
         """For the last pose, if it got lost on the way."""
-        for pose in self.service.client.last(POSE_TRACKED):
+        for pose in self.service.client.latest(POSE_TRACKED):
             assert isinstance(pose, TrackedPose)
             if pose.frame > max((known.frame for known in self.poses), default=-1):
                 self._take(pose)
@@ -73,9 +73,9 @@ class Heard:
 
     def graph(self) -> dict[int, np.ndarray]:
         """T_map_keyframe [4, 4] by keyframe, as the optimizer has them."""
-        (correction,) = self.service.client.last(GRAPH_CORRECTION)
+        (correction,) = self.service.client.latest(GRAPH_CORRECTION)
         assert isinstance(correction, Correction)
-        return keyframe_poses_of(correction)
+        return keyframe_poses_from_correction(correction)
 
     def map(self) -> tuple[GaussianMap, tuple[str, ...]]:
         """As the mapper has it, and the names of its labels."""
@@ -84,5 +84,5 @@ class Heard:
         state = FolderStore(self.service.state / "state").load("mapper")
         assert state is not None
         saved = state["map"]
-        vocabulary = Vocabulary.unpacked(saved["semantics"]["vocabulary"])
+        vocabulary = Vocabulary.unpack(saved["semantics"]["vocabulary"])
         return GaussianMap.restore(saved["map"]["map"]), vocabulary.names

@@ -55,7 +55,7 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path, room: Sequen
             poses = service.wait_for_poses(15)
             assert all(pose.status == "OK" for pose in poses)
             wait_until(
-                lambda: bool(service.client.last(MAP_SNAPSHOT, timeout_s=60)), 10, "a new map"
+                lambda: bool(service.client.latest(MAP_SNAPSHOT, timeout_s=60)), 10, "a new map"
             )
             wait_until(
                 lambda: service.update_health()["optimizer"].facts.get("optimizations", 0) > 0,

@@ -22,7 +22,7 @@ def test_every_keyframe_is_answered_whatever_the_network_is(
     use = ("--set", f"detector.model={model}", "--set", "detector.min_score=0")
     boxes: list[DetectionBoxes] = []
     with live_service(tmp_path, *APART, *use) as service:
-        with service.client.listen("detection/boxes", DetectionBoxes, keep=64) as inbox:
+        with service.client.poller("detection/boxes", DetectionBoxes, keep=64) as inbox:
             service.wait_for_actors()
             publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "40")
             service.wait_for_poses(20)

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from ldo_service.schemas import Health, InputCount
-from ldo_service.service.diagnostics import Seen, remarks, troubles
+from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 
 
 def health(**fields) -> Health:
@@ -23,8 +23,8 @@ def inputs(topic: str = "frame/rgbd", **fields) -> tuple[InputCount, ...]:
     return (msgspec.structs.replace(health().inputs[0], topic=topic, **fields),)
 
 
-def seen(of: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1) -> Seen:
-    return Seen("tracker", has_token, of, 1.5, heartbeat_age_s)
+def seen(of: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1) -> ActorStatus:
+    return ActorStatus("tracker", has_token, of, 1.5, heartbeat_age_s)
 
 
 @pytest.mark.parametrize(
@@ -38,8 +38,8 @@ def seen(of: Health | None, has_token: bool = True, heartbeat_age_s: float = 0.1
         seen(health(inputs=inputs(dropped=500, rejected=3))),  # what a slow machine does
     ],
 )
-def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
-    assert list(troubles(actor)) == []
+def test_an_actor_that_is_well_has_no_trouble(actor: ActorStatus) -> None:
+    assert list(diagnose(actor)) == []
 
 
 @pytest.mark.parametrize(
@@ -70,8 +70,8 @@ def test_an_actor_that_is_well_has_no_trouble(actor: Seen) -> None:
         (seen(health(facts={"is_unsaved": 1.0, "saves_failed": 3.0})), "cannot save its last step"),
     ],
 )
-def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
-    (trouble,) = troubles(actor)
+def test_each_trouble_is_told_from_the_others(actor: ActorStatus, says: str) -> None:
+    (trouble,) = diagnose(actor)
     assert says in trouble.what
     assert len(trouble.advice) > 20
 
@@ -94,14 +94,14 @@ def test_each_trouble_is_told_from_the_others(actor: Seen, says: str) -> None:
     ],
 )
 def test_what_is_no_fault_is_a_remark(of: Health, says: str) -> None:
-    (remark,) = remarks(seen(of))
+    (remark,) = notes(seen(of))
     assert says in remark
-    assert list(troubles(seen(of))) == []
+    assert list(diagnose(seen(of))) == []
 
 
 def test_a_detector_without_a_model_is_no_trouble_and_is_remarked_upon() -> None:
     actor = seen(health(facts={"networks": 0.0, "networks_missing": 0.0}))
-    assert list(troubles(actor)) == []
-    (remark,) = remarks(actor)
+    assert list(diagnose(actor)) == []
+    (remark,) = notes(actor)
     assert "ldo models" in remark
-    assert list(remarks(seen(health(facts={"networks": 1.0})))) == []
+    assert list(notes(seen(health(facts={"networks": 1.0})))) == []

@@ -32,7 +32,7 @@ def see(service: LiveService, folder: Path, poses: int) -> None:
     assert camera.wait(60) == 0
 
 
-def test_folder_run_service_query_recording_resume_and_localising(
+def test_folder_run_service_query_recording_resume_and_localizing(
     room_folder: Path, tmp_path: Path
 ) -> None:
     frames = len(open_sequence(str(room_folder)))

@@ -8,7 +8,7 @@ import pytest
 from ldo_service.client import connect
 from ldo_service.schemas import TrackedPose
 from ldo_service.schemas.topics import POSE_TRACKED
-from ldo_service.transport.certificate_authority import Authority
+from ldo_service.transport.certificate_authority import CertificateAuthority
 from tests.ports import free_endpoint
 from tests.service.conftest import LDO, wait_until
 
@@ -16,7 +16,7 @@ from tests.service.conftest import LDO, wait_until
 @pytest.mark.slow
 def test_frames_go_in_and_poses_come_out_over_tls(tmp_path: Path) -> None:
     keys = tmp_path / "keys"
-    authority = Authority.new(keys, days=2)
+    authority = CertificateAuthority.new(keys, days=2)
     for role in ("service", "camera", "viewer", "operator"):
         authority.add(role, role, "robot", days=1)
     port = free_endpoint().rpartition(":")[2]
@@ -30,7 +30,7 @@ def test_frames_go_in_and_poses_come_out_over_tls(tmp_path: Path) -> None:
         frames = ("synthetic:room", "--rate", "15", "--max-frames", "30")
         camera = subprocess.Popen([*LDO, "publish", *frames, *to_camera])
         with connect("robot", here, keys / "viewer") as viewer:
-            with viewer.listen(POSE_TRACKED.name, TrackedPose) as poses:
+            with viewer.poller(POSE_TRACKED.name, TrackedPose) as poses:
                 found: list[TrackedPose] = []
                 wait_until(lambda: len(found.extend(poses()) or found) >= 20, 20, "20 poses")
             assert {pose.status for pose in found} == {"OK"}

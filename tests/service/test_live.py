@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from ldo_service.actors.topology import GRAPH
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import MapSnapshot, TrackedPose
@@ -37,18 +37,18 @@ def test_frames_in_poses_and_map_out(tmp_path: Path) -> None:
         assert publisher.wait(PATIENCE * 20) == 0
         poses += service.poses()
         assert {pose.status for pose in poses} == {"OK"}
-        last = service.client.last(POSE_TRACKED, timeout_s=60)
+        last = service.client.latest(POSE_TRACKED, timeout_s=60)
         assert isinstance(last[0], TrackedPose)
-        assert service.client.last("pose/tracked", timeout_s=60) == last
+        assert service.client.latest("pose/tracked", timeout_s=60) == last
         heard = service.client.messages("health", keep=16)
         silent = set(EVERY_ACTOR)
         while silent:
             silent.discard(next(heard)[1].actor)
         with pytest.raises(ConfigError, match="Did you mean pose/tracked"):
-            service.client.last("pose/traked")
+            service.client.latest("pose/traked")
         with pytest.raises(ConfigError, match="map/delta keeps no last value"):
-            service.client.last("map/delta")
-        parts = service.client.last(MAP_SNAPSHOT, timeout_s=60)
+            service.client.latest("map/delta")
+        parts = service.client.latest(MAP_SNAPSHOT, timeout_s=60)
         assert all(isinstance(part, MapSnapshot) for part in parts)
         assert sum(part.gaussians.ids.shape[0] for part in parts) > 1000
         assert service.stop() == 0
@@ -119,7 +119,7 @@ def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         for index in range(30):
-            service.pose_of(camera_rgbd_message(room.read(index)))
+            service.pose_of(raw_frame_to_message(room.read(index)))
         state = tmp_path / "s"
         assert "another service keeps its state" in refused(state)
         wait_until(lambda: service.update_health()["mapper"].facts["keyframes"] > 2, 10, "a map")
@@ -128,7 +128,7 @@ def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         for index in range(30, 60):
-            service.pose_of(camera_rgbd_message(room.read(index)))
+            service.pose_of(raw_frame_to_message(room.read(index)))
         wait_until(
             lambda: service.update_health()["mapper"].facts.get("keyframes", 0) > keyframes,
             10,

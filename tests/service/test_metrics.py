@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import encode
-from ldo_service.service.metrics import COMES_BACK_S, HealthCollector, exported
+from ldo_service.service.metrics import COMES_BACK_S, HealthCollector, serve_metrics
 from tests.ports import free_port
 from tests.schemas.examples import EXAMPLES
 
@@ -23,9 +23,9 @@ from tests.schemas.examples import EXAMPLES
 def port() -> Iterator[int]:
     """Where the example's health is exported."""
     collector, port = HealthCollector("mule", ["mapper"]), free_port()
-    collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
-    collector.heard(b"", memoryview(b"\xc1 no health message"))
-    with exported(collector, port):
+    collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
+    collector.on_health(b"", memoryview(b"\xc1 no health message"))
+    with serve_metrics(collector, port):
         yield port
 
 
@@ -56,12 +56,12 @@ def asked(port: int) -> tuple[int, str]:
 def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) -> None:
     collector, port = HealthCollector("mule", ["mapper", "tracker"]), free_port()
     mapper = EXAMPLES["health"]  # it has failed and was restarted, which is past
-    with exported(collector, port):
+    with serve_metrics(collector, port):
         assert asked(port) == (503, "no heartbeat: mapper, tracker")
-        collector.heard(b"", memoryview(encode(mapper)))
+        collector.on_health(b"", memoryview(encode(mapper)))
         assert asked(port) == (503, "no heartbeat: tracker")
         tracker = msgspec.structs.replace(mapper, actor="tracker")
-        collector.heard(b"", memoryview(encode(tracker)))
+        collector.on_health(b"", memoryview(encode(tracker)))
         assert asked(port) == (200, "every actor reports")
         later_s = time.monotonic() + 2 * (10 + COMES_BACK_S)
         monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
@@ -71,16 +71,19 @@ def test_health_is_of_now_and_of_every_actor(monkeypatch: pytest.MonkeyPatch) ->
 def test_who_may_be_silent_for_long_is_not_missed_before(monkeypatch: pytest.MonkeyPatch) -> None:
     patient, hasty = (HealthCollector("mule", ["mapper"], silent_s) for silent_s in (60, 5))
     for collector in (patient, hasty):
-        collector.heard(b"", memoryview(encode(EXAMPLES["health"])))
+        collector.on_health(b"", memoryview(encode(EXAMPLES["health"])))
     later_s = time.monotonic() + 30
     monkeypatch.setattr("ldo_service.service.metrics.time.monotonic", lambda: later_s)
-    assert (patient.silent(), hasty.silent()) == ([], ["mapper"])
+    assert (patient.silent_actors(), hasty.silent_actors()) == ([], ["mapper"])
 
 
 @pytest.mark.parametrize("address", ["localhost", "127.0.0.1", "::1"])
 def test_any_address_of_this_machine_will_do(address: str) -> None:
     port = free_port()
-    with suppress(ConfigError), exported(HealthCollector("mule"), port, address):  # no IPv6 here
+    with (
+        suppress(ConfigError),
+        serve_metrics(HealthCollector("mule"), port, address),
+    ):  # no IPv6 here
         url = f"http://{f'[{address}]' if ':' in address else address}:{port}/healthz"
         with urllib.request.urlopen(url, timeout=60) as reply:
             assert reply.status == 200
@@ -128,7 +131,7 @@ def test_an_actor_that_was_killed_is_counted_and_its_gauges_go(
     collector, health = HealthCollector("mule"), EXAMPLES["health"]
     for pid in (7, 7, 8, 8, 9):
         again = msgspec.structs.replace(health, pid=pid)
-        collector.heard(b"", memoryview(encode(again)))
+        collector.on_health(b"", memoryview(encode(again)))
     samples = {s.name: s.value for family in collector.collect() for s in family.samples}
     assert samples["ldo_process_restarts_total"] == 2
     assert "ldo_resident_bytes" in samples
@@ -162,16 +165,16 @@ def _own_address() -> str:
 def test_a_taken_port_is_said_and_can_be_had_again_afterwards(port: int) -> None:
     with (
         pytest.raises(ConfigError, match=re.escape(f"cannot listen on 127.0.0.1:{port}")),
-        exported(HealthCollector("mule"), port),
+        serve_metrics(HealthCollector("mule"), port),
     ):
         pass
     other = free_port()
     for _ in range(2):
-        with exported(HealthCollector("mule"), other):
+        with serve_metrics(HealthCollector("mule"), other):
             assert scraped(other) == {}
 
 
 @pytest.mark.parametrize("port_", [0, -1, 65536])
 def test_an_impossible_port_is_refused(port_: int) -> None:
-    with pytest.raises(ConfigError), exported(HealthCollector("mule"), port_):
+    with pytest.raises(ConfigError), serve_metrics(HealthCollector("mule"), port_):
         pass

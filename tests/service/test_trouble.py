@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 import zenoh
 
-from ldo_service.conversions.frames import camera_rgbd_message
+from ldo_service.conversions.frames import raw_frame_to_message
 from ldo_service.datasets import Sequence
 from ldo_service.geometry.frames import RgbdFrame
 from ldo_service.schemas import CameraRgbd, TrackedPose, encode
-from ldo_service.transport.zenoh_transport import Network, open_session
+from ldo_service.transport.zenoh_transport import Endpoint, open_session
 from tests.service.conftest import PATIENCE, LiveService, live_service, wait_until
 
 PROGRAM = Path(__file__).with_name("troubled_service.py")
@@ -38,7 +38,7 @@ def troubled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
 
 
 def message(room: Sequence, index: int) -> CameraRgbd:
-    return camera_rgbd_message(room.read(index))
+    return raw_frame_to_message(room.read(index))
 
 
 def tracked(service: LiveService, room: Sequence, indices: Iterable[int]) -> list[TrackedPose]:
@@ -122,7 +122,7 @@ def test_what_is_no_frame_is_rejected_and_counted_while_the_stream_goes_on(
         good = message(room, 0)
         service.pose_of(good)
         bad = list(not_frames(good))
-        with open_session(Network("robot", service.endpoint)) as session:
+        with open_session(Endpoint("robot", service.endpoint)) as session:
             camera = session.declare_publisher(
                 "ldo/robot/camera/rgbd", congestion_control=zenoh.CongestionControl.BLOCK
             )

@@ -29,7 +29,7 @@ def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
         command = [*LDO, "control", "add-label", "fire hydrant", "--endpoint", service.endpoint]
         done = subprocess.run(command, capture_output=True, text=True)
         assert (done.returncode, "from 2 names" in done.stdout) == (0, True), done.stderr
-        (last,) = service.client.last(LABEL_NAMES, timeout_s=60)
+        (last,) = service.client.latest(LABEL_NAMES, timeout_s=60)
         assert isinstance(last, LabelNames)
         assert last.names == ("red", "fire hydrant")
         with pytest.raises(ConfigError, match="cannot be added: a name of 101"):
@@ -58,7 +58,7 @@ def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequen
     with (
         serving(says("fire hydrant", 0.9)) as server,
         live_service(tmp_path, *asking(server.url), *names) as service,
-        service.client.listen("map/delta", MapDelta) as deltas,
+        service.client.poller("map/delta", MapDelta) as deltas,
     ):
         service.wait_for_actors()
         with pytest.raises(ConfigError, match="no objects yet, which takes a keyframe"):
@@ -113,7 +113,7 @@ def test_a_name_added_while_it_runs_is_found_on_what_is_seen_after(tmp_path: Pat
     use = (*demo, f"vlm_labeller.class_names={tmp_path / 'names.txt'}")
     with (
         live_service(tmp_path, *(word for one in use for word in ("--set", one))) as service,
-        service.client.listen("map/objects", MapObjects) as objects,
+        service.client.poller("map/objects", MapObjects) as objects,
     ):
         service.wait_for_actors()
         publisher = service.publisher("synthetic:flat", "--rate", "1", "--max-frames", "50")

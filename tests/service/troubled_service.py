@@ -36,7 +36,7 @@ def meet_trouble(frame: int) -> None:
         raise RuntimeError(f"trouble at frame {frame}")
 
 
-def troubled(box: topology.Box) -> topology.Box:
+def troubled(box: topology.ActorSpec) -> topology.ActorSpec:
     if box.name != "tracker":
         return box
     return replace(box, make=lambda parameters: TroubledTracker(parameters.tracker))

@@ -3,25 +3,25 @@ from pathlib import Path
 import pytest
 
 from ldo_service.errors import DataError
-from ldo_service.storage.checksummed_folder import SealedFolder
+from ldo_service.storage.checksummed_folder import ChecksummedFolder
 
 BODY = bytes(range(40))
 
 
 def test_what_was_written_is_read_and_found_by_a_successor(tmp_path: Path) -> None:
-    folder = SealedFolder(tmp_path, "part", "")
+    folder = ChecksummedFolder(tmp_path, "part", "")
     assert folder.write(7, BODY)
     assert folder.write(7, BODY[::-1])
     assert folder.write(123456789, b"")
-    for each in (folder, SealedFolder(tmp_path, "part", "")):
+    for each in (folder, ChecksummedFolder(tmp_path, "part", "")):
         assert bytes(each.read(7)) == BODY[::-1]
         assert bytes(each.read(123456789)) == b""
         assert each.sizes == {7: 48, 123456789: 8}
-    assert SealedFolder(tmp_path, "other", "").sizes == {}
+    assert ChecksummedFolder(tmp_path, "other", "").sizes == {}
 
 
 def test_every_cut_and_every_changed_byte_is_noticed(tmp_path: Path) -> None:
-    folder = SealedFolder(tmp_path, "part", "")
+    folder = ChecksummedFolder(tmp_path, "part", "")
     folder.write(1, BODY)
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
@@ -36,7 +36,7 @@ def test_every_cut_and_every_changed_byte_is_noticed(tmp_path: Path) -> None:
 
 
 def test_a_removed_file_is_gone(tmp_path: Path) -> None:
-    folder = SealedFolder(tmp_path, "part", "")
+    folder = ChecksummedFolder(tmp_path, "part", "")
     folder.write(1, BODY)
     folder.remove(1)
     folder.remove(1)

@@ -177,11 +177,11 @@ def test_what_was_forgotten_on_a_bad_disk_is_written_whole_again(
 
     monkeypatch.setattr(os, "unlink", refuse)
     with suppress(OSError):
-        store.forget("mapper")
+        store.delete("mapper")
     monkeypatch.undo()
     store.save("mapper", {"same": same, "step": [1]})
     assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [1]}
-    store.forget("mapper")
+    store.delete("mapper")
     assert FolderStore(tmp_path).load("mapper") is None
     store.save("mapper", {"same": same})
     assert FolderStore(tmp_path).load("mapper") == {"same": [0]}

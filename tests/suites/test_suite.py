@@ -11,11 +11,11 @@ import pytest
 from ldo_service.config import load_config
 from ldo_service.errors import ConfigError
 from ldo_service.suites import (
-    Entry,
     Judged,
     Outcome,
     Suite,
-    Work,
+    SuiteRun,
+    SuiteRunner,
     known_suites,
     load_suite,
     markdown,
@@ -60,7 +60,7 @@ def test_folders_run_once_and_synthetic_sources_with_each_seed() -> None:
         *("flat/plain@0", "flat/plain@3", "flat/short@0", "flat/short@3"),
         *("desk/plain", "desk/short"),
     ]
-    assert entries[3] == Entry("flat", "short", "synthetic:flat@3", (SETTING,), 3)
+    assert entries[3] == SuiteRun("flat", "short", "synthetic:flat@3", (SETTING,), 3)
     assert entries[4].source == "/data/tum/desk"
 
 
@@ -74,7 +74,7 @@ def test_all_take_the_front_end_of_the_first_with_their_seed_where_one_is_named(
 
 def test_a_first_run_whose_front_end_is_gone_is_not_finished(tmp_path: Path) -> None:
     shared = msgspec.structs.replace(TWO, front_end="plain", figures=("ate_cm",))
-    work = Work(shared, Path("/data"), tmp_path)
+    work = SuiteRunner(shared, Path("/data"), tmp_path)
     first, _, other, _ = work.entries()[:4]
     for entry in (first, other):
         (tmp_path / entry.folder).mkdir(parents=True)

@@ -186,7 +186,7 @@ def test_depth_noise_is_a_kinects(exact: FlatSequence, noisy: FlatSequence) -> N
     assert abs(np.median(error)) < 1e-3
 
 
-def test_neighbours_share_their_depth_noise(exact: FlatSequence, noisy: FlatSequence) -> None:
+def test_neighbors_share_their_depth_noise(exact: FlatSequence, noisy: FlatSequence) -> None:
     z, measured = exact.read(20).depth.astype(float), noisy.read(20).depth.astype(float)
     flat = (measured > 0) & (np.abs(measured - z) < 0.01 * z**2)  # no ragged edge
     error = np.where(flat, (measured - z) / z**2, 0)
@@ -346,10 +346,10 @@ def test_the_walk_sees_them_before_bare_walls(exact: FlatSequence) -> None:
 @pytest.mark.parametrize("index", [20, 180])
 def test_walls_are_weakly_textured_but_not_flat(exact: FlatSequence, index: int) -> None:
     """Grey levels about the local mean, away from outlines and shadows."""
-    grey = exact.read(index).color.mean(axis=2)
+    gray = exact.read(index).color.mean(axis=2)
     wall = exact.labels(index).class_ids == CLASS_NAMES.index("wall")
     inner = cv2.erode(wall.astype(np.uint8), np.ones((9, 9))) > 0
-    spread = np.abs(grey - cv2.GaussianBlur(grey, (0, 0), 3))[inner]
+    spread = np.abs(gray - cv2.GaussianBlur(gray, (0, 0), 3))[inner]
     assert 0.1 < spread.mean() < 3
 
 

@@ -62,7 +62,7 @@ def test_views_of_the_same_point_agree(room: SyntheticSequence, i: int, j: int) 
     assert np.median(np.abs(depth)) < 1e-5
 
 
-def test_a_pose_off_by_two_centimetres_shows(room: SyntheticSequence) -> None:
+def test_a_pose_off_by_two_centimeters_shows(room: SyntheticSequence) -> None:
     T = room.truth().T_world_camera
     off = se3.exp(np.array([0, 0, 0, 0.02, 0, 0]))
     good, *_ = warped(room[0], room[6], se3.inverse(T[6]) @ T[0])
@@ -70,7 +70,7 @@ def test_a_pose_off_by_two_centimetres_shows(room: SyntheticSequence) -> None:
     assert np.abs(bad).mean() > 1.5 * np.abs(good).mean()
 
 
-def test_depth_lies_on_the_walls_to_a_micrometre(room: SyntheticSequence) -> None:
+def test_depth_lies_on_the_walls_to_a_micrometer(room: SyntheticSequence) -> None:
     """Every point is inside the room, and many lie on each wall that is seen."""
     T = room.truth().T_world_camera[50]
     p_world = se3.transform(T, room.camera.rays() * room.read(50).depth[..., None])

@@ -13,9 +13,9 @@ from functools import partial
 import numpy as np
 
 from ldo_service.datasets import Sequence, open_sequence
-from ldo_service.evaluation.trajectory import align
+from ldo_service.evaluation.trajectory import fit_rigid_transform
 from ldo_service.geometry import RawFrame, RgbdFrame, associate, rectify, se3
-from ldo_service.tracking import Odometry, Status
+from ldo_service.tracking import Odometry, TrackingStatus
 
 Frames = Callable[[int], RgbdFrame]
 Degrader = Callable[[Frames, int], RgbdFrame | None]  # None: nothing arrives
@@ -138,7 +138,7 @@ class Outcome:
 class Step:
     k: int  # when
     source: int  # which frame of the sequence was shown
-    status: Status
+    status: TrackingStatus
     T_odom_camera: np.ndarray
 
 
@@ -156,14 +156,16 @@ def outcome(
     steps: list[Step], trouble: range, T_true: Mapping[int, np.ndarray], T_true_odom: np.ndarray
 ) -> Outcome:
     outside = [s for s in steps if s.k not in trouble]
-    meanwhile = [s.status is Status.OK for s in steps if s.k in trouble]
+    meanwhile = [s.status is TrackingStatus.OK for s in steps if s.k in trouble]
     p_odom, p_true, times = ok_positions(steps, T_true)
     errors_m = np.linalg.norm(se3.transform(T_true_odom, p_odom) - p_true, axis=1)
-    residuals_m = np.linalg.norm(se3.transform(align(p_odom, p_true), p_odom) - p_true, axis=1)
-    after = [s.k for s in outside if s.k >= trouble.stop and s.status is Status.OK]
+    residuals_m = np.linalg.norm(
+        se3.transform(fit_rigid_transform(p_odom, p_true), p_odom) - p_true, axis=1
+    )
+    after = [s.k for s in outside if s.k >= trouble.stop and s.status is TrackingStatus.OK]
     worst = int(np.argmax(errors_m))
     return Outcome(
-        100 * float(np.mean([s.status is Status.OK for s in outside])),
+        100 * float(np.mean([s.status is TrackingStatus.OK for s in outside])),
         100 * float(np.mean(meanwhile)) if meanwhile else None,
         float(errors_m[worst]),
         times[worst],
@@ -176,7 +178,7 @@ def ok_positions(
     steps: list[Step], T_true: Mapping[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Estimated and true [M, 3] of the OK frames that have a true pose, and their times k."""
-    judged = [s for s in steps if s.status is Status.OK and s.source in T_true]
+    judged = [s for s in steps if s.status is TrackingStatus.OK and s.source in T_true]
     p_odom = np.array([s.T_odom_camera[:3, 3] for s in judged])
     p_true = np.array([T_true[s.source][:3, 3] for s in judged])
     return p_odom, p_true, [s.k for s in judged]
@@ -189,7 +191,7 @@ def undisturbed(
     with a trouble, so the same alignment shows what a trouble did, jumps included."""
     none = range(count // 3, count // 3)
     steps = follow(map(sequence.__getitem__, range(count)), sequence.stamps_ns)
-    T_true_odom = align(*ok_positions(steps, T_true)[:2])
+    T_true_odom = fit_rigid_transform(*ok_positions(steps, T_true)[:2])
     return outcome(steps, none, T_true, T_true_odom), T_true_odom
 
 

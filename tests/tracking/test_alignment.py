@@ -50,7 +50,7 @@ def test_known_motion_is_found(make_room, size: tuple[int, int]) -> None:
     assert result.condition < 1e4
 
 
-def test_thumbnail_of_80_by_60_pixels_is_aligned_to_five_millimetres(make_room) -> None:
+def test_thumbnail_of_80_by_60_pixels_is_aligned_to_five_millimeters(make_room) -> None:
     room = make_room(80, 60)
     result = aligned(room.view(np.eye(4)), room.view(T_REFERENCE_CAMERA))
     assert errors(result.T_reference_camera, T_REFERENCE_CAMERA)[0] < 5e-3
@@ -73,7 +73,7 @@ def test_an_exposure_that_clips_a_third_of_the_image_does_not_move_the_pose(room
     assert result.gain == pytest.approx(gain, rel=0.03)
 
 
-def test_colour_alone_aligns_a_frame_without_depth(room) -> None:
+def test_color_alone_aligns_a_frame_without_depth(room) -> None:
     view = room.view(T_REFERENCE_CAMERA)
     result = aligned(room.view(np.eye(4)), replace(view, depth_m=np.zeros_like(view.depth_m)))
     assert_close(result.T_reference_camera, T_REFERENCE_CAMERA)
@@ -92,7 +92,7 @@ def wall(T_wall_camera: np.ndarray, camera: Camera, is_textured: bool) -> RgbdFr
     return RgbdFrame(np.repeat(gray[..., None], 3, 2), depth_m.astype(np.float32), camera)
 
 
-def test_colour_fixes_what_a_plane_leaves_open(room) -> None:
+def test_color_fixes_what_a_plane_leaves_open(room) -> None:
     views = [wall(T, room.camera, is_textured=True) for T in (np.eye(4), T_REFERENCE_CAMERA)]
     assert_close(aligned(*views).T_reference_camera, T_REFERENCE_CAMERA)
 

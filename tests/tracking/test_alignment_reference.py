@@ -3,11 +3,11 @@ import pytest
 
 from ldo_service.geometry import Camera, se3
 from ldo_service.tracking import PyramidConfig, build_reference, pyramid_of
-from ldo_service.tracking.alignment import Appearance, ResidualConfig, normal_equations
+from ldo_service.tracking.alignment import BrightnessModel, ResidualConfig, normal_equations
 from ldo_service.tracking.pyramid import Level
 from tests.reference import alignment
 
-APPEARANCE = Appearance(gain=1.1, bias=-4.0, intensity_sigma=6.0, depth_noise_scale=1.5)
+APPEARANCE = BrightnessModel(gain=1.1, bias=-4.0, intensity_sigma=6.0, depth_noise_scale=1.5)
 T_CAMERA_REFERENCE = se3.exp(np.array([0.02, -0.03, 0.01, 0.04, -0.02, 0.03]))
 
 
@@ -77,13 +77,13 @@ def test_photometric_jacobian_is_the_derivative() -> None:
     points, normals = surface(np.random.default_rng(1))
     shade = np.linspace(10, 200, len(points))
 
-    def residuals(xi: np.ndarray, appearance: Appearance = APPEARANCE) -> np.ndarray:
+    def residuals(xi: np.ndarray, appearance: BrightnessModel = APPEARANCE) -> np.ndarray:
         p, _ = perturbed(xi, points, normals)
         return alignment.photometric(level, p, shade, *camera.project(p).T, appearance)[0]
 
     p, _ = perturbed(np.zeros(6), points, normals)
     _, J = alignment.photometric(level, p, shade, *camera.project(p).T, APPEARANCE)
     np.testing.assert_allclose(J[:, :6], central_differences(residuals), atol=1e-5)
-    brighter = Appearance(APPEARANCE.gain + 1, APPEARANCE.bias + 2)
+    brighter = BrightnessModel(APPEARANCE.gain + 1, APPEARANCE.bias + 2)
     change = residuals(np.zeros(6), brighter) - residuals(np.zeros(6))
     np.testing.assert_allclose(J[:, 6] + 2 * J[:, 7], change, atol=1e-9)

@@ -14,7 +14,7 @@ from ldo_service.synthetic.path import look_at
 from ldo_service.synthetic.room import furnished_room
 from ldo_service.synthetic.room_render import Renderer
 from ldo_service.synthetic.room_sequence import kinect_depth
-from ldo_service.tracking import Status
+from ldo_service.tracking import TrackingStatus
 from tests.tracking.degraded import (
     Degrader,
     covered,
@@ -84,7 +84,7 @@ def test_no_ok_pose_is_wrong_and_tracking_comes_back(walk: Walk, name: str) -> N
 def test_what_a_covered_camera_shows_is_never_ok(walk: Walk) -> None:
     trouble = range(START, START + 5)
     steps = walk.through(covered, trouble)
-    assert not {s.status for s in steps if s.k in trouble} & {Status.OK}
+    assert not {s.status for s in steps if s.k in trouble} & {TrackingStatus.OK}
 
 
 def test_dropped_frames_do_not_arrive(walk: Walk) -> None:
@@ -100,14 +100,14 @@ def test_dropped_frames_do_not_arrive(walk: Walk) -> None:
 def test_tracking_goes_on_through_what_leaves_enough_to_see(walk: Walk, name: str) -> None:
     degrade, trouble = TROUBLES[name]
     steps = walk.through(degrade, trouble)
-    assert {s.status for s in steps} == {Status.OK}
+    assert {s.status for s in steps} == {TrackingStatus.OK}
 
 
 def test_a_camera_that_only_turns_is_followed(room) -> None:
     poses = [se3.exp(np.array([0.0, 0.02 * k, 0, 0, 0, 0])) for k in range(40)]
     turn = Walk([room.view(T, stamp_ns=k * STEP_NS, index=k) for k, T in enumerate(poses)], poses)
     steps = turn.through(dropped, range(0))
-    assert {s.status for s in steps} == {Status.OK}
+    assert {s.status for s in steps} == {TrackingStatus.OK}
     assert max(np.linalg.norm(s.T_odom_camera[:3, 3]) for s in steps) < 0.01
 
 

@@ -4,7 +4,12 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import PyramidConfig, build_reference, pyramid_of
-from ldo_service.tracking.alignment import Appearance, ResidualConfig, Term, normal_equations
+from ldo_service.tracking.alignment import (
+    BrightnessModel,
+    ResidualConfig,
+    ResidualStatistics,
+    normal_equations,
+)
 
 
 def test_first_step_is_the_missing_right_perturbation(room) -> None:
@@ -14,7 +19,7 @@ def test_first_step_is_the_missing_right_perturbation(room) -> None:
     guess = T_reference_camera @ se3.exp(-xi)
     points = build_reference(pyramid_of(room.view(np.eye(4)), PyramidConfig())).points[0]
     target = pyramid_of(room.view(T_reference_camera), PyramidConfig()).levels[0]
-    e = normal_equations(points, target, se3.inverse(guess), Appearance(), ResidualConfig())
+    e = normal_equations(points, target, se3.inverse(guess), BrightnessModel(), ResidualConfig())
     step = -np.linalg.solve(e.hessian, e.gradient)[:6]
     left = se3.adjoint(T_reference_camera) @ xi
     np.testing.assert_allclose(step, xi, atol=1e-3)
@@ -22,8 +27,8 @@ def test_first_step_is_the_missing_right_perturbation(room) -> None:
 
 
 def test_inlier_fraction_of_nothing_is_zero() -> None:
-    assert Term(0, 0, 0.0).inlier_fraction == 0.0
-    assert Term(8, 6, 1.0).inlier_fraction == 0.75
+    assert ResidualStatistics(0, 0, 0.0).inlier_fraction == 0.0
+    assert ResidualStatistics(8, 6, 1.0).inlier_fraction == 0.75
 
 
 def test_hidden_points_do_not_count(room) -> None:
@@ -31,7 +36,7 @@ def test_hidden_points_do_not_count(room) -> None:
     view = room.view(np.eye(4))
     view.depth_m[:, :80] *= 0.5  # something stands before the left half
     target = pyramid_of(view, PyramidConfig()).levels[0]
-    e = normal_equations(points, target, np.eye(4), Appearance(), ResidualConfig())
+    e = normal_equations(points, target, np.eye(4), BrightnessModel(), ResidualConfig())
     assert e.visible == pytest.approx(points.shape[1] / 2, rel=0.05)
 
 

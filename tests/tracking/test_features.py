@@ -8,7 +8,7 @@ from ldo_service.tracking import PyramidConfig, pyramid_of
 from ldo_service.tracking.features import (
     FeatureConfig,
     detect,
-    detect_across_scales,
+    detect_sift,
     estimate_pose,
     match,
 )
@@ -43,7 +43,7 @@ def test_points_are_the_surface_under_the_pixels(large_room) -> None:
 
 def test_gradients_are_matched_as_opencv_matches_them(large_room) -> None:
     there, here = (
-        detect_across_scales(view.gray, view.depth_m, view.camera, 300, CONFIG)
+        detect_sift(view.gray, view.depth_m, view.camera, 300, CONFIG)
         for view in (
             pyramid_of(large_room.view(T), PyramidConfig()) for T in (np.eye(4), T_REFERENCE_CAMERA)
         )

@@ -5,7 +5,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig, is_due
+from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig, needs_keyframe
 
 CONFIG = KeyframeConfig()
 TURNED = se3.exp(np.array([0, np.radians(16), 0, 0, 0, 0]))
@@ -33,7 +33,7 @@ SLIGHTLY = se3.exp(np.array([0.0, 0.0, 0.0, 0.03, 0.0, 0.0]))
 def test_keyframe_is_due_when_the_view_has_changed(
     T: np.ndarray, overlap: float, median_depth_m: float, frames: int, expected: bool
 ) -> None:
-    assert is_due(T, overlap, median_depth_m, frames, CONFIG) is expected
+    assert needs_keyframe(T, overlap, median_depth_m, frames, CONFIG) is expected
 
 
 def test_features_are_detected_once(room) -> None:

@@ -8,16 +8,16 @@ import pytest
 
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import RgbdFrame, se3
-from ldo_service.tracking import Odometry, OdometryConfig, Status, TrackingResult
+from ldo_service.tracking import Odometry, OdometryConfig, TrackingResult, TrackingStatus
 from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.submaps import SegmentConfig
+from ldo_service.tracking.submaps import SubmapConfig
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def followed(frames: Iterable[RgbdFrame], patience_s: float = 0) -> list[TrackingResult]:
     """`patience_s`: how long it is LOST until a new segment begins; 0: none does."""
-    segments = SegmentConfig(begin_after_s=patience_s)
+    segments = SubmapConfig(begin_after_s=patience_s)
     config = OdometryConfig(segments=segments, keyframes=KeyframeConfig(supporting=2.0))
     odometry = Odometry(config)
     return [odometry.process(frame) for frame in frames]
@@ -32,7 +32,7 @@ def distances_m(
 
 def assert_found(back: Sequence[TrackingResult], distances: np.ndarray) -> None:
     """Within 3 cm of the truth from the tenth frame on, and never wrong where it is not LOST."""
-    known = np.array([r.status is not Status.LOST for r in back])
+    known = np.array([r.status is not TrackingStatus.LOST for r in back])
     assert known[10:].all(), [str(r.status) for r in back]
     assert distances[known].max() < 0.03, distances.round(3)
 
@@ -46,7 +46,7 @@ def test_kitchen_after_a_visit_to_an_apartment(data: Path, away: range) -> None:
     undisturbed = followed([*before, *after])[201:]
     results = followed([*before, *(apartment[k] for k in away), *after])
     gone, back = results[201 : 201 + len(away)], results[201 + len(away) :]
-    assert {r.status for r in gone} == {Status.LOST}
+    assert {r.status for r in gone} == {TrackingStatus.LOST}
     assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
 
 
@@ -58,14 +58,14 @@ def test_the_apartment_becomes_a_segment_of_its_own_and_the_kitchen_stays(data: 
     visit = [apartment[k] for k in range(100)]
     results = followed([*frames[:60], *visit, *frames[60:]], patience_s=0.63)
     gone, back = results[60:160], results[160:]
-    assert {r.status for r in gone[:19]} == {Status.LOST}
+    assert {r.status for r in gone[:19]} == {TrackingStatus.LOST}
     apart = [r for r in gone if r.submap > 0]
-    assert sum(r.status is Status.OK for r in apart) > 40
-    assert all(r.status is Status.LOST for r in gone if r.submap == 0)
+    assert sum(r.status is TrackingStatus.OK for r in apart) > 40
+    assert all(r.status is TrackingStatus.LOST for r in gone if r.submap == 0)
     assert not any(r.keyframe and r.keyframe.submap_measurement for r in results), (
         "two places that do not meet"
     )
-    known = [r for r in back if r.status is not Status.LOST]
+    known = [r for r in back if r.status is not TrackingStatus.LOST]
     assert {r.submap for r in known[3:]} == {0}
     assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
 
@@ -86,7 +86,7 @@ def errors_m(flat, results: Sequence[TrackingResult], frames: range, start: int)
 def test_flat_after_a_jump_to_a_room_never_seen() -> None:
     flat = open_sequence("synthetic:flat")
     _, gone, back = walked(flat, range(200, 300), range(20, 60), range(300, 330))
-    assert {r.status for r in gone} == {Status.LOST}
+    assert {r.status for r in gone} == {TrackingStatus.LOST}
     assert_found(back, errors_m(flat, back, range(300, 330), start=200))
 
 
@@ -94,7 +94,7 @@ def test_flat_after_a_jump_to_a_room_seen_before() -> None:
     """There the camera is found; what is found is right, and what is not found is LOST."""
     flat = open_sequence("synthetic:flat")
     _, gone, back = walked(flat, range(20, 120), range(400, 440), range(120, 150))
-    known = np.array([r.status is not Status.LOST for r in gone])
+    known = np.array([r.status is not TrackingStatus.LOST for r in gone])
     assert known.any()
     assert errors_m(flat, gone, range(400, 440), start=20)[known].max() < 0.03
     assert_found(back, errors_m(flat, back, range(120, 150), start=20))

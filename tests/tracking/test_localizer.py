@@ -2,27 +2,31 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import se3
-from ldo_service.tracking import OdometryConfig, PyramidConfig, Status, pyramid_of
+from ldo_service.tracking import OdometryConfig, PyramidConfig, TrackingStatus, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import Places, PlacesConfig, place_of
+from ldo_service.tracking.keyframe_database import (
+    KeyframeDatabase,
+    KeyframeDatabaseConfig,
+    make_keyframe_record,
+)
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.localizer import Fix, Localizer
-from ldo_service.tracking.submaps import SegmentConfig
+from ldo_service.tracking.localizer import Localizer, MapFix
+from ldo_service.tracking.submaps import SubmapConfig
 
 T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
 T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-CONFIG = OdometryConfig(segments=SegmentConfig(begin_after_s=0.06, look_every=4, confirm_after=2))
+CONFIG = OdometryConfig(segments=SubmapConfig(begin_after_s=0.06, look_every=4, confirm_after=2))
 
 
 @pytest.fixture(scope="module")
-def places(large_room, make_walk) -> Places:
+def places(large_room, make_walk) -> KeyframeDatabase:
     """A map in a frame of its own."""
     made = []
     for number, T_world_camera in enumerate(make_walk(3, 0.15, 0.1)):
         view = pyramid_of(large_room.view(T_world_camera), PyramidConfig())
         keyframe = Keyframe(view, T_MAP_WORLD @ T_world_camera, number)
-        made.append(place_of(keyframe, FeatureConfig(), PlacesConfig()))
-    return Places(tuple(made))
+        made.append(make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()))
+    return KeyframeDatabase(tuple(made))
 
 
 def located(localizer: Localizer, room, truth: list[np.ndarray]) -> list[float | None]:
@@ -32,7 +36,7 @@ def located(localizer: Localizer, room, truth: list[np.ndarray]) -> list[float |
         frame = room.view(T_world_camera, stamp_ns=index * 33_333_333, index=index)
         result = localizer.process(frame)
         assert (result.reference, result.keyframe) == (None, None)
-        if result.status is Status.LOST:
+        if result.status is TrackingStatus.LOST:
             errors.append(None)
             continue
         T_error = (
@@ -67,7 +71,7 @@ def test_after_a_kidnap_the_old_fix_is_forgotten(large_room, make_walk, places) 
 def test_a_fix_survives_packing(large_room, make_walk, places) -> None:
     localizer = Localizer(places, CONFIG)
     located(localizer, large_room, make_walk(4))
-    fix, again = localizer._fix, Fix.unpacked(localizer.snapshot()["fix"])
+    fix, again = localizer._fix, MapFix.unpack(localizer.snapshot()["fix"])
     np.testing.assert_array_equal(again.T_map_odom, fix.T_map_odom)
     assert again.last is not None
     assert again.since_look == fix.since_look

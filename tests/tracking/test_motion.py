@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import se3
-from ldo_service.tracking.motion import Motion, extent
+from ldo_service.tracking.motion import Motion, image_motion_rad
 
 TWIST = np.array([0.02, -0.1, 0.05, 0.1, 0.02, -0.03])
 STEP_NS = 33_000_000
@@ -35,11 +35,11 @@ def test_ten_thousand_predictions_stay_rotations() -> None:
 
 
 def test_stopped_motion_predicts_the_same_place() -> None:
-    motion = Motion().moved_to(se3.exp(TWIST), STEP_NS).stopped()
+    motion = Motion().moved_to(se3.exp(TWIST), STEP_NS).without_velocity()
     np.testing.assert_allclose(motion.predicted(9 * STEP_NS), se3.exp(TWIST), atol=1e-12)
 
 
 def test_extent_adds_rotation_and_parallax() -> None:
     T = se3.exp(np.array([0, 0.1, 0, 0, 0, 0]))
     T[0, 3] = 0.4
-    assert extent(T, 2.0) == pytest.approx(0.3)
+    assert image_motion_rad(T, 2.0) == pytest.approx(0.3)

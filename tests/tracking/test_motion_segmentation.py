@@ -7,18 +7,25 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import open_sequence
-from ldo_service.detection.dynamic_classes import Box, MovableConfig, movable_pixels
+from ldo_service.detection.dynamic_classes import Box, DynamicClassConfig, dynamic_class_mask
 from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Camera, RgbdFrame, Trajectory, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.synthetic import SyntheticConfig, SyntheticSequence
-from ldo_service.tracking import Odometry, OdometryConfig, Status, TrackingResult
+from ldo_service.tracking import Odometry, OdometryConfig, TrackingResult, TrackingStatus
 from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.motion_segmentation import MovingConfig, Watched, gap_m, spread, watch
+from ldo_service.tracking.motion_segmentation import (
+    MotionMasks,
+    MotionSegmentationConfig,
+    depth_gap_m,
+    grow_mask,
+    segment_motion,
+)
 from ldo_service.tracking.pyramid import DepthNoise, Level, Pyramid, PyramidConfig, pyramid_of
 
-CONFIG = MovingConfig(level=0)  # images of 160 pixels, as the level that is looked at otherwise
+# images of 160 pixels, as the level that is looked at otherwise
+CONFIG = MotionSegmentationConfig(level=0)
 EMPTY, LATE = 0, 70  # frames: before anybody came, and in the middle of the way
 NOISE_SCALE = 2.0
 
@@ -51,11 +58,11 @@ class Walked:
 
     def watched(
         self, keyframe: int, frames: list[int], has_moved: np.ndarray | None = None
-    ) -> Watched:
+    ) -> MotionMasks:
         """Of the last of several frames."""
         suspicion, seen = None, None
         for k in frames:
-            seen = watch(
+            seen = segment_motion(
                 self.view(k),
                 self.view(keyframe),
                 has_moved,
@@ -82,7 +89,7 @@ def recall_and_precision(mask: np.ndarray, true: np.ndarray) -> tuple[float, flo
 
 def test_who_came_since_the_keyframe_is_found(walked: Walked) -> None:
     seen = walked.watched(EMPTY, [LATE - 1, LATE])
-    whole = spread(seen.is_moving, walked.view(LATE), CONFIG)
+    whole = grow_mask(seen.is_moving, walked.view(LATE), CONFIG)
     recall, precision = recall_and_precision(whole, walked.person(LATE))
     assert recall > 0.95
     assert precision > 0.7  # the rim is wanted
@@ -125,10 +132,10 @@ def test_gap_is_the_difference_in_depth_where_surfaces_were_measured() -> None:
     far[4:8, :4, 3] = 0
     T_far_near = np.eye(4)
     T_far_near[2, 3] = 0.1  # the camera of `near` stands 0.1 m ahead
-    ahead = gap_m(Level(near, camera), Level(far, camera), T_far_near, CONFIG)
+    ahead = depth_gap_m(Level(near, camera), Level(far, camera), T_far_near, CONFIG)
     np.testing.assert_allclose(ahead[:, 12], 2.0 - 1.6, atol=1e-6)
     assert np.isnan(ahead[6, 1])
-    behind = gap_m(Level(far, camera), Level(near, camera), se3.inverse(T_far_near), CONFIG)
+    behind = depth_gap_m(Level(far, camera), Level(near, camera), se3.inverse(T_far_near), CONFIG)
     np.testing.assert_allclose(behind[12, 12], 1.5 - 1.9, atol=1e-6)
     assert np.isnan(behind[6, 1])
 
@@ -137,7 +144,7 @@ def test_spread_takes_what_is_beside_and_as_far_away_but_no_wall_behind(walked: 
     person, view = walked.person(LATE), walked.view(LATE)
     half = person.copy()
     half[60:] = False  # the legs were missed
-    whole = spread(half, view, CONFIG)
+    whole = grow_mask(half, view, CONFIG)
     assert recall_and_precision(whole, person)[0] > recall_and_precision(half, person)[0] + 0.05
     assert recall_and_precision(whole, person)[1] > 0.7
 
@@ -145,16 +152,16 @@ def test_spread_takes_what_is_beside_and_as_far_away_but_no_wall_behind(walked: 
 def test_boxes_of_a_detector_become_the_pixels_of_the_thing(walked: Walked) -> None:
     person, view = walked.person(LATE), walked.view(LATE)
     box, other = box_around(person), Box("couch", 0, 0, 160, 120)
-    mask = movable_pixels([box, other], view.levels[0].depth_m, MovableConfig())
+    mask = dynamic_class_mask([box, other], view.levels[0].depth_m, DynamicClassConfig())
     recall, precision = recall_and_precision(mask, person)
     assert recall > 0.95
     assert precision > 0.6  # the sofa stands within reach
-    assert not movable_pixels([other], view.levels[0].depth_m, MovableConfig()).any()
+    assert not dynamic_class_mask([other], view.levels[0].depth_m, DynamicClassConfig()).any()
 
 
 def test_a_box_without_depth_counts_as_a_whole_and_one_outside_the_image_not_at_all() -> None:
     boxes = [Box("dog", 2, 3, 6, 8), Box("cat", -20, -20, -5, -5)]
-    mask = movable_pixels(boxes, np.zeros((12, 16), np.float32), MovableConfig())
+    mask = dynamic_class_mask(boxes, np.zeros((12, 16), np.float32), DynamicClassConfig())
     assert mask[3:8, 2:6].all()
     assert np.count_nonzero(mask) == 20
 
@@ -162,7 +169,7 @@ def test_a_box_without_depth_counts_as_a_whole_and_one_outside_the_image_not_at_
 @pytest.mark.parametrize("bad", [{"least_m": -1.0}, {"gone_frames": 0}, {"rim_px": -1}])
 def test_impossible_settings_are_refused(bad: dict) -> None:
     with pytest.raises(ConfigError):
-        MovingConfig(**bad)
+        MotionSegmentationConfig(**bad)
 
 
 # --- in the odometry ------------------------------------------------------------------------------
@@ -227,7 +234,7 @@ def test_tracking_past_somebody_is_exact_and_never_unsure() -> None:
     T = np.array([r.T_odom_camera for r in results])
     truth = sequence.truth()
     errors = evaluate_trajectory(Trajectory(truth.stamps_s, T), truth)
-    assert {r.status for r in results} == {Status.OK}
+    assert {r.status for r in results} == {TrackingStatus.OK}
     assert errors.ate_m.rmse < 0.0012
     recalls, precisions = zip(
         *(

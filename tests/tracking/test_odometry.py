@@ -10,7 +10,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import RgbdFrame, Trajectory, se3
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.tracking import Odometry, OdometryConfig, Status, TrackingResult
+from ldo_service.tracking import Odometry, OdometryConfig, TrackingResult, TrackingStatus
 from ldo_service.tracking.keyframes import KeyframeConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
 
@@ -44,7 +44,7 @@ def assert_bitwise_equal(a: Sequence[TrackingResult], b: Sequence[TrackingResult
 def test_walk_is_followed_and_keyframes_are_made(room, make_walk) -> None:
     truth = make_walk(25)
     results = track(Odometry(), [room.view(T, index=k) for k, T in enumerate(truth)])
-    assert {r.status for r in results} == {Status.OK}
+    assert {r.status for r in results} == {TrackingStatus.OK}
     assert largest_error_m(results, truth) < 5e-3
     assert 2 < sum(map(became_reference, results)) < 14
     made = [index for index, r in enumerate(results) if r.keyframe is not None]
@@ -59,7 +59,7 @@ def test_tracking_survives_when_there_is_never_room_for_a_keyframe(room, make_wa
     odometry = Odometry()
     odometry.process(room.view(truth[0]))
     results = [odometry.process(room.view(T), may_map=False) for T in truth[1:]]
-    assert {r.status for r in results} == {Status.OK}
+    assert {r.status for r in results} == {TrackingStatus.OK}
     assert largest_error_m(results, truth[1:]) < 5e-3
     assert all(r.keyframe is None for r in results)
     assert all(r.denied_keyframe is KeyframeKind.REFERENCE for r in results[-5:])
@@ -67,10 +67,10 @@ def test_tracking_survives_when_there_is_never_room_for_a_keyframe(room, make_wa
 
 def test_before_the_first_keyframe_every_usable_frame_is_the_first(room) -> None:
     odometry = Odometry()
-    assert odometry.process(room.blank()).status is Status.LOST
+    assert odometry.process(room.blank()).status is TrackingStatus.LOST
     for _ in range(2):
         result = odometry.process(room.view(np.eye(4)), may_map=False)
-        assert (result.status, result.method) == (Status.OK, "first")
+        assert (result.status, result.method) == (TrackingStatus.OK, "first")
         assert result.denied_keyframe is KeyframeKind.FIRST
         assert result.awaits_mapping
     result = odometry.process(room.view(np.eye(4)))
@@ -90,7 +90,7 @@ def test_steps_beyond_the_reach_of_direct_alignment_are_found_by_features(large_
     truth = [np.linalg.matrix_power(step, k) for k in range(4)]
     results = track(Odometry(), [large_room.view(T, index=k) for k, T in enumerate(truth)])
     assert largest_error_m(results, truth) < 5e-3
-    assert {r.status for r in results} == {Status.OK}
+    assert {r.status for r in results} == {TrackingStatus.OK}
     assert "features" in {r.method for r in results}
 
 
@@ -99,7 +99,7 @@ def test_repeated_frame_stays_where_it_is(room, make_walk) -> None:
     odometry = Odometry()
     moving = track(odometry, frames)
     still = track(odometry, [frames[-1]] * 4)
-    assert {r.status for r in still} == {Status.OK}
+    assert {r.status for r in still} == {TrackingStatus.OK}
     for r in still:
         np.testing.assert_allclose(r.T_odom_camera, moving[-1].T_odom_camera, atol=1e-3)
 
@@ -109,9 +109,9 @@ def test_frame_without_depth_is_weak_and_does_not_break_the_track(room, make_wal
     frames = [room.view(T) for T in truth]
     frames[6] = replace(frames[6], depth_m=np.zeros_like(frames[6].depth_m))
     results = track(Odometry(), frames)
-    assert results[6].status is Status.WEAK
+    assert results[6].status is TrackingStatus.WEAK
     assert results[6].keyframe is None
-    assert results[-1].status is Status.OK
+    assert results[-1].status is TrackingStatus.OK
     assert largest_error_m(results, truth) < 5e-3
 
 
@@ -120,23 +120,23 @@ def test_blank_frame_is_not_ok_and_the_next_one_is_found_again(large_room, make_
     frames = [large_room.view(T) for T in truth]
     frames[5] = large_room.blank()
     results = track(Odometry(), frames)
-    assert results[5].status is not Status.OK
-    assert results[-1].status is Status.OK
+    assert results[5].status is not TrackingStatus.OK
+    assert results[-1].status is TrackingStatus.OK
     assert largest_error_m(results[6:], truth[6:]) < 5e-3
 
 
-def test_kidnapped_camera_knows_it_and_relocalises_on_return(large_room, make_walk) -> None:
+def test_kidnapped_camera_knows_it_and_relocalizes_on_return(large_room, make_walk) -> None:
     odometry = Odometry()
     track(odometry, [large_room.view(T, index=k) for k, T in enumerate(make_walk(8))])
     before = odometry.process(large_room.view(make_walk(8)[-1]), may_map=False)
     gone = [odometry.process(large_room.view(T_ELSEWHERE @ T)) for T in make_walk(5)]
-    assert {r.status for r in gone} == {Status.LOST}
+    assert {r.status for r in gone} == {TrackingStatus.LOST}
     for r in gone:  # the pose does not jump
         np.testing.assert_array_equal(r.T_odom_camera, before.T_odom_camera)
         assert not r.information.any()
     T_back = make_walk(3)[-1] @ se3.exp(np.array([0.0, -0.1, 0.05, -0.1, 0.0, 0.05]))
     back = odometry.process(large_room.view(T_back), may_map=False)
-    assert back.status is Status.OK
+    assert back.status is TrackingStatus.OK
     np.testing.assert_allclose(back.T_odom_camera, T_back, atol=5e-3)
 
 
@@ -144,7 +144,7 @@ def test_lost_frame_cannot_become_a_keyframe(room) -> None:
     odometry = Odometry()
     for frame in (room.blank(), room.view(np.eye(4)), room.blank()):
         result = odometry.process(frame)
-        is_lost = result.status is Status.LOST
+        is_lost = result.status is TrackingStatus.LOST
         assert (result.keyframe is None) is is_lost
         assert result.denied_keyframe is None
     assert is_lost
@@ -182,18 +182,18 @@ def test_a_place_left_long_ago_is_found_again(large_room) -> None:
     turns = [se3.exp(np.array([0.0, 0.12 * k, 0.0, 0.0, 0.0, 0.0])) for k in range(20)]
     odometry = Odometry()
     out = track(odometry, [large_room.view(T) for T in turns])
-    assert {r.status for r in out} == {Status.OK}
+    assert {r.status for r in out} == {TrackingStatus.OK}
     assert sum(map(became_reference, out)) >= 9
     walk = [se3.exp(np.array([0.0, 0.05, 0.0, 0.01 * k, 0.0, 0.02])) for k in range(8)]
     frames = [large_room.view(T) for T in walk]
     back = odometry.process(frames[0], may_map=False)
-    assert (back.status, back.method) == (Status.OK, "relocalised")
+    assert (back.status, back.method) == (TrackingStatus.OK, "relocalised")
     assert back.reference in (0, 1)
     np.testing.assert_allclose(back.T_odom_camera, walk[0], atol=0.01)
     restored = Odometry()
     restored.restore(decode_state(encode_state(odometry.snapshot())))
     after = track(odometry, frames[1:])
-    assert {r.status for r in after} == {Status.OK}
+    assert {r.status for r in after} == {TrackingStatus.OK}
     assert largest_error_m(after, walk[1:]) < 0.01
     assert_bitwise_equal(track(restored, frames[1:]), after)
 
@@ -211,7 +211,7 @@ def test_a_lost_camera_is_found_by_the_last_frame_mapped(large_room) -> None:
     restored.restore(decode_state(encode_state(odometry.snapshot())))
     frames = [large_room.blank(), large_room.view(turned[-1])]
     *_, found = track(odometry, frames)
-    assert (found.status, found.method) == (Status.OK, "relocalised")
+    assert (found.status, found.method) == (TrackingStatus.OK, "relocalised")
     np.testing.assert_allclose(found.T_odom_camera, turned[-1], atol=0.01)
     assert_bitwise_equal(track(restored, frames)[-1:], [found])
 
@@ -221,7 +221,7 @@ def test_odd_sizes_are_tracked(make_room, make_walk, size: tuple[int, int]) -> N
     room, truth = make_room(*size), make_walk(8)
     results = track(Odometry(), [room.view(T) for T in truth])
     assert largest_error_m(results, truth) < 0.02
-    assert {r.status for r in results} == {Status.OK}
+    assert {r.status for r in results} == {TrackingStatus.OK}
 
 
 def test_motion_limit_of_zero_is_refused() -> None:
@@ -229,10 +229,10 @@ def test_motion_limit_of_zero_is_refused() -> None:
         OdometryConfig(large_motion=0.0)
 
 
-def test_forty_real_frames_stay_within_three_centimetres(data: Path) -> None:
+def test_forty_real_frames_stay_within_three_centimeters(data: Path) -> None:
     kitchen = open_sequence(str(data / "tum" / "kitchen"))
     results = track(Odometry(), [kitchen[index] for index in range(40)])
-    assert {r.status for r in results} == {Status.OK}
+    assert {r.status for r in results} == {TrackingStatus.OK}
     T_odom_camera = np.array([r.T_odom_camera for r in results])
     truth = kitchen.truth()
     assert truth is not None

@@ -14,15 +14,15 @@ from ldo_service.storage.state_codec import decode_state, encode_state
 from ldo_service.tracking import (
     Odometry,
     OdometryConfig,
-    Prior,
+    OdometryPriorBuffer,
     PriorConfig,
-    Status,
     TrackingResult,
+    TrackingStatus,
 )
 from ldo_service.tracking.keyframes import KeyframeConfig
-from ldo_service.tracking.odometry_prior import KEPT, Anchor, Reading, Verdict
-from ldo_service.tracking.relocalization import RelocalisationConfig
-from ldo_service.tracking.submaps import SegmentConfig
+from ldo_service.tracking.odometry_prior import KEPT, DeadReckoningStart, PriorCheck, PriorPose
+from ldo_service.tracking.relocalization import RelocalizationConfig
+from ldo_service.tracking.submaps import SubmapConfig
 
 CONFIG = PriorConfig()
 PERIOD_NS = 33_333_333
@@ -31,15 +31,15 @@ FORWARD = np.array([0.0, 0.1, 0.0, 0.2, 0.0, 0.5])  # a turn and a step
 IDENTITY = np.eye(4)
 
 
-def prior_of(stamps_ns: list[int], poses: list[np.ndarray]) -> Prior:
-    prior = Prior()
+def prior_of(stamps_ns: list[int], poses: list[np.ndarray]) -> OdometryPriorBuffer:
+    prior = OdometryPriorBuffer()
     for stamp_ns, T in zip(stamps_ns, poses, strict=True):
         prior, verdict = prior.added(stamp_ns, T, CONFIG)
-        assert verdict is Verdict.FOLLOWS
+        assert verdict is PriorCheck.FOLLOWS
     return prior
 
 
-def at(prior: Prior, stamp_ns: int) -> np.ndarray | None:
+def at(prior: OdometryPriorBuffer, stamp_ns: int) -> np.ndarray | None:
     reading = prior.at(stamp_ns, IDENTITY, CONFIG)
     return None if reading is None else reading.T_prior_camera
 
@@ -81,7 +81,7 @@ def test_nothing_is_known_across_a_gap_before_the_first_pose_or_without_any() ->
     prior = prior_of([0, 260 * MS], [IDENTITY, se3.exp(FORWARD)])
     assert at(prior, 100 * MS) is None
     assert at(prior, -1) is None
-    assert at(Prior(), 0) is None
+    assert at(OdometryPriorBuffer(), 0) is None
     assert at(prior, 260 * MS) is not None
 
 
@@ -99,19 +99,19 @@ SPIN = se3.exp(np.array([0.0, 2.5, 0.0, 0.0, 0.0, 0.0]))
 @pytest.mark.parametrize(
     ("stamp_ns", "T", "verdict"),
     [
-        (2_000 * MS, IDENTITY, Verdict.LATE),
-        (1_900 * MS, IDENTITY, Verdict.LATE),
-        (2_100 * MS, np.full((4, 4), np.nan), Verdict.BROKEN),
-        (900 * MS, IDENTITY, Verdict.RESTARTED),
-        (2_100 * MS, JUMP, Verdict.JUMPED),
-        (2_100 * MS, SPIN, Verdict.JUMPED),
+        (2_000 * MS, IDENTITY, PriorCheck.LATE),
+        (1_900 * MS, IDENTITY, PriorCheck.LATE),
+        (2_100 * MS, np.full((4, 4), np.nan), PriorCheck.BROKEN),
+        (900 * MS, IDENTITY, PriorCheck.RESTARTED),
+        (2_100 * MS, JUMP, PriorCheck.JUMPED),
+        (2_100 * MS, SPIN, PriorCheck.JUMPED),
     ],
 )
 def test_what_does_not_follow_is_refused_or_begins_a_new_stretch(stamp_ns, T, verdict) -> None:
     before = prior_of([1_900 * MS, 2_000 * MS], [IDENTITY, IDENTITY])
     after, found = before.added(stamp_ns, T, CONFIG)
     assert found is verdict
-    if verdict in (Verdict.LATE, Verdict.BROKEN):
+    if verdict in (PriorCheck.LATE, PriorCheck.BROKEN):
         assert after is before
     else:
         assert [pose.stamp_ns for pose in after.poses] == [stamp_ns]
@@ -137,21 +137,21 @@ def test_the_camera_moves_as_the_base_does_whatever_the_frame_and_the_mounting()
     assert then is not None
     assert now is not None
     T_odom_camera = se3.exp(np.array([0.1, 0.0, 0.2, 1.0, 2.0, 3.0]))
-    carried = Anchor(T_odom_camera, then).carried_to(now, CONFIG)
+    carried = DeadReckoningStart(T_odom_camera, then).dead_reckon(now, CONFIG)
     np.testing.assert_allclose(carried, T_odom_camera @ T_world_camera[1], atol=1e-12)
 
 
 def test_nothing_is_carried_from_one_stretch_to_another_or_for_too_long() -> None:
-    anchor = Anchor(IDENTITY, Reading(0, IDENTITY, stretch=1))
-    assert anchor.carried_to(Reading(10 * MS, IDENTITY, stretch=2), CONFIG) is None
-    assert anchor.carried_to(Reading(31_000 * MS, IDENTITY, stretch=1), CONFIG) is None
-    assert anchor.carried_to(Reading(29_000 * MS, IDENTITY, stretch=1), CONFIG) is not None
+    anchor = DeadReckoningStart(IDENTITY, PriorPose(0, IDENTITY, stretch=1))
+    assert anchor.dead_reckon(PriorPose(10 * MS, IDENTITY, stretch=2), CONFIG) is None
+    assert anchor.dead_reckon(PriorPose(31_000 * MS, IDENTITY, stretch=1), CONFIG) is None
+    assert anchor.dead_reckon(PriorPose(29_000 * MS, IDENTITY, stretch=1), CONFIG) is not None
 
 
 # --- tracking through a covered stretch -----------------------------------------------------------
 BEFORE, COVERED, AFTER = 8, 22, 6
 # SIFT finds the camera in these views too, at many times the cost.
-LAST_RESORT_OFF = OdometryConfig(relocalisation=RelocalisationConfig(across_scales=0))
+LAST_RESORT_OFF = OdometryConfig(relocalisation=RelocalizationConfig(across_scales=0))
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class Covered:
         self, poses: list[np.ndarray] | None, config: OdometryConfig | None = None
     ) -> list[TrackingResult]:
         config = replace(config or OdometryConfig(), keyframes=KeyframeConfig(supporting=2.0))
-        odometry, prior, results = Odometry(config), Prior(), []
+        odometry, prior, results = Odometry(config), OdometryPriorBuffer(), []
         for k, frame in enumerate(self.frames):
             if poses is not None:
                 prior, _ = prior.added(frame.stamp_ns, poses[k], CONFIG)
@@ -209,7 +209,7 @@ WRONG: dict[str, Callable[[list[np.ndarray]], list[np.ndarray]]] = {
 }
 
 
-def statuses(results: list[TrackingResult]) -> list[Status]:
+def statuses(results: list[TrackingResult]) -> list[TrackingStatus]:
     return [tracked.status for tracked in results]
 
 
@@ -217,16 +217,18 @@ def largest_error_m(covered: Covered, results: list[TrackingResult]) -> float:
     return max(
         float(np.linalg.norm(tracked.T_odom_camera[:3, 3] - T[:3, 3]))
         for tracked, T in zip(results, covered.T_world_camera, strict=True)
-        if tracked.status is Status.OK
+        if tracked.status is TrackingStatus.OK
     )
 
 
 @pytest.mark.parametrize("name", RIGHT)
 def test_a_covered_camera_is_found_at_once_by_a_prior(covered: Covered, name: str) -> None:
     alone = covered.followed(None, LAST_RESORT_OFF)
-    assert statuses(alone)[BEFORE:] == [Status.LOST] * (COVERED + AFTER)
+    assert statuses(alone)[BEFORE:] == [TrackingStatus.LOST] * (COVERED + AFTER)
     results = covered.followed(RIGHT[name](covered.T_world_camera), LAST_RESORT_OFF)
-    assert statuses(results)[BEFORE:] == [Status.LOST] * COVERED + [Status.OK] * AFTER
+    assert (
+        statuses(results)[BEFORE:] == [TrackingStatus.LOST] * COVERED + [TrackingStatus.OK] * AFTER
+    )
     assert "prior" in {tracked.method for tracked in results}
     assert largest_error_m(covered, results) < 5e-3
 
@@ -245,7 +247,7 @@ def test_no_covered_frame_is_ok_by_a_prior_and_its_pose_stays_the_last_trusted(
     results = covered.followed(covered.T_world_camera)
     last = results[BEFORE - 1].T_odom_camera
     for tracked in results[BEFORE : BEFORE + COVERED]:
-        assert (tracked.status, tracked.method) == (Status.LOST, "none")
+        assert (tracked.status, tracked.method) == (TrackingStatus.LOST, "none")
         np.testing.assert_array_equal(tracked.T_odom_camera, last)
         assert not tracked.information.any()
 
@@ -261,7 +263,7 @@ def test_a_new_segment_begins_where_a_prior_has_the_camera(room, make_walk) -> N
         for k, T in enumerate(truth)
     ]
     turned = Covered(frames, truth)
-    config = OdometryConfig(segments=SegmentConfig(begin_after_s=0.3))
+    config = OdometryConfig(segments=SubmapConfig(begin_after_s=0.3))
     alone, helped = turned.followed(None, config), turned.followed(drifting(truth), config)
     for results in (alone, helped):
         assert {tracked.submap for tracked in results[BEFORE + COVERED :]} == {1}
@@ -274,19 +276,19 @@ def test_a_fast_camera_is_followed_by_a_prior(room, make_walk) -> None:
     truth = make_walk(6, 0.12, 0.08)
     frames = [room.view(T, stamp_ns=k * 200 * MS, index=k) for k, T in enumerate(truth)]
     walk = Covered(frames, truth)
-    assert Status.LOST in statuses(walk.followed(None, LAST_RESORT_OFF))
-    assert statuses(walk.followed(drifting(truth), LAST_RESORT_OFF)) == [Status.OK] * 6
+    assert TrackingStatus.LOST in statuses(walk.followed(None, LAST_RESORT_OFF))
+    assert statuses(walk.followed(drifting(truth), LAST_RESORT_OFF)) == [TrackingStatus.OK] * 6
 
 
 # --- state ----------------------------------------------------------------------------------------
 def test_prior_and_anchor_come_back_bit_for_bit_from_disk() -> None:
     prior = prior_of([0, 100 * MS], [IDENTITY, se3.exp(FORWARD)])
-    again = Prior.unpacked(decode_state(encode_state(prior.packed)))
+    again = OdometryPriorBuffer.unpack(decode_state(encode_state(prior.packed)))
     assert encode_state(again.packed) == encode_state(prior.packed)
     reading = prior.at(50 * MS, IDENTITY, CONFIG)
     assert reading is not None
-    anchor = Anchor(se3.exp(FORWARD), reading)
-    kept = Anchor.unpacked(decode_state(encode_state(anchor.packed)))
+    anchor = DeadReckoningStart(se3.exp(FORWARD), reading)
+    kept = DeadReckoningStart.unpack(decode_state(encode_state(anchor.packed)))
     assert encode_state(kept.packed) == encode_state(anchor.packed)
 
 
@@ -301,4 +303,4 @@ def test_a_successor_that_begins_while_covered_resumes_bit_for_bit(covered: Cove
             tracked = second.process(frame, prior)
             assert tracked.T_odom_camera.tobytes() == expected.T_odom_camera.tobytes()
             assert (tracked.status, tracked.method) == (expected.status, expected.method)
-    assert expected.status is Status.OK
+    assert expected.status is TrackingStatus.OK

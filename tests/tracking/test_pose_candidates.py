@@ -3,7 +3,11 @@ import numpy as np
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.pose_candidates import CandidateConfig, attempt, best
+from ldo_service.tracking.pose_candidates import (
+    PoseHypothesisConfig,
+    align_hypothesis,
+    select_hypothesis,
+)
 
 T_KEYFRAME_CAMERA = se3.exp(np.array([0.0, 0.1, 0.0, 0.1, 0.0, 0.1]))
 T_ASTRAY = se3.exp(np.array([0.0, -0.4, 0.1, -0.6, 0.1, 0.0]))
@@ -13,8 +17,12 @@ def chosen_from(room, guesses, second=None):
     keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
     view = pyramid_of(room.view(T_KEYFRAME_CAMERA), PyramidConfig())
     align = AlignConfig()
-    attempts = [attempt(keyframe, view, T, f"guess {k}", align) for k, T in enumerate(guesses)]
-    return attempts, best(attempts, second, keyframe, view, CandidateConfig(), align)
+    attempts = [
+        align_hypothesis(keyframe, view, T, f"guess {k}", align) for k, T in enumerate(guesses)
+    ]
+    return attempts, select_hypothesis(
+        attempts, second, keyframe, view, PoseHypothesisConfig(), align
+    )
 
 
 def test_true_pose_wins_over_a_wrong_minimum_that_calls_itself_inliers(room) -> None:
@@ -23,7 +31,7 @@ def test_true_pose_wins_over_a_wrong_minimum_that_calls_itself_inliers(room) -> 
     off = se3.inverse(wrong.alignment.T_reference_camera) @ T_KEYFRAME_CAMERA
     assert np.linalg.norm(off[:3, 3]) > 0.1
     assert winner.method == "guess 1"
-    assert winner.second_agrees is None
+    assert winner.is_confirmed is None
 
 
 def test_first_of_equals_wins(room) -> None:
@@ -33,17 +41,17 @@ def test_first_of_equals_wins(room) -> None:
 
 def test_features_at_the_same_pose_agree(room) -> None:
     _, winner = chosen_from(room, [np.eye(4), T_KEYFRAME_CAMERA], T_KEYFRAME_CAMERA)
-    assert winner.second_agrees is True
+    assert winner.is_confirmed is True
 
 
 def test_two_starts_that_met_agree_even_where_the_raw_feature_pose_was_rough(room) -> None:
     rough = T_KEYFRAME_CAMERA @ se3.exp(np.array([0.0, 0.05, 0.0, 0.1, 0.0, 0.0]))
     for guesses in ([T_KEYFRAME_CAMERA, rough], [rough, T_KEYFRAME_CAMERA]):
         _, winner = chosen_from(room, guesses, rough)
-        assert winner.second_agrees is True
+        assert winner.is_confirmed is True
 
 
 def test_features_that_the_images_refute_have_no_say(room) -> None:
     _, winner = chosen_from(room, [T_KEYFRAME_CAMERA, T_ASTRAY], T_ASTRAY)
     assert winner.method == "guess 0"
-    assert winner.second_agrees is None
+    assert winner.is_confirmed is None

@@ -18,7 +18,7 @@ def ramp(height: int, width: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("size", [(8, 12), (9, 13)])
-def test_halving_moves_pixel_centres_as_the_conventions_say(size: tuple[int, int]) -> None:
+def test_halving_moves_pixel_centers_as_the_conventions_say(size: tuple[int, int]) -> None:
     half = halved_image(ramp(*size))
     v, u = np.mgrid[: half.shape[0], : half.shape[1]]
     np.testing.assert_allclose(half, 3.0 * (2 * u + 0.5) + 5.0 * (2 * v + 0.5) + 1.0, rtol=1e-6)

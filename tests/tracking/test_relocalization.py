@@ -8,46 +8,46 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframe_database import (
-    Place,
-    Places,
-    PlacesConfig,
-    place_of,
-    thumbnail_of,
+    KeyframeDatabase,
+    KeyframeDatabaseConfig,
+    KeyframeRecord,
+    make_keyframe_record,
+    make_thumbnail,
 )
 from ldo_service.tracking.keyframes import Keyframe
-from ldo_service.tracking.relocalization import RelocalisationConfig, Relocaliser
-from ldo_service.tracking.tracking_quality import History, JudgementConfig
+from ldo_service.tracking.relocalization import RelocalizationConfig, Relocalizer
+from ldo_service.tracking.tracking_quality import ResidualHistory, TrackingQualityConfig
 
 T_AWAY = se3.exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))
 T_NEAR = se3.exp(np.array([0.03, -0.15, 0.05, 0.15, 0.05, 0.1]))
 T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
 
 
-def relocaliser(config: RelocalisationConfig | None = None) -> Relocaliser:
-    return Relocaliser(
+def relocalizer(config: RelocalizationConfig | None = None) -> Relocalizer:
+    return Relocalizer(
         PyramidConfig(),
         AlignConfig(),
         FeatureConfig(),
-        JudgementConfig(),
-        config or RelocalisationConfig(),
+        TrackingQualityConfig(),
+        config or RelocalizationConfig(),
     )
 
 
-def place_at(room, T_odom_keyframe: np.ndarray, number: int) -> Place:
+def place_at(room, T_odom_keyframe: np.ndarray, number: int) -> KeyframeRecord:
     view = pyramid_of(room.view(T_odom_keyframe), PyramidConfig())
     keyframe = Keyframe(view, T_odom_keyframe, number)
-    return place_of(keyframe, FeatureConfig(), PlacesConfig())
+    return make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig())
 
 
 @pytest.fixture(scope="module")
-def places(large_room) -> Places:
-    return Places((place_at(large_room, np.eye(4), 0), place_at(large_room, T_AWAY, 1)))
+def places(large_room) -> KeyframeDatabase:
+    return KeyframeDatabase((place_at(large_room, np.eye(4), 0), place_at(large_room, T_AWAY, 1)))
 
 
-def found(places: Places, frame: RgbdFrame, turn: int = 0, **fields):
+def found(places: KeyframeDatabase, frame: RgbdFrame, turn: int = 0, **fields):
     view = pyramid_of(frame, PyramidConfig())
-    finder = relocaliser(RelocalisationConfig(**fields))
-    return finder.find(view, places, turn, History())
+    finder = relocalizer(RelocalizationConfig(**fields))
+    return finder.find(view, places, turn, ResidualHistory())
 
 
 def test_right_keyframe_is_found_whatever_its_age(large_room, places) -> None:
@@ -59,17 +59,17 @@ def test_right_keyframe_is_found_whatever_its_age(large_room, places) -> None:
         np.testing.assert_allclose(candidate.alignment.T_reference_camera, T_NEAR, atol=1e-3)
 
 
-def test_unknown_place_is_not_recognised(large_room, places) -> None:
+def test_unknown_place_is_not_recognized(large_room, places) -> None:
     assert found(places, large_room.view(T_BEHIND)) is None
     assert found(places, large_room.blank()) is None
 
 
 def test_without_places_nothing_is_found(large_room) -> None:
-    assert found(Places(), large_room.view(np.eye(4))) is None
+    assert found(KeyframeDatabase(), large_room.view(np.eye(4))) is None
 
 
 def test_each_place_has_its_turn_however_unlike_its_thumbnail(large_room) -> None:
-    crowd = Places(
+    crowd = KeyframeDatabase(
         (
             *(place_at(large_room, T_BEHIND, number) for number in range(4)),
             place_at(large_room, np.eye(4), 4),
@@ -92,7 +92,7 @@ def test_a_place_is_known_again_from_far_behind_it(large_room, places) -> None:
 
 def test_who_is_not_lost_is_looked_for_by_what_is_fast(large_room, places) -> None:
     view = pyramid_of(large_room.view(se3.exp(np.array([0, 0.05, 0, 0, 0, -2.4]))), PyramidConfig())
-    assert relocaliser().find(view, places, 0, History(), is_lost=False) is None
+    assert relocalizer().find(view, places, 0, ResidualHistory(), is_lost=False) is None
 
 
 def test_a_place_is_refused_when_features_and_images_disagree(large_room, places) -> None:
@@ -103,28 +103,38 @@ def test_a_view_that_two_distant_places_explain_is_not_found(large_room, places)
     twin = replace(places.all[0], id=7, T_odom_keyframe=T_BEHIND)
     near = replace(places.all[0], id=7, T_odom_keyframe=se3.exp(np.full(6, 0.1)))
     frame = large_room.view(T_NEAR)
-    assert found(Places((*places.all, twin)), frame) is None
-    assert found(Places((*places.all, near)), frame) is not None, "as far as odometry drifts"
+    assert found(KeyframeDatabase((*places.all, twin)), frame) is None
+    assert found(KeyframeDatabase((*places.all, near)), frame) is not None, (
+        "as far as odometry drifts"
+    )
 
 
-def test_likely_places_are_of_different_neighbourhoods(large_room, places) -> None:
+def test_likely_places_are_of_different_neighborhoods(large_room, places) -> None:
     here = places.all[0]
     crowd = [replace(here, id=k, T_odom_keyframe=se3.exp(np.full(6, 1e-3 * k))) for k in range(6)]
     view = pyramid_of(large_room.view(T_AWAY), PyramidConfig())
-    finder, crowded = relocaliser(RelocalisationConfig(alike=2)), Places((*crowd, places.all[1]))
-    chosen = finder._likely(crowded.all[index] for index in crowded.alike(view))
+    finder, crowded = (
+        relocalizer(RelocalizationConfig(alike=2)),
+        KeyframeDatabase((*crowd, places.all[1])),
+    )
+    chosen = finder._distinct_candidates(
+        crowded.all[index] for index in crowded.rank_by_similarity(view)
+    )
     assert {place.id for place in chosen} >= {1}
     assert len(chosen) == 2
 
 
 def test_another_place_is_not_familiar_and_a_darker_image_is(large_room) -> None:
-    trusted = thumbnail_of(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()))
+    trusted = make_thumbnail(pyramid_of(large_room.view(np.eye(4)), PyramidConfig()))
     for frame, familiar in (
         (large_room.view(np.eye(4), 0.5, 10.0), True),
         (large_room.view(T_BEHIND), False),
         (large_room.blank(), False),
     ):
-        assert relocaliser().is_familiar(pyramid_of(frame, PyramidConfig()), trusted) is familiar
+        assert (
+            relocalizer().resembles_last_trusted(pyramid_of(frame, PyramidConfig()), trusted)
+            is familiar
+        )
 
 
 @pytest.mark.parametrize(
@@ -138,4 +148,4 @@ def test_another_place_is_not_familiar_and_a_darker_image_is(large_room) -> None
 )
 def test_impossible_limits_are_refused(fields) -> None:
     with pytest.raises(ConfigError):
-        RelocalisationConfig(**fields)
+        RelocalizationConfig(**fields)

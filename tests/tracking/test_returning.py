@@ -15,29 +15,40 @@ from ldo_service.tracking import (
     Odometry,
     OdometryConfig,
     PyramidConfig,
-    Status,
     TrackingResult,
+    TrackingStatus,
     pyramid_of,
 )
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import Place, PlacesConfig, place_of
+from ldo_service.tracking.keyframe_database import (
+    KeyframeDatabaseConfig,
+    KeyframeRecord,
+    make_keyframe_record,
+)
 from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig
 from ldo_service.tracking.map_frame import MapCorrection
-from ldo_service.tracking.relocalization import KeyframeReuse, ReturnConfig, nearby
-from ldo_service.tracking.state import Origin
-from ldo_service.tracking.tracking_quality import History, JudgementConfig
+from ldo_service.tracking.relocalization import (
+    KeyframeReuse,
+    KeyframeReuseConfig,
+    find_nearby_keyframes,
+)
+from ldo_service.tracking.state import KeyframeOrigin
+from ldo_service.tracking.tracking_quality import ResidualHistory, TrackingQualityConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
 
-SOON = OdometryConfig(returning=ReturnConfig(after=1))
+SOON = OdometryConfig(returning=KeyframeReuseConfig(after=1))
 
 
 def moved(x_m: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
     return se3.exp(np.array([0.0, turn_rad, 0.0, x_m, 0.0, 0.0]))
 
 
-def place_at(room, number: int) -> Place:
+def place_at(room, number: int) -> KeyframeRecord:
     keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number)
-    return replace(place_of(keyframe, FeatureConfig(), PlacesConfig()), median_depth_m=2.0)
+    return replace(
+        make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()),
+        median_depth_m=2.0,
+    )
 
 
 def correction_of(T_map_keyframe: Mapping[int, np.ndarray]) -> MapCorrection:
@@ -47,7 +58,7 @@ def correction_of(T_map_keyframe: Mapping[int, np.ndarray]) -> MapCorrection:
 def connect(odometry: Odometry) -> None:
     """Let the reference count as measured from a known keyframe, as one keyframe more would."""
     frames = odometry._frames
-    frames.state = replace(frames.state, origin=Origin.TIED)
+    frames.state = replace(frames.state, origin=KeyframeOrigin.TIED)
 
 
 def followed(
@@ -67,7 +78,7 @@ def test_places_are_near_until_a_keyframe_is_due_the_nearest_first(room) -> None
     config = KeyframeConfig(max_translation=0.1, max_rotation_rad=0.2)  # 0.2 m of 2 m
     places = [place_at(room, number) for number in range(5)]
     T_map = {0: moved(0.19), 1: moved(0.21), 2: moved(-0.05), 3: moved(0, 0.15), 4: moved(0, -0.25)}
-    near = nearby(places, T_map, np.eye(4), config)
+    near = find_nearby_keyframes(places, T_map, np.eye(4), config)
     assert [place.id for place, _ in near] == [2, 3, 0]
     for place, T_place_camera in near:
         np.testing.assert_allclose(T_map[place.id] @ T_place_camera, np.eye(4), atol=1e-12)
@@ -75,8 +86,10 @@ def test_places_are_near_until_a_keyframe_is_due_the_nearest_first(room) -> None
 
 def test_places_that_the_map_does_not_have_are_left_out(room) -> None:
     places = [place_at(room, number) for number in range(2)]
-    assert [p.id for p, _ in nearby(places, {1: np.eye(4)}, np.eye(4), KeyframeConfig())] == [1]
-    assert nearby(places, {}, np.eye(4), KeyframeConfig()) == []
+    assert [
+        p.id for p, _ in find_nearby_keyframes(places, {1: np.eye(4)}, np.eye(4), KeyframeConfig())
+    ] == [1]
+    assert find_nearby_keyframes(places, {}, np.eye(4), KeyframeConfig()) == []
 
 
 def due_on_the_way_back(
@@ -124,7 +137,7 @@ def test_odometry_goes_on_where_it_is_against_the_known_keyframe(room, make_walk
     assert returned.reused_keyframe is not None
     assert returned.reference == returned.reused_keyframe == back.odometry.reference
     assert returned.reference != otherwise.reference
-    assert (returned.status, returned.method) == (Status.OK, "returned")
+    assert (returned.status, returned.method) == (TrackingStatus.OK, "returned")
     assert (returned.keyframe, returned.denied_keyframe) == (None, None)
     np.testing.assert_array_equal(returned.T_odom_camera, otherwise.T_odom_camera)
     again = back.odometry.process(room.view(returned.T_odom_camera))
@@ -138,7 +151,7 @@ def test_what_a_known_keyframe_shows_is_not_mapped_again(room, make_walk) -> Non
     step = se3.exp(np.array([0, 0.1, 0, 0, 0, 0]))  # worth mapping, but for that
     tracked = odometry.process(room.view(returned.T_odom_camera @ step), may_map=False)
     assert tracked.reference == returned.reference
-    assert tracked.status is Status.OK
+    assert tracked.status is TrackingStatus.OK
     assert tracked.denied_keyframe in (None, KeyframeKind.REFERENCE)
     aside = tracked.T_odom_camera @ moved(turn_rad=0.3)  # where no known keyframe is
     for T in (aside, aside):
@@ -173,12 +186,16 @@ def test_nobody_returns_before_a_keyframe_is_measured_from_a_known_one(room, mak
 
 def test_nobody_returns_to_what_looks_otherwise_now(room) -> None:
     reuse = KeyframeReuse(
-        PyramidConfig(), AlignConfig(), KeyframeConfig(), JudgementConfig(), ReturnConfig()
+        PyramidConfig(),
+        AlignConfig(),
+        KeyframeConfig(),
+        TrackingQualityConfig(),
+        KeyframeReuseConfig(),
     )
     near = [(place_at(room, 0), np.eye(4))]
     blank, same = (pyramid_of(f, PyramidConfig()) for f in (room.blank(), room.view(np.eye(4))))
-    assert reuse.find(blank, near, History()) is None
-    assert reuse.find(same, near, History()) is not None
+    assert reuse.find(blank, near, ResidualHistory()) is None
+    assert reuse.find(same, near, ResidualHistory()) is not None
 
 
 def test_the_next_frames_after_a_return_survive_a_restart_bit_for_bit(room, make_walk) -> None:
@@ -233,7 +250,7 @@ def test_a_keyframe_made_after_a_return_is_measured_from_those_returned_to(room,
 )
 def test_settings_that_cannot_be_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        ReturnConfig(**wrong)
+        KeyframeReuseConfig(**wrong)
 
 
 def test_a_camera_that_moves_slowly_stays_with_the_keyframe_it_returned_to(room, make_walk) -> None:
@@ -252,7 +269,7 @@ def test_what_was_put_there_since_then_is_not_taken_for_something_that_moves(
     back = left_and_back(room, make_walk, np.eye(4))
     assert back.result.reused_keyframe is not None
     tracked = back.odometry.process(with_a_box(room.view(back.result.T_odom_camera)))
-    assert tracked.status is Status.OK
+    assert tracked.status is TrackingStatus.OK
     assert tracked.reference == back.result.reference
     assert tracked.dynamic_mask is None
 
@@ -289,7 +306,7 @@ def test_a_lost_camera_that_is_found_again_maps_nothing_anew(room, make_walk) ->
     followed(odometry, room, there)
     odometry.process(room.blank())
     found = odometry.process(room.view(there[2]), may_map=False)
-    assert (found.status, found.method) == (Status.OK, "relocalised")
+    assert (found.status, found.method) == (TrackingStatus.OK, "relocalised")
     assert found.denied_keyframe in (None, KeyframeKind.REFERENCE)
     assert odometry._is_connected_to_map
 
@@ -297,7 +314,7 @@ def test_a_lost_camera_that_is_found_again_maps_nothing_anew(room, make_walk) ->
 @pytest.mark.parametrize(("after", "may"), [(0, False), (3, False), (2, True)])
 def test_known_keyframes_do_once_there_are_many(room, after: int, may: bool) -> None:
     each_frame = KeyframeConfig(min_frames=1, max_frames=1, still_motion=0.0)
-    config = OdometryConfig(returning=ReturnConfig(after=after), keyframes=each_frame)
+    config = OdometryConfig(returning=KeyframeReuseConfig(after=after), keyframes=each_frame)
     odometry = Odometry(config)
     _, made = followed(odometry, room, [moved(0.02 * number) for number in range(2)])
     assert len(made) == 2

@@ -13,12 +13,12 @@ from ldo_service.tracking import (
     Odometry,
     OdometryConfig,
     PyramidConfig,
-    Status,
+    TrackingStatus,
     align,
     build_reference,
     pyramid_of,
 )
-from ldo_service.tracking.features import ShapeConfig, pose_from_shape
+from ldo_service.tracking.features import GicpConfig, register_gicp
 from ldo_service.tracking.keyframes import KeyframeConfig
 
 T_WORLD_CORNER = se3.exp(np.array([-0.35, 0.6, 0.0, 0.0, 0.0, 0.0]))  # floor and two walls in view
@@ -38,7 +38,7 @@ def aligned(room, T_corner_camera: np.ndarray) -> tuple[Alignment, np.ndarray | 
     reference = build_reference(pyramid_of(white(room, np.eye(4)), PyramidConfig()))
     view = pyramid_of(white(room, T_corner_camera), PyramidConfig())
     direct = align(reference, view, np.eye(4), AlignConfig())
-    return direct, pose_from_shape(reference, view, np.eye(4), ShapeConfig())
+    return direct, register_gicp(reference, view, np.eye(4), GicpConfig())
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 5])
@@ -56,10 +56,10 @@ def test_shape_reaches_farther_than_alignment(large_room) -> None:
 def test_nothing_is_found_without_depth_or_partners(large_room) -> None:
     reference = build_reference(pyramid_of(white(large_room, np.eye(4)), PyramidConfig()))
     blank = pyramid_of(large_room.blank(), PyramidConfig())
-    assert pose_from_shape(reference, blank, np.eye(4), ShapeConfig()) is None
+    assert register_gicp(reference, blank, np.eye(4), GicpConfig()) is None
     far = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 50.0]))
     view = pyramid_of(white(large_room, np.eye(4)), PyramidConfig())
-    assert pose_from_shape(reference, view, far, ShapeConfig()) is None
+    assert register_gicp(reference, view, far, GicpConfig()) is None
 
 
 def test_equal_input_gives_equal_bits(large_room) -> None:
@@ -77,7 +77,7 @@ def walked(room, poses: Sequence[np.ndarray]) -> list:
 def test_the_odometry_follows_large_steps_past_white_walls(large_room) -> None:
     truth = [se3.exp(k * STEP) for k in (0, 2, 1, 3)]
     results = walked(large_room, truth)
-    assert [r.status for r in results] == [Status.OK] * 4
+    assert [r.status for r in results] == [TrackingStatus.OK] * 4
     assert max(error_m(r.T_odom_camera, T) for r, T in zip(results, truth, strict=True)) < 2e-3
     assert "shape" in {r.method for r in results}
     assert max(r.hypothesis_spread_rad for r in results) > 0.1, "where the others led is told"
@@ -86,4 +86,4 @@ def test_the_odometry_follows_large_steps_past_white_walls(large_room) -> None:
 @pytest.mark.parametrize("wrong", [{"level": -1}, {"spacing": 0.3}, {"min_partners": 0.0}])
 def test_a_wrong_configuration_is_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError):
-        ShapeConfig(**wrong)
+        GicpConfig(**wrong)

@@ -3,10 +3,10 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
-from ldo_service.tracking.submaps import Look, SegmentConfig, Submaps
+from ldo_service.tracking.submaps import SubmapConfig, SubmapMatch, Submaps
 
 PERIOD_NS = 33_333_333
-CONFIG = SegmentConfig(begin_after_s=0.1, look_every=4, confirm_after=2)
+CONFIG = SubmapConfig(begin_after_s=0.1, look_every=4, confirm_after=2)
 T_THERE_HERE = se3.exp(np.array([0.0, 0.4, 0.0, 1.0, 0.0, 2.0]))
 
 
@@ -16,14 +16,14 @@ def turned(angle_rad: float) -> np.ndarray:
 
 def look(
     T_there_here: np.ndarray = T_THERE_HERE, here: int = 2, there: int = 0, angle_rad: float = 0.0
-) -> Look:
-    return Look(here, there, T_there_here, turned(angle_rad), median_depth_m=2.0)
+) -> SubmapMatch:
+    return SubmapMatch(here, there, T_there_here, turned(angle_rad), median_depth_m=2.0)
 
 
 def begun(count: int) -> Submaps:
     segments = Submaps()
     for _ in range(count):
-        segments = segments.begun()
+        segments = segments.started()
     return segments
 
 
@@ -33,7 +33,7 @@ def after(segments: Submaps, frames: int) -> Submaps:
     return segments
 
 
-def begins(is_lost: list[bool], stamps_ns: list[int], config: SegmentConfig) -> list[bool]:
+def begins(is_lost: list[bool], stamps_ns: list[int], config: SubmapConfig) -> list[bool]:
     """Whether a segment may begin with each frame."""
     segments, may_begin = begun(1), []
     for lost, stamp_ns in zip(is_lost, stamps_ns, strict=True):
@@ -46,7 +46,7 @@ def begins(is_lost: list[bool], stamps_ns: list[int], config: SegmentConfig) -> 
 def test_a_segment_begins_after_so_many_seconds_lost_at_any_rate(rate_hz: int) -> None:
     stamps_ns = [round(1e9 * k / rate_hz) for k in range(4 * rate_hz)]
     expected = [stamp_ns >= 3_000_000_000 for stamp_ns in stamps_ns]
-    assert begins([True] * len(stamps_ns), stamps_ns, SegmentConfig()) == expected
+    assert begins([True] * len(stamps_ns), stamps_ns, SubmapConfig()) == expected
 
 
 def test_a_frame_that_is_not_lost_ends_the_patience_and_renews_it() -> None:
@@ -57,7 +57,7 @@ def test_a_frame_that_is_not_lost_ends_the_patience_and_renews_it() -> None:
 
 def test_no_segment_begins_where_none_is_wanted() -> None:
     stamps_ns = [k * 10**9 for k in range(99)]
-    assert not any(begins([True] * 99, stamps_ns, SegmentConfig(begin_after_s=0)))
+    assert not any(begins([True] * 99, stamps_ns, SubmapConfig(begin_after_s=0)))
 
 
 def test_a_camera_that_starts_again_while_lost_is_waited_for_by_its_new_clock() -> None:
@@ -68,18 +68,18 @@ def test_a_camera_that_starts_again_while_lost_is_waited_for_by_its_new_clock() 
 def test_nobody_looks_for_other_segments_where_there_is_none_apart() -> None:
     assert not after(begun(1), 99).is_search_due(CONFIG)
     assert after(begun(2), 4).is_search_due(CONFIG)
-    assert not after(begun(2).joined(1, 0), 99).is_search_due(CONFIG)
+    assert not after(begun(2).with_merge(1, 0), 99).is_search_due(CONFIG)
 
 
 def test_a_find_is_looked_at_again_sooner() -> None:
-    found = begun(2).looked(look(), CONFIG)
+    found = begun(2).with_search_result(look(), CONFIG)
     assert after(found, 2).is_search_due(CONFIG)
-    assert not after(begun(2).looked(None, CONFIG), 2).is_search_due(CONFIG)
+    assert not after(begun(2).with_search_result(None, CONFIG), 2).is_search_due(CONFIG)
 
 
 def test_two_finds_confirm_each_other_when_they_say_the_same_of_different_views() -> None:
     near = T_THERE_HERE @ se3.exp(np.full(6, 0.01))
-    found = begun(3).looked(look(), CONFIG)
+    found = begun(3).with_search_result(look(), CONFIG)
     assert found.is_confirmed_by(look(near, angle_rad=1.2), CONFIG)
     assert not found.is_confirmed_by(look(near, angle_rad=0.5), CONFIG), "the same view"
     assert not found.is_confirmed_by(look(T_THERE_HERE @ near, angle_rad=1.2), CONFIG)
@@ -88,32 +88,34 @@ def test_two_finds_confirm_each_other_when_they_say_the_same_of_different_views(
 
 
 def test_the_oldest_find_that_nothing_contradicts_is_the_one_to_be_confirmed() -> None:
-    found = begun(3).looked(look(), CONFIG).looked(look(angle_rad=0.6), CONFIG)
+    found = (
+        begun(3).with_search_result(look(), CONFIG).with_search_result(look(angle_rad=0.6), CONFIG)
+    )
     assert found.is_confirmed_by(look(angle_rad=1.2), CONFIG)
-    other = found.looked(look(T_THERE_HERE @ T_THERE_HERE, angle_rad=0.6), CONFIG)
+    other = found.with_search_result(look(T_THERE_HERE @ T_THERE_HERE, angle_rad=0.6), CONFIG)
     assert not other.is_confirmed_by(look(angle_rad=1.2), CONFIG)
 
 
 def test_a_find_is_forgotten_after_looks_that_find_nothing() -> None:
-    found = begun(2).looked(look(), CONFIG)
+    found = begun(2).with_search_result(look(), CONFIG)
     for _ in range(CONFIG.misses):
-        found = found.looked(None, CONFIG)
+        found = found.with_search_result(None, CONFIG)
     assert found.last is not None
-    assert found.looked(None, CONFIG).last is None
+    assert found.with_search_result(None, CONFIG).last is None
 
 
 def test_joined_segments_share_the_oldest_as_their_root() -> None:
-    segments = begun(4).joined(3, 2).joined(2, 1)
+    segments = begun(4).with_merge(3, 2).with_merge(2, 1)
     assert segments.roots == (0, 1, 1, 1)
     assert segments.are_merged(3, 1)
     assert not segments.are_merged(3, 0)
 
 
 @pytest.mark.parametrize(
-    "segments", [Submaps(), begun(3).looked(look(), CONFIG), begun(2).joined(0, 1)]
+    "segments", [Submaps(), begun(3).with_search_result(look(), CONFIG), begun(2).with_merge(0, 1)]
 )
 def test_segments_survive_packing(segments: Submaps) -> None:
-    again = Submaps.unpacked(segments.packed)
+    again = Submaps.unpack(segments.packed)
     assert again.roots == segments.roots
     assert (again.last is None) == (segments.last is None)
     if again.last is not None:
@@ -132,4 +134,4 @@ def test_segments_survive_packing(segments: Submaps) -> None:
 )
 def test_impossible_settings_are_refused(fields) -> None:
     with pytest.raises(ConfigError):
-        SegmentConfig(**fields)
+        SubmapConfig(**fields)

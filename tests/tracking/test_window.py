@@ -8,14 +8,14 @@ import pytest
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
-from ldo_service.tracking.alignment import Appearance
+from ldo_service.tracking.alignment import BrightnessModel
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframe_database import PlacesConfig, place_of
+from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig, make_keyframe_record
 from ldo_service.tracking.keyframes import Keyframe
 from ldo_service.tracking.pyramid import build_pyramid
-from ldo_service.tracking.window import EarlierKeyframes, WindowConfig, measured_from
+from ldo_service.tracking.window import RecentKeyframeCache, WindowConfig, measure_against
 
-USUAL = Appearance(intensity_sigma=1.0, depth_noise_scale=0.3)
+USUAL = BrightnessModel(intensity_sigma=1.0, depth_noise_scale=0.3)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def keyframes(room, truth) -> list[Keyframe]:
 
 def test_each_measurement_is_nearer_to_the_truth_than_odometry(keyframes, truth) -> None:
     *earlier, newest = keyframes
-    poses = measured_from(reversed(earlier), newest, USUAL, AlignConfig(), WindowConfig())
+    poses = measure_against(reversed(earlier), newest, USUAL, AlignConfig(), WindowConfig())
     assert [(p.a, p.b) for p in poses] == [(5, 6), (4, 6), (3, 6)]
     for pose in poses:
         true = se3.inverse(truth[pose.a]) @ truth[6]
@@ -50,15 +50,18 @@ def test_keyframes_that_show_another_place_are_passed_over(keyframes, room) -> N
     turned = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
     elsewhere = Keyframe(pyramid_of(room.view(turned), PyramidConfig()), turned, 9)
     *earlier, newest = keyframes
-    poses = measured_from(
+    poses = measure_against(
         [elsewhere, *reversed(earlier)], newest, USUAL, AlignConfig(), WindowConfig()
     )
     assert [p.a for p in poses] == [5, 4, 3]
 
 
 def test_a_keyframe_that_odometry_has_elsewhere_now_is_not_the_one_that_was_kept(keyframes) -> None:
-    places = [place_of(keyframe, FeatureConfig(), PlacesConfig()) for keyframe in keyframes]
-    earlier, shift = EarlierKeyframes(PyramidConfig()), se3.exp(np.array([0, 0, 0, 0.5, 0, 0]))
+    places = [
+        make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig())
+        for keyframe in keyframes
+    ]
+    earlier, shift = RecentKeyframeCache(PyramidConfig()), se3.exp(np.array([0, 0, 0, 0.5, 0, 0]))
     first = list(earlier.newest_first(places, 3))
     assert [k.id for k in first] == [6, 5, 4]
     elsewhere = replace(places[5], T_odom_keyframe=shift @ places[5].T_odom_keyframe)
@@ -73,7 +76,7 @@ def test_a_poor_fit_is_left_out(keyframes) -> None:
     first, *_, newest = keyframes
     gray = np.random.default_rng(1).integers(0, 60, first.view.gray.shape) + first.view.gray // 2
     frame = replace_gray(first, gray.astype(np.uint8))
-    assert not measured_from([frame], newest, USUAL, AlignConfig(), WindowConfig(min_overlap=0.1))
+    assert not measure_against([frame], newest, USUAL, AlignConfig(), WindowConfig(min_overlap=0.1))
 
 
 def replace_gray(keyframe: Keyframe, gray: np.ndarray) -> Keyframe:
@@ -85,7 +88,7 @@ def replace_gray(keyframe: Keyframe, gray: np.ndarray) -> Keyframe:
 def test_none_are_measured_on_request(keyframes) -> None:
     *earlier, newest = keyframes
     none = WindowConfig(measurements=0)
-    assert measured_from(reversed(earlier), newest, USUAL, AlignConfig(), none) == []
+    assert measure_against(reversed(earlier), newest, USUAL, AlignConfig(), none) == []
 
 
 @pytest.mark.parametrize(

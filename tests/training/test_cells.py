@@ -33,7 +33,7 @@ def frame() -> tuple[np.ndarray, np.ndarray]:
 
 def told(cells: ModuleType, plane: np.ndarray, names: np.ndarray) -> dict[int, tuple]:
     """Names, weights, boxes and whether they are told, in rows and columns of each grid."""
-    columns = cells.told(plane, cells.visible(plane, names))
+    columns = cells.make_targets(plane, cells.visible(plane, names))
     grids, start = {}, 0
     for stride in cells.STRIDES_PX:
         shape = tuple(side // stride for side in plane.shape)

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --group train")
 
-RED, GREEN, GREY = (200, 0, 0), (0, 200, 0), 90
+RED, GREEN, GRAY = (200, 0, 0), (0, 200, 0), 90
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def drawn(encoder: ModuleType, shape: tuple[int, int], color: tuple, instance: i
     plane = np.zeros(shape, np.uint8)
     height, width = shape
     plane[height // 4 : -height // 4, width // 4 : -width // 4] = instance
-    image = np.full((*shape, 3), GREY, np.uint8)
+    image = np.full((*shape, 3), GRAY, np.uint8)
     image[plane > 0] = color
     return encoder.Shown(image, plane, instance)
 
@@ -42,7 +42,7 @@ def test_another_thing_covers_with_its_own_pixels_alone(encoder: ModuleType) -> 
         assert is_green.sum() <= (by.plane > 0).sum()
         # the rest is as it was
         assert (shown.color[~is_green & (shown.plane > 0)] == RED).all()
-        assert (shown.color[~is_green & (shown.plane == 0)] == GREY).all()
+        assert (shown.color[~is_green & (shown.plane == 0)] == GRAY).all()
         covered.add(int(is_green.sum()))
     assert len(covered) > 5
 
@@ -55,7 +55,7 @@ def test_walls_cover_nothing(encoder: ModuleType) -> None:
 
 
 def test_a_box_is_cut_resized_and_set_in_the_middle(encoder: ModuleType) -> None:
-    image = np.full((60, 80, 3), GREY, np.uint8)
+    image = np.full((60, 80, 3), GRAY, np.uint8)
     image[10:30, 20:60] = RED
     taken = encoder.crop(image, np.array([20.0, 10.0, 60.0, 30.0]), 32)
     assert taken.shape == (32, 32, 3)

@@ -18,8 +18,8 @@ def examples(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     monkeypatch.syspath_prepend(Path(__file__).parents[2] / "training")
     import examples
 
-    monkeypatch.setattr(examples, "repainted", lambda color, _plane, _rng: color)
-    monkeypatch.setattr(examples, "worsened", lambda color, _rng, _blur_px: color)
+    monkeypatch.setattr(examples, "recolor", lambda color, _plane, _rng: color)
+    monkeypatch.setattr(examples, "degrade", lambda color, _rng, _blur_px: color)
     yield examples
     for name in MADE:
         sys.modules.pop(name, None)

@@ -34,10 +34,10 @@ def test_both_readings_of_a_network_tell_the_same(layers: ModuleType, tmp_path: 
 
     rng = np.random.default_rng(0)
     image = rng.random((1, 16, 24, 3), np.float32)
-    drawn = layers.Live({}, rng=rng)
+    drawn = layers.JaxNetwork({}, rng=rng)
     network(drawn, image)
     moments = {name: tuple(map(np.asarray, pair)) for name, pair in drawn.observed.items()}
-    mine = np.asarray(network(layers.Live(drawn.weights, moments), image))[0, 0, 0]
+    mine = np.asarray(network(layers.JaxNetwork(drawn.weights, moments), image))[0, 0, 0]
 
     graph = layers.Graph(drawn.weights, moments)
     told = graph.node("Flatten", network(graph, "image"), output="told")

@@ -78,7 +78,7 @@ def test_names_of_regions(trainer: SimpleNamespace) -> None:
     encoder, pair = trainer.encoder, trainer.pair
     unknown = CLASS_NAMES.index("person")
     ids = np.array([OVEN, trainer.regions.NO_THING, unknown, CHAIR])
-    seen = trainer.views.Seen(
+    seen = trainer.views.VisibleBoxes(
         np.arange(4), ids, np.arange(4), np.tile([0.0, 0, 20, 20], (4, 1)), np.full(4, 400.0)
     )
     chosen, names = pair.named(seen)
@@ -116,9 +116,9 @@ def test_half_of_a_batch_are_regions(trainer: SimpleNamespace) -> None:
     colors = np.zeros((2, 240, 320, 3), np.uint8)
     colors[0, ..., 0], colors[1, ..., 1] = 200, 200
     first, box, pixels = np.zeros(2, np.int64), np.array([[40.0, 40, 90, 90]] * 2), [2500.0] * 2
-    things = views.Seen(first, np.array([OVEN, OVEN]), first, box, np.array(pixels))
+    things = views.VisibleBoxes(first, np.array([OVEN, OVEN]), first, box, np.array(pixels))
     ids = np.array([trainer.regions.NO_THING, CHAIR])
-    regions = views.Seen(first + 1, ids, first, box, np.array(pixels))
+    regions = views.VisibleBoxes(first + 1, ids, first, box, np.array(pixels))
     instances = np.zeros((2, 240, 320), np.uint8)
     source = trainer.pair.batches(
         views.Views(colors, instances, things, regions), np.random.default_rng(0)

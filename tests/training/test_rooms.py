@@ -64,10 +64,10 @@ def test_of_several_glances_the_one_with_most_before_it_is_taken(
     rooms: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views, flat = rooms.views, rooms.flats[0]
-    centres_m = np.array([thing.bounds_m[0] for thing in flat.things])
+    centers_m = np.array([thing.bounds_m[0] for thing in flat.things])
     counts = []
     for glances in (1, 4):
         monkeypatch.setattr(views, "GLANCES", glances)
         poses = views._poses(flat, 20, np.random.default_rng(0))
-        counts.append(np.mean([views._things_before(T, centres_m) for T in poses]))
+        counts.append(np.mean([views._things_before(T, centers_m) for T in poses]))
     assert counts[1] > counts[0]

@@ -5,20 +5,20 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 
-from ldo_service.transport.zenoh_transport import Network, open_session
+from ldo_service.transport.zenoh_transport import Endpoint, open_session
 from tests.ports import free_port
 
 
 @pytest.fixture
-def network() -> Iterator[Network]:
+def network() -> Iterator[Endpoint]:
     """Of a router that lives as long as the test."""
-    network = Network("test", f"tcp/127.0.0.1:{free_port()}")
+    network = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
     with open_session(network, router=True):
         yield network
 
 
 @pytest.fixture
-def client(network: Network) -> Iterator[Callable[[], zenoh.Session]]:
+def client(network: Endpoint) -> Iterator[Callable[[], zenoh.Session]]:
     """Opens sessions, as other processes would."""
     sessions: list[zenoh.Session] = []
 

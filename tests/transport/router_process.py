@@ -3,9 +3,9 @@
 import sys
 import time
 
-from ldo_service.transport.zenoh_transport import Network, open_session
+from ldo_service.transport.zenoh_transport import Endpoint, open_session
 
 if __name__ == "__main__":
-    with open_session(Network("test", sys.argv[1]), router=True):
+    with open_session(Endpoint("test", sys.argv[1]), router=True):
         print("up", flush=True)
         time.sleep(1e6)

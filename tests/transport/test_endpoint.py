@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.endpoint import Network
-from ldo_service.transport.keys import Keys
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.endpoint import Endpoint
+from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_port
 
@@ -34,7 +34,7 @@ def sockets() -> list[tuple[str, int, str]]:
 @pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux' /proc")
 def test_a_router_listens_on_loopback_and_scouts_nobody() -> None:
     before = sockets()
-    network = Network("test", f"tcp/127.0.0.1:{free_port()}")
+    network = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
     with open_session(network, router=True):
         opened = [one for one in sockets() if one not in before]
     loopback = socket.inet_aton("127.0.0.1")[::-1].hex().upper()
@@ -45,7 +45,7 @@ def test_a_router_listens_on_loopback_and_scouts_nobody() -> None:
     "endpoint", ["tcp/127.0.0.1:7447", "tcp/localhost:7447", "tcp/[::1]:7447", "tcp/127.1.2.3:1"]
 )
 def test_loopback_needs_no_keys(endpoint: str) -> None:
-    Network("mule", endpoint).require_safe()
+    Endpoint("mule", endpoint).require_safe()
 
 
 @pytest.mark.parametrize(
@@ -53,16 +53,18 @@ def test_loopback_needs_no_keys(endpoint: str) -> None:
 )
 def test_a_network_needs_keys(endpoint: str) -> None:
     with pytest.raises(ConfigError, match="everybody on the network"):
-        Network("mule", endpoint).require_safe()
+        Endpoint("mule", endpoint).require_safe()
 
 
 def test_keys_and_tls_go_together(tmp_path: Path) -> None:
-    keys = Keys(Authority.new(tmp_path / "keys", days=2).add("mule", "service", "mule", days=1))
+    keys = TlsKeys(
+        CertificateAuthority.new(tmp_path / "keys", days=2).add("mule", "service", "mule", days=1)
+    )
     with pytest.raises(ConfigError, match="needs keys"):
-        Network("mule", "tls/0.0.0.0:7447")
+        Endpoint("mule", "tls/0.0.0.0:7447")
     with pytest.raises(ConfigError, match="write tls/"):
-        Network("mule", "tcp/0.0.0.0:7447", keys)
-    Network("mule", "tls/0.0.0.0:7447", keys).require_safe()
+        Endpoint("mule", "tcp/0.0.0.0:7447", keys)
+    Endpoint("mule", "tls/0.0.0.0:7447", keys).require_safe()
 
 
 @pytest.mark.parametrize(
@@ -74,4 +76,4 @@ def test_keys_and_tls_go_together(tmp_path: Path) -> None:
     ],
 )
 def test_processes_of_the_service_reach_it_where_it_listens(endpoint: str, here: str) -> None:
-    assert Network("mule", endpoint).local_endpoint == here
+    assert Endpoint("mule", endpoint).local_endpoint == here

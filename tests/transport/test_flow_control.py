@@ -9,18 +9,18 @@ import pytest
 
 from ldo_service.runtime.actor import Out
 from ldo_service.runtime.outlet import Outlet
-from ldo_service.runtime.stage import StageConfig
+from ldo_service.runtime.stage import SupervisionConfig
 from ldo_service.transport.flow_control import (
-    OutletPast,
-    again_key,
+    OutletPosition,
+    credit_key,
     data_key,
-    grant_key,
-    welcome_key,
+    producer_hello_key,
+    retransmit_key,
 )
 from ldo_service.transport.interface import MemoryTransport
 from tests.runtime.cast import NUMBERS, collector, eventually, number, running, send
 
-KEYS = [key(NUMBERS.name) for key in (data_key, again_key, grant_key, welcome_key)]
+KEYS = [key(NUMBERS.name) for key in (data_key, retransmit_key, credit_key, producer_hello_key)]
 
 
 def outlet(transport: MemoryTransport, *expected: str, epoch: int = 1, **options: float) -> Outlet:
@@ -38,7 +38,7 @@ async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> N
 
     async with running(stage):
         producing = asyncio.create_task(produce())
-        await eventually(lambda: source.room() == 0 and source.sent == 4)
+        await eventually(lambda: source.credits() == 0 and source.sent == 4)
         await asyncio.sleep(0.05)
         assert source.sent == 4  # not one more than the window, however long it takes
         let_go.set()
@@ -99,7 +99,7 @@ async def test_a_consumer_that_dies_again_and_again_on_a_bad_network_misses_noth
 
 async def test_a_consumer_that_waits_is_found_as_soon_as_the_producer_starts() -> None:
     transport, seen = MemoryTransport(), []
-    patient = StageConfig(heartbeat_s=1000)
+    patient = SupervisionConfig(heartbeat_s=1000)
     async with running(collector(transport, seen, config=patient)):
         source = outlet(transport, "collector")
         await send(source, number(0))
@@ -132,7 +132,7 @@ async def test_a_consumer_nobody_expects_releases_the_window_when_it_dies() -> N
     transport, stuck = MemoryTransport(), Event()
     source = outlet(transport)
     async with running(collector(transport, [], lambda _value: stuck.wait(60) and None)):
-        await eventually(lambda: source.room() == 4)
+        await eventually(lambda: source.credits() == 4)
         for value in range(4):
             await send(source, number(value))
         waiting = asyncio.create_task(send(source, number(4)))
@@ -157,10 +157,10 @@ async def test_an_expected_consumer_that_died_gets_what_it_had_not_handled() -> 
             await send(source, number(value))
         await eventually(lambda: first == [0, 1])
     transport.leave("collector")
-    assert source.room() == 0
+    assert source.credits() == 0
     stuck.set()
     async with running(collector(transport, second)):
-        await eventually(lambda: second == [2, 3, 4, 5] and source.room() == 4)
+        await eventually(lambda: second == [2, 3, 4, 5] and source.credits() == 4)
         await send(source, number(6))
         await eventually(lambda: second == [2, 3, 4, 5, 6])
 
@@ -168,7 +168,7 @@ async def test_an_expected_consumer_that_died_gets_what_it_had_not_handled() -> 
 async def test_before_the_expected_consumer_has_joined_there_is_no_room() -> None:
     transport, seen = MemoryTransport(), []
     source = outlet(transport, "collector")
-    assert source.room() == 0
+    assert source.credits() == 0
     sending = asyncio.create_task(send(source, number(0)))
     await asyncio.sleep(0.01)
     assert not sending.done()
@@ -223,13 +223,13 @@ async def test_a_living_consumer_that_takes_nothing_is_evicted_and_returns_when_
         Out(NUMBERS), "producer", 1, transport, (), evict_after_s=0.05, on_evicted=evicted.append
     )
     async with running(collector(transport, seen, lambda _value: stuck.wait(60) and None)):
-        await eventually(lambda: source.room() == 4)
+        await eventually(lambda: source.credits() == 4)
         for value in range(4):
             await send(source, number(value))
         sending = asyncio.create_task(send(source, number(4)))
 
         def check() -> bool:
-            source.check_windows()
+            source.evict_stalled()
             return sending.done()
 
         await eventually(check)
@@ -237,7 +237,7 @@ async def test_a_living_consumer_that_takes_nothing_is_evicted_and_returns_when_
             await send(source, number(value))  # its heartbeats alone do not let it hold us up again
         assert evicted == ["collector"]
         stuck.set()
-        await eventually(lambda: source.room() == 4)
+        await eventually(lambda: source.credits() == 4)
         await send(source, number(99))
         await eventually(lambda: seen[-1:] == [99])
     assert seen[:4] == [0, 1, 2, 3]
@@ -251,8 +251,8 @@ async def test_bytes_that_are_no_grant_or_welcome_are_left_alone(
     source = outlet(transport, "collector")
     async with running(collector(transport, seen)):
         for noise in (b"", b"\xff\x00", b"\x92\x01\x80", b"\x91" * 5000):
-            transport.deliver(grant_key(NUMBERS.name), b"", noise)
-            transport.deliver(welcome_key(NUMBERS.name), b"", noise)
+            transport.deliver(credit_key(NUMBERS.name), b"", noise)
+            transport.deliver(producer_hello_key(NUMBERS.name), b"", noise)
         await send(source, number(0))
         await eventually(lambda: seen == [0])
     assert "unreadable welcome" in caplog.text
@@ -269,8 +269,8 @@ async def test_a_producer_older_than_its_consumer_says_what_to_do(caplog) -> Non
         await eventually(lambda: len(seen) == 3)
         source.close()
         older = Outlet(
-            Out(NUMBERS), "producer", 9, transport, ("collector",), past=OutletPast(1, 1)
+            Out(NUMBERS), "producer", 9, transport, ("collector",), past=OutletPosition(1, 1)
         )
         await eventually(lambda: "ldo control reset" in caplog.text)
-        assert older.room() == 0
+        assert older.credits() == 0
     assert caplog.text.count("collector has had 3 messages, and 1 were made") == 1

@@ -7,42 +7,42 @@ import pytest
 
 from ldo_service.errors import ConfigError
 from ldo_service.transport.access_control import read_access
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.keys import Keys
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.keys import TlsKeys
 
 
 @pytest.fixture
-def authority(tmp_path: Path) -> Authority:
-    return Authority.new(tmp_path / "keys", days=2)
+def authority(tmp_path: Path) -> CertificateAuthority:
+    return CertificateAuthority.new(tmp_path / "keys", days=2)
 
 
 @pytest.fixture
-def folder(authority: Authority) -> Path:
+def folder(authority: CertificateAuthority) -> Path:
     return authority.add("mule", "service", "mule", days=1)
 
 
 def test_a_whole_folder_is_taken(folder: Path) -> None:
-    settings = Keys(folder).settings(router=True)
+    settings = TlsKeys(folder).settings(router=True)
     assert settings["access_control"]["default_permission"] == "deny"
-    assert "access_control" not in Keys(folder).settings(router=False)
+    assert "access_control" not in TlsKeys(folder).settings(router=False)
 
 
 @pytest.mark.parametrize("name", ["ca.crt", "tls.crt", "tls.key"])
 def test_what_is_missing_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with pytest.raises(ConfigError, match=f"{name} cannot be read: No such file"):
-        Keys(folder)
+        TlsKeys(folder)
 
 
 def test_a_secret_that_everybody_may_read_is_refused(folder: Path) -> None:
     (folder / "tls.key").chmod(0o644)
     with pytest.raises(ConfigError, match="chmod 600"):
-        Keys(folder)
+        TlsKeys(folder)
     (folder / "tls.key").chmod(0o640)  # as Kubernetes mounts secrets for a group
-    Keys(folder)
+    TlsKeys(folder)
 
 
-def of_another(folder: Path, authority: Authority) -> None:
+def of_another(folder: Path, authority: CertificateAuthority) -> None:
     other = authority.add("other", "viewer", "mule", days=1)
     (folder / "tls.key").write_bytes((other / "tls.key").read_bytes())
 
@@ -58,11 +58,14 @@ def of_another(folder: Path, authority: Authority) -> None:
     ids=["no authority", "no certificate", "no key", "another key"],
 )
 def test_damaged_keys_are_refused(
-    folder: Path, authority: Authority, damage: Callable[[Path, Authority], object], says: str
+    folder: Path,
+    authority: CertificateAuthority,
+    damage: Callable[[Path, CertificateAuthority], object],
+    says: str,
 ) -> None:
     damage(folder, authority)
     with pytest.raises(ConfigError, match=says):
-        Keys(folder)
+        TlsKeys(folder)
 
 
 @pytest.mark.parametrize(

@@ -55,16 +55,16 @@ def test_after_close_what_was_submitted_still_runs_and_the_rest_is_cancelled() -
 def test_one_that_is_at_work_when_all_is_over_is_named() -> None:
     busy, idle, go = Worker("busy"), Worker("idle"), Event()
     busy.submit(go.wait, 60)
-    assert "busy" not in Worker.left_busy(0.0), "it is not closed"
+    assert "busy" not in Worker.busy_workers(0.0), "it is not closed"
     for worker in (busy, idle):
         worker.close()
     idle.join(10)
-    left = Worker.left_busy(0.01)
+    left = Worker.busy_workers(0.01)
     assert "busy" in left
     assert "idle" not in left
     go.set()
     busy.join(10)
-    assert "busy" not in Worker.left_busy(0.01)
+    assert "busy" not in Worker.busy_workers(0.01)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux lets a thread be nice by itself")

@@ -20,7 +20,12 @@ from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import Health, decode
 from ldo_service.transport.flow_control import data_key, encode_link
-from ldo_service.transport.zenoh_transport import MAX_QUERIES, Network, ZenohTransport, open_session
+from ldo_service.transport.zenoh_transport import (
+    MAX_QUERIES,
+    Endpoint,
+    ZenohTransport,
+    open_session,
+)
 from tests.ports import free_port
 from tests.runtime.cast import (
     DOUBLES,
@@ -46,7 +51,7 @@ def outlet(transport: ZenohTransport, *expected: str) -> Outlet:
 
 
 async def test_lossless_images_reach_a_slow_consumer_in_order(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     seen: list[int] = []
     source = outlet(ZenohTransport(client(), network), "collector")
@@ -63,7 +68,7 @@ async def test_lossless_images_reach_a_slow_consumer_in_order(
     assert counted.dropped == 0
 
 
-async def test_stages_in_different_sessions_form_a_chain(network: Network, client: Client) -> None:
+async def test_stages_in_different_sessions_form_a_chain(network: Endpoint, client: Client) -> None:
     seen: list[int] = []
     expected = {DOUBLES.name: frozenset({"double_collector"})}
     one, two, three = (ZenohTransport(client(), network) for _ in range(3))
@@ -79,7 +84,7 @@ async def test_stages_in_different_sessions_form_a_chain(network: Network, clien
 
 
 async def test_an_outside_subscriber_that_sleeps_does_not_slow_the_others(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     awake, asleep = threading.Event(), []
 
@@ -101,7 +106,7 @@ async def test_an_outside_subscriber_that_sleeps_does_not_slow_the_others(
 
 
 async def test_a_late_joiner_gets_the_last_value_by_a_query(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     transport = ZenohTransport(client(), network)
     pieces = Outlet(Out(PIECES), "me", 1, transport)
@@ -121,7 +126,7 @@ async def test_a_late_joiner_gets_the_last_value_by_a_query(
 
 
 async def test_a_query_that_is_answered_slowly_holds_up_nothing(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     transport, seen = ZenohTransport(client(), network), []
     asked, go = threading.Event(), threading.Event()
@@ -131,7 +136,7 @@ async def test_a_query_that_is_answered_slowly_holds_up_nothing(
         go.wait(60)
         return [(b"", b"value")]
 
-    transport.answer("test/slow", slow_values)
+    transport.serve_queries("test/slow", slow_values)
     asker = client()
     many = range(MAX_QUERIES + 5)
     replies = [asker.get(network.expression("test/slow"), timeout=60.0) for _ in many]
@@ -148,23 +153,23 @@ async def test_a_query_that_is_answered_slowly_holds_up_nothing(
 
 
 async def test_those_who_watch_learn_who_is_there_joins_and_leaves(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     seen: list[tuple[str, bool]] = []
     early, watcher = (ZenohTransport(client(), network) for _ in range(2))
-    early.announce("early")
-    watcher.watch(lambda name, alive: seen.append((name, alive)))
+    early.declare_liveliness("early")
+    watcher.watch_liveliness(lambda name, alive: seen.append((name, alive)))
     await eventually(lambda: ("early", True) in seen)
     session = client()
     late = ZenohTransport(session, network)
-    late.announce("late")
+    late.declare_liveliness("late")
     await eventually(lambda: ("late", True) in seen)
     session.close()
     await eventually(lambda: ("late", False) in seen)
 
 
 async def test_a_foreign_program_reads_body_and_header_with_a_plain_library(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     samples: list[tuple[dict[str, object], list[object]]] = []
 
@@ -189,7 +194,7 @@ async def test_a_foreign_program_reads_body_and_header_with_a_plain_library(
 
 
 async def test_what_a_foreign_program_sends_reaches_a_latest_input(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     seen: list[int] = []
     stage = collector(ZenohTransport(client(), network), seen, policy=Latest(4))
@@ -207,7 +212,7 @@ async def test_what_a_foreign_program_sends_reaches_a_latest_input(
     assert set(seen) == {5}
 
 
-async def test_heartbeats_travel(network: Network, client: Client) -> None:
+async def test_heartbeats_travel(network: Endpoint, client: Client) -> None:
     beats: list[Health] = []
     transport = ZenohTransport(client(), network)
     transport.subscribe("health/doubler", lambda _header, body: beats.append(decode(body, Health)))
@@ -217,7 +222,7 @@ async def test_heartbeats_travel(network: Network, client: Client) -> None:
 
 
 async def test_a_newer_post_replaces_one_that_has_not_left(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     publisher = ZenohTransport(client(), network).publisher("test/post")
     received: list[bytes] = []
@@ -233,11 +238,11 @@ async def test_a_newer_post_replaces_one_that_has_not_left(
 
 
 async def test_closing_twice_or_after_the_session_harms_nothing(
-    network: Network, client: Client
+    network: Endpoint, client: Client
 ) -> None:
     session = client()
     transport = ZenohTransport(session, network)
-    transport.announce("me")
+    transport.declare_liveliness("me")
     transport.subscribe("test/number", lambda _header, _body: None)
     publisher = transport.publisher("test/number")
     session.close()
@@ -247,7 +252,7 @@ async def test_closing_twice_or_after_the_session_harms_nothing(
     transport.close()
 
 
-def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Network, client: Client) -> None:
+def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Endpoint, client: Client) -> None:
     session, seen = client(), []
 
     async def live_briefly() -> None:
@@ -265,10 +270,10 @@ def test_callbacks_after_the_loop_has_ended_harm_nothing(network: Network, clien
     assert seen == []
 
 
-def test_a_taken_port_and_an_absent_service_are_said_plainly(network: Network) -> None:
+def test_a_taken_port_and_an_absent_service_are_said_plainly(network: Endpoint) -> None:
     with pytest.raises(ConfigError, match=r"is another `ldo serve` running there\?"):
         open_session(network, router=True)
-    nobody = Network("test", f"tcp/127.0.0.1:{free_port()}")
+    nobody = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
     with pytest.raises(ConfigError, match="nobody answers on"):
         open_session(nobody)
 
@@ -276,7 +281,7 @@ def test_a_taken_port_and_an_absent_service_are_said_plainly(network: Network) -
 @pytest.mark.parametrize("robot", ["", "a/b", "*", "a b", "$x", "a?", "#", "@"])
 def test_a_robot_name_that_breaks_topics_is_refused(robot: str) -> None:
     with pytest.raises(ConfigError, match="robot name"):
-        Network(robot)
+        Endpoint(robot)
 
 
 def test_a_number_decodes_as_a_number() -> None:
@@ -287,7 +292,7 @@ def test_a_number_decodes_as_a_number() -> None:
 
 @pytest.mark.slow
 async def test_a_network_that_hangs_for_seconds_blocks_no_loop_and_loses_nothing() -> None:
-    network, seen = Network("test", f"tcp/127.0.0.1:{free_port()}"), []
+    network, seen = Endpoint("test", f"tcp/127.0.0.1:{free_port()}"), []
     program = [sys.executable, str(Path(__file__).with_name("router_process.py"))]
     router = subprocess.Popen([*program, network.endpoint], stdout=subprocess.PIPE)
     try:

@@ -30,7 +30,7 @@ FLAGS = (
     "--window-size=960,600",
 )
 STARTS_WITHIN_S = 60
-LARGEST_ANSWER_BYTES = 64_000_000  # a screenshot
+MAX_ANSWER_BYTES = 64_000_000  # a screenshot
 
 
 class Page:
@@ -110,7 +110,7 @@ def browser(folder: Path) -> Iterator[Page]:
         command = [path, *FLAGS, f"--user-data-dir={folder / 'profile'}", "about:blank"]
         process = subprocess.Popen(command, stdout=log, stderr=log)
         try:
-            with connect(_address(process, log_path), max_size=LARGEST_ANSWER_BYTES) as socket:
+            with connect(_address(process, log_path), max_size=MAX_ANSWER_BYTES) as socket:
                 yield Page(socket)
         finally:
             process.kill()

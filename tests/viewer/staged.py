@@ -8,7 +8,7 @@ import numpy as np
 from ldo_service.gaussians.model import aligned_rows
 from ldo_service.geometry import Camera
 from ldo_service.schemas import MapObject, MapObjects, ObjectView, Pose
-from ldo_service.viewer.scene import Layer, Scene, Sight
+from ldo_service.viewer.scene import Layer, ObjectBox, Scene
 from tests.schemas.examples import EXAMPLES
 
 RED, GREEN = (0.9, 0.05, 0.05), (0.05, 0.9, 0.05)
@@ -68,7 +68,7 @@ def scene_of(rows: np.ndarray, *objects: MapObject) -> Scene:
         final=path + np.array([0, 0.1, 0]),
         keyframes=keyframes,
         camera=Camera(64, 48, 60.0, 60.0, 31.5, 23.5),
-        sights={1: (Sight("chair", (10.0, 10.0, 30.0, 30.0)),)},
+        sights={1: (ObjectBox("chair", (10.0, 10.0, 30.0, 30.0)),)},
         objects=msgspec.structs.replace(found, objects=objects),
         loops=((0, 2),),
         T_map_camera=keyframes[0],

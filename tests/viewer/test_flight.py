@@ -9,7 +9,14 @@ import pytest
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import se3
 from ldo_service.schemas import MapObject, MapObjects, ObjectView, Pose
-from ldo_service.viewer.flight import NEAREST_M, View, flight, overview, up_of, view_of
+from ldo_service.viewer.flight import (
+    NEAREST_M,
+    CameraView,
+    estimate_up,
+    interpolate_views,
+    overview,
+    view_of,
+)
 from tests.schemas.examples import EXAMPLES
 
 FOUND = EXAMPLES["map_objects"]
@@ -65,8 +72,8 @@ def test_who_stands_in_the_object_steps_back() -> None:
 
 
 def test_a_flight_begins_and_ends_slowly_and_arrives() -> None:
-    start, end = View(np.zeros(3), np.ones(3)), View(np.array([4.0, 0, 0]), np.zeros(3))
-    views = list(flight(start, end, 20))
+    start, end = CameraView(np.zeros(3), np.ones(3)), CameraView(np.array([4.0, 0, 0]), np.zeros(3))
+    views = list(interpolate_views(start, end, 20))
     x = np.array([0.0, *(view.position[0] for view in views)])
     steps = np.diff(x)
     assert len(views) == 20
@@ -94,10 +101,10 @@ def test_up_is_up(name: str) -> None:
     assert truth is not None
     T_first = truth.T_world_camera[0]
     T_map_camera = se3.inverse(T_first) @ truth.T_world_camera
-    up = up_of(dict(enumerate(T_map_camera)))
+    up = estimate_up(dict(enumerate(T_map_camera)))
     true_up = T_first[2, :3]  # z of the world in the axes of the first camera
     assert np.rad2deg(np.arccos(up @ true_up)) < 5
 
 
 def test_without_keyframes_up_is_that_of_a_level_camera() -> None:
-    np.testing.assert_array_equal(up_of({}), [0, -1, 0])
+    np.testing.assert_array_equal(estimate_up({}), [0, -1, 0])

@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.conversions.poses import pose_message
+from ldo_service.conversions.poses import pose_to_message
 from ldo_service.geometry import Camera, se3
 from ldo_service.schemas import MapObjects
 from ldo_service.viewer.lines import (
     FRUSTUM_M,
     JUMP_M,
-    MOST_SIGHTS,
+    MAX_SIGHTS,
     box_lines,
     color_of,
     keyframe_lines,
@@ -20,7 +20,7 @@ from ldo_service.viewer.lines import (
     path_lines,
     sight_lines,
 )
-from ldo_service.viewer.scene import Sight, thinned
+from ldo_service.viewer.scene import ObjectBox, thinned
 from tests.schemas.examples import EXAMPLES
 
 CAMERA = Camera(64, 48, 60.0, 50.0, 30.0, 25.0)
@@ -46,7 +46,9 @@ def test_a_keyframe_is_drawn_as_its_camera_sees() -> None:
 
 
 def test_a_detection_is_drawn_around_what_was_detected() -> None:
-    sights = {7: (Sight("cup", (10.0, 5.0, 20.0, 15.0)), Sight("sofa", (0.0, 0.0, 60.0, 40.0)))}
+    sights = {
+        7: (ObjectBox("cup", (10.0, 5.0, 20.0, 15.0)), ObjectBox("sofa", (0.0, 0.0, 60.0, 40.0)))
+    }
     lines = sight_lines({7: T_MAP_CAMERA, 8: np.eye(4)}, CAMERA, sights)
     assert lines.points.shape == (8, 2, 3)
     corners = [(10, 5), (20, 5), (20, 15), (10, 15)]
@@ -57,9 +59,9 @@ def test_a_detection_is_drawn_around_what_was_detected() -> None:
 
 
 def test_detections_wait_for_the_camera_and_are_not_too_many() -> None:
-    sights = {7: tuple(Sight("cup", (i, 0.0, i + 1.0, 1.0)) for i in range(2 * MOST_SIGHTS))}
+    sights = {7: tuple(ObjectBox("cup", (i, 0.0, i + 1.0, 1.0)) for i in range(2 * MAX_SIGHTS))}
     assert len(sight_lines({7: T_MAP_CAMERA}, None, sights).points) == 0
-    assert len(sight_lines({7: T_MAP_CAMERA}, CAMERA, sights).points) == 4 * MOST_SIGHTS
+    assert len(sight_lines({7: T_MAP_CAMERA}, CAMERA, sights).points) == 4 * MAX_SIGHTS
     assert len(sight_lines({}, CAMERA, sights).points) == 0
 
 
@@ -67,7 +69,7 @@ def test_a_box_has_the_edges_of_its_object() -> None:
     found = EXAMPLES["map_objects"]
     assert isinstance(found, MapObjects)
     one = msgspec.structs.replace(
-        found.objects[0], T_map_object=pose_message(T_MAP_CAMERA), size=(0.5, 0.25, 1.0)
+        found.objects[0], T_map_object=pose_to_message(T_MAP_CAMERA), size=(0.5, 0.25, 1.0)
     )
     lines = box_lines([one])
     lengths = np.linalg.norm(lines.points[:, 1] - lines.points[:, 0], axis=1)
@@ -107,7 +109,7 @@ def test_a_loop_is_drawn_where_both_ends_are_known() -> None:
     np.testing.assert_allclose(lines.points, [[np.zeros(3), T_MAP_CAMERA[:3, 3]]], atol=1e-6)
 
 
-def test_names_have_colours_of_their_own() -> None:
+def test_names_have_colors_of_their_own() -> None:
     names = ("chair", "couch", "cup", "oven", "bed", "clock")
     assert len({color_of(name) for name in names}) == len(names)
     assert color_of("chair") == color_of("chair")

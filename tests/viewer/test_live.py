@@ -24,10 +24,10 @@ from ldo_service.schemas.topics import (
     POSE_TRACKED,
     Topic,
 )
-from ldo_service.transport.certificate_authority import Authority
-from ldo_service.transport.keys import Keys
-from ldo_service.transport.zenoh_transport import Network, open_session
-from ldo_service.viewer.live import Live, live
+from ldo_service.transport.certificate_authority import CertificateAuthority
+from ldo_service.transport.keys import TlsKeys
+from ldo_service.transport.zenoh_transport import Endpoint, open_session
+from ldo_service.viewer.live import LiveSource, live
 from ldo_service.viewer.view_config import ViewerConfig
 from tests.maps.streams import ChangingMap
 from tests.ports import free_endpoint
@@ -38,7 +38,7 @@ from tests.service.conftest import wait_until
 class Robot:
     """A router with the keys of a service: says what it is told to say."""
 
-    def __init__(self, network: Network, session: zenoh.Session) -> None:
+    def __init__(self, network: Endpoint, session: zenoh.Session) -> None:
         self._network, self._session = network, session
 
     def says(self, topic: Topic, *messages: Message, below: str = "") -> None:
@@ -61,22 +61,22 @@ class Robot:
 
 
 @pytest.fixture
-def network(tmp_path: Path) -> Network:
-    authority = Authority.new(tmp_path / "keys", days=2)
+def network(tmp_path: Path) -> Endpoint:
+    authority = CertificateAuthority.new(tmp_path / "keys", days=2)
     for role in ("service", "viewer"):
         authority.add(role, role, "robot", days=1)
     here = free_endpoint().replace("tcp/", "tls/")
-    return Network("robot", here, Keys.of(tmp_path / "keys" / "service"))
+    return Endpoint("robot", here, TlsKeys.of(tmp_path / "keys" / "service"))
 
 
 @pytest.fixture
-def robot(network: Network) -> Iterator[Robot]:
+def robot(network: Endpoint) -> Iterator[Robot]:
     with open_session(network, router=True) as session:
         yield Robot(network, session)
 
 
 @contextmanager
-def looked_at(network: Network, tmp_path: Path) -> Iterator[Live]:
+def looked_at(network: Endpoint, tmp_path: Path) -> Iterator[LiveSource]:
     with (
         connect("robot", network.endpoint, tmp_path / "keys" / "viewer") as service,
         live(service, ViewerConfig()) as source,
@@ -85,12 +85,12 @@ def looked_at(network: Network, tmp_path: Path) -> Iterator[Live]:
 
 
 @pytest.fixture
-def source(robot: Robot, network: Network, tmp_path: Path) -> Iterator[Live]:  # noqa: ARG001
+def source(robot: Robot, network: Endpoint, tmp_path: Path) -> Iterator[LiveSource]:  # noqa: ARG001
     with looked_at(network, tmp_path) as source:
         yield source
 
 
-def test_all_that_it_says_is_seen(robot: Robot, source: Live) -> None:
+def test_all_that_it_says_is_seen(robot: Robot, source: LiveSource) -> None:
     changing = ChangingMap()
     robot.says(KEYFRAME_NEW, EXAMPLES["keyframe"])
     robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
@@ -116,7 +116,7 @@ def test_all_that_it_says_is_seen(robot: Robot, source: Live) -> None:
 
 
 def test_who_comes_late_is_told_what_there_is(
-    robot: Robot, network: Network, tmp_path: Path
+    robot: Robot, network: Endpoint, tmp_path: Path
 ) -> None:
     changing = ChangingMap()
     for _ in range(5):
@@ -137,7 +137,7 @@ def test_who_comes_late_is_told_what_there_is(
 
 @pytest.mark.parametrize("first", [1, 4], ids=["from its beginning", "from later on"])
 def test_a_service_that_is_started_again_with_an_empty_map_is_followed(
-    robot: Robot, source: Live, first: int
+    robot: Robot, source: LiveSource, first: int
 ) -> None:
     """Its versions begin at 0, and what is heard first may be any of them."""
     old, new = ChangingMap(1), ChangingMap(2)
@@ -156,7 +156,7 @@ def test_a_service_that_is_started_again_with_an_empty_map_is_followed(
 
 
 def test_an_actor_that_was_started_again_alone_goes_on_with_the_map(
-    robot: Robot, source: Live
+    robot: Robot, source: LiveSource
 ) -> None:
     old = ChangingMap(1)
     robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
@@ -177,12 +177,14 @@ def lives(robot: Robot, epoch: int, actors: tuple[str, ...] = ("tracker", "mappe
         robot.says(HEALTH, beat, below=f"/{actor}")
 
 
-def shows(source: Live, changing: ChangingMap) -> bool:
+def shows(source: LiveSource, changing: ChangingMap) -> bool:
     source.update()
     return np.array_equal(source.scene.rows, changing.map.rows)
 
 
-def test_what_nobody_watches_is_not_worked_out_and_not_lost(robot: Robot, source: Live) -> None:
+def test_what_nobody_watches_is_not_worked_out_and_not_lost(
+    robot: Robot, source: LiveSource
+) -> None:
     changing = ChangingMap()
     robot.says(POSE_TRACKED, EXAMPLES["tracked_pose"])
     robot.says(MAP_DELTA, changing.delta())
@@ -193,7 +195,7 @@ def test_what_nobody_watches_is_not_worked_out_and_not_lost(robot: Robot, source
     wait_until(lambda: shows(source, changing) and len(source.scene.online) == 1, 10, "all of it")
 
 
-def test_only_one_keyframe_is_fetched_for_its_lens(robot: Robot, source: Live) -> None:
+def test_only_one_keyframe_is_fetched_for_its_lens(robot: Robot, source: LiveSource) -> None:
     """They are large, and nothing else is taken from them."""
     publisher = robot.publisher(KEYFRAME_NEW)
     wait_until(lambda: publisher.matching_status.matching, 10, "heard")

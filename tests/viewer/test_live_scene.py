@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from ldo_service.conversions.frames import camera_of
-from ldo_service.conversions.poses import correction_message, pose_message
+from ldo_service.conversions.frames import camera_from_message
+from ldo_service.conversions.poses import correction_to_message, pose_to_message
 from ldo_service.geometry import se3
 from ldo_service.schemas import (
     Correction,
@@ -19,7 +19,7 @@ from ldo_service.schemas import (
     ObjectView,
     TrackedPose,
 )
-from ldo_service.viewer.live import FACTS_EVERY_S, MOST_ACTORS, LiveScene
+from ldo_service.viewer.live import FACTS_EVERY_S, MAX_ACTORS, LiveScene
 from ldo_service.viewer.view_config import ViewerConfig
 from tests.maps.streams import ChangingMap
 from tests.schemas.examples import EXAMPLES
@@ -58,9 +58,9 @@ def pose(frame: int, x_m: float, reference: int | None, **fields: object) -> Tra
         "frame": frame,
         "status": "OK",
         "reference": reference,
-        "T_odom_camera": pose_message(at(x_m)),
-        "T_map_odom": pose_message(np.eye(4)),
-        "T_reference_camera": pose_message(T_reference_camera),
+        "T_odom_camera": pose_to_message(at(x_m)),
+        "T_map_odom": pose_to_message(np.eye(4)),
+        "T_reference_camera": pose_to_message(T_reference_camera),
         "keyframe": None,
         "segment": 0,
     }
@@ -68,7 +68,7 @@ def pose(frame: int, x_m: float, reference: int | None, **fields: object) -> Tra
 
 
 def correction(version: int, x_m: dict[int, float], **fields: object) -> Correction:
-    message = correction_message(0, version, {k: at(x) for k, x in x_m.items()})
+    message = correction_to_message(0, version, {k: at(x) for k, x in x_m.items()})
     return msgspec.structs.replace(message, **fields)
 
 
@@ -160,7 +160,7 @@ def test_the_lens_is_learnt_from_a_keyframe(live: LiveScene) -> None:
     assert isinstance(keyframe, Keyframe)
     assert not live.has_camera
     taken(live, keyframe)
-    assert live.scene.camera == camera_of(keyframe.camera)
+    assert live.scene.camera == camera_from_message(keyframe.camera)
 
 
 def test_detections_belong_to_their_keyframe_and_the_oldest_go(clock: Clock) -> None:
@@ -255,11 +255,11 @@ def test_words_change_no_faster_than_they_can_be_read(live: LiveScene, clock: Cl
 def test_actors_are_as_many_as_there_is_room_for(live: LiveScene, clock: Clock) -> None:
     health = EXAMPLES["health"]
     assert isinstance(health, Health)
-    for number in range(2 * MOST_ACTORS):
+    for number in range(2 * MAX_ACTORS):
         live.take(msgspec.structs.replace(health, actor=f"a{number}"))
     clock.now_s += FACTS_EVERY_S
     live.update()
-    assert live.scene.facts.count("\n| a") == MOST_ACTORS + 1  # and the names of the columns
+    assert live.scene.facts.count("\n| a") == MAX_ACTORS + 1  # and the names of the columns
 
 
 def test_silence_is_told_of(live: LiveScene, clock: Clock) -> None:

@@ -22,7 +22,7 @@ def test_covariances_are_those_of_scipys_rotations() -> None:
     np.testing.assert_array_equal(splats.centers, rows[:, 0:3])
 
 
-def test_colours_beyond_the_range_are_clipped() -> None:
+def test_colors_beyond_the_range_are_clipped() -> None:
     rows = random_rows(np.random.default_rng(1), 2)
     rows[:, 11:14] = [[-0.5, 0.5, 1.5], [0.0, 1.0, 0.25]]
     np.testing.assert_array_equal(splats_of(rows).colors, [[0, 0.5, 1], [0, 1, 0.25]])

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from ldo_service.datasets import Sequence
-from ldo_service.gaussians import GaussianMap, InsertionConfig, insert
+from ldo_service.gaussians import DensificationConfig, GaussianMap, densify
 from ldo_service.geometry import se3
 from ldo_service.volumes import Viewpoint
 
 KEYFRAMES = range(0, 120, 15)
-FINE = InsertionConfig(max_contrast=0.2)  # what is judged here is made from the map, not the map
+# what is judged here is made from the map, not the map
+FINE = DensificationConfig(max_contrast=0.2)
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ def mapped(room: Sequence) -> Mapped:
     """Gaussians inserted from eight frames at their true poses; the map is the world."""
     T_world_camera, gaussians = room.truth().T_world_camera, GaussianMap()
     for keyframe, index in enumerate(KEYFRAMES):
-        insert(gaussians, room[index], T_world_camera[index], keyframe, FINE)
+        densify(gaussians, room[index], T_world_camera[index], keyframe, FINE)
     viewpoints = [Viewpoint(room.camera, T_world_camera[index]) for index in KEYFRAMES]
     return Mapped(gaussians.rows, viewpoints, KEYFRAMES)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ldo_service.errors import ConfigError
-from ldo_service.volumes.marching_cubes import CORNERS, Surface, marching_cubes, packed
+from ldo_service.volumes.marching_cubes import CORNERS, Surface, marching_cubes, pack
 
 N = 24
 
@@ -78,9 +78,9 @@ def test_noise_meets_all_cases_and_leaves_no_crack(seed: int) -> None:
 def test_triples_keep_their_order_and_their_own_number() -> None:
     far = (1 << 19) - 1
     triples = np.array([[-far, far, far], [0, -far, 0], [0, 0, -1], [0, 0, 0], [far, -far, -far]])
-    assert (np.diff(packed(triples)) > 0).all()
+    assert (np.diff(pack(triples)) > 0).all()
     with pytest.raises(ConfigError, match="larger voxels"):
-        packed(np.array([[0, 1 << 19, 0]]))
+        pack(np.array([[0, 1 << 19, 0]]))
 
 
 def test_no_crossing_makes_no_surface() -> None:

@@ -12,7 +12,7 @@ TETRAHEDRON = Mesh(
 )
 
 
-def test_another_reader_finds_vertices_colours_and_triangles(tmp_path: Path) -> None:
+def test_another_reader_finds_vertices_colors_and_triangles(tmp_path: Path) -> None:
     trimesh = pytest.importorskip("trimesh", reason="pip install trimesh")
     write_mesh(tmp_path / "mesh.ply", TETRAHEDRON)
     read = trimesh.load(tmp_path / "mesh.ply", process=False)

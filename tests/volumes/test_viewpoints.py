@@ -35,7 +35,7 @@ def test_depth_between_two_surfaces_is_none() -> None:
     assert surface_depth_m(rendering, 0.02)[3, 4] == 0
 
 
-def test_colour_has_nothing_of_the_background() -> None:
+def test_color_has_nothing_of_the_background() -> None:
     rendering = seen(disc(1.0, 0.5, 0.8))
     assert rendering.color[3, 4, 0] < 0.6
     np.testing.assert_allclose(surface_color(rendering)[3, 4], 0.8, atol=1e-5)

@@ -37,7 +37,7 @@ class Labeller(Protocol):
         """Choose from this name too, from now on. Raises ConfigError when it cannot."""
         ...
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """What it counts."""
         ...
 

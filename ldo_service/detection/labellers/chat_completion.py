@@ -21,7 +21,7 @@ from ldo_service.errors import ConfigError, EndpointError
 from ldo_service.geometry import codecs
 from ldo_service.geometry.codecs import shrunk
 
-from .http_endpoint import Endpoint, EndpointConfig
+from .http_endpoint import HttpClient, HttpClientConfig
 
 log = logging.getLogger(__name__)
 
@@ -30,11 +30,11 @@ _NO_NAME = {NONE, "unknown", "unclear", "nothing", "object", "thing", "item", "n
 _NAME = re.compile(r"[^\W\d_][\w' -]*")  # of words, beginning with a letter
 _MARK = re.compile(r"<[|/]?\w+[|]?>")  # of a model's own, such as an end of turn
 
-OPEN = (
+OPEN_PROMPT = (
     "What is the object in the middle of this picture? Answer with its common name alone, in one "
     f'to three words, in English, without a sentence. If you cannot tell, answer "{NONE}".'
 )
-CLOSED = (
+CLOSED_PROMPT = (
     "Which of these is the object in the middle of this picture? {names}. Answer with one of these "
     f'names alone, as it is written here. If none of them fits, answer "{NONE}".'
 )
@@ -52,12 +52,12 @@ class _Logprobs(msgspec.Struct):
     content: list[_Token] | None = None
 
 
-class _Said(msgspec.Struct):
+class _Message(msgspec.Struct):
     content: str | None = None
 
 
 class _Choice(msgspec.Struct):
-    message: _Said
+    message: _Message
     logprobs: msgspec.Raw = msgspec.Raw(b"null")
 
 
@@ -139,7 +139,7 @@ class HttpConfig:
     confidence_untold: float = 0.3  # where the server tells no log-probabilities
     most_words: int = 4  # of an answer to the open question; more is a sentence
     most_tokens: int = 16  # asked for
-    endpoint: EndpointConfig = field(default_factory=EndpointConfig)
+    endpoint: HttpClientConfig = field(default_factory=HttpClientConfig)
 
     def __post_init__(self) -> None:
         if self.confidence not in ("product", "mean"):
@@ -157,7 +157,7 @@ class HttpLabeller:
 
     url    of the API, such as http://127.0.0.1:8000/v1
     names  to choose from; empty: the question is open
-    clock, sleep  see `Endpoint`
+    clock, sleep  see `HttpClient`
 
     Raises ConfigError for an address or a key that cannot be.
     """
@@ -171,7 +171,7 @@ class HttpLabeller:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.config = config or HttpConfig()
-        self._endpoint, self._clock = Endpoint(url, self.config.endpoint, clock, sleep), clock
+        self._endpoint, self._clock = HttpClient(url, self.config.endpoint, clock, sleep), clock
         self._names = list(dict.fromkeys(map(canonical, names)))
         self._questions = self._refused = self._undecided = self._untold = 0
         self.identity = f"{self.config.model or 'model'} at {url}"
@@ -211,7 +211,7 @@ class HttpLabeller:
             slowest_s = max(slowest_s, self._clock() - start_s)
         return fused_over_views(views)
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """`answers_refused`: no name, or none of the list. `answers_undecided`: the model said that
         it cannot tell. `answers_without_logprobs`: sure to a configured degree only."""
         return {
@@ -249,7 +249,7 @@ class HttpLabeller:
     def _question(self, crop: np.ndarray) -> bytes:
         """As OpenAI's API has it: text, then the picture in the address of a data URL."""
         picture = base64.b64encode(codecs.encode_jpeg(shrunk(crop, self.config.side_px))).decode()
-        text = CLOSED.format(names=", ".join(self._names)) if self._names else OPEN
+        text = CLOSED_PROMPT.format(names=", ".join(self._names)) if self._names else OPEN_PROMPT
         content = [
             {"type": "text", "text": text},
             {"type": "image_url", "image_url": {"url": f"data:image/jpeg;base64,{picture}"}},

@@ -13,13 +13,20 @@ from ldo_service.detection.onnx_network import Network, sha256
 from ldo_service.detection.vocabulary import COCO, LONGEST, canonical, is_name
 from ldo_service.errors import ConfigError, ModelError
 
-from .text_embeddings import BytePairs, CachedEmbeddings, TextEncoder, Texts, only_embedding, unit
+from .text_embeddings import (
+    BpeTokenizer,
+    CachedEmbeddings,
+    TextEmbeddings,
+    TextEncoder,
+    only_embedding,
+    unit,
+)
 
 CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of RGB in 0..1; Radford et al., their code
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
 CLIP_SCALE = 100.0  # what CLIP's logit scale is clipped to, and ends at
 CLIP_PX = 224  # for an encoder that takes any size
-TOLD = 5  # opinions; the others are noise
+MAX_LABELS = 5  # opinions; the others are noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +60,7 @@ class DualEncoderConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class EncoderFiles:
     """Files of a pair: an image encoder, and where texts lie: a text encoder with its byte pairs,
     or embeddings."""
 
@@ -88,7 +95,7 @@ class DualEncoder:
 
     def __init__(
         self,
-        pair: Pair,
+        pair: EncoderFiles,
         config: DualEncoderConfig | None = None,
         names: Sequence[str] = (),
         name: str = "",
@@ -98,7 +105,7 @@ class DualEncoder:
         try:
             self._image = ImageEncoder(pair.image, self.config)
             cached = CachedEmbeddings(pair.embeddings) if pair.embeddings else None
-            self.texts = Texts(cached, _text_encoder(pair, self.config))
+            self.texts = TextEmbeddings(cached, _text_encoder(pair, self.config))
         except ModelError as error:
             raise ModelError(f"{what} cannot be used as a labeller: {error}") from error
         for space in (self.texts.encoder, self.texts.cached):
@@ -138,7 +145,7 @@ class DualEncoder:
         best = fused_over_views(self._view(crop, rows) for crop in crops)
         if not best or best[0][0] not in told:
             return []
-        return [opinion for opinion in best if opinion[0] in told][:TOLD]
+        return [opinion for opinion in best if opinion[0] in told][:MAX_LABELS]
 
     def add(self, name: str) -> None:
         """Raises ConfigError for what is no name, or when there is nothing to place it with."""
@@ -148,7 +155,7 @@ class DualEncoder:
             self._rows[canonical(name)] = self._place(name)
             self._listed[canonical(name)] = name
 
-    def facts(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {"names": len(self.names)}
 
     def _view(self, crop: np.ndarray, rows: np.ndarray) -> list[Opinion]:
@@ -217,10 +224,10 @@ class ImageEncoder:
         return values
 
 
-def _text_encoder(pair: Pair, config: DualEncoderConfig) -> TextEncoder | None:
+def _text_encoder(pair: EncoderFiles, config: DualEncoderConfig) -> TextEncoder | None:
     if pair.text is None or pair.vocabulary is None:
         return None
-    pairs = BytePairs.read(pair.vocabulary)
+    pairs = BpeTokenizer.read(pair.vocabulary)
     return TextEncoder(Network(pair.text, config.providers, config.threads), pairs, config.prompts)
 
 

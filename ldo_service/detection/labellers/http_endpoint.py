@@ -13,12 +13,12 @@ from urllib.parse import SplitResult, urlsplit
 
 from ldo_service.errors import ConfigError, EndpointError, named
 
-MOST_BYTES = 1 << 20  # of an answer
-TRY_AGAIN = (408, 425, 429, 500, 502, 503, 504)  # what a later attempt may find otherwise
+MAX_BYTES = 1 << 20  # of an answer
+RETRY_STATUS_CODES = (408, 425, 429, 500, 502, 503, 504)  # what a later attempt may find otherwise
 
 
 @dataclass(frozen=True, slots=True)
-class EndpointConfig:
+class HttpClientConfig:
     """How long, how often."""
 
     timeout_s: float = 10.0  # of one attempt
@@ -55,11 +55,11 @@ class EndpointConfig:
             raise ConfigError("attempts must be at least 1.")
 
 
-class OutOfPatience(EndpointError):
+class DeadlineExceeded(EndpointError):
     """No time is left, and the server did nothing wrong."""
 
 
-class Endpoint:
+class HttpClient:
     """Asked by one thread.
 
     url    http or https
@@ -71,7 +71,7 @@ class Endpoint:
     def __init__(
         self,
         url: str,
-        config: EndpointConfig,
+        config: HttpClientConfig,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
@@ -89,8 +89,8 @@ class Endpoint:
         if self._clock() < self._rested_at_s:
             raise EndpointError(f"{self.url} failed before and is left alone for a while.")
         try:
-            answer = self._insist(path, body, until_s)
-        except OutOfPatience:
+            answer = self._post_with_retries(path, body, until_s)
+        except DeadlineExceeded:
             raise
         except EndpointError:
             rest_s = self._config.rest_s * 2 ** min(self._failures, 30)
@@ -100,15 +100,15 @@ class Endpoint:
         self._failures = 0
         return answer
 
-    def _insist(self, path: str, body: bytes, until_s: float) -> bytes:
-        failure = OutOfPatience(f"{self.url} may not be asked again within patience_s.")
+    def _post_with_retries(self, path: str, body: bytes, until_s: float) -> bytes:
+        failure = DeadlineExceeded(f"{self.url} may not be asked again within patience_s.")
         for attempt in range(self._config.attempts):
             pause_s = self._config.backoff_s * 2 ** (attempt - 1) if attempt else 0.0
             self._wait(pause_s, until_s, failure)
             within_s = min(self._config.timeout_s, until_s - self._clock())
             try:
                 return self._ask(path, body, within_s)
-            except _Passing as passing:
+            except _TransientError as passing:
                 if within_s < self._config.timeout_s and self._clock() >= until_s:
                     raise failure from passing  # nobody knows what it would have said
                 failure = EndpointError(
@@ -137,28 +137,30 @@ class Endpoint:
                 connection.request("POST", self._address.path + path, body, self._headers)
                 return _checked(connection.getresponse(), self.url)
         except TimeoutError as error:
-            raise _Passing(f"did not answer within {within_s:.1f} s") from error
+            raise _TransientError(f"did not answer within {within_s:.1f} s") from error
         except (OSError, HTTPException, ValueError) as error:
-            raise _Passing(f"cannot be asked: {type(error).__name__} {error}".strip()) from error
+            raise _TransientError(
+                f"cannot be asked: {type(error).__name__} {error}".strip()
+            ) from error
         finally:
             connection.close()
 
 
-class _Passing(Exception):
+class _TransientError(Exception):
     """A failure that another attempt may not meet."""
 
 
 def _checked(response: HTTPResponse, url: str) -> bytes:
-    body = response.read(MOST_BYTES + 1)
-    if response.status in TRY_AGAIN:
-        raise _Passing(f"answers {response.status} {response.reason[:40]}")
+    body = response.read(MAX_BYTES + 1)
+    if response.status in RETRY_STATUS_CODES:
+        raise _TransientError(f"answers {response.status} {response.reason[:40]}")
     if response.status != 200:
         raise EndpointError(
             f"{url} answers {response.status} {response.reason[:40]}: check the address (often it "
             "ends in /v1), the name of the model and the key."
         )
-    if len(body) > MOST_BYTES:
-        raise EndpointError(f"{url} answers more than {MOST_BYTES} bytes.")
+    if len(body) > MAX_BYTES:
+        raise EndpointError(f"{url} answers more than {MAX_BYTES} bytes.")
     return body
 
 

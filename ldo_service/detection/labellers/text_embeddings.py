@@ -17,24 +17,24 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from ldo_service.detection.onnx_network import Network
-from ldo_service.detection.vocabulary import canonical, is_name, normalised
+from ldo_service.detection.vocabulary import canonical, is_name, normalized
 from ldo_service.errors import ModelError
 from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
 END = "</w>"
 # CLIP's vocabulary of 49,408 less the 512 bytes and the two marks; its file goes on beyond.
-MOST_MERGES = 49_408 - 512 - 2
-LARGEST_VOCABULARY_BYTES = 1 << 26  # unpacked; CLIP's has 3 MB
+MAX_MERGES = 49_408 - 512 - 2
+MAX_VOCABULARY_BYTES = 1 << 26  # unpacked; CLIP's has 3 MB
 _WORDS = re.compile(r"'(?:s|t|re|ve|m|ll|d)|[^\W\d_]+|\d|(?:[^\s\w]|_)+")
 
-LARGEST_BYTES = 1 << 30  # of 260,000 names in 1024 dimensions
+MAX_BYTES = 1 << 30  # of 260,000 names in 1024 dimensions
 CONTEXT = 77  # tokens of a text, where a network takes any number: CLIP's
 
 
 Pair = tuple[str, str]
 
 
-class BytePairs:
+class BpeTokenizer:
     """A tokenizer, from the merges in order of their rank.
 
     The bytes are numbered as GPT-2 has it, first those that print; then the same as ends of words,
@@ -49,17 +49,17 @@ class BytePairs:
         self.start, self.end = len(symbols), len(symbols) + 1
 
     @staticmethod
-    def read(path: Path) -> "BytePairs":
+    def read(path: Path) -> "BpeTokenizer":
         """From a file as CLIP's bpe_simple_vocab_16e6.txt.gz: a line about itself, then a pair a
         line. Raises ModelError."""
         _, *lines = _text(path).splitlines() or [""]
-        merges = [tuple(line.split()) for line in lines[:MOST_MERGES] if line.strip()]
+        merges = [tuple(line.split()) for line in lines[:MAX_MERGES] if line.strip()]
         if not merges or any(len(pair) != 2 for pair in merges):
             raise ModelError(
                 f"{path} is no list of byte pairs: a line about itself is expected, then two "
                 "symbols a line, as in CLIP's bpe_simple_vocab_16e6.txt.gz."
             )
-        return BytePairs([(pair[0], pair[1]) for pair in merges])
+        return BpeTokenizer([(pair[0], pair[1]) for pair in merges])
 
     def __len__(self) -> int:
         return self.end + 1
@@ -110,9 +110,9 @@ def _text(path: Path) -> str:
         body = path.read_bytes()
         if body.startswith(b"\x1f\x8b"):
             with gzip.open(path) as file:
-                body = file.read(LARGEST_VOCABULARY_BYTES + 1)
-        if len(body) > LARGEST_VOCABULARY_BYTES:
-            raise ModelError(f"{path} unpacks to more than {LARGEST_VOCABULARY_BYTES} bytes.")
+                body = file.read(MAX_VOCABULARY_BYTES + 1)
+        if len(body) > MAX_VOCABULARY_BYTES:
+            raise ModelError(f"{path} unpacks to more than {MAX_VOCABULARY_BYTES} bytes.")
         return body.decode("utf-8")
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise ModelError(f"the byte pairs in {path} cannot be read: {error}.") from error
@@ -124,7 +124,7 @@ class TextEncoder:
     Raises ModelError for a file that is no text encoder.
     """
 
-    def __init__(self, network: Network, pairs: BytePairs, prompts: Sequence[str]) -> None:
+    def __init__(self, network: Network, pairs: BpeTokenizer, prompts: Sequence[str]) -> None:
         self._network, self._pairs, self._prompts = network, pairs, tuple(prompts)
         self._inputs, self._context = _text_inputs(network)
         self.dimensions = len(self._of_text("a"))
@@ -169,16 +169,16 @@ class CachedEmbeddings:
         self.logit_scale = _scale(arrays.get("logit_scale"), path)
         rows = list(zip(names, embeddings, strict=True))
         self._rows = {canonical(name): row for name, row in reversed(rows)}
-        self._rows |= {normalised(name): row for name, row in rows}
+        self._rows |= {normalized(name): row for name, row in rows}
 
     def find(self, name: str) -> np.ndarray | None:
         """[D] float32 of length 1, of this word or one that means the same; None when there is
         none in the file."""
-        row = self._rows.get(normalised(name), self._rows.get(canonical(name)))
+        row = self._rows.get(normalized(name), self._rows.get(canonical(name)))
         return None if row is None else unit(row)
 
 
-class Texts:
+class TextEmbeddings:
     """The text half of a pair: what is in the file is read, anything else is computed."""
 
     def __init__(self, cached: CachedEmbeddings | None, encoder: TextEncoder | None) -> None:
@@ -188,7 +188,7 @@ class Texts:
         """[D] float32 of length 1; None where it is not in the file and there is no encoder."""
         row = self.cached.find(text) if self.cached else None
         if row is None and self.encoder is not None:
-            row = self.encoder.embed(normalised(text))
+            row = self.encoder.embed(normalized(text))
         return row
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
@@ -230,7 +230,7 @@ def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
 
 
 def _npz(path: Path) -> tuple[tuple[str, ...], dict[str, np.ndarray]]:
-    arrays = read_arrays(path, LARGEST_BYTES)
+    arrays = read_arrays(path, MAX_BYTES)
     return tuple(map(str, arrays.pop("names").tolist())), arrays
 
 

@@ -6,7 +6,7 @@ stands there; the two rooms are furnished differently. As in the single room, ev
 built from + - * / and square roots of float64 in a fixed order: the same bytes on every machine.
 """
 
-from .scene_object import CLASS_NAMES, COCO_COUNT, Thing
+from .scene_object import CLASS_NAMES, COCO_COUNT, SceneObject
 from .sequence import NAMED, FlatConfig, FlatSequence
 
 __all__ = [
@@ -15,5 +15,5 @@ __all__ = [
     "NAMED",
     "FlatConfig",
     "FlatSequence",
-    "Thing",
+    "SceneObject",
 ]

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from ldo_service.synthetic.flat.catalogue import CATALOGUE
+from ldo_service.synthetic.flat.catalog import CATALOG
 
 from .building import CORRIDOR, CORRIDOR_SIZE_M, ROOM_A, ROOM_B
-from .paint import Paints
-from .scene_object import Heading, Placement, Thing
+from .paint import Materials
+from .scene_object import Heading, Placement, SceneObject
 
 Row = tuple[str, int, tuple[float, float, float], Heading]
 
@@ -130,9 +130,9 @@ _HALF_M = CORRIDOR_SIZE_M[0] / 2
 ENDS = (Placement((_HALF_M, 0, 0), LEFT), Placement((-_HALF_M, 0, 0), RIGHT))
 
 
-def things(seed: int) -> tuple[tuple[Thing, int], ...]:
+def things(seed: int) -> tuple[tuple[SceneObject, int], ...]:
     """Every object of the flat, with the room (0, 1, or 2 for the corridor) it stands in."""
-    paint = Paints(np.random.default_rng([seed, 0]))
+    paint = Materials(np.random.default_rng([seed, 0]))
     rooms = ((LIVING_ROOM, ROOM_A, 0), (KITCHEN, ROOM_B, 1), (HALL, CORRIDOR, 2))
     furnished = [
         (placed, index)
@@ -144,14 +144,16 @@ def things(seed: int) -> tuple[tuple[Thing, int], ...]:
     return tuple(furnished)
 
 
-def _built(rows: tuple[Row, ...], paint: Paints) -> list[Thing]:
+def _built(rows: tuple[Row, ...], paint: Materials) -> list[SceneObject]:
     """The rows' things in their room's frame."""
-    made = [(label, CATALOGUE[label](paint, shape), at, way) for label, shape, at, way in rows]
+    made = [(label, CATALOG[label](paint, shape), at, way) for label, shape, at, way in rows]
     return [
-        Thing(label, tuple(Placement(at, way)(solid) for solid in solids))
+        SceneObject(label, tuple(Placement(at, way)(solid) for solid in solids))
         for label, solids, at, way in made
     ]
 
 
-def _placed(built: list[Thing], frame: Placement) -> list[Thing]:
-    return [Thing(thing.label, tuple(frame(solid) for solid in thing.solids)) for thing in built]
+def _placed(built: list[SceneObject], frame: Placement) -> list[SceneObject]:
+    return [
+        SceneObject(thing.label, tuple(frame(solid) for solid in thing.solids)) for thing in built
+    ]

@@ -12,7 +12,7 @@ KINDS |= {"books": 2, "picture": 5, "screen": 3}
 
 
 @dataclass
-class Paints:
+class Materials:
     """Draws material names of a kind, such as "wood 3"; what is drawn depends on the seed."""
 
     rng: np.random.Generator

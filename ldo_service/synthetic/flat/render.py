@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.geometry import Camera
 from ldo_service.synthetic.light import LIGHT_CELL_M, interpolated, lit_share, plane_axes, shade
-from ldo_service.synthetic.ray_casting import Hits, View, outline
+from ldo_service.synthetic.ray_casting import Hits, RayCaster, outline
 from ldo_service.synthetic.room_render import QUARTERS_PX
 from ldo_service.synthetic.solids import Solid, Vector, vector
 
@@ -110,7 +110,7 @@ class FlatRenderer:
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> Rendering:
         """Pixels on an outline average four rays in light; depth and labels never mix surfaces."""
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
-        view = View(SHELL, self._table.solids, camera, T_world_camera)
+        view = RayCaster(SHELL, self._table.solids, camera, T_world_camera)
         hits = view.cast(u, v)
         size = (camera.height, camera.width)
         light = self._reflected(view, u, v, hits)
@@ -123,7 +123,7 @@ class FlatRenderer:
             self._instance_ids[hits.surface].reshape(size),
         )
 
-    def _antialiased(self, view: View, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def _antialiased(self, view: RayCaster, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """The mean light [P, 3] of the quarters of pixels; all of them are cast at once."""
         du, dv = np.array(QUARTERS_PX).T
         u, v = (u[:, None] + du).ravel(), (v[:, None] + dv).ravel()
@@ -133,7 +133,7 @@ class FlatRenderer:
         light[order] = self._reflected(view, u, v, view.cast(u, v))
         return light.reshape(-1, len(du), 3).sum(axis=1) / len(du)
 
-    def _reflected(self, view: View, u: np.ndarray, v: np.ndarray, hits: Hits) -> np.ndarray:
+    def _reflected(self, view: RayCaster, u: np.ndarray, v: np.ndarray, hits: Hits) -> np.ndarray:
         """Light [P, 3] in 0..1: albedo times diffuse shading."""
         light = np.zeros((len(u), 3))
         for surface, rays in hits.by_surface():

@@ -10,7 +10,7 @@ from ldo_service.synthetic.textures import Texture
 from .building import Panel, panels
 from .furnishing import things
 from .paint import materials
-from .scene_object import CLASS_NAMES, Thing
+from .scene_object import CLASS_NAMES, SceneObject
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class Flat:
     """The building, everything in it, and of each thing the room whose lamp lights it."""
 
     panels: tuple[Panel, ...]
-    things: tuple[Thing, ...]
+    things: tuple[SceneObject, ...]
     rooms: tuple[int, ...]
     textures: dict[str, Texture]
 

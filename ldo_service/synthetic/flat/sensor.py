@@ -8,7 +8,7 @@ from ldo_service.geometry import Camera
 from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY_STEP_PER_M
 
 from .render import Rendering
-from .walk import FRAMES, RATE_HZ, Walk, closed_spline
+from .walk import FRAMES, RATE_HZ, CameraPath, closed_spline
 
 SHUTTER_S = 0.02  # indoors in the evening: 11 pixels of blur at 60 degrees per second
 BLUR_TAPS = 7
@@ -28,7 +28,7 @@ class Sensor:
     """A camera on a walk; `seed` draws its gain and its noise."""
 
     camera: Camera
-    walk: Walk
+    walk: CameraPath
     seed: int
 
     def color(self, frame: int, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:

@@ -16,7 +16,7 @@ from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 from .cache import FrameCache, StoredFrame
 from .render import FlatRenderer
 from .scene import Flat, furnished_flat
-from .scene_object import CLASS_NAMES, Thing
+from .scene_object import CLASS_NAMES, SceneObject
 from .sensor import Sensor
 from .walk import FRAMES, RATE_HZ, hand_held
 
@@ -81,7 +81,7 @@ class FlatSequence(Sequence):
         return self._cache.folder
 
     @cached_property
-    def things(self) -> tuple[Thing, ...]:
+    def things(self) -> tuple[SceneObject, ...]:
         """The objects in the world."""
         return self._flat.things
 

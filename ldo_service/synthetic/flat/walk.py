@@ -58,7 +58,7 @@ TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE = 0.2, 0.0015, 0.004  # its quick tremor
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
+class CameraPath:
     """The camera's motion as a function of time, a closed curve that `FRAMES` frames sample.
 
     along   [M + 1] place on the knots at times of equal steps
@@ -80,12 +80,12 @@ class Walk:
         return _looking(state[:3], state[3:6], state[6])
 
 
-def hand_held(seed: int) -> Walk:
+def hand_held(seed: int) -> CameraPath:
     """The walk with the sway and tremor of a hand drawn from `seed`."""
     rng = np.random.default_rng([seed, 2])
     sway = _shake(rng, SWAY_S, SWAY_EYE_M, SWAY_GAZE)
     tremor = _shake(rng, TREMOR_S, TREMOR_EYE_M, TREMOR_GAZE)
-    return Walk(_timed(), (sway, tremor))
+    return CameraPath(_timed(), (sway, tremor))
 
 
 def _shake(rng: np.random.Generator, period_s: float, eye_m: float, gaze: float) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ldo_service.detection.labellers.chat_completion import HttpConfig, HttpLabeller
-from ldo_service.detection.labellers.http_endpoint import EndpointConfig
+from ldo_service.detection.labellers.http_endpoint import HttpClientConfig
 from ldo_service.errors import ConfigError, EndpointError
 
 from .encoders import plain
@@ -37,7 +37,7 @@ class Time:
 
 def labeller(url: str, names=NAMES, time: Time | None = None, **fields) -> HttpLabeller:
     time = time or Time()
-    endpoint = EndpointConfig(**fields.pop("endpoint", {}))
+    endpoint = HttpClientConfig(**fields.pop("endpoint", {}))
     config = HttpConfig(model="llava", endpoint=endpoint, **fields)
     return HttpLabeller(url, config, names, time.clock, time.sleep)
 
@@ -76,7 +76,7 @@ def test_views_are_fused_and_no_more_than_configured_are_asked() -> None:
     with serving(says("cup", 0.9), says("sofa", 0.8), says("couch", 0.7), says("x")) as server:
         one = labeller(server.url, views=3)
         assert one.label([RED] * 5) == [("couch", pytest.approx(0.5)), ("cup", pytest.approx(0.3))]
-    assert one.facts()["questions"] == 3
+    assert one.metrics()["questions"] == 3
 
 
 def test_without_log_probabilities_confidence_is_low_and_said_so(caplog) -> None:
@@ -86,7 +86,7 @@ def test_without_log_probabilities_confidence_is_low_and_said_so(caplog) -> None
             assert one.label([RED]) == [("cup", 0.3)]
     (record,) = caplog.records
     assert "tells no log-probabilities" in record.getMessage()
-    assert one.facts()["answers_without_logprobs"] == 3
+    assert one.metrics()["answers_without_logprobs"] == 3
 
 
 @pytest.mark.parametrize(
@@ -106,14 +106,14 @@ def test_an_answer_that_is_none_of_the_names_is_refused_and_counted(text: str) -
     with serving(says(text, 0.99)) as server:
         one = labeller(server.url, views=1)
         assert one.label([RED]) == []
-    assert one.facts()["answers_refused"] == 1
+    assert one.metrics()["answers_refused"] == 1
 
 
 def test_none_is_an_honest_answer() -> None:
     with serving(says("None.", 0.99)) as server:
         one = labeller(server.url, views=1)
         assert one.label([RED]) == []
-        assert (one.facts()["answers_refused"], one.facts()["answers_undecided"]) == (0, 1)
+        assert (one.metrics()["answers_refused"], one.metrics()["answers_undecided"]) == (0, 1)
 
 
 def test_an_open_question_takes_any_name_and_no_sentence() -> None:
@@ -144,7 +144,7 @@ def test_what_may_pass_is_tried_again_with_growing_pauses(trouble: Callable) -> 
     with serving(trouble, trouble, says("cup", 0.5)) as server:
         one = labeller(server.url, time=time, views=1, endpoint={"per_minute": 1e9})
         assert one.label([RED]) == [("cup", pytest.approx(0.5))]
-    assert one.facts()["attempts"] == 3
+    assert one.metrics()["attempts"] == 3
     assert time.now_s == pytest.approx(100 + 0.5 + 1.0)
 
 
@@ -155,7 +155,7 @@ def test_a_server_that_keeps_failing_is_left_alone_for_longer_and_longer() -> No
         for _ in range(100):
             with pytest.raises(EndpointError):
                 one.label([RED])
-            attempts.append(one.facts()["attempts"])
+            attempts.append(one.metrics()["attempts"])
             time.now_s += 1
         with pytest.raises(EndpointError, match="left alone"):
             one.label([RED])
@@ -231,7 +231,7 @@ def test_all_views_of_a_region_together_try_its_patience(each_s: float, asked: i
         one = labeller(server.url, time=time, views=3)
         assert one.label([RED] * 3) == [("cup", pytest.approx(0.5))]
     assert len(server.asked) == asked
-    assert time.now_s - 100 <= EndpointConfig().patience_s
+    assert time.now_s - 100 <= HttpClientConfig().patience_s
 
 
 @pytest.mark.parametrize(
@@ -263,7 +263,7 @@ def test_a_view_cut_off_by_patience_is_no_failure_of_the_server(
 
 def test_a_question_that_may_not_have_one_attempt_s_time_is_refused() -> None:
     with pytest.raises(ConfigError, match="patience_s=5 must be at least timeout_s=10"):
-        EndpointConfig(patience_s=5)
+        HttpClientConfig(patience_s=5)
 
 
 # --- manners --------------------------------------------------------------------------------------
@@ -329,4 +329,4 @@ def test_settings_that_cannot_be_are_refused(fields: dict) -> None:
     with pytest.raises(ConfigError, match="http"):
         HttpConfig(**fields)
     with pytest.raises(ConfigError):
-        EndpointConfig(attempts=0)
+        HttpClientConfig(attempts=0)

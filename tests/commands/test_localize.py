@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ldo_service.commands.run import localised
+from ldo_service.commands.run import format_localization
 from ldo_service.datasets import open_sequence
 from ldo_service.geometry import Trajectory, se3
 
@@ -37,8 +37,8 @@ def test_a_second_run_is_in_the_frame_of_the_first(
 
 
 @pytest.mark.parametrize(("ok", "says"), [(0, "is maps a map of this place"), (1, "as it was")])
-def test_where_no_frame_is_recognised_the_map_is_asked_about(ok: int, says: str) -> None:
-    assert says in localised({"OK": ok, "WEAK": 0, "LOST": 3}, Path("maps"))
+def test_where_no_frame_is_recognized_the_map_is_asked_about(ok: int, says: str) -> None:
+    assert says in format_localization({"OK": ok, "WEAK": 0, "LOST": 3}, Path("maps"))
 
 
 def test_a_folder_that_is_no_run_is_bad_data(capsys, tmp_path: Path, room_folder: Path) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from autograd import grad
 
-from ldo_service.gaussians.renderer import Rasteriser
+from ldo_service.gaussians.renderer import Rasterizer
 from ldo_service.geometry import Camera, se3
-from ldo_service.kernels import _rasterise
+from ldo_service.kernels import _rasterize
 from tests.reference.render import render_reference
 
 from .scenes import camera_of, gaussians
@@ -24,14 +24,14 @@ GROUPS = {
     "color": slice(11, 14),
 }
 DIFFERENTIATE_ALL = """
-from ldo_service.gaussians.renderer import Rasteriser
+from ldo_service.gaussians.renderer import Rasterizer
 from ldo_service.geometry import Camera
 for name in {key.split("/")[0] for key in given}:
     rows, T, camera, by_planes = (given[f"{name}/{part}"] for part in ("rows", "T", "camera", "by"))
-    rasteriser = Rasteriser(threads=2)
+    rasterizer = Rasterizer(threads=2)
     camera = Camera(int(camera[0]), int(camera[1]), *camera[2:])
-    result[f"{name}/planes"] = rasteriser.render(rows, camera, T)
-    gradients = rasteriser.gradients(by_planes)
+    result[f"{name}/planes"] = rasterizer.render(rows, camera, T)
+    gradients = rasterizer.gradients(by_planes)
     result[f"{name}/rows"] = np.zeros_like(rows)
     result[f"{name}/rows"][gradients.indices] = gradients.rows
     result[f"{name}/xi"] = gradients.xi
@@ -122,11 +122,11 @@ def test_view_of_nothing_has_no_gradients(by_kernel: dict) -> None:
     assert not by_kernel["nothing/planes"].any()
 
 
-def test_planes_are_the_images_of_the_rasteriser() -> None:
+def test_planes_are_the_images_of_the_rasterizer() -> None:
     rows, camera, T = SCENES["odd_size"]
-    planes = Rasteriser().render(rows, camera, T)
+    planes = Rasterizer().render(rows, camera, T)
     intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
-    color, depth_m, _, opacity = _rasterise.rasterise(rows, T[:3].astype(np.float32), *intrinsics)
+    color, depth_m, _, opacity = _rasterize.rasterize(rows, T[:3].astype(np.float32), *intrinsics)
     np.testing.assert_allclose(planes[:3], np.moveaxis(color, -1, 0), atol=1e-6)
     np.testing.assert_allclose(planes[3], depth_m, atol=1e-5)
     np.testing.assert_allclose(planes[4], opacity, atol=1e-6)
@@ -136,9 +136,9 @@ def test_early_stop_leaves_out_the_same_splats_forward_and_backward() -> None:
     rows = gaussians(1500, 8)
     rows[:, 10] = 3
     camera = camera_of(24, 24)
-    rasteriser = Rasteriser()
-    planes = rasteriser.render(rows, camera, np.eye(4))
-    gradients = rasteriser.gradients(np.ones((5, 24, 24), np.float32))
+    rasterizer = Rasterizer()
+    planes = rasterizer.render(rows, camera, np.eye(4))
+    gradients = rasterizer.gradients(np.ones((5, 24, 24), np.float32))
     assert np.mean(planes[4] > 0.9999) > 0.9
     hidden = gradients.rows[:, 14] == 0
     assert 0.1 < hidden.mean() < 0.9
@@ -151,9 +151,9 @@ def test_needle_penalty_shortens_the_longest_axis_and_widens_the_middle_one() ->
     rows = gaussians(40, 11)
     rows[:, 3:6] = np.log([0.5, 0.05, 0.01])
     rows[20:, 3:6] = np.log([0.01, 0.06, 0.05])  # a disc: below the ratio
-    rasteriser = Rasteriser()
-    rasteriser.render(rows, camera_of(24, 24), np.eye(4))
-    gradients = rasteriser.gradients(
+    rasterizer = Rasterizer()
+    rasterizer.render(rows, camera_of(24, 24), np.eye(4))
+    gradients = rasterizer.gradients(
         np.zeros((5, 24, 24), np.float32), needle_weight=2.0, needle_ratio=4.0
     )
     needles = gradients.indices < 20
@@ -170,9 +170,9 @@ def test_number_of_threads_changes_no_bit(threads: int) -> None:
     rows, camera = gaussians(30_000, 9), camera_of(213, 157)
     results = []
     for n in (1, threads):
-        rasteriser = Rasteriser(threads=n)
-        planes = rasteriser.render(rows, camera, TURNED).copy()
-        gradients = rasteriser.gradients(by_planes_of(camera))
+        rasterizer = Rasterizer(threads=n)
+        planes = rasterizer.render(rows, camera, TURNED).copy()
+        gradients = rasterizer.gradients(by_planes_of(camera))
         results.append([planes, gradients.indices, gradients.rows, gradients.xi])
     for one, many in zip(*results, strict=True):
         assert one.tobytes() == many.tobytes()
@@ -180,7 +180,7 @@ def test_number_of_threads_changes_no_bit(threads: int) -> None:
 
 def test_memory_of_a_larger_view_does_not_change_the_next() -> None:
     rows, camera, T = SCENES["many"]
-    used, fresh = Rasteriser(), Rasteriser()
+    used, fresh = Rasterizer(), Rasterizer()
     used.render(gaussians(20_000, 1), camera_of(160, 120), np.eye(4))
     used.gradients(by_planes_of(camera_of(160, 120)))
     assert used.render(rows, camera, T).tobytes() == fresh.render(rows, camera, T).tobytes()
@@ -190,7 +190,7 @@ def test_memory_of_a_larger_view_does_not_change_the_next() -> None:
 
 
 def test_pass_that_another_thread_uses_is_refused() -> None:
-    rows, forward = gaussians(200_000, 0), _rasterise.Pass()
+    rows, forward = gaussians(200_000, 0), _rasterize.Pass()
     T, planes = np.eye(4, dtype=np.float32)[:3], np.zeros((5, 480, 640), np.float32)
     arguments = (forward, rows, T, 500.0, 500.0, 320.0, 240.0, planes)
     refused = []
@@ -198,7 +198,7 @@ def test_pass_that_another_thread_uses_is_refused() -> None:
     def render_often() -> None:
         for _ in range(20):
             try:
-                _rasterise.rasterise_planes(*arguments)
+                _rasterize.rasterize_planes(*arguments)
             except ValueError as error:
                 refused.append(str(error))
 
@@ -211,10 +211,10 @@ def test_pass_that_another_thread_uses_is_refused() -> None:
     assert all("in use by another thread" in message for message in refused)
 
 
-def rendered(n: int = 5) -> tuple[_rasterise.Pass, dict]:
-    rows, forward, planes = gaussians(n, 0), _rasterise.Pass(), np.zeros((5, 9, 9), np.float32)
+def rendered(n: int = 5) -> tuple[_rasterize.Pass, dict]:
+    rows, forward, planes = gaussians(n, 0), _rasterize.Pass(), np.zeros((5, 9, 9), np.float32)
     T = np.eye(4, dtype=np.float32)[:3]
-    visible = _rasterise.rasterise_planes(forward, rows, T, 9.0, 9.0, 4.0, 4.0, planes)
+    visible = _rasterize.rasterize_planes(forward, rows, T, 9.0, 9.0, 4.0, 4.0, planes)
     return forward, {
         "rows": rows,
         "planes": planes,
@@ -240,12 +240,12 @@ def rendered(n: int = 5) -> tuple[_rasterise.Pass, dict]:
 def test_bad_arguments_raise_value_error(change: dict, message: str) -> None:
     forward, arguments = rendered()
     assert len(arguments["indices"]) > 1
-    _rasterise.backpropagate(forward, **arguments)
+    _rasterize.backpropagate(forward, **arguments)
     with pytest.raises(ValueError, match=message):
-        _rasterise.backpropagate(forward, **arguments | change)
+        _rasterize.backpropagate(forward, **arguments | change)
 
 
 def test_gradients_before_any_rendering_are_refused() -> None:
     _, arguments = rendered()
     with pytest.raises(ValueError, match="no rendering"):
-        _rasterise.backpropagate(_rasterise.Pass(), **arguments)
+        _rasterize.backpropagate(_rasterize.Pass(), **arguments)

@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 
-from ldo_service.synthetic.flat.paint import Paints
+from ldo_service.synthetic.flat.paint import Materials
 from ldo_service.synthetic.flat.scene_object import Heading
 from ldo_service.synthetic.solids import Shape, Solid
 
 Solids = tuple[Solid, ...]
-Builder = Callable[[Paints, int], Solids]
+Builder = Callable[[Materials, int], Solids]
 Triple = tuple[float, float, float]
 
 

@@ -4,7 +4,7 @@ from numpy.typing import NDArray
 def isa() -> str:
     """Instruction set that this process runs with: avx512, avx2 or baseline."""
 
-def rasterise(
+def rasterize(
     rows: NDArray[np.float32],
     T_camera_map: NDArray[np.float32],
     fx: float,
@@ -65,7 +65,7 @@ def contributions(
     weights the nearer one's. Bitwise equal for any number of threads.
     """
 
-def rasterise_planes(
+def rasterize_planes(
     forward: Pass,
     rows: NDArray[np.float32],
     T_camera_map: NDArray[np.float32],

@@ -12,7 +12,7 @@
 
 #include "adam_arguments.hpp"
 #include "isa.hpp"
-#include "rasterise.hpp"
+#include "rasterize.hpp"
 
 namespace ldo {
 namespace {
@@ -26,17 +26,17 @@ using Image = nb::ndarray<nb::numpy, float>;
 
 // The functions of the chosen instruction set.
 struct Kernels {
-  decltype(&baseline::rasterise) rasterise;
+  decltype(&baseline::rasterize) rasterize;
   decltype(&baseline::contributions) contributions;
   decltype(&baseline::new_pass) new_pass;
-  decltype(&baseline::rasterise_planes) rasterise_planes;
+  decltype(&baseline::rasterize_planes) rasterize_planes;
   decltype(&baseline::backpropagate) backpropagate;
   decltype(&baseline::descend) descend;
 };
 
 #define LDO_KERNELS(isa)                                                                          \
   Kernels {                                                                                       \
-    isa::rasterise, isa::contributions, isa::new_pass, isa::rasterise_planes, isa::backpropagate, \
+    isa::rasterize, isa::contributions, isa::new_pass, isa::rasterize_planes, isa::backpropagate, \
         isa::descend                                                                              \
   }
 Kernels kernels_for(Isa isa) {
@@ -172,7 +172,7 @@ class Seen {
   std::optional<BoundsOfPython::Use> use_;
 };
 
-std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array& T_camera_map,
+std::tuple<Image, Image, Image, Image> rasterize(const Array& rows, const Array& T_camera_map,
                                                  float fx, float fy, float cx, float cy, int width,
                                                  int height, int threads, PassOfPython* memory,
                                                  BoundsOfPython* bounds) {
@@ -188,7 +188,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
   held.is_rendered = false;
   {
     nb::gil_scoped_release release;
-    kernels.rasterise(seen.gaussians, view, threads, *pass,
+    kernels.rasterize(seen.gaussians, view, threads, *pass,
                       {color.get(), depth.get(), median_depth.get(), opacity.get()});
   }
   held.is_rendered = true;
@@ -196,7 +196,7 @@ std::tuple<Image, Image, Image, Image> rasterise(const Array& rows, const Array&
           image(median_depth.release(), {h, w}), image(opacity.release(), {h, w})};
 }
 
-int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_camera_map, float fx,
+int64_t rasterize_planes(PassOfPython& held, const Array& rows, const Array& T_camera_map, float fx,
                          float fy, float cx, float cy, const WritableArray& planes, int threads,
                          BoundsOfPython* bounds, const std::optional<Array>& tiles) {
   require_threads(threads);
@@ -213,7 +213,7 @@ int64_t rasterise_planes(PassOfPython& held, const Array& rows, const Array& T_c
   held.is_rendered = false;
   {
     nb::gil_scoped_release release;
-    kernels.rasterise_planes(seen.gaussians, view, wanted, threads, *pass, images);
+    kernels.rasterize_planes(seen.gaussians, view, wanted, threads, *pass, images);
   }
   held.is_rendered = true;
   return pass->visible;
@@ -314,7 +314,7 @@ PoseGradient descend(PassOfPython& held, const WritableArray& rows, const Writab
 
 }  // namespace
 
-NB_MODULE(_rasterise, m) {
+NB_MODULE(_rasterize, m) {
   using namespace nb::literals;
   isa = chosen_isa();
   kernels = kernels_for(isa);
@@ -324,9 +324,9 @@ NB_MODULE(_rasterise, m) {
       .def("forget", &BoundsOfPython::forget, "first"_a = 0, "last"_a = kMaxGaussians)
       .def("forget_rows", &BoundsOfPython::forget_rows, "indices"_a);
   m.def("isa", [] { return std::string(name(isa)); });
-  m.def("rasterise", &rasterise, "rows"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
+  m.def("rasterize", &rasterize, "rows"_a, "T_camera_map"_a, "fx"_a, "fy"_a, "cx"_a, "cy"_a,
         "width"_a, "height"_a, "threads"_a = 1, "memory"_a = nb::none(), "bounds"_a = nb::none());
-  m.def("rasterise_planes", &rasterise_planes, "forward"_a, "rows"_a, "T_camera_map"_a, "fx"_a,
+  m.def("rasterize_planes", &rasterize_planes, "forward"_a, "rows"_a, "T_camera_map"_a, "fx"_a,
         "fy"_a, "cx"_a, "cy"_a, "planes"_a, "threads"_a = 1, "bounds"_a = nb::none(),
         "tiles"_a = nb::none());
   m.def("backpropagate", &backpropagate, "forward"_a, "rows"_a, "planes"_a, "gradients"_a,

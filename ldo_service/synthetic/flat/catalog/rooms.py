@@ -1,18 +1,18 @@
 """Builders of furniture, doors, windows and fixtures."""
 
-from ldo_service.synthetic.flat.paint import Paints
+from ldo_service.synthetic.flat.paint import Materials
 
 from .build import Builder, Solids, ball, box, cylinder, legs, solid
 
 
-def door(paint: Paints, _: int) -> Solids:
+def door(paint: Materials, _: int) -> Solids:
     """A leaf standing open; the hinge is at the origin, the leaf along -y."""
     wood = paint("wood")
     knob = ball((0.045, -0.78, 1.0), (0.06, 0.06, 0.06), paint("metal"))
     return box((0, -0.425, 0.01), (0.04, 0.85, 2.02), wood), knob
 
 
-def window(paint: Paints, _: int) -> Solids:
+def window(paint: Materials, _: int) -> Solids:
     """To hang up: two panes, a frame, a sill; the origin is the middle of its back."""
     frame = paint("wood")
     bars = [box((x, -0.025, -0.55), (0.06, 0.05, 1.1), frame) for x in (-0.62, 0.0, 0.62)]
@@ -21,7 +21,7 @@ def window(paint: Paints, _: int) -> Solids:
     return pane, *bars, *beams, box((0, -0.07, -0.6), (1.34, 0.14, 0.03), frame)
 
 
-def coat_rack(paint: Paints, _: int) -> Solids:
+def coat_rack(paint: Materials, _: int) -> Solids:
     wood = paint("wood")
     arms = [
         box((0, 0, z), (0.4, 0.025, 0.025), wood, turn)
@@ -39,7 +39,7 @@ def coat_rack(paint: Paints, _: int) -> Solids:
 FIXTURES: dict[str, Builder] = {"door": door, "window": window, "coat rack": coat_rack}
 
 
-def chair(paint: Paints, shape: int) -> Solids:
+def chair(paint: Materials, shape: int) -> Solids:
     """A kitchen chair, a stool with a back, or an office chair."""
     seat, frame = paint("fabric"), paint("wood")
     if shape == 0:
@@ -65,7 +65,7 @@ def chair(paint: Paints, shape: int) -> Solids:
     return (*feet, column, top, spine, box((0, 0.22, 0.64), (0.42, 0.06, 0.38), seat))
 
 
-def couch(paint: Paints, shape: int) -> Solids:
+def couch(paint: Materials, shape: int) -> Solids:
     """Two seats with arms, or a long one without."""
     cover, seat = paint("fabric"), paint("fabric")
     width = 1.5 if shape == 0 else 1.8
@@ -78,7 +78,7 @@ def couch(paint: Paints, shape: int) -> Solids:
     return body, back, *pads, *arms
 
 
-def bed(paint: Paints, _: int) -> Solids:
+def bed(paint: Materials, _: int) -> Solids:
     frame, sheet, cover = paint("wood"), paint("fabric"), paint("print")
     return (
         box((0, 0, 0.12), (0.95, 1.95, 0.16), frame),
@@ -90,7 +90,7 @@ def bed(paint: Paints, _: int) -> Solids:
     )
 
 
-def dining_table(paint: Paints, shape: int) -> Solids:
+def dining_table(paint: Materials, shape: int) -> Solids:
     """On four legs, round on a foot, or a long desk on two sides."""
     top = paint("wood")
     if shape == 0:
@@ -103,13 +103,13 @@ def dining_table(paint: Paints, shape: int) -> Solids:
     return (*sides, box((0, 0, 0.71), (1.4, 0.64, 0.03), top))
 
 
-def bench(paint: Paints, _: int) -> Solids:
+def bench(paint: Materials, _: int) -> Solids:
     wood = paint("wood")
     planks = [box((0, y, 0.42), (0.8, 0.12, 0.03), wood) for y in (-0.07, 0.07)]
     return (*planks, *(box((s * 0.34, 0, 0), (0.05, 0.26, 0.42), wood) for s in (-1, 1)))
 
 
-def shelf(paint: Paints, shape: int) -> Solids:
+def shelf(paint: Materials, shape: int) -> Solids:
     """A bookcase with boards, or a low open one."""
     wood = paint("wood")
     height, width = (1.8, 0.9) if shape == 0 else (0.8, 0.7)
@@ -119,7 +119,7 @@ def shelf(paint: Paints, shape: int) -> Solids:
     return (*sides, *boards, box((0, 0.14, 0), (width, 0.02, height), wood))
 
 
-def cabinet(paint: Paints, shape: int) -> Solids:
+def cabinet(paint: Materials, shape: int) -> Solids:
     """A sideboard, or a kitchen unit with a worktop."""
     front, metal = paint("wood" if shape == 0 else "plastic"), paint("metal")
     width = 1.1 if shape == 0 else 1.2
@@ -132,18 +132,18 @@ def cabinet(paint: Paints, shape: int) -> Solids:
     return body, *doors, *knobs, top
 
 
-def cushion(paint: Paints, shape: int) -> Solids:
+def cushion(paint: Materials, shape: int) -> Solids:
     cover = paint("print" if shape == 0 else "fabric")
     return (ball((0, 0, 0), (0.44, 0.2, 0.42), cover),)
 
 
-def rug(paint: Paints, shape: int) -> Solids:
+def rug(paint: Materials, shape: int) -> Solids:
     if shape == 0:
         return (box((0, 0, 0), (1.7, 1.1, 0.012), paint("print")),)
     return (cylinder((0, 0, 0), 1.2, 0.012, paint("print")),)
 
 
-def lamp(paint: Paints, shape: int) -> Solids:
+def lamp(paint: Materials, shape: int) -> Solids:
     """A floor lamp, a table lamp with a cone, or a ball on a rod."""
     metal, shade = paint("metal"), paint("fabric")
     if shape == 0:
@@ -156,7 +156,7 @@ def lamp(paint: Paints, shape: int) -> Solids:
     return (*rod, ball((0, 0, 0.33), (0.2, 0.2, 0.2), shade))
 
 
-def potted_plant(paint: Paints, shape: int) -> Solids:
+def potted_plant(paint: Materials, shape: int) -> Solids:
     """A bush, a tree of three balls, or a cone-shaped conifer."""
     leaves, pot = paint("leaves"), solid("bucket", (0, 0, 0), (0.3, 0.3, 0.28), paint("ceramic"))
     if shape == 0:

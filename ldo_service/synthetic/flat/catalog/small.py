@@ -1,11 +1,11 @@
 """Builders of small things: vessels, fruit, bags, toys and tools."""
 
-from ldo_service.synthetic.flat.paint import Paints
+from ldo_service.synthetic.flat.paint import Materials
 
 from .build import Builder, Solids, ball, box, cylinder, solid
 
 
-def bottle(paint: Paints, shape: int) -> Solids:
+def bottle(paint: Materials, shape: int) -> Solids:
     """Slim with a neck, or wide with a cone for a shoulder."""
     glass = paint("ceramic")
     if shape == 0:
@@ -18,7 +18,7 @@ def bottle(paint: Paints, shape: int) -> Solids:
     )
 
 
-def cup(paint: Paints, shape: int) -> Solids:
+def cup(paint: Materials, shape: int) -> Solids:
     """A mug with an ear, or a tapered beaker."""
     glaze = paint("ceramic")
     if shape == 0:
@@ -27,17 +27,17 @@ def cup(paint: Paints, shape: int) -> Solids:
     return (solid("bucket", (0, 0, 0), (0.1, 0.1, 0.12), glaze),)
 
 
-def wine_glass(paint: Paints, _: int) -> Solids:
+def wine_glass(paint: Materials, _: int) -> Solids:
     glass = paint("plastic")
     foot = (cylinder((0, 0, 0), 0.07, 0.006, glass), cylinder((0, 0, 0.006), 0.012, 0.09, glass))
     return *foot, ball((0, 0, 0.09), (0.08, 0.08, 0.11), glass)
 
 
-def bowl(paint: Paints, _: int) -> Solids:
+def bowl(paint: Materials, _: int) -> Solids:
     return (solid("bucket", (0, 0, 0), (0.26, 0.26, 0.09), paint("ceramic")),)
 
 
-def vase(paint: Paints, shape: int) -> Solids:
+def vase(paint: Materials, shape: int) -> Solids:
     """A belly with a neck, or a tall taper."""
     glaze = paint("ceramic")
     if shape == 0:
@@ -46,11 +46,11 @@ def vase(paint: Paints, shape: int) -> Solids:
     return (solid("lampshade", (0, 0, 0), (0.16, 0.16, 0.36), glaze),)
 
 
-def fruit(paint: Paints, _: int) -> Solids:
+def fruit(paint: Materials, _: int) -> Solids:
     return (ball((0, 0, 0), (0.085, 0.085, 0.08), paint("plastic")),)
 
 
-def banana(paint: Paints, _: int) -> Solids:
+def banana(paint: Materials, _: int) -> Solids:
     return (ball((0, 0, 0), (0.2, 0.045, 0.045), paint("plastic")),)
 
 
@@ -66,7 +66,7 @@ KITCHENWARE: dict[str, Builder] = {
 }
 
 
-def backpack(paint: Paints, _: int) -> Solids:
+def backpack(paint: Materials, _: int) -> Solids:
     cloth, pocket = paint("fabric"), paint("fabric")
     top = ball((0, 0, 0.3), (0.32, 0.2, 0.2), cloth)
     straps = [box((s * 0.09, 0.1, 0.06), (0.04, 0.03, 0.32), pocket) for s in (-1, 1)]
@@ -78,7 +78,7 @@ def backpack(paint: Paints, _: int) -> Solids:
     )
 
 
-def suitcase(paint: Paints, shape: int) -> Solids:
+def suitcase(paint: Materials, shape: int) -> Solids:
     """Upright on wheels with its handle out, or a flat old one."""
     shell, metal = paint("plastic"), paint("metal")
     if shape == 1:
@@ -90,7 +90,7 @@ def suitcase(paint: Paints, shape: int) -> Solids:
     return box((0, 0, 0.05), (0.4, 0.24, 0.57), shell), *rods, bar
 
 
-def handbag(paint: Paints, _: int) -> Solids:
+def handbag(paint: Materials, _: int) -> Solids:
     leather = paint("fabric")
     rods = [box((s * 0.09, 0, 0.22), (0.015, 0.015, 0.14), leather) for s in (-1, 1)]
     return (
@@ -100,7 +100,7 @@ def handbag(paint: Paints, _: int) -> Solids:
     )
 
 
-def umbrella(paint: Paints, _: int) -> Solids:
+def umbrella(paint: Materials, _: int) -> Solids:
     """Folded, standing on its tip."""
     rod = cylinder((0, 0, 0), 0.014, 0.88, paint("metal"))
     return (
@@ -110,11 +110,11 @@ def umbrella(paint: Paints, _: int) -> Solids:
     )
 
 
-def sports_ball(paint: Paints, _: int) -> Solids:
+def sports_ball(paint: Materials, _: int) -> Solids:
     return (ball((0, 0, 0), (0.24, 0.24, 0.24), paint("print")),)
 
 
-def skateboard(paint: Paints, _: int) -> Solids:
+def skateboard(paint: Materials, _: int) -> Solids:
     """Leaning flat against the wall, on its tail."""
     wheels = [
         solid("wheel", (s * 0.09, -0.05, z), (0.04, 0.06, 0.06), paint("plastic"))
@@ -124,7 +124,7 @@ def skateboard(paint: Paints, _: int) -> Solids:
     return box((0, 0, 0), (0.2, 0.02, 0.8), paint("print")), *wheels
 
 
-def teddy_bear(paint: Paints, _: int) -> Solids:
+def teddy_bear(paint: Materials, _: int) -> Solids:
     fur = paint("fabric")
     ears = [ball((s * 0.07, 0, 0.36), (0.07, 0.04, 0.07), fur) for s in (-1, 1)]
     limbs = [ball((s * 0.12, -0.06, z), (0.1, 0.18, 0.1), fur) for s in (-1, 1) for z in (0, 0.14)]
@@ -136,7 +136,7 @@ def teddy_bear(paint: Paints, _: int) -> Solids:
     )
 
 
-def fire_extinguisher(paint: Paints, _: int) -> Solids:
+def fire_extinguisher(paint: Materials, _: int) -> Solids:
     metal = paint("metal")
     body = (
         cylinder((0, 0, 0.02), 0.15, 0.4, paint("plastic")),
@@ -149,7 +149,7 @@ def fire_extinguisher(paint: Paints, _: int) -> Solids:
     )
 
 
-def ladder(paint: Paints, _: int) -> Solids:
+def ladder(paint: Materials, _: int) -> Solids:
     metal = paint("metal")
     rails = [box((s * 0.2, 0, 0), (0.04, 0.06, 1.9), metal) for s in (-1, 1)]
     return *rails, *(
@@ -157,19 +157,19 @@ def ladder(paint: Paints, _: int) -> Solids:
     )
 
 
-def broom(paint: Paints, _: int) -> Solids:
+def broom(paint: Materials, _: int) -> Solids:
     return cylinder((0, 0, 0.16), 0.028, 1.2, paint("wood")), solid(
         "lampshade", (0, 0, 0), (0.36, 0.07, 0.17), paint("fabric")
     )
 
 
-def bucket(paint: Paints, _: int) -> Solids:
+def bucket(paint: Materials, _: int) -> Solids:
     return solid("bucket", (0, 0, 0), (0.3, 0.3, 0.28), paint("plastic")), cylinder(
         (0, 0, 0.279), 0.26, 0.004, paint("screen")
     )
 
 
-def cardboard_box(paint: Paints, shape: int) -> Solids:
+def cardboard_box(paint: Materials, shape: int) -> Solids:
     """One, or a small one on a large one."""
     first = box((0, 0, 0), (0.46, 0.36, 0.32), paint("plastic"))
     tape = box((0, 0, 0.32), (0.06, 0.36, 0.003), paint("wood"))
@@ -178,7 +178,7 @@ def cardboard_box(paint: Paints, shape: int) -> Solids:
     return first, tape, box((0.04, 0, 0.323), (0.3, 0.26, 0.22), paint("plastic"), (0.8, 0.6))
 
 
-def toolbox(paint: Paints, _: int) -> Solids:
+def toolbox(paint: Materials, _: int) -> Solids:
     metal = paint("metal")
     return (
         box((0, 0, 0), (0.42, 0.2, 0.17), paint("plastic")),
@@ -187,7 +187,7 @@ def toolbox(paint: Paints, _: int) -> Solids:
     )
 
 
-def trash_can(paint: Paints, shape: int) -> Solids:
+def trash_can(paint: Materials, shape: int) -> Solids:
     """Wide above, or a cylinder with a dome."""
     if shape == 0:
         return (solid("bucket", (0, 0, 0), (0.28, 0.28, 0.36), paint("plastic")),)

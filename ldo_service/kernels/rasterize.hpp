@@ -96,21 +96,21 @@ struct Reached {      // by a step of Adam
 
 // `tiles`, one byte for each tile of kTile x kTile pixels, row by row: where it is 0 the planes are
 // zero. Null: all are wanted.
-#define LDO_DECLARE_RASTERISE(isa)                                                             \
+#define LDO_DECLARE_RASTERIZE(isa)                                                             \
   namespace isa {                                                                              \
-  void rasterise(const Gaussians&, const View& view, int threads, Pass& memory, Images out);   \
+  void rasterize(const Gaussians&, const View& view, int threads, Pass& memory, Images out);   \
   void contributions(Pass&, int threads, Contributions out);                                   \
   std::unique_ptr<Pass> new_pass();                                                            \
-  void rasterise_planes(const Gaussians&, const View& view, const uint8_t* tiles, int threads, \
+  void rasterize_planes(const Gaussians&, const View& view, const uint8_t* tiles, int threads, \
                         Pass&, float* planes);                                                 \
   void backpropagate(Pass&, const float* planes, const float* gradients, NeedlePenalty,        \
                      int threads, Gradients out);                                              \
   void descend(Pass&, const float* planes, const float* gradients, NeedlePenalty, SizeLimit,   \
                AdamRows, const AdamRates&, int threads, Reached out);                          \
   }
-LDO_DECLARE_RASTERISE(baseline)
-LDO_DECLARE_RASTERISE(avx2)
-LDO_DECLARE_RASTERISE(avx512)
-#undef LDO_DECLARE_RASTERISE
+LDO_DECLARE_RASTERIZE(baseline)
+LDO_DECLARE_RASTERIZE(avx2)
+LDO_DECLARE_RASTERIZE(avx512)
+#undef LDO_DECLARE_RASTERIZE
 
 }  // namespace ldo

@@ -1,11 +1,11 @@
 """Builders of machines of kitchen, bath and living room, and of things on desks and walls."""
 
-from ldo_service.synthetic.flat.paint import Paints
+from ldo_service.synthetic.flat.paint import Materials
 
 from .build import Builder, Solids, ball, box, cylinder, legs, solid
 
 
-def tv(paint: Paints, shape: int) -> Solids:
+def tv(paint: Materials, shape: int) -> Solids:
     """A wide one on a foot, or a flat one to hang up."""
     case, width = paint("plastic"), 1.0 if shape == 0 else 0.8
     height = 0.56 * width
@@ -16,14 +16,14 @@ def tv(paint: Paints, shape: int) -> Solids:
     return (panel, glass, *foot) if shape == 0 else (panel, glass)
 
 
-def refrigerator(paint: Paints, _: int) -> Solids:
+def refrigerator(paint: Materials, _: int) -> Solids:
     case, metal = paint("plastic"), paint("metal")
     doors = [box((0, -0.31, z), (0.58, 0.03, h), case) for z, h in ((0.06, 1.0), (1.09, 0.58))]
     grips = [box((-0.24, -0.34, z), (0.02, 0.03, h), metal) for z, h in ((0.6, 0.36), (1.15, 0.3))]
     return box((0, 0, 0.03), (0.6, 0.6, 1.68), case), *doors, *grips
 
 
-def oven(paint: Paints, _: int) -> Solids:
+def oven(paint: Materials, _: int) -> Solids:
     case, metal, glass = paint("metal"), paint("metal"), paint("screen")
     plates = [(x, y) for x in (-0.14, 0.14) for y in (-0.12, 0.14)]
     knobs = [solid("ball", (x, -0.3, 0.74), (0.04, 0.04, 0.04), metal) for x in (-0.2, 0, 0.2)]
@@ -36,7 +36,7 @@ def oven(paint: Paints, _: int) -> Solids:
     )
 
 
-def microwave(paint: Paints, _: int) -> Solids:
+def microwave(paint: Materials, _: int) -> Solids:
     case = paint("metal")
     return (
         box((0, 0, 0.01), (0.48, 0.34, 0.28), case),
@@ -45,13 +45,13 @@ def microwave(paint: Paints, _: int) -> Solids:
     )
 
 
-def toaster(paint: Paints, _: int) -> Solids:
+def toaster(paint: Materials, _: int) -> Solids:
     case = paint("metal")
     slots = [box((0, y, 0.2), (0.22, 0.03, 0.004), paint("screen")) for y in (-0.04, 0.04)]
     return box((0, 0, 0.01), (0.28, 0.18, 0.19), case), *slots
 
 
-def sink(paint: Paints, _: int) -> Solids:
+def sink(paint: Materials, _: int) -> Solids:
     """A basin on a column, with its tap."""
     glaze, metal = paint("ceramic"), paint("metal")
     return (
@@ -63,7 +63,7 @@ def sink(paint: Paints, _: int) -> Solids:
     )
 
 
-def toilet(paint: Paints, _: int) -> Solids:
+def toilet(paint: Materials, _: int) -> Solids:
     glaze = paint("ceramic")
     return (
         solid("bucket", (0, -0.12, 0), (0.38, 0.5, 0.4), glaze),
@@ -72,7 +72,7 @@ def toilet(paint: Paints, _: int) -> Solids:
     )
 
 
-def speaker(paint: Paints, shape: int) -> Solids:
+def speaker(paint: Materials, shape: int) -> Solids:
     """A tower, or a small box for a shelf."""
     case, cone = paint("wood"), paint("screen")
     height, width = (0.8, 0.22) if shape == 0 else (0.3, 0.18)
@@ -81,14 +81,14 @@ def speaker(paint: Paints, shape: int) -> Solids:
     return box((0, 0, 0), (width, 0.22, height), case), *cones
 
 
-def fan(paint: Paints, _: int) -> Solids:
+def fan(paint: Materials, _: int) -> Solids:
     metal, blade = paint("metal"), paint("plastic")
     disc = solid("wheel", (0, 0, 0.95), (0.04, 0.4, 0.4), blade, (0.0, 1.0))
     foot = (cylinder((0, 0, 0), 0.34, 0.03, metal), cylinder((0, 0, 0.03), 0.03, 1.0, metal))
     return *foot, disc, ball((0, 0, 1.09), (0.12, 0.16, 0.12), metal)
 
 
-def radiator(paint: Paints, _: int) -> Solids:
+def radiator(paint: Materials, _: int) -> Solids:
     white = paint("plastic")
     ribs = [
         box((x / 10, 0, 0.12), (0.07, 0.09, 0.6), white) for x in (-4, -3, -2, -1, 0, 1, 2, 3, 4)
@@ -97,7 +97,7 @@ def radiator(paint: Paints, _: int) -> Solids:
     return *ribs, *pipes
 
 
-def projector(paint: Paints, _: int) -> Solids:
+def projector(paint: Materials, _: int) -> Solids:
     """On a stand of its own."""
     case, metal = paint("plastic"), paint("metal")
     lens = solid("wheel", (-0.07, -0.14, 0.93), (0.06, 0.09, 0.09), paint("screen"), (0.0, 1.0))
@@ -110,7 +110,7 @@ def projector(paint: Paints, _: int) -> Solids:
     )
 
 
-def printer(paint: Paints, _: int) -> Solids:
+def printer(paint: Materials, _: int) -> Solids:
     case = paint("plastic")
     return (
         box((0, 0, 0), (0.42, 0.36, 0.2), case),
@@ -135,7 +135,7 @@ APPLIANCES: dict[str, Builder] = {
 }
 
 
-def laptop(paint: Paints, _: int) -> Solids:
+def laptop(paint: Materials, _: int) -> Solids:
     case = paint("metal")
     return (
         box((0, 0, 0), (0.34, 0.23, 0.018), case),
@@ -145,30 +145,30 @@ def laptop(paint: Paints, _: int) -> Solids:
     )
 
 
-def keyboard(paint: Paints, _: int) -> Solids:
+def keyboard(paint: Materials, _: int) -> Solids:
     case = paint("plastic")
     return box((0, 0, 0), (0.42, 0.14, 0.02), case), box(
         (0, 0, 0.02), (0.4, 0.12, 0.006), paint("books")
     )
 
 
-def mouse(paint: Paints, _: int) -> Solids:
+def mouse(paint: Materials, _: int) -> Solids:
     return (ball((0, 0, 0), (0.06, 0.1, 0.045), paint("plastic")),)
 
 
-def remote(paint: Paints, _: int) -> Solids:
+def remote(paint: Materials, _: int) -> Solids:
     return box((0, 0, 0), (0.05, 0.18, 0.02), paint("plastic")), box(
         (0, 0, 0.02), (0.04, 0.14, 0.003), paint("print")
     )
 
 
-def cell_phone(paint: Paints, _: int) -> Solids:
+def cell_phone(paint: Materials, _: int) -> Solids:
     return box((0, 0, 0), (0.075, 0.155, 0.009), paint("plastic")), box(
         (0, 0, 0.009), (0.068, 0.145, 0.001), paint("screen")
     )
 
 
-def book(paint: Paints, shape: int) -> Solids:
+def book(paint: Materials, shape: int) -> Solids:
     """One lying, a stack, or a row standing."""
     if shape == 0:
         return (box((0, 0, 0), (0.17, 0.24, 0.035), paint("print"), (0.96, 0.28)),)
@@ -180,7 +180,7 @@ def book(paint: Paints, shape: int) -> Solids:
     return (box((0, 0, 0), (0.6, 0.2, 0.26), paint("books")),)
 
 
-def clock(paint: Paints, shape: int) -> Solids:
+def clock(paint: Materials, shape: int) -> Solids:
     """Round or square, to hang up; the face is pale, the hands are dark."""
     rim, hand = paint("plastic"), paint("screen")
     body = solid("wheel", (0, -0.02, -0.16), (0.04, 0.32, 0.32), rim, (0.0, 1.0))
@@ -193,7 +193,7 @@ def clock(paint: Paints, shape: int) -> Solids:
     return body, *hands
 
 
-def picture_frame(paint: Paints, shape: int) -> Solids:
+def picture_frame(paint: Materials, shape: int) -> Solids:
     """Upright or wide, to hang up; the origin is the middle of its back."""
     width, height = ((0.5, 0.64), (0.9, 0.6), (0.34, 0.34))[shape]
     rim = box((0, -0.015, -height / 2), (width, 0.03, height), paint("wood"))
@@ -201,7 +201,7 @@ def picture_frame(paint: Paints, shape: int) -> Solids:
     return rim, box((0, -0.032, 0.04 - height / 2), inner, paint("picture"))
 
 
-def whiteboard(paint: Paints, _: int) -> Solids:
+def whiteboard(paint: Materials, _: int) -> Solids:
     rim = paint("metal")
     return (
         box((0, -0.01, -0.45), (1.5, 0.02, 0.9), "wall_c"),
@@ -212,7 +212,7 @@ def whiteboard(paint: Paints, _: int) -> Solids:
     )
 
 
-def globe(paint: Paints, _: int) -> Solids:
+def globe(paint: Materials, _: int) -> Solids:
     foot = (
         cylinder((0, 0, 0), 0.18, 0.02, paint("wood")),
         cylinder((0, 0, 0.02), 0.02, 0.08, paint("metal")),

@@ -1,5 +1,5 @@
 // Compiled once per instruction set, LDO_ISA.
-#include "rasterise.hpp"
+#include "rasterize.hpp"
 
 #include "adam_step.hpp"
 #include "contributions.hpp"
@@ -182,12 +182,12 @@ void differentiate(Pass& opaque, const float* planes, const float* gradients, Ne
 
 }  // namespace
 
-void rasterise(const Gaussians& gaussians, const View& view, int threads, Pass& pass, Images out) {
+void rasterize(const Gaussians& gaussians, const View& view, int threads, Pass& pass, Images out) {
   blend_tiles<true>(gaussians, view, nullptr, threads, pass,
                     [&](const Tile& tile) { tile.store(out); });
 }
 
-void rasterise_planes(const Gaussians& gaussians, const View& view, const uint8_t* tiles,
+void rasterize_planes(const Gaussians& gaussians, const View& view, const uint8_t* tiles,
                       int threads, Pass& pass, float* planes) {
   blend_tiles<false>(gaussians, view, tiles, threads, pass,
                      [&](const Tile& tile) { tile.store_planes(planes); });

@@ -10,7 +10,7 @@ import pytest
 
 from ldo_service.gaussians import Rendering, render
 from ldo_service.geometry import Camera, se3
-from ldo_service.kernels import _rasterise, isa
+from ldo_service.kernels import _rasterize, isa
 from tests.reference.render import render_reference
 
 from .scenes import camera_of, gaussians
@@ -20,22 +20,22 @@ EYE = np.eye(4, dtype=np.float32)[:3]
 
 RENDER_ALL = """
 import sys, numpy as np
-from ldo_service.kernels import _rasterise
+from ldo_service.kernels import _rasterize
 scenes = np.load(sys.argv[1])
 images = {}
 for name in {key.split("/")[0] for key in scenes.files}:
     rows, T, camera = (scenes[f"{name}/{part}"] for part in ("rows", "T", "camera"))
     fx, fy, cx, cy, width, height = camera
-    memory = _rasterise.Pass()
+    memory = _rasterize.Pass()
     size = int(width), int(height)
-    out = _rasterise.rasterise(rows, T, fx, fy, cx, cy, *size, 2, memory)
+    out = _rasterize.rasterize(rows, T, fx, fy, cx, cy, *size, 2, memory)
     images |= {f"{name}/{k}": image for k, image in enumerate(out)}
     V = memory.visible
     indices, weights = np.zeros(V, np.uint32), np.zeros(V, np.float32)
     top = np.zeros(size[::-1], np.int32)
-    _rasterise.contributions(memory, indices, weights, top, 2)
+    _rasterize.contributions(memory, indices, weights, top, 2)
     images |= {f"{name}/indices": indices, f"{name}/weights": weights, f"{name}/top": top}
-np.savez(sys.argv[2], isa=_rasterise.isa(), **images)
+np.savez(sys.argv[2], isa=_rasterize.isa(), **images)
 """
 
 
@@ -140,7 +140,7 @@ def test_nearer_of_two_equal_weights_is_on_top() -> None:
 def test_contributions_follow_culling_and_leave_out_who_is_hidden() -> None:
     rows = np.concatenate([gaussians(5_000, 1), gaussians(5_000, 2, depth_m=(-3, -1))])
     rows[:, 10] += 4
-    camera, bounds = camera_of(60, 50), _rasterise.Bounds()
+    camera, bounds = camera_of(60, 50), _rasterize.Bounds()
     seen = [
         render(rows, camera, np.eye(4), contributions=True, **options).contributions
         for options in ({}, {"bounds": bounds}, {"bounds": bounds, "threads": 3})
@@ -165,7 +165,7 @@ def test_equal_depths_are_blended_by_index() -> None:
     rows = np.repeat(gaussians(1, 0), 2, axis=0)
     rows[:, :3], rows[:, 10] = (0, 0, 1), 2
     rows[:, 11:14] = [[1, 0, 0], [0, 1, 0]]
-    color = _rasterise.rasterise(rows, EYE, 20, 20, 4, 4, 9, 9)[0]
+    color = _rasterize.rasterize(rows, EYE, 20, 20, 4, 4, 9, 9)[0]
     assert color[4, 4, 0] > 2 * color[4, 4, 1] > 0
     assert color[4, 4, 1] > color[4, 4, 0] * 0.05
 
@@ -175,7 +175,7 @@ def test_depths_that_differ_in_the_last_bit_are_blended_in_order() -> None:
     rows[:, :2], rows[:, 10] = 0, 2
     rows[:, 2] = [np.nextafter(np.float32(1), np.float32(2)), 1, 900]
     rows[:, 11:14] = np.eye(3)
-    color = _rasterise.rasterise(rows, EYE, 20, 20, 4, 4, 9, 9)[0]
+    color = _rasterize.rasterize(rows, EYE, 20, 20, 4, 4, 9, 9)[0]
     assert color[4, 4, 1] > color[4, 4, 0]
 
 
@@ -183,7 +183,7 @@ def test_depths_that_differ_in_the_last_bit_are_blended_in_order() -> None:
 def test_number_of_threads_changes_no_bit(threads: int) -> None:
     rows = gaussians(30_000, 9)
     one, many = (
-        _rasterise.rasterise(rows, EYE, 200, 200, 100, 80, 213, 157, n) for n in (1, threads)
+        _rasterize.rasterize(rows, EYE, 200, 200, 100, 80, 213, 157, n) for n in (1, threads)
     )
     for a, b in zip(one, many, strict=True):
         assert a.tobytes() == b.tobytes()
@@ -194,8 +194,8 @@ def test_rows_that_are_not_finite_are_not_drawn(value: float) -> None:
     rows = gaussians(64, 10)
     broken = rows.copy()
     broken[np.arange(14), np.arange(14)] = value
-    drawn = _rasterise.rasterise(broken, EYE, 20, 20, 10, 10, 20, 20)
-    wanted = _rasterise.rasterise(rows[14:], EYE, 20, 20, 10, 10, 20, 20)
+    drawn = _rasterize.rasterize(broken, EYE, 20, 20, 10, 10, 20, 20)
+    wanted = _rasterize.rasterize(rows[14:], EYE, 20, 20, 10, 10, 20, 20)
     for a, b in zip(drawn, wanted, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -230,6 +230,6 @@ GOOD = {"fx": 20.0, "fy": 20.0, "cx": 4.0, "cy": 4.0, "width": 9, "height": 9, "
 )
 def test_bad_arguments_raise_value_error(change: dict, message: str) -> None:
     arguments = {"rows": gaussians(3, 0), "T_camera_map": EYE} | GOOD
-    _rasterise.rasterise(**arguments)
+    _rasterize.rasterize(**arguments)
     with pytest.raises(ValueError, match=message):
-        _rasterise.rasterise(**arguments | change)
+        _rasterize.rasterize(**arguments | change)

@@ -7,7 +7,7 @@ is the middle of its underside (of its back, for what hangs on a wall) and its f
 from . import machines, rooms, small
 from .build import Builder
 
-CATALOGUE: dict[str, Builder] = {
+CATALOG: dict[str, Builder] = {
     **rooms.FURNITURE,
     **machines.APPLIANCES,
     **small.KITCHENWARE,
