@@ -9,9 +9,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ldo_service.actors.topology import mermaid_diagram, topics_table
+from ldo_service.config import Config
+from ldo_service.config.printing import section_titles, settings_of
 
 ROOT = Path(__file__).parent.parent
-PAGES = (ROOT / "README.md", ROOT / "docs/architecture.md")
+PAGES = (ROOT / "README.md", ROOT / "docs/architecture.md", ROOT / "docs/configuration.md")
+UNITS = {"_s": "s", "_m": "m", "_rad": "rad", "_px": "px", "_mb": "MB", "_gb": "GB"}
+UNITS |= {"_frames": "frames", "_keyframes": "keyframes", "_ratio": "fraction"}
 BLOCK = re.compile(r"(<!-- (?P<name>[^>]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
@@ -35,10 +39,43 @@ def _first_sentence(path: Path) -> str:
     return re.split(r"(?<=\.) ", text)[0]
 
 
+def public_settings() -> str:
+    """Return Markdown: a table of the public settings for each section of the configuration."""
+    titles, lines, section = section_titles(), list[str](), ""
+    for setting in settings_of(Config()):
+        if not setting.is_public:
+            continue
+        if (first := setting.path.split(".")[0]) != section:
+            section = first
+            lines += ["", f"### {section}", "", titles[section], ""]
+            lines += ["| setting | default | unit | meaning |", "|---|---|---|---|"]
+        name, default = setting.path, setting.text.replace("|", "\\|")
+        lines.append(f"| `{name}` | `{default}` | {_unit(name)} | {setting.comment} |")
+    return "\n".join(lines[1:])
+
+
+def settings_count() -> str:
+    """Return a sentence with the numbers of settings."""
+    settings = settings_of(Config())
+    public = sum(setting.is_public for setting in settings)
+    paper = sum(setting.path.startswith("paper.") for setting in settings)
+    return (
+        f"There are {public} public settings, {len(settings) - public - paper} advanced ones, and "
+        f"{paper} constants of the paper in the section `paper`."
+    )
+
+
+def _unit(path: str) -> str:
+    endings = [ending for ending in UNITS if path.endswith(ending)]
+    return UNITS[max(endings, key=len)] if endings else ""
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     "ldo topics --markdown": topics_table,
-    "ldo topics --mermaid": lambda: f"```mermaid\n{mermaid_diagram()}\n```",
-    "packages": packages_table,
+    "ldo topics --mermaid": lambda: f"```mermaid\n{drawing()}\n```",
+    "rooms": rooms_table,
+    "public settings": public_settings,
+    "number of settings": settings_count,
 }
 
 

@@ -27,7 +27,7 @@ from tests.detection.networks import SQUARES
 from .of_runs import bytes_of
 from .target import Read, Target, as_file, in_folder
 
-CONFIG = b"tracker:\n  hold_out: 5\nservice: {spawned: [optimizer], max_message_mb: 60}\n"
+CONFIG = b"tracker:\n  hold_out: 5\nservice: {process_actors: [optimizer], max_message_mb: 60}\n"
 SUITE = b"""title: Desks
 sequences: {fr1: desk, room: "synthetic:room"}
 variants: {as it is: [], fewer: [tracker.hold_out=2]}
