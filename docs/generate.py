@@ -72,8 +72,8 @@ def _unit(path: str) -> str:
 
 BLOCKS: dict[str, Callable[[], str]] = {
     "ldo topics --markdown": topics_table,
-    "ldo topics --mermaid": lambda: f"```mermaid\n{drawing()}\n```",
-    "rooms": rooms_table,
+    "ldo topics --mermaid": lambda: f"```mermaid\n{mermaid_diagram()}\n```",
+    "packages": packages_table,
     "public settings": public_settings,
     "number of settings": settings_count,
 }
