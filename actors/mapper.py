@@ -398,8 +398,8 @@ class Mapper(Actor):
             "keyframes": len(self._poses),
             "keyframes_repeated": self._repeated,
             **self._repair.metrics(),
-            **self._map.statistics(),
-            **self._semantics.statistics(),
+            **self._map.metrics(),
+            **self._semantics.metrics(),
         }
 
 

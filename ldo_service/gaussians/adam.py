@@ -60,9 +60,7 @@ class Adam:
         self._ids = np.zeros(0, np.int64)
         self._moments = [aligned_rows(0), aligned_rows(0)]  # with room to grow
         self._steps = np.zeros(0, np.int32)
-        self._followed: tuple[ref[GaussianMap], int] | None = (
-            None  # whose ids, and which of them
-        )
+        self._followed: tuple[ref[GaussianMap], int] | None = None  # whose ids, and which of them
 
     def step(
         self,

@@ -91,7 +91,7 @@ class KeyframeStore:
             if keyframe not in kept:
                 self._drop(keyframe)
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "keyframes_stored": len(self),
             "keyframes_disk_mb": sum(self._files.sizes.values()) / 1e6,

@@ -391,13 +391,13 @@ class MapBuilder:
         self._newest, self._shown = state["newest"], None
         self._log.mark_all_published(self.gaussians)
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self._fitting.iterations,
             "keyframes_unusable": self._fitting.unusable,  # chosen; gone, or see what sleeps
             "gaussians_over_cap": self._excess,  # they may be looked at, so they do not sleep
-            **self.sleeping.statistics(),
-            **self.views.store.statistics(),
+            **self.sleeping.metrics(),
+            **self.views.store.metrics(),
         }

@@ -239,7 +239,7 @@ class OffloadedGaussians:
         for number in self._entries.keys() - self._files.sizes.keys():
             self._lose(number, "their file is gone")
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "gaussians_asleep": len(self),
             "chunks_asleep": len(self._entries),

@@ -114,7 +114,7 @@ class Recorder(Journal):
             self._writer.close()
         return self._closed
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "journal_is_open": float(self._file.is_open),
             "journal_steps": self._steps,

@@ -217,7 +217,7 @@ class OpenVocabularyLabeling:
         }
         return out
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "regions_to_name": len(self._regions),
             "questions": self._questions,

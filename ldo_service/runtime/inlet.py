@@ -84,7 +84,7 @@ class Inlet:
         """Forget what waits."""
         self.waiting.clear()
 
-    def statistics(self) -> InputCount:
+    def counts(self) -> InputCount:
         return InputCount(
             topic=self.port.topic.name,
             delivered=self.delivered,

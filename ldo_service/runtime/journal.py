@@ -118,5 +118,5 @@ class Journal:
         future.set_result(None)
         return future
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {}

@@ -240,9 +240,9 @@ class Mailbox:
                 if isinstance(inlet, LosslessInlet)
             }
 
-    def statistics(self) -> tuple[InputCount, ...]:
+    def counts(self) -> tuple[InputCount, ...]:
         with self._lock:
-            return tuple(inlet.statistics() for inlet in self._inlets.values())
+            return tuple(inlet.counts() for inlet in self._inlets.values())
 
 
 def _read_header(raw: bytes) -> Header | None:

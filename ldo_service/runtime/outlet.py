@@ -263,7 +263,7 @@ class Outlet:
             self._on_evicted(name)
 
     # --- the rest ---------------------------------------------------------------------------
-    def statistics(self) -> OutputCount:
+    def counts(self) -> OutputCount:
         return OutputCount(
             topic=self.topic.name,
             sent=self.sent,
@@ -336,8 +336,8 @@ class Outlets:
         for outlet in self._all.values():
             outlet.evict_stalled()
 
-    def statistics(self) -> tuple[OutputCount, ...]:
-        return tuple(outlet.statistics() for outlet in self._all.values())
+    def counts(self) -> tuple[OutputCount, ...]:
+        return tuple(outlet.counts() for outlet in self._all.values())
 
     def close(self) -> None:
         for outlet in self._all.values():

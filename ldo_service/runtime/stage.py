@@ -354,7 +354,7 @@ class Stage:
         self._keeper.write(self._actor, state)
         self._vitals.facts = {
             **self._actor.metrics(),
-            **self._journal.statistics(),
+            **self._journal.metrics(),
             **self._keeper.metrics(),
         }
 
@@ -393,6 +393,6 @@ class Stage:
             actor=self.name,
             epoch=self._epoch,
             held=self._mailbox is not None and self._mailbox.is_held,
-            inputs=self._mailbox.statistics() if self._mailbox else (),
-            outputs=self._outlets.statistics(),
+            inputs=self._mailbox.counts() if self._mailbox else (),
+            outputs=self._outlets.counts(),
         )

@@ -383,7 +383,7 @@ class Objects:
         out._next_id, out._merged, out._retired, out._refused = map(int, packed["counts"])
         return out
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         return {
             "objects": len(self),
             "object_candidates": len(self._table) - len(self),

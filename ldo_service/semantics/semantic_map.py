@@ -310,7 +310,7 @@ class SemanticMap:
                 state["naming"], self.config.naming, is_heard=is_heard
             )
 
-    def statistics(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """`label_disagreement` is that of the newest keyframe labelled, summed over its Gaussians:
         `_literal` as the paper prints it, `_expected` as it is made smaller."""
         labelled = 0
@@ -328,8 +328,8 @@ class SemanticMap:
             "label_disagreement_expected": self._disagreement.expected,
             "label_names": len(self.names),
             "label_names_refused": self.vocabulary.refused,
-            **self.objects.statistics(),
-            **(self.naming.statistics() if self.naming else {}),
+            **self.objects.metrics(),
+            **(self.naming.metrics() if self.naming else {}),
             "answers_without_images": self._answers_without_images,  # of keyframes forgotten
         }
 

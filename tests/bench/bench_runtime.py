@@ -71,7 +71,7 @@ async def throughput(network: Endpoint) -> Throughput:
                 await asyncio.sleep(0.001)
             total_s = time.perf_counter() - started_s
             deepest = stage.health().inputs[0].peak
-    return Throughput(total_s, deepest, most_mb - before_mb, outlet.statistics().repeated)
+    return Throughput(total_s, deepest, most_mb - before_mb, outlet.counts().repeated)
 
 
 async def release_ms(network: Endpoint) -> float:

@@ -42,13 +42,13 @@ def bench_keyframes(source: str, count: int, stride: int, folder: Path) -> None:
     store = KeyframeStore(folder, KeyframeStoreConfig(cache_mb=memory_mb / 2))  # too little for all
     puts = [timed_ms(lambda one=one: store.put(one)) for one in images]
     gets = [timed_ms(lambda one=one: store.get(one.keyframe)) for one in images]
-    if store.statistics()["keyframes_read"] < len(images):
+    if store.metrics()["keyframes_read"] < len(images):
         sys.exit("some came from memory: the times mean nothing.")
     for one in images:
         got = store.get(one.keyframe)
         if got is None or got.depth_m.tobytes() != one.depth_m.tobytes():
             sys.exit(f"keyframe {one.keyframe} did not come back: the times mean nothing.")
-    disk_mb = store.statistics()["keyframes_disk_mb"]
+    disk_mb = store.metrics()["keyframes_disk_mb"]
     print(f"{source}: {len(images)} keyframes of {sequence.camera.width}x{sequence.camera.height}")
     report("put", puts)
     report("get", gets)

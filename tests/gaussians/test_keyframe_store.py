@@ -127,17 +127,17 @@ def test_cache_holds_the_last_used_and_no_more_than_its_megabytes(tmp_path: Path
     store = KeyframeStore(tmp_path, KeyframeStoreConfig(cache_mb=3.5 * MB_EACH))
     for keyframe in range(4):
         store.put(images_of(keyframe))
-        assert store.statistics()["keyframes_cache_mb"] <= 3.5 * MB_EACH
+        assert store.metrics()["keyframes_cache_mb"] <= 3.5 * MB_EACH
     store.get(1)
     store.put(images_of(4))  # 2 goes, 1 was used
-    assert store.statistics()["keyframes_read"] == 0
+    assert store.metrics()["keyframes_read"] == 0
     for keyframe in (1, 3, 4):
         store.get(keyframe)
-    assert store.statistics()["keyframes_read"] == 0
+    assert store.metrics()["keyframes_read"] == 0
     for keyframe in (0, 2):
         assert_same(store.get(keyframe), images_of(keyframe))
-    assert store.statistics()["keyframes_read"] == 2
-    assert store.statistics()["keyframes_cache_mb"] == pytest.approx(3 * MB_EACH)
+    assert store.metrics()["keyframes_read"] == 2
+    assert store.metrics()["keyframes_cache_mb"] == pytest.approx(3 * MB_EACH)
 
 
 def test_a_successor_finds_what_is_there(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_senseless_configuration_is_refused(change: dict) -> None:
 def quota_for(folder: Path, count: int) -> float:
     """MB that `count` keyframes need, and half of one."""
     store = store_on_disk(folder, [0])
-    return (count + 0.5) * store.statistics()["keyframes_disk_mb"]
+    return (count + 0.5) * store.metrics()["keyframes_disk_mb"]
 
 
 def test_over_the_quota_the_one_with_the_nearest_neighbors_goes_first(tmp_path: Path) -> None:
@@ -199,14 +199,14 @@ def test_over_the_quota_the_one_with_the_nearest_neighbors_goes_first(tmp_path: 
     assert store.keyframes() == [0, 10, 20, 31, 40]
     store.put(images_of(50))  # 10 has 20, 20 has 21, 31 has 20: the older of two
     assert store.keyframes() == [0, 20, 31, 40, 50]
-    assert store.statistics()["keyframes_forgotten"] == 3
+    assert store.metrics()["keyframes_forgotten"] == 3
     assert len(list((tmp_path / "many").iterdir())) == 5
 
 
 def test_a_long_run_stays_within_the_quota_and_keeps_keyframes_of_all_times(tmp_path: Path) -> None:
     quota_mb = quota_for(tmp_path / "one", 8)
     store = store_on_disk(tmp_path / "many", list(range(60)), quota_mb=quota_mb, newest_kept=3)
-    assert store.statistics()["keyframes_disk_mb"] <= quota_mb
+    assert store.metrics()["keyframes_disk_mb"] <= quota_mb
     kept = store.keyframes()
     assert (len(kept), kept[0], kept[-3:]) == (8, 0, [57, 58, 59])
     assert max(np.diff(kept)) <= 4 * 60 / 8
@@ -252,7 +252,7 @@ def test_a_damaged_keyframe_is_dropped_with_one_line(
     assert "keyframe 1 is dropped" in caplog.text
     assert store.keyframes() == [2]
     assert not path.exists()
-    assert store.statistics()["keyframes_damaged"] == 1
+    assert store.metrics()["keyframes_damaged"] == 1
 
 
 def test_a_file_that_is_gone_or_under_another_name_is_dropped(tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_a_full_disk_leaves_the_newest_in_memory_and_is_told_once(
     assert store.keyframes() == [0, 2, 3]
     assert_same(store.get(3), images_of(3))
     assert_same(store.get(0), images_of(0))
-    assert store.statistics()["keyframes_not_written"] == 3
+    assert store.metrics()["keyframes_not_written"] == 3
     assert len(caplog.records) == 1
     assert "free some disk space" in caplog.text
     store.put(images_of(4))
@@ -297,6 +297,6 @@ def test_a_file_that_the_system_cuts_leaves_nothing_behind(tmp_path: Path) -> No
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
-    assert store.statistics()["keyframes_not_written"] == 1
+    assert store.metrics()["keyframes_not_written"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["00000001.keyframe"]
     assert_same(store.get(1), images_of(1))

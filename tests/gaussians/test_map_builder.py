@@ -77,7 +77,7 @@ def test_a_restored_builder_goes_on_as_its_predecessor(posed: dict, tmp_path: Pa
         builder.add(*posed[KEYFRAMES[3]], 3, 5)
         builder.refine(5)
     assert first.gaussians.rows.tobytes() == second.gaussians.rows.tobytes()
-    assert first.statistics()["iterations"] == second.statistics()["iterations"]
+    assert first.metrics()["iterations"] == second.metrics()["iterations"]
 
 
 def test_a_new_journey_finds_nothing_of_another_in_its_folder(posed: dict, tmp_path: Path) -> None:
@@ -105,13 +105,13 @@ def test_keyframes_that_are_gone_from_the_disk_are_left_out(posed: dict, tmp_pat
         file.write_bytes(file.read_bytes()[:-20])
     builder.add(*posed[KEYFRAMES[3]], 3, 20)
     assert builder.views.store.keyframes() == [2, 3]
-    assert builder.statistics()["keyframes_unusable"] >= 2
+    assert builder.metrics()["keyframes_unusable"] >= 2
 
 
 def test_pruning_looks_at_what_was_fitted_alone(posed: dict) -> None:
     config = MapBuilderConfig(pruning=PruningConfig(min_opacity=0.9), prune_keyframes=1)
     builder = built(posed, config, iterations=3)
-    assert builder.statistics()["gaussians_pruned"] > 100
+    assert builder.metrics()["gaussians_pruned"] > 100
     assert (1 / (1 + np.exp(-builder.gaussians.opacity_logits))).min() < 0.9 + 0.1
 
 
@@ -161,7 +161,7 @@ def with_sleepers(posed: dict, **options) -> MapBuilder:
 
 def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     builder = with_sleepers(posed)
-    asleep = builder.statistics()["gaussians_asleep"]
+    asleep = builder.metrics()["gaussians_asleep"]
     assert asleep > 1000
     assert builder.size() == len(builder.gaussians) + asleep
     whole = np.concatenate([piece.ids for piece in builder.batches()])
@@ -173,7 +173,7 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     assert builder.refine(2, first=see_sleepers[:2]) == 0, "views of what sleeps are left out"
     size = builder.size()
     builder.add(*posed[KEYFRAMES[0]], 2 * len(KEYFRAMES), 0)  # home again
-    assert builder.statistics()["gaussians_woken"] > 1000
+    assert builder.metrics()["gaussians_woken"] > 1000
     assert builder.size() < 1.15 * size, "inserted a second time"
     assert mean_psnr(builder, posed, KEYFRAMES[:1]) > 20
 

@@ -311,7 +311,7 @@ def test_a_walk_and_back_shows_every_camera_the_whole_map_and_keeps_few_in_memor
         most = max(most, len(gaussians))
     assert len(plain) == 3200
     assert most <= config.max_active
-    assert sleeping.statistics()["gaussians_woken"] > 1000
+    assert sleeping.metrics()["gaussians_woken"] > 1000
     assert pieces_of(gaussians, sleeping)[1].tobytes() == plain.rows.tobytes()
 
 
@@ -404,7 +404,7 @@ def test_a_damaged_chunk_is_lost_with_one_line_and_the_rest_goes_on(
     assert gaussians.ids.tolist() == list(range(5, 18))
     assert "anchor 0: 5 of its sleeping Gaussians are lost" in caplog.text
     assert len(caplog.records) == 1
-    assert sleeping.statistics()["gaussians_lost_on_disk"] == 5
+    assert sleeping.metrics()["gaussians_lost_on_disk"] == 5
     assert sleeping.pop_lost_ids(gaussians).tolist() == list(range(5))
     assert sleeping.pop_lost_ids(gaussians).tolist() == [], "once is enough"
 
@@ -448,7 +448,7 @@ def test_on_a_full_disk_they_stay_awake_and_it_is_told_once(
     assert list(tmp_path.iterdir()) == []
     assert len(caplog.records) == 1
     assert "free some disk space" in caplog.text
-    assert sleeping.statistics()["chunks_not_written"] == 2
+    assert sleeping.metrics()["chunks_not_written"] == 2
     assert put_to_sleep(gaussians, sleeping, [0, 1]) == [0, 1]
     assert_whole(gaussians, sleeping, plain)
 
@@ -463,7 +463,7 @@ def test_statistics_count_who_slept_and_woke(tmp_path: Path) -> None:
     gaussians, sleeping = map_of(5, 6, 7), OffloadedGaussians(tmp_path)
     put_to_sleep(gaussians, sleeping, [0, 1])
     sleeping.load_into(gaussians, [1])
-    told = sleeping.statistics()
+    told = sleeping.metrics()
     assert told["gaussians_asleep"] == 5
     assert told["chunks_asleep"] == 1
     assert told["gaussians_fell_asleep"] == 11

@@ -40,7 +40,7 @@ async def test_latest_drops_the_oldest_and_counts() -> None:
     for value in range(10):
         feed.send(value)
     assert await take_all(mailbox) == [("", 8), ("", 9)]
-    (counted,) = mailbox.statistics()
+    (counted,) = mailbox.counts()
     assert (counted.delivered, counted.dropped, counted.peak, counted.waiting) == (2, 8, 2, 0)
 
 
@@ -53,7 +53,7 @@ async def test_what_goes_first_is_taken_before_all_that_waits_and_in_its_own_ord
         patient.send(value)
         hasty.send(10 + value)
     assert [stamp for _, stamp in await take_all(mailbox)] == [10, 11, 12, 0, 1, 2]
-    assert [counted.delivered for counted in mailbox.statistics()] == [3, 3]
+    assert [counted.delivered for counted in mailbox.counts()] == [3, 3]
 
 
 async def test_latest_per_key_keeps_the_newest_of_each() -> None:
@@ -63,7 +63,7 @@ async def test_latest_per_key_keeps_the_newest_of_each() -> None:
     for value, key in enumerate("aabcab"):
         feed.send(value, key)
     assert await take_all(mailbox) == [("c", 3), ("a", 4), ("b", 5)]
-    assert mailbox.statistics()[0].dropped == 3
+    assert mailbox.counts()[0].dropped == 3
 
 
 async def test_beyond_max_keys_the_key_that_waited_longest_makes_room() -> None:
@@ -73,7 +73,7 @@ async def test_beyond_max_keys_the_key_that_waited_longest_makes_room() -> None:
     for value, key in enumerate(["a", "a", "b", "c"]):
         feed.send(value, key)
     assert await take_all(mailbox) == [("b", 2), ("c", 3)]
-    assert mailbox.statistics()[0].dropped == 2
+    assert mailbox.counts()[0].dropped == 2
 
 
 async def test_inputs_are_merged_in_order_of_arrival() -> None:
@@ -97,7 +97,7 @@ async def test_a_message_whose_header_cannot_be_read_is_rejected_and_counted() -
         transport.deliver(NUMBERS.name, noise, b"")
         transport.deliver(DOUBLES.name, noise, b"")
     assert await take_all(mailbox) == []
-    assert [counted.rejected for counted in mailbox.statistics()] == [4, 4]
+    assert [counted.rejected for counted in mailbox.counts()] == [4, 4]
 
 
 async def test_a_foreign_program_may_send_to_a_latest_input_without_a_header() -> None:
@@ -114,7 +114,7 @@ async def test_a_flood_into_a_lossless_input_stays_within_its_window() -> None:
     feed = Feed(transport)
     for value in range(100):
         feed.send(value)
-    (counted,) = mailbox.statistics()
+    (counted,) = mailbox.counts()
     assert (counted.waiting, counted.peak) == (3, 3)
     assert await take_all(mailbox) == [("", 0), ("", 1), ("", 2)]
 
@@ -137,7 +137,7 @@ async def test_a_message_over_the_size_limit_is_rejected_before_it_is_decoded() 
     mailbox = Mailbox("me", (In(NUMBERS, Latest(4)),), transport, max_bytes=100)
     transport.deliver(NUMBERS.name, b"", bytes(101))
     transport.deliver(NUMBERS.name, b"", bytes(100))  # no message either, but that shows later
-    (counted,) = mailbox.statistics()
+    (counted,) = mailbox.counts()
     assert (counted.rejected, counted.waiting) == (1, 1)
 
 
@@ -160,7 +160,7 @@ async def test_what_never_came_is_counted_by_the_numbers_of_what_did() -> None:
         for seq in numbers:
             header = encode_link(Header("source", epoch, seq, 0))
             transport.deliver(NUMBERS.name, header, encode_message(number(seq)))
-        return mailbox.statistics()[0].lost
+        return mailbox.counts()[0].lost
 
     assert arrives(1, 5, 6, 7) == 0, "who comes late has lost nothing"
     assert arrives(1, 10) == 2
@@ -168,5 +168,5 @@ async def test_what_never_came_is_counted_by_the_numbers_of_what_did() -> None:
     assert arrives(1, 9, 10, 7) == 1, "these came again"
     assert arrives(2, 0, 1, 3) == 2, "another producer counts anew"
     transport.deliver(NUMBERS.name, b"", encode_message(number(0)))
-    assert mailbox.statistics()[0].lost == 2, "a foreign program numbers nothing"
+    assert mailbox.counts()[0].lost == 2, "a foreign program numbers nothing"
     mailbox.disconnect()

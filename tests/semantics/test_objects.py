@@ -143,13 +143,13 @@ def test_what_is_called_something_else_each_time_is_no_object() -> None:
 def test_regions_of_too_few_gaussians_begin_nothing() -> None:
     stage = Stage(Objects(ObjectsConfig(AssociationConfig(min_gaussians=5000))))
     stand(stage, (BALL,), 4)
-    assert stage.objects.statistics()["object_candidates"] == 0
+    assert stage.objects.metrics()["object_candidates"] == 0
 
 
 def test_candidates_and_objects_are_bounded() -> None:
     stage = Stage(Objects(ObjectsConfig(max_objects=1, max_candidates=1)))
     for _ in stage.walk(THINGS, poses(8)):
-        counts = stage.objects.statistics()
+        counts = stage.objects.metrics()
         assert counts["objects"] <= 1
         assert counts["object_candidates"] <= 1
 
@@ -258,7 +258,7 @@ def test_a_thing_that_is_detected_in_parts_is_one_object(scores: tuple[float, ..
         boxes += [(seen.box, claims.boxes[0]) for seen in told.observations]
     (landmark,) = stage.objects.landmarks
     assert landmark["seen"] == 6
-    assert stage.objects.statistics()["object_candidates"] == 0
+    assert stage.objects.metrics()["object_candidates"] == 0
     assert boxes
     for seen, whole in boxes:
         np.testing.assert_array_equal(seen, whole)

@@ -69,8 +69,8 @@ def test_what_is_in_a_box_gets_its_label_and_the_rest_does_not(posed) -> None:
     top = top_labels(builder.gaussians.labels)
     assert np.mean(top[inside] == CHAIR) > 0.9
     assert np.mean(top[outside] == CHAIR) < 0.01
-    assert semantics.statistics()["gaussians_labelled"] == np.count_nonzero(top)
-    assert semantics.statistics()["label_disagreement_literal"] > 0
+    assert semantics.metrics()["gaussians_labelled"] == np.count_nonzero(top)
+    assert semantics.metrics()["label_disagreement_literal"] > 0
 
 
 def test_where_depth_is_missing_the_map_knows_it(posed) -> None:
@@ -105,7 +105,7 @@ def test_few_boxes_wait_for_keyframes_that_never_come(posed) -> None:
     semantics = SemanticMap(builder, replace(BY_BOX, most_waiting=2))
     for keyframe in (7, 8, 9):
         semantics.add_detections(keyframe, claims())
-    assert semantics.statistics()["boxes_too_early"] == 1
+    assert semantics.metrics()["boxes_too_early"] == 1
     assert [keyframe for keyframe, _ in semantics.snapshot()["waiting"]] == [8, 9]
 
 
@@ -114,7 +114,7 @@ def test_boxes_of_a_forgotten_keyframe_are_counted_and_left_out(posed) -> None:
     semantics = SemanticMap(builder, BY_BOX)
     builder.views.store.keep_only([1])
     semantics.add_detections(0, claims())
-    assert semantics.statistics()["boxes_without_images"] == 1
+    assert semantics.metrics()["boxes_without_images"] == 1
     assert not builder.gaussians.labels.any()
 
 
@@ -128,7 +128,7 @@ def test_late_boxes_find_gaussians_that_sleep(posed) -> None:
         builder.add(frame, T, keyframe, 0)
     builder.changes(with_changed=True)
     builder.offload_excess()
-    assert builder.statistics()["gaussians_asleep"] > 100
+    assert builder.metrics()["gaussians_asleep"] > 100
     semantics.add_detections(0, claims())
     SemanticMap(awake, BY_BOX).add_detections(0, claims())
     assert builder.gaussians.labels.any()
