@@ -33,7 +33,7 @@ from ldo_service.conversions.poses import (
     pose_from_message,
     pose_to_message,
 )
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.loop_refit import LoopRefit, LoopRefitConfig
 from ldo_service.gaussians.map_builder import MapBuilder, MapBuilderConfig
 from ldo_service.geometry import se3
@@ -74,15 +74,8 @@ from ldo_service.schemas.topics import (
 )
 from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap, SemanticMapConfig
 
-Output = (
-    ModelView
-    | MapDelta
-    | MapSnapshot
-    | LabelRequest
-    | MapObjects
-    | ObjectObservation
-    | KeyframeRefinement
-)
+MapOutput = ModelView | MapDelta | MapSnapshot | MapObjects
+Output = MapOutput | LabelRequest | ObjectObservation | KeyframeRefinement
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +100,7 @@ class MapperConfig:
     # renderer moves them; of older ones, which the optimizer has condensed, that from the reference
     checkpoint_keyframes: int = 5  # between saved maps: after a crash so many are mapped again
     motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
-    motion_min_rad: float = 2e-4  # As builder.refined_m: what is not told must not be taken back
+    motion_min_rad: float = 2e-4  # As that of MapBuilderConfig: what is not told must stay
     mending_min_m: float = 0.01  # a keyframe that a correction moves farther is mended: it may lie
     mending_min_rad: float = 0.01  # over surface that the map holds already. Less is refined anyway
     mended_keyframes: int = 2  # per new one: a closure that moves a hundred is mended in fifty
@@ -119,23 +112,19 @@ class MapperConfig:
     # as long again. A run over a file does the rest at its end, `map/refine` when asked
 
     def __post_init__(self) -> None:
-        counts = (
-            *(self.snapshot_keyframes, self.part_gaussians, self.checkpoint_keyframes),
-            *(self.changed_keyframes, self.measured_keyframes),
+        amounts = (
+            *("iterations", "least_iterations", "threads", "snapshot_growth"),
+            *("mended_keyframes", "mended_at_end", "mending_iterations"),
+            *("due_iterations", "paid_iterations"),
         )
-        if min(self.iterations, self.least_iterations) < 0:
-            raise ConfigError("mapper.iterations and least_iterations must not be negative.")
-        mending = (self.mended_keyframes, self.mended_at_end, self.mending_iterations)
-        if min(*mending, self.due_iterations, self.paid_iterations) < 0:
-            raise ConfigError(
-                "mapper.mended_keyframes, mended_at_end, mending_iterations, due_iterations and "
-                "paid_iterations: none is negative."
-            )
-        if min(counts) < 1 or self.threads < 0 or self.snapshot_growth < 0:
-            raise ConfigError(
-                f"mapper: counts {counts} must be at least 1, threads {self.threads} and "
-                f"snapshot_growth {self.snapshot_growth:g} at least 0."
-            )
+        if min(getattr(self, name) for name in amounts) < 0:
+            raise ConfigError(named(self, *amounts) + ": none may be negative.")
+        counts = (
+            *("snapshot_keyframes", "part_gaussians", "checkpoint_keyframes"),
+            *("changed_keyframes", "measured_keyframes"),
+        )
+        if min(getattr(self, name) for name in counts) < 1:
+            raise ConfigError(named(self, *counts) + ": each must be at least 1.")
 
     def thread_count(self) -> int:
         return self.threads or max(1, (os.cpu_count() or 1) - 1)

@@ -218,10 +218,7 @@ class MapBuilder:
         return self._fitting.iterations - before
 
     def _fit(
-        self,
-        plan: Iterable[int],
-        rates: tuple[float, float] = (1.0, 1.0),
-        effort: float = inf,
+        self, plan: Iterable[int], rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
     ) -> np.ndarray:
         touched = self._fitting.fit(self.gaussians, plan, rates, effort)
         self._log.changed(touched)

@@ -66,23 +66,14 @@ class ObjectsConfig:
 
     def __post_init__(self) -> None:
         counts = (
-            *(self.min_keyframes, self.miss_limit, self.uncertain_miss_limit),
-            *(self.candidate_miss_limit, self.max_objects, self.max_candidates),
+            *("min_keyframes", "miss_limit", "uncertain_miss_limit"),
+            *("candidate_miss_limit", "max_objects", "max_candidates"),
         )
-        if min(counts) < 1 or min(self.max_divergence, self.uncertain_entropy) < 0:
+        if min(getattr(self, name) for name in counts) < 1:
+            raise ConfigError(named(self, *counts) + ": each must be at least 1.")
+        if min(self.max_divergence, self.uncertain_entropy) < 0:
             raise ConfigError(
-                named(
-                    self,
-                    "min_keyframes",
-                    "max_divergence",
-                    "miss_limit",
-                    "uncertain_miss_limit",
-                    "uncertain_entropy",
-                    "candidate_miss_limit",
-                    "max_objects",
-                    "max_candidates",
-                )
-                + ": counts must be at least 1, nats not negative."
+                named(self, "max_divergence", "uncertain_entropy") + ": none may be negative."
             )
         if not (0 < self.min_visible <= 1 and 0 < self.merge_overlap <= 1):
             raise ConfigError(
