@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ldo_service.errors import ConfigError, ModelError
+from ldo_service.errors import ConfigError, ModelError, named
 
 from .onnx_network import Network, sha256
 from .vocabulary import canonical, class_names, read_names
@@ -32,14 +32,11 @@ class NetworkConfig:
         if self.layout:
             layout_named(self.layout)
         if not (0 <= self.score_min <= 1 and 0 <= self.nms_iou <= 1):
-            raise ConfigError(
-                f"detector.network: score_min {self.score_min:g} and nms_iou {self.nms_iou:g} must "
-                "be within 0..1."
-            )
+            raise ConfigError(named(self, "score_min", "nms_iou") + ": both must be within 0..1.")
         if min(self.max_boxes, self.max_candidates, self.threads, *self.input_px) < 1:
             raise ConfigError(
-                "detector.network: max_boxes, max_candidates, threads and input_px must be at "
-                "least 1."
+                named(self, "max_boxes", "max_candidates", "threads", "input_px")
+                + ": each must be at least 1."
             )
 
 
