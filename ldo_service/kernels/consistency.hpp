@@ -22,7 +22,7 @@ inline uint8_t top_label(const LabelRow& row) {
 class Neighbors16 {
  public:
   Neighbors16(const float* rows, const uint32_t* indices, const LabelRow* labels,
-               const uint32_t* places, int count) {
+              const uint32_t* places, int count) {
     for (auto& column : mean_) std::fill_n(column, kLanes, std::numeric_limits<float>::infinity());
     label_[0] = kBackground;
     std::fill_n(share_[0], kLanes, 0.0f);

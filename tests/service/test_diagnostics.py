@@ -87,7 +87,7 @@ def test_each_trouble_is_told_from_the_others(actor: ActorStatus, says: str) -> 
             "one region for 12 s, and 3 wait: names come late",
         ),
         (health(facts={"answers_refused": 2.0, "questions": 9.0}), "refused 2 of 9 answers"),
-        (health(facts={"answers_without_logprobs": 4.0}), "confidence_untold"),
+        (health(facts={"answers_without_logprobs": 4.0}), "default_confidence"),
         (health(facts={"names_refused": 1.0}), "refused 1 names"),
         (health(facts={"iterations_due": 40.0}), "ldo control refine --iterations 40`"),
         (health(facts={"iterations_due": 900.0}), "ldo control refine --iterations 500`"),
