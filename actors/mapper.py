@@ -100,7 +100,7 @@ class MapperConfig:
     # renderer moves them; of older ones, which the optimizer has condensed, that from the reference
     checkpoint_keyframes: int = 5  # between saved maps: after a crash so many are mapped again
     motion_min_m: float = 2e-4  # a correction that moves a keyframe less shows nowhere: 0.1 px.
-    motion_min_rad: float = 2e-4  # As that of MapBuilderConfig: what is not told must stay
+    motion_min_rad: float = 2e-4  # Equal to MapBuilderConfig.refined_rad
     mending_min_m: float = 0.01  # a keyframe that a correction moves farther is mended: it may lie
     mending_min_rad: float = 0.01  # over surface that the map holds already. Less is refined anyway
     mended_keyframes: int = 2  # per new one: a closure that moves a hundred is mended in fifty

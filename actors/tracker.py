@@ -9,8 +9,8 @@ out  pose/tracked       TrackedPose
 out  keyframe/new       Keyframe      made only when every consumer has room: never waited for
 
 The actor converts messages, and keeps the ports, the prior and the counters. What becomes of a
-frame is decided in one call: `Odometry.process`. When `tracker.localise` names a finished run, a
-`Localizer` stands in place of the odometry. It makes no keyframe, so the mapper and the optimizer
+frame is decided in one call: `Odometry.process`. When `TrackerConfig.localise` names a finished
+run, a `Localizer` stands in place of the odometry. It makes no keyframe, so the mapper and the optimizer
 are idle and the map stays as it is; subscribers of poses see no difference.
 """
 
@@ -59,9 +59,9 @@ from ldo_service.tracking.tracking_result import TrackingResult
 
 log = logging.getLogger(__name__)
 
-UNIT_WITHIN = 1e-3  # Of a quaternion's norm: four digits, as people copy them; then normalized.
+UNIT_WITHIN = 1e-3  # Tolerance of a quaternion's norm: people copy four digits; it is normalized.
 MISSED_PRIOR_WARNING_COUNT = 30  # Frames in a row without a prior: a second is no hiccup.
-OWN_PARTS = "keyframe", "supporting"  # Of the odometry's state, each a part of its own.
+OWN_PARTS = "keyframe", "supporting"  # Entries of the odometry's state that are parts of their own.
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +220,7 @@ class Tracker(Actor):
         """Continue from a snapshot.
 
         Raises:
-            ConfigError: The snapshot was taken with another `tracker.localise`.
+            ConfigError: The snapshot was taken with another map.
         """
         now = state["now"]
         if now["localise"] != self.config.localise:

@@ -53,7 +53,7 @@ def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Iteration:
-    """The steps of an iteration against one view, as `Optimiser.step` makes them.
+    """The steps of an iteration against one view, as `GaussianOptimizer.step` makes them.
 
     n          Gaussians about the view
     elsewhere  as many more in other directions, which no pixel shows

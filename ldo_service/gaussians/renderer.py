@@ -1,6 +1,6 @@
 """Rendering of the map and its derivatives: EWA splatting of 3D Gaussians, front to back.
 
-The kernels are `kernels/rasterise.cpp`, `kernels/blend_gradient.hpp` and
+The kernels are `kernels/rasterize.cpp`, `kernels/blend_gradient.hpp` and
 `kernels/projection_gradient.hpp`; `tests/reference/render.py` implements them in plain NumPy.
 """
 

@@ -1,8 +1,8 @@
 """Regions that nobody has a name for, followed over keyframes until a labeller can be asked.
 
 Two sightings are of the same region when most of what each shows of the other lies in it (see
-`same_region`). Each keeps its best views, and what was said of it: it has the name that most speaks
-for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one way, now
+`region_matching`). Each keeps its best views, and what was said of it: it has the name that most
+speaks for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one way, now
 in another; so of regions that have an answer, what speaks for the name of one counts for those that
 overlap it, by how much they do. What stands on a thing, and the thing, tell nothing of each other.
 

@@ -25,10 +25,10 @@ from .summary import Usage, summarize
 
 
 def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
-    """Like `run_over_file`, with the stages and policies of the service, all in this process.
+    """Like `run_offline`, with the stages and policies of the service, all in this process.
 
     A frame that comes before the tracker is done with the last one is dropped and counted, so the
-    result depends on the machine's speed and load. Raises what `run_over_file` raises, and
+    result depends on the machine's speed and load. Raises what `run_offline` raises, and
     ConfigError when the map is to be refined: live, `map/refine` asks for that.
     """
     if job.refine:
