@@ -18,12 +18,14 @@ def refuse_moved(tree: dict[str, Any]) -> None:
     Raises:
         ConfigError: A setting of an earlier version is among them; the message has its new name.
     """
-    told = [text for path in _leaves(tree, "") if (text := moved(path))]
-    if not told:
+    refusals = [text for path in _leaves(tree, "") if (text := moved(path))]
+    if not refusals:
         return
-    rest = f" And {len(told) - SHOWN} more settings have moved." if len(told) > SHOWN else ""
+    rest = (
+        f" And {len(refusals) - SHOWN} more settings have moved." if len(refusals) > SHOWN else ""
+    )
     raise ConfigError(
-        f"{' '.join(told[:SHOWN])}{rest} docs/configuration.md and `ldo config --all` list the "
+        f"{' '.join(refusals[:SHOWN])}{rest} docs/configuration.md and `ldo config --all` list the "
         "settings."
     )
 
@@ -45,7 +47,7 @@ def was_section(path: str) -> bool:
 
 @functools.cache
 def _table() -> dict[str, tuple[str, str]]:
-    """Kind and new place of each old path."""
+    """Return the kind and the new place of each old path."""
     text = files("ldo_service.config").joinpath("moved_settings.tsv").read_text()
     rows = [line.split("\t") for line in text.splitlines()[1:]]
     return {old: (kind, new) for old, kind, new in rows}
