@@ -10,8 +10,8 @@ out  keyframe/new       Keyframe      made only when every consumer has room: ne
 
 The actor converts messages, and keeps the ports, the prior and the counters. What becomes of a
 frame is decided in one call: `Odometry.process`. When `TrackerConfig.localise` names a finished
-run, a `Localizer` stands in place of the odometry. It makes no keyframe, so the mapper and the optimizer
-are idle and the map stays as it is; subscribers of poses see no difference.
+run, a `Localizer` stands in place of the odometry. It makes no keyframe, so the mapper and the
+optimizer are idle and the map stays as it is; subscribers of poses see no difference.
 """
 
 import logging

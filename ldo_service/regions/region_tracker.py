@@ -2,9 +2,10 @@
 
 Two sightings are of the same region when most of what each shows of the other lies in it (see
 `region_matching`). Each keeps its best views, and what was said of it: it has the name that most
-speaks for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one way, now
-in another; so of regions that have an answer, what speaks for the name of one counts for those that
-overlap it, by how much they do. What stands on a thing, and the thing, tell nothing of each other.
+speaks for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one
+way, now in another; so of regions that have an answer, what speaks for the name of one counts for
+those that overlap it, by how much they do. What stands on a thing, and the thing, tell nothing of
+each other.
 
 A region is asked about once, when no better view of it has come for a while, and as it was at its
 best. Most regions are no things but parts and shadows of them; so there is a budget, and what has
