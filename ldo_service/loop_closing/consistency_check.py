@@ -32,7 +32,8 @@ class ConsistencyCheckConfig:
     def __post_init__(self) -> None:
         if min(getattr(self, name) for name in self.__slots__) < 0 or self.rival_inliers > 1:
             raise ConfigError(
-                named(self, *self.__slots__) + ": nothing may be negative, rival_inliers at most 1."
+                named(self, *self.__slots__)
+                + ": each must be at least 0, and rival_inliers at most 1."
             )
 
 

@@ -73,7 +73,7 @@ class ObjectsConfig:
             raise ConfigError(named(self, *counts) + ": each must be at least 1.")
         if min(self.max_divergence, self.uncertain_entropy) < 0:
             raise ConfigError(
-                named(self, "max_divergence", "uncertain_entropy") + ": none may be negative."
+                named(self, "max_divergence", "uncertain_entropy") + ": each must be at least 0."
             )
         if not (0 < self.min_visible <= 1 and 0 < self.merge_overlap <= 1):
             raise ConfigError(
