@@ -179,8 +179,8 @@ class FrameSource(Actor):
             "frames_rejected": self._rejected,
             "camera_sessions": self._sessions,
             "pairs": self._pairing.pairs,
-            "lost_color": self._pairing.lost_a,
-            "lost_depth": self._pairing.lost_b,
+            "color_unpaired": self._pairing.lost_a,
+            "depth_unpaired": self._pairing.lost_b,
             "skew_ms_p50": float(np.median(skews_ms)),  # of the recent pairs
             "skew_ms_max": max(skews_ms),
         }

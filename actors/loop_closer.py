@@ -2,7 +2,7 @@
 
 in   keyframe/new       Keyframe         Lossless(8)   a missing one would be no place to come back
 in   detection/boxes    DetectionBoxes   Lossless(8)   what is there, for every keyframe
-in   graph/correction   Correction       Latest(1)     a versioned absolute state: the newest says
+in   graph/correction   GraphCorrection  Latest(1)     a versioned absolute state: the newest says
 out  loop/closure    LoopClosure
 out  loop/candidate  LoopCandidate
 
@@ -27,9 +27,9 @@ from ldo_service.loop_closing import LoopCandidateResult, LoopDetector, LoopsCon
 from ldo_service.loop_closing.object_points import DetectionPoints, locate_detections
 from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
-    Correction,
     Detection,
     DetectionBoxes,
+    GraphCorrection,
     Keyframe,
     LoopCandidate,
     LoopClosure,
@@ -89,7 +89,7 @@ class LoopCloser(Actor):
         self.recognizer = LoopDetector(self.config.loops)
         self._vocabulary = Vocabulary()
         self.poses = KeyframePoses()  # of the keyframes kept, and the newest
-        self._joined: dict[int, int] = {}  # segments placed in an older one
+        self._joined: dict[int, int] = {}  # submaps placed in an older one
         self._waiting: dict[int, PendingKeyframe] = {}  # by keyframe
         self._boxes: dict[int, DetectionBoxes] = {}  # that came before their keyframe, or wait
         self._newest = -1  # keyframe taken
@@ -98,16 +98,16 @@ class LoopCloser(Actor):
         self._saved_poses: dict[str, Any] | None = None  # likewise; None: they have changed
 
     def handle(
-        self, message: Keyframe | DetectionBoxes | Correction
+        self, message: Keyframe | DetectionBoxes | GraphCorrection
     ) -> Iterator[LoopClosure | LoopCandidate]:
         if not self.config.is_on:
             return
         self._parts = None
-        if isinstance(message, Correction):
+        if isinstance(message, GraphCorrection):
             T_map = keyframe_poses_from_correction(message, only=self.poses)
             self.poses.correct(message.graph_version, T_map)
             self._saved_poses = None
-            self._joined = dict(message.joined)
+            self._joined = dict(message.merged_submaps)
             return
         if isinstance(message, Keyframe):
             self._take(message)
@@ -127,7 +127,7 @@ class LoopCloser(Actor):
             message.reference,
             pose_from_message(message.T_reference_keyframe),
             pose_from_message(message.T_odom_keyframe),
-            message.segment,
+            message.submap,
         )
         loops = self.config.loops
         place = make_keyframe_record(
@@ -265,7 +265,7 @@ class LoopCloser(Actor):
         return {
             "subgraphs": len(self.recognizer.subgraphs),
             "loops_accepted": self._accepted,
-            "loops_refused": self._refused,
-            "keyframes_without_boxes": self._without_boxes,  # that never came
+            "loops_rejected": self._refused,
+            "keyframes_without_detections": self._without_boxes,  # that never came
             "keyframes_repeated": self._repeated,
         }

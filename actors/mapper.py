@@ -2,10 +2,10 @@
 
 in   keyframe/new          Keyframe             Lossless(8)       a missing one is a hole in the map
 in   detection/boxes       DetectionBoxes       Lossless(8)       without it there are no labels
-in   label/open            LabelOpen            Latest(1 per key) the newest look at a region
-in   graph/correction      Correction           Latest(1)         a versioned absolute state
-in   map/refine            MapRefine            Latest(1)         what was asked last
-out  map/view              ModelView            the map as rendered at the newest keyframe
+in   label/result          LabelResult          Latest(1 per key) the newest look at a region
+in   graph/correction      GraphCorrection      Latest(1)         a versioned absolute state
+in   map/refine            RefineMap            Latest(1)         what was asked last
+out  map/view              MapRendering         the map as rendered at the newest keyframe
 out  map/delta             MapDelta             what changed
 out  map/snapshot          MapSnapshot          the whole of it, in parts, now and then
 out  label/request         LabelRequest         what a labeller is to name, if there is one
@@ -45,26 +45,26 @@ from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.schemas import (
     AnchorMotion,
     Array,
-    Correction,
     DetectionBoxes,
+    GraphCorrection,
     Keyframe,
     KeyframeRefinement,
-    LabelOpen,
     LabelRequest,
+    LabelResult,
     MapDelta,
     MapObjects,
-    MapRefine,
+    MapRendering,
     MapSnapshot,
-    ModelView,
     ObjectObservation,
+    RefineMap,
 )
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     GRAPH_CORRECTION,
     KEYFRAME_NEW,
     KEYFRAME_REFINEMENT,
-    LABEL_OPEN,
     LABEL_REQUEST,
+    LABEL_RESULT,
     MAP_DELTA,
     MAP_OBJECTS,
     MAP_REFINE,
@@ -74,7 +74,7 @@ from ldo_service.schemas.topics import (
 )
 from ldo_service.semantics.semantic_map import KeyframeSemantics, SemanticMap, SemanticMapConfig
 
-MapOutput = ModelView | MapDelta | MapSnapshot | MapObjects
+MapOutput = MapRendering | MapDelta | MapSnapshot | MapObjects
 Output = MapOutput | LabelRequest | ObjectObservation | KeyframeRefinement
 
 
@@ -147,7 +147,7 @@ class Mapper(Actor):
     inputs = (
         In(KEYFRAME_NEW, Lossless(8)),
         In(DETECTION_BOXES, Lossless(8)),
-        In(LABEL_OPEN, Latest(1, per_key=True)),
+        In(LABEL_RESULT, Latest(1, per_key=True)),
         In(GRAPH_CORRECTION, Latest(1)),
         In(MAP_REFINE, Latest(1)),
     )
@@ -181,16 +181,16 @@ class Mapper(Actor):
         self._repeated = 0
 
     def handle(
-        self, message: Keyframe | DetectionBoxes | LabelOpen | Correction | MapRefine
+        self, message: Keyframe | DetectionBoxes | LabelResult | GraphCorrection | RefineMap
     ) -> Iterator[Output]:
         match message:
             case DetectionBoxes():
                 yield from self._take_boxes(message)
-            case LabelOpen():
+            case LabelResult():
                 yield from self._take_label(message)
-            case Correction():
+            case GraphCorrection():
                 yield from self._correct(message)
-            case MapRefine():
+            case RefineMap():
                 yield from self._refine(message)
             case Keyframe() if message.keyframe in self._poses:
                 self._repeated += 1  # sent again after a restart
@@ -205,13 +205,13 @@ class Mapper(Actor):
             message.reference,
             pose_from_message(message.T_reference_keyframe),
             pose_from_message(message.T_odom_keyframe),
-            message.segment,
+            message.submap,
         )
         self._links.add(message)
         self._newest = (message.stamp_ns, message.keyframe)
         # map it
         frame = frame_from_message(message)
-        moving = mask_from_array(message.is_moving)
+        moving = mask_from_array(message.dynamic_mask)
         self._map.add(frame, T_map_keyframe, message.keyframe, self._iterations(), moving)
         learnt = self._semantics.on_keyframe_mapped(message.keyframe)
         self._repair.with_keyframe(is_behind=self._waiting() > 0)
@@ -234,8 +234,8 @@ class Mapper(Actor):
     def _waiting(self) -> int:
         return self.situation.backlog.get(KEYFRAME_NEW, 0)
 
-    def _refine(self, message: MapRefine) -> Iterator[Output]:
-        self._repair.refine(message.iterations, (message.first_rate, message.last_rate))
+    def _refine(self, message: RefineMap) -> Iterator[Output]:
+        self._repair.refine(message.iterations, (message.initial_rate, message.final_rate))
         self._semantics.refresh()
         self._checkpoint = {}  # is due: half a minute of work, and perhaps no keyframe follows
         yield from self._refinement()
@@ -256,8 +256,8 @@ class Mapper(Actor):
         learnt = self._semantics.add_detections(message.keyframe, claims)
         yield from self._publish_semantics(learnt, message.stamp_ns)
 
-    def _take_label(self, message: LabelOpen) -> Iterator[Output]:
-        answer = RegionLabelResult(message.label, message.confidence, message.others)
+    def _take_label(self, message: LabelResult) -> Iterator[Output]:
+        answer = RegionLabelResult(message.label, message.confidence, message.alternatives)
         if self._semantics.apply_label(message.region, message.keyframe, answer):
             yield from self._objects()
 
@@ -278,9 +278,9 @@ class Mapper(Actor):
             yield self._objects_teller.message(semantics.objects, semantics.names, *now)
 
     # --- corrections ------------------------------------------------------------------------------
-    def _correct(self, message: Correction) -> Iterator[Output]:
+    def _correct(self, message: GraphCorrection) -> Iterator[Output]:
         """Move Gaussians with their keyframes; subscribers apply the same rounded motions."""
-        held = self._links.acknowledged(message.refinements)
+        held = self._links.acknowledged(message.last_refinement)
         self._poses.correct(
             message.graph_version, keyframe_poses_from_correction(message), held=held
         )
@@ -313,10 +313,10 @@ class Mapper(Actor):
     def _message_context(self) -> MessageContext:
         return MessageContext(self._newest[0], self._poses.version, self._semantics.names)
 
-    def _view(self, keyframe: Keyframe) -> ModelView:
+    def _view(self, keyframe: Keyframe) -> MapRendering:
         views, k = self._map.views, keyframe.keyframe
         rendering = self._map.render_keyframe(k, contributions=self._semantics.is_used)
-        return ModelView(
+        return MapRendering(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.keyframe,
             version=self._teller.version,

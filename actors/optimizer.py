@@ -4,7 +4,7 @@ in   keyframe/new          Keyframe             Lossless(8)   a missing link wou
 in   keyframe/refinement   KeyframeRefinement   Lossless(8)   the better measurement
 in   loop/closure          LoopClosure          Lossless(8)   seldom, and costly to find
 in   object/observation    ObjectObservation    Lossless(8)   evidence adds up
-out  graph/correction   Correction
+out  graph/correction   GraphCorrection
 
 gtsam holds the GIL during every call: by default this actor runs in a process of its own.
 """
@@ -27,17 +27,17 @@ from ldo_service.conversions.poses import (
 )
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera, se3
-from ldo_service.geometry.keyframe_poses import T_map_segment
+from ldo_service.geometry.keyframe_poses import T_map_submap
 from ldo_service.pose_graph.landmarks import (
     MAX_CLASSES,
+    LandmarkObservation,
     ObjectLandmarkConfig,
     ObjectLandmarks,
-    Observation,
 )
 from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
 from ldo_service.runtime import Actor, In, Lossless, Out
 from ldo_service.schemas import (
-    Correction,
+    GraphCorrection,
     GraphLandmark,
     Keyframe,
     KeyframeRefinement,
@@ -75,7 +75,7 @@ class OptimizerConfig:
 
 
 class Optimizer(Actor):
-    """The one owner of keyframe poses in the map, and of which segments are joined."""
+    """The one owner of keyframe poses in the map, and of which submaps are joined."""
 
     name = "optimizer"
     inputs = (
@@ -95,8 +95,8 @@ class Optimizer(Actor):
         self._cameras: dict[int, Camera] = {}  # of the newest keyframes
         self._version = 0
         self._stamp_ns = 0  # of the newest message
-        self._newest: dict[int, tuple[int, np.ndarray]] = {}  # by segment: id and T_odom_keyframe
-        self._first: dict[int, int] = {}  # keyframe of each segment
+        self._newest: dict[int, tuple[int, np.ndarray]] = {}  # by submap: id and T_odom_keyframe
+        self._first: dict[int, int] = {}  # keyframe of each submap
         self._early: dict[tuple[int, int], MeasuredPose] = {}  # came before their keyframe
         self._early_closures: list[LoopClosure] = []
         self._early_observations: list[ObjectObservation] = []
@@ -106,7 +106,7 @@ class Optimizer(Actor):
 
     def handle(
         self, message: Keyframe | KeyframeRefinement | LoopClosure | ObjectObservation
-    ) -> Iterator[Correction]:
+    ) -> Iterator[GraphCorrection]:
         self._stamp_ns = max(self._stamp_ns, message.stamp_ns)
         match message:
             case ObjectObservation() if not self.config.uses_objects:
@@ -129,12 +129,12 @@ class Optimizer(Actor):
                 self._take(message)
         yield self._correction(message.stamp_ns)
 
-    def on_restored(self) -> Iterator[Correction]:
+    def on_restored(self) -> Iterator[GraphCorrection]:
         """The last one may not have been sent."""
         if len(self._graph):
             yield self._correction(self._stamp_ns)
 
-    def _correction(self, stamp_ns: int) -> Correction:
+    def _correction(self, stamp_ns: int) -> GraphCorrection:
         self._version += 1
         if not self._early:
             self._refinements = self._waiting_number
@@ -175,7 +175,7 @@ class Optimizer(Actor):
 
     def _add(self, message: Keyframe) -> None:
         T_odom_keyframe = pose_from_message(message.T_odom_keyframe)
-        newest = self._newest.get(message.segment)
+        newest = self._newest.get(message.submap)
         known = [m for m in measurements_from_message(message) if m.a in self._graph]
         if newest is None:
             self._add_first_keyframe(message, T_odom_keyframe)
@@ -183,14 +183,14 @@ class Optimizer(Actor):
             self._graph.add(*known)
         else:
             self._add_odometry_fallback(newest, message.keyframe, T_odom_keyframe)
-        self._newest[message.segment] = (message.keyframe, T_odom_keyframe)
-        for pose in message.joins:
+        self._newest[message.submap] = (message.keyframe, T_odom_keyframe)
+        for pose in message.submap_measurements:
             self._join(pose)
 
     def _add_first_keyframe(self, message: Keyframe, T_odom_keyframe: np.ndarray) -> None:
-        """The first keyframe of a segment; where it is among the others, nobody knows yet."""
-        self._first[message.segment] = message.keyframe
-        T_map_keyframe = T_map_segment(message.segment) @ T_odom_keyframe
+        """The first keyframe of a submap; where it is among the others, nobody knows yet."""
+        self._first[message.submap] = message.keyframe
+        T_map_keyframe = T_map_submap(message.submap) @ T_odom_keyframe
         self._graph.add_first(message.keyframe, T_map_keyframe)
 
     def _add_odometry_fallback(
@@ -204,7 +204,7 @@ class Optimizer(Actor):
         self._graph.add(self._graph.odometry_fallback(known, keyframe, T_known_keyframe))
 
     def _join(self, pose: MeasuredPose) -> None:
-        """A keyframe in one of another segment; where loops joined these by now, it is judged as a
+        """A keyframe in one of another submap; where loops joined these by now, it is judged as a
         closure is."""
         if pose.reference not in self._graph:
             log.warning("keyframe %d joins %d, which is missing", pose.keyframe, pose.reference)
@@ -214,8 +214,8 @@ class Optimizer(Actor):
         self._log_merged(before)
 
     def _log_merged(self, before: dict[int, int]) -> None:
-        for segment, older in self._joined().items() - before.items():
-            log.info("segment %d is placed in %d now", segment, older)
+        for submap, older in self._joined().items() - before.items():
+            log.info("submap %d is placed in %d now", submap, older)
 
     # --- loops and objects ------------------------------------------------------------------------
     def _close(self) -> bool:
@@ -256,8 +256,8 @@ class Optimizer(Actor):
                 self._too_late += 1
         self._early_observations = self._keep_newest(later)
 
-    def _observation(self, seen: ObjectObservation, camera: Camera) -> Observation:
-        return Observation(
+    def _observation(self, seen: ObjectObservation, camera: Camera) -> LandmarkObservation:
+        return LandmarkObservation(
             seen.keyframe,
             seen.object,
             np.array(seen.box_px),
@@ -286,14 +286,12 @@ class Optimizer(Actor):
             for k, centroid in self._graph.landmarks().items()
         ]
 
-    # --- segments ---------------------------------------------------------------------------------
+    # --- submaps ---------------------------------------------------------------------------------
     def _joined(self) -> dict[int, int]:
-        """Segments that are placed in an older one, and in which."""
-        segments = {first: segment for segment, first in self._first.items()}
-        placed = {
-            s: segments[self._graph.component_root(first)] for s, first in self._first.items()
-        }
-        return {segment: older for segment, older in placed.items() if older < segment}
+        """Submaps that are placed in an older one, and in which."""
+        submaps = {first: submap for submap, first in self._first.items()}
+        placed = {s: submaps[self._graph.component_root(first)] for s, first in self._first.items()}
+        return {submap: older for submap, older in placed.items() if older < submap}
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
@@ -303,8 +301,8 @@ class Optimizer(Actor):
         rest = {
             "version": self._version,
             "stamp_ns": self._stamp_ns,
-            "segments": [
-                (segment, self._first[segment], *newest) for segment, newest in self._newest.items()
+            "submaps": [
+                (submap, self._first[submap], *newest) for submap, newest in self._newest.items()
             ],
             "refinements": (self._waiting_number, self._refinements),
             "changes": graph["changes"],
@@ -321,8 +319,8 @@ class Optimizer(Actor):
     def restore(self, state: dict[str, Any]) -> None:  # type: ignore[override]
         saved = state["rest"]
         self._version, self._stamp_ns = saved["version"], saved["stamp_ns"]
-        self._first = {segment: first for segment, first, *_ in saved["segments"]}
-        self._newest = {segment: (newest, T) for segment, _, newest, T in saved["segments"]}
+        self._first = {submap: first for submap, first, *_ in saved["submaps"]}
+        self._newest = {submap: (newest, T) for submap, _, newest, T in saved["submaps"]}
         self._waiting_number, self._refinements = saved["refinements"]
         self._graph.restore({"base": state["graph"], "changes": saved["changes"]})
         self._landmarks.restore({**saved, "known": state["landmarks"]})
@@ -337,17 +335,17 @@ class Optimizer(Actor):
         graph = self._graph
         return {
             "keyframes": len(graph),
-            "keyframes_solved": graph.variables,
+            "graph_variables": graph.variables,
             "optimizations": graph.solved_times,
-            "optimizations_saved": self._landmarks.skipped,
+            "optimizations_skipped": self._landmarks.skipped,
             "closures": len(graph.closures.accepted),
-            "closures_refused": len(graph.closures.rejected),
-            "closures_dropped": len(graph.closures.removed),
+            "closures_rejected": len(graph.closures.rejected),
+            "closures_removed": len(graph.closures.removed),
             "landmarks": len(graph.landmarks()),
             "keyframes_repeated": self._repeated,
-            "keyframes_bridged": self._bridged,
+            "keyframes_odometry_fallback": self._bridged,
             "keyframes_refined": self._refined,
-            "waited_in_vain": self._too_early,
-            "observations_too_late": self._too_late,  # in keyframes whose camera was forgotten
-            "segments_apart": len(self._first) - len(self._joined()),
+            "early_messages_discarded": self._too_early,
+            "late_observations_discarded": self._too_late,  # Their keyframe was forgotten.
+            "submaps_unmerged": len(self._first) - len(self._joined()),
         }

@@ -1,7 +1,7 @@
 """Camera pose of each RGB-D frame.                                          actors/tracker.py
 
 in   frame/rgbd         FrameRgbd     Latest(1)   a late frame is worth less than the next one
-in   graph/correction   Correction    Latest(1)   a versioned absolute state: the newest says it all
+in   graph/correction   GraphCorrection  Latest(1)  a versioned absolute state
 in   odometry/prior     OdometryPrior Latest(64)  0.3 s at 200 Hz, while a frame is tracked; older
                                                   poses are worth less, and no robot waits for us
 in   detection/boxes    DetectionBoxes Latest(1)  dynamic objects are not tracked against
@@ -34,10 +34,10 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.runtime import Actor, In, Latest, Out
 from ldo_service.schemas import (
-    Correction,
     Detection,
     DetectionBoxes,
     FrameRgbd,
+    GraphCorrection,
     Keyframe,
     OdometryPrior,
     TrackedPose,
@@ -51,7 +51,7 @@ from ldo_service.schemas.topics import (
     ODOMETRY_PRIOR,
     POSE_TRACKED,
 )
-from ldo_service.tracking.keyframe_database import places_of
+from ldo_service.tracking.keyframe_database import load_keyframe_database
 from ldo_service.tracking.localizer import Localizer
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer, PriorCheck
@@ -133,13 +133,13 @@ class Tracker(Actor):
         self._parts: dict[str, Any] | None = None
 
     def handle(
-        self, message: FrameRgbd | Correction | OdometryPrior | DetectionBoxes
+        self, message: FrameRgbd | GraphCorrection | OdometryPrior | DetectionBoxes
     ) -> Iterator[TrackedPose | Keyframe]:
         if isinstance(message, OdometryPrior):
             self._take_prior(message)
             return
         self._parts = None
-        if isinstance(message, Correction):
+        if isinstance(message, GraphCorrection):
             self._correct(message)
         elif isinstance(message, DetectionBoxes):
             boxes = [_box(detection) for detection in message.detections]
@@ -177,7 +177,7 @@ class Tracker(Actor):
             )  # fmt: skip
 
     def _take_prior(self, message: OdometryPrior) -> None:
-        T_odom_base = pose_from_message(message.T_odom_base)
+        T_odom_base = pose_from_message(message.T_prior_base)
         config = self.config.odometry.prior
         self._prior, verdict = self._prior.added(message.stamp_ns, T_odom_base, config)
         self._verdicts[verdict] += 1
@@ -187,9 +187,9 @@ class Tracker(Actor):
                 message.stamp_ns, verdict,
             )  # fmt: skip
 
-    def _correct(self, message: Correction) -> None:
+    def _correct(self, message: GraphCorrection) -> None:
         body = encode(message)
-        if self._odometry.correct(map_correction_of(decode(body, Correction))):
+        if self._odometry.correct(map_correction_of(decode(body, GraphCorrection))):
             self._correction = body
 
     # --- state ------------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ class Tracker(Actor):
         return {
             **{f"place_{number}": place for number, place in places.items()},
             **own,
-            "correction": self._correction,
+            "graph_correction": self._correction,
             "now": {"odometry": state, "poses": poses, "localise": localize},
             "prior": self._prior.packed,
             **fix,
@@ -225,13 +225,13 @@ class Tracker(Actor):
         now = state["now"]
         if now["localise"] != self.config.localise:
             raise ConfigError(
-                f"the saved state is of --localise {now['localise'] or '(none)'}, this service of "
+                f"the saved state is of --localize {now['localise'] or '(none)'}, this service of "
                 f"{self.config.localise or '(none)'}. Choose another folder with --state."
             )
         places = [state[f"place_{number}"] for number in now["odometry"]["order"]]
         own = {name: state[name] for name in (*OWN_PARTS, "fix") if name in state}
-        self._correction = state["correction"]
-        correction = decode(self._correction, Correction) if self._correction else None
+        self._correction = state["graph_correction"]
+        correction = decode(self._correction, GraphCorrection) if self._correction else None
         self._odometry.restore(
             {**now["odometry"], **own, "places": places, "poses": now["poses"]},
             None if correction is None else map_correction_of(correction),
@@ -243,11 +243,11 @@ class Tracker(Actor):
         restarts = self._verdicts[PriorCheck.RESTARTED] + self._verdicts[PriorCheck.JUMPED]
         return {
             "keyframes": self._made,
-            "keyframes_without_room": self._without_room,
-            "keyframes_returned_to": self._reused,
+            "keyframes_without_credit": self._without_room,
+            "keyframes_reused": self._reused,
             "frames_with_prior": self._with_prior,
             "frames_without_prior": self._without_prior,  # Since the first pose of the prior.
-            "prior_refused": refused,
+            "prior_rejected": refused,
             "prior_restarts": restarts,
         }
 
@@ -260,7 +260,7 @@ def _make_odometry(config: TrackerConfig, T_base_camera: np.ndarray) -> Odometry
     """
     if not config.localise:
         return Odometry(config.odometry, T_base_camera)
-    return Localizer(places_of(Path(config.localise)), config.odometry, T_base_camera)
+    return Localizer(load_keyframe_database(Path(config.localise)), config.odometry, T_base_camera)
 
 
 def _box(detection: Detection) -> Box:

@@ -1,9 +1,9 @@
 """Names of regions that the detector does not know.                     actors/vlm_labeller.py
 
 in   label/request   LabelRequest   Latest(1 per region)   a newer look at a region says more
-in   label/add       LabelAdd       Latest(32)             asked by a person, now and then, who
+in   label/add       AddLabel       Latest(32)             asked by a person, now and then, who
                                                            waits: it goes first
-out  label/open      LabelOpen      one for every request, late by design
+out  label/result    LabelResult    one for every request, late by design
 out  label/names     LabelNames     one for every label/add
 
 One region at a time, however long that takes: nobody waits for it. A labeller that cannot be used,
@@ -27,9 +27,9 @@ from ldo_service.detection.model_registry import open_labeller
 from ldo_service.detection.vocabulary import read_names
 from ldo_service.errors import ConfigError, EndpointError, FrameError, ModelError
 from ldo_service.runtime import Actor, In, Latest, Out
-from ldo_service.schemas import LabelAdd, LabelNames, LabelOpen, LabelRequest
+from ldo_service.schemas import AddLabel, LabelNames, LabelRequest, LabelResult
 from ldo_service.schemas.labels import MAX_ALTERNATIVES, MAX_NAMES
-from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
+from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LABEL_RESULT
 from ldo_service.storage.state_store import State
 
 log = logging.getLogger(__name__)
@@ -64,7 +64,7 @@ class VlmLabeller(Actor):
         In(LABEL_REQUEST, Latest(1, per_key=True, max_keys=32)),
         In(LABEL_ADD, Latest(32), has_priority=True),
     )
-    outputs = (Out(LABEL_OPEN), Out(LABEL_NAMES))
+    outputs = (Out(LABEL_RESULT), Out(LABEL_NAMES))
 
     def __init__(
         self, config: VlmLabellerConfig | None = None, labeller: Labeller | None = None
@@ -82,26 +82,26 @@ class VlmLabeller(Actor):
         except ConfigError as error:
             log.error("no region is named: %s", error)
 
-    def handle(self, message: LabelRequest | LabelAdd) -> Iterator[LabelOpen | LabelNames]:
+    def handle(self, message: LabelRequest | AddLabel) -> Iterator[LabelResult | LabelNames]:
         match message:
             case LabelRequest():
                 yield self._answer(message)
-            case LabelAdd():
+            case AddLabel():
                 yield self._add(message)
 
-    def _answer(self, request: LabelRequest) -> LabelOpen:
+    def _answer(self, request: LabelRequest) -> LabelResult:
         opinions = self._label_region(request)
         (label, confidence), *others = opinions or [("", 0.0)]
         self._named += bool(label)
         self._unnamed += not label
-        return LabelOpen(
+        return LabelResult(
             stamp_ns=request.stamp_ns,
             region=request.region,
             keyframe=request.keyframe,
             label=label,
             confidence=min(confidence, 1.0) if label else 0.0,
             labeller=self._labeller.identity if self._labeller and opinions is not None else "",
-            others=tuple((name, min(sure, 1.0)) for name, sure in others[:MAX_ALTERNATIVES]),
+            alternatives=tuple((name, min(sure, 1.0)) for name, sure in others[:MAX_ALTERNATIVES]),
         )
 
     def _label_region(self, request: LabelRequest) -> list[Opinion] | None:
@@ -121,7 +121,7 @@ class VlmLabeller(Actor):
         self._is_failing = False
         return opinions
 
-    def _add(self, message: LabelAdd) -> LabelNames:
+    def _add(self, message: AddLabel) -> LabelNames:
         refused = self._try_to_add(message.name)
         if refused:
             self._refusals += 1
@@ -130,7 +130,7 @@ class VlmLabeller(Actor):
             log.info("%r is added to the names", message.name)
             self._state = {"added": tuple(dict.fromkeys((*self._state["added"], message.name)))}
         names = self._labeller.names[:MAX_NAMES] if self._labeller else ()
-        return LabelNames(stamp_ns=message.stamp_ns, names=names, refused=refused)
+        return LabelNames(stamp_ns=message.stamp_ns, names=names, error=refused)
 
     def _try_to_add(self, name: str) -> str:
         """Why not; empty when it is done."""

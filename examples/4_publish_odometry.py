@@ -37,7 +37,7 @@ with (
         message = {
             "type": "OdometryPrior",
             "stamp_ns": round(stamp_s * 1e9),
-            "T_odom_base": {"translation": [x, y, z], "quaternion": [qw, qx, qy, qz]},
+            "T_prior_base": {"translation": [x, y, z], "quaternion": [qw, qx, qy, qz]},
         }
         prior.put(msgpack.packb(message))
 print(f"{len(poses)} poses sent")

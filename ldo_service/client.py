@@ -25,6 +25,7 @@ import zenoh
 
 from ldo_service.errors import ConfigError
 from ldo_service.schemas import (
+    AddLabel,
     CameraColor,
     CameraDepth,
     CameraModel,
@@ -32,13 +33,12 @@ from ldo_service.schemas import (
     ControlAnswer,
     ControlRequest,
     Image,
-    LabelAdd,
     LabelNames,
     MapObjects,
-    MapRefine,
     Message,
     OdometryPrior,
     Pose,
+    RefineMap,
     TrackedPose,
     decode,
 )
@@ -133,12 +133,12 @@ class Client:
         )
         self.send(message)
 
-    def publish_prior(self, T_odom_base: Pose, stamp_ns: int | None = None) -> None:
+    def publish_prior(self, T_prior_base: Pose, stamp_ns: int | None = None) -> None:
         """Send where another odometry of the robot has its base, in a frame of its own.
 
         stamp_ns  of the measurement, by the clock that stamps frames; default: now
         """
-        message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_odom_base=T_odom_base)
+        message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_prior_base=T_prior_base)
         header = Header("odometry", self._epoch, self._priors, message.stamp_ns)
         body = msgspec.msgpack.encode(message)
         self._publisher(OdometryPrior).put(body, attachment=encode_link(header))
@@ -249,7 +249,7 @@ class Client:
         """
         replies = self._session.get(
             self._network.expression(CONTROL.name),
-            payload=msgspec.msgpack.encode(ControlRequest(stamp_ns=time.time_ns(), verb=verb)),
+            payload=msgspec.msgpack.encode(ControlRequest(stamp_ns=time.time_ns(), command=verb)),
             timeout=timeout_s,
         )
         for reply in replies:
@@ -270,11 +270,11 @@ class Client:
         Raises ValueError for more than 500 iterations or rates outside (0, 1], ConfigError when
         nobody listens.
         """
-        message = MapRefine(
+        message = RefineMap(
             stamp_ns=time.time_ns(),
             iterations=iterations,
-            first_rate=first_rate,
-            last_rate=last_rate,
+            initial_rate=first_rate,
+            final_rate=last_rate,
         )
         message.check()
         self._ask(MAP_REFINE, message, timeout_s)
@@ -286,7 +286,7 @@ class Client:
         Raises ConfigError when it refuses, or nobody answers.
         """
         try:
-            message = LabelAdd(stamp_ns=time.time_ns(), name=name)
+            message = AddLabel(stamp_ns=time.time_ns(), name=name)
         except ValueError as error:
             raise ConfigError(f"{name[:40]!r} cannot be added: {error}.") from error
         until_s = time.monotonic() + timeout_s
@@ -299,7 +299,7 @@ class Client:
                 time.sleep(0.02)
         raise self._nobody("answers", LABEL_ADD)
 
-    def _ask(self, topic: Topic, message: MapRefine | LabelAdd, timeout_s: float) -> None:
+    def _ask(self, topic: Topic, message: RefineMap | AddLabel, timeout_s: float) -> None:
         """Send, when somebody listens. Raises ConfigError when nobody does."""
         publisher, until_s = self._publisher(type(message)), time.monotonic() + timeout_s
         while not publisher.matching_status.matching:
@@ -332,8 +332,8 @@ def _topic(topic: Topic | str) -> Topic:
 
 
 def _names_or_why(name: str, answer: LabelNames) -> tuple[str, ...]:
-    if answer.refused:
-        raise ConfigError(f"{name!r} is not added: {answer.refused}")
+    if answer.error:
+        raise ConfigError(f"{name!r} is not added: {answer.error}")
     return answer.names
 
 

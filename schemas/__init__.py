@@ -17,18 +17,18 @@ from ldo_service.schemas.frames import (
     FrameRgbd,
     Image,
 )
-from ldo_service.schemas.graph import Correction, GraphLandmark
+from ldo_service.schemas.graph import GraphCorrection, GraphLandmark
 from ldo_service.schemas.health import Health, InputCount, OutputCount
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement, MeasuredPose
-from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
+from ldo_service.schemas.labels import AddLabel, LabelNames, LabelRequest, LabelResult
 from ldo_service.schemas.loops import LoopCandidate, LoopClosure
 from ldo_service.schemas.map import (
     AnchorMotion,
     Gaussians,
     MapDelta,
-    MapRefine,
+    MapRendering,
     MapSnapshot,
-    ModelView,
+    RefineMap,
 )
 from ldo_service.schemas.message import Message, decode, encode
 from ldo_service.schemas.objects import MapObject, MapObjects, ObjectObservation, ObjectView
@@ -36,6 +36,7 @@ from ldo_service.schemas.odometry import OdometryPrior
 from ldo_service.schemas.pose import Pose, TrackedPose, TrackingStatus
 
 __all__ = [
+    "AddLabel",
     "AnchorMotion",
     "Array",
     "CameraColor",
@@ -44,36 +45,35 @@ __all__ = [
     "CameraRgbd",
     "ControlAnswer",
     "ControlRequest",
-    "Correction",
     "Detection",
     "DetectionBoxes",
     "FrameRgbd",
     "Gaussians",
+    "GraphCorrection",
     "GraphLandmark",
     "Health",
     "Image",
     "InputCount",
     "Keyframe",
     "KeyframeRefinement",
-    "LabelAdd",
     "LabelNames",
-    "LabelOpen",
     "LabelRequest",
+    "LabelResult",
     "LoopCandidate",
     "LoopClosure",
     "MapDelta",
     "MapObject",
     "MapObjects",
-    "MapRefine",
+    "MapRendering",
     "MapSnapshot",
     "MeasuredPose",
     "Message",
-    "ModelView",
     "ObjectObservation",
     "ObjectView",
     "OdometryPrior",
     "OutputCount",
     "Pose",
+    "RefineMap",
     "TrackedPose",
     "TrackingStatus",
     "decode",

@@ -12,11 +12,11 @@ class ControlRequest(Message, frozen=True, kw_only=True):
     reset    every actor begins anew, with an empty state and a new epoch
     """
 
-    verb: str  # another one is answered with the list of those there are
+    command: str  # another one is answered with the list of those there are
 
 
 class ControlAnswer(Message, frozen=True, kw_only=True):
     """The reply, sent when all actors have done it. stamp_ns is that of the request."""
 
     ok: bool
-    text: str  # one paragraph for people: what was done, or what is wrong and what to do
+    message: str  # one paragraph for people: what was done, or what is wrong and what to do

@@ -31,23 +31,25 @@ class GraphLandmark(msgspec.Struct, frozen=True, kw_only=True):
         require_entropy(self.entropy)
 
 
-class Correction(Message, frozen=True, kw_only=True):
+class GraphCorrection(Message, frozen=True, kw_only=True):
     """graph/correction: absolute, so the newest one says it all. 56 bytes a keyframe."""
 
     graph_version: int  # ascending
     keyframes: Array  # i8 [K], ids, ascending
     T_map_keyframe: Array  # f8 [K, 7]: translation in metres, quaternion wxyz
-    refinements: int = 0  # number of the last keyframe/refinement that it takes into account
-    joined: tuple[Pair, ...] = ()  # segments, each with the older one it is placed in
-    closures: tuple[Pair, ...] = ()  # loop closures that it agrees with: reference and keyframe
-    not_believed: tuple[Pair, ...] = ()  # that were refused or have left, the newest 512
+    last_refinement: int = 0  # number of the last keyframe/refinement that it takes into account
+    merged_submaps: tuple[Pair, ...] = ()  # submaps, each with the older one it is placed in
+    # Loop closures that it agrees with: reference and keyframe.
+    accepted_closures: tuple[Pair, ...] = ()
+    # Loop closures that were rejected or removed, the newest 512.
+    rejected_closures: tuple[Pair, ...] = ()
     landmarks: tuple[GraphLandmark, ...] = ()  # by id
 
     def check(self) -> None:
         require_count("graph_version", self.graph_version)
-        require_count("refinements", self.refinements)
-        if any(not 0 <= older < segment for segment, older in self.joined):
-            raise ValueError(f"joined {self.joined}: a segment joins an older one")
+        require_count("last_refinement", self.last_refinement)
+        if any(not 0 <= older < submap for submap, older in self.merged_submaps):
+            raise ValueError(f"merged_submaps={self.merged_submaps}: a submap joins an older one")
         self.keyframes.require("keyframes", "i8", (None,))
         count = self.keyframes.shape[0]
         self.T_map_keyframe.require("T_map_keyframe", "f8", (count, 7))

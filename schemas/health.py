@@ -15,18 +15,18 @@ class InputCount(msgspec.Struct, frozen=True, kw_only=True):
     dropped: int  # displaced by newer ones, by the input's policy
     rejected: int  # did not decode or did not pass the checks
     gaps: int  # lossless only: came out of order and was asked for again
-    waiting: int  # in the mailbox now
-    peak: int  # most that ever waited
-    paused: int = 0  # left out while the service was paused
+    queued: int  # in the mailbox now
+    peak_queued: int  # most that ever waited
+    dropped_paused: int = 0  # left out while the service was paused
     lost: int = 0  # not lossless only: never came, by the numbers of those that did
 
 
 class OutputCount(msgspec.Struct, frozen=True, kw_only=True):
     topic: str
     sent: int
-    waited: int  # times the stage waited for a consumer's window
-    evicted: int  # consumers whose window stayed shut
-    repeated: int = 0  # lossless messages sent again, because they got lost
+    backpressure_waits: int  # times the stage waited for a consumer's window
+    evicted_consumers: int  # consumers whose window stayed shut
+    retransmitted: int = 0  # lossless messages sent again, because they got lost
 
 
 class Health(Message, frozen=True, kw_only=True):
@@ -39,19 +39,19 @@ class Health(Message, frozen=True, kw_only=True):
     steps: int  # messages handled
     failures: int  # exceptions in the handler
     restarts: int  # times the actor was rebuilt from its last state
-    set_aside: int  # messages that made it fail twice
+    dead_lettered: int  # messages that made it fail twice
     step_age_s: float  # since the last step finished
-    busy_s: float  # age of the step under way, 0 when waiting
+    current_step_s: float  # age of the step under way, 0 when waiting
     step_ms_p50: float  # over the last steps, but those that only took note of a message
     step_ms_p95: float
     rss_mb: float  # of the process
     inputs: tuple[InputCount, ...]
     outputs: tuple[OutputCount, ...]
-    facts: dict[str, float] = {}  # what the actor counts itself
-    held: bool = False  # takes nothing, on request
+    metrics: dict[str, float] = {}  # what the actor counts itself
+    paused: bool = False  # takes nothing, on request
 
     def check(self) -> None:
-        for name in ("pid", "epoch", "steps", "failures", "restarts", "set_aside"):
+        for name in ("pid", "epoch", "steps", "failures", "restarts", "dead_lettered"):
             require_count(name, getattr(self, name))
-        times = (self.step_age_s, self.busy_s, self.step_ms_p50, self.step_ms_p95)
-        require_finite("health", (*times, self.rss_mb, *self.facts.values()))
+        times = (self.step_age_s, self.current_step_s, self.step_ms_p50, self.step_ms_p95)
+        require_finite("health", (*times, self.rss_mb, *self.metrics.values()))

@@ -32,7 +32,7 @@ class Keyframe(Message, frozen=True, kw_only=True):
 
     The optimizer alone owns poses in the map; a receiver chains this one to the pose it knows of
     `reference`. `T_odom_keyframe` lets a receiver that missed the reference chain to any other.
-    The first of a segment has no reference: tracking was lost, and where it is, is not known.
+    The first of a submap has no reference: tracking was lost, and where it is, is not known.
     """
 
     keyframe: int  # id, ascending
@@ -40,15 +40,18 @@ class Keyframe(Message, frozen=True, kw_only=True):
     camera: CameraModel  # without distortion
     color: Array  # u1 [H, W, 3] RGB
     depth_m: Array  # f4 [H, W], z in metres, 0 = not measured
-    reference: int | None  # id of the reference keyframe; None for the first of a segment
+    reference: int | None  # id of the reference keyframe; None for the first of a submap
     T_reference_keyframe: Pose
     information: Matrix6  # of T_reference_keyframe, perturbed on the right
     T_odom_keyframe: Pose
     overlap: float = 1.0  # share of the reference's surface that this keyframe sees
-    window: tuple[MeasuredPose, ...] = ()  # this keyframe measured from others but the reference
-    is_moving: Array = NO_MASK  # u1 [H, W], 1: shows what moves, not to be mapped; [0, 0]: nothing
-    segment: int = 0  # which of the stretches without a loss it was made in
-    joins: tuple[MeasuredPose, ...] = ()  # as window, in keyframes of segments that this one joins
+    # This keyframe measured from others than the reference.
+    window_measurements: tuple[MeasuredPose, ...] = ()
+    # u1 [H, W], 1: shows what moves and is not mapped; [0, 0]: nothing moves.
+    dynamic_mask: Array = NO_MASK
+    submap: int = 0  # which of the stretches without a loss it was made in
+    # As window_measurements, in keyframes of submaps that this one joins.
+    submap_measurements: tuple[MeasuredPose, ...] = ()
 
     def check(self) -> None:
         require_count("keyframe", self.keyframe)
@@ -56,16 +59,16 @@ class Keyframe(Message, frozen=True, kw_only=True):
         require_rgbd(self.camera, self.color, self.depth_m)
         require_matrix6("information", self.information)
         require_finite("overlap", (self.overlap,))
-        require_count("segment", self.segment)
-        if self.is_moving.shape != (0, 0):
-            self.is_moving.require("is_moving", "u1", (self.camera.height, self.camera.width))
-        if any(pose.keyframe != self.keyframe for pose in self.joins):
+        require_count("submap", self.submap)
+        if self.dynamic_mask.shape != (0, 0):
+            self.dynamic_mask.require("dynamic_mask", "u1", (self.camera.height, self.camera.width))
+        if any(pose.keyframe != self.keyframe for pose in self.submap_measurements):
             raise ValueError(f"a join of keyframe {self.keyframe} measures another keyframe")
         if self.reference is not None and not 0 <= self.reference < self.keyframe:
             raise ValueError(
                 f"keyframe {self.keyframe} refers to {self.reference}, not an older one"
             )
-        for pose in self.window:
+        for pose in self.window_measurements:
             if not pose.reference < pose.keyframe == self.keyframe:
                 raise ValueError(
                     f"keyframe {self.keyframe} comes with {pose.keyframe} from {pose.reference}"

@@ -35,8 +35,8 @@ class LabelRequest(Message, frozen=True, kw_only=True):
         _require_opinion(self.label, self.score)
 
 
-class LabelOpen(Message, frozen=True, kw_only=True):
-    """label/open: what the labeller takes a region for. stamp_ns, region and keyframe are those of
+class LabelResult(Message, frozen=True, kw_only=True):
+    """label/result: the labels of a region. stamp_ns, region and keyframe are those of
     the request, which may be long ago."""
 
     region: int
@@ -44,8 +44,8 @@ class LabelOpen(Message, frozen=True, kw_only=True):
     label: str  # in lower case, single spaces; empty: it has no opinion, or could not look
     confidence: float  # 0..1; 0 without a label
     labeller: str = ""  # which one looked; empty: none could
-    others: tuple[tuple[str, float], ...] = ()  # what else it may be, and its confidence 0..1, the
-    # likelier first
+    # Other labels and their confidence 0..1, the likelier first.
+    alternatives: tuple[tuple[str, float], ...] = ()
 
     def check(self) -> None:
         require_count("region", self.region)
@@ -53,16 +53,18 @@ class LabelOpen(Message, frozen=True, kw_only=True):
         _require_opinion(self.label, self.confidence)
         if self.label and not self.labeller:
             raise ValueError("there is a label, and no labeller that gave it")
-        if len(self.others) > MAX_ALTERNATIVES:
-            raise ValueError(f"{len(self.others)} others are over {MAX_ALTERNATIVES}")
-        for other in self.others:
+        if len(self.alternatives) > MAX_ALTERNATIVES:
+            raise ValueError(f"{len(self.alternatives)} alternatives are over {MAX_ALTERNATIVES}")
+        for other in self.alternatives:
             _require_opinion(*other)
-        names = [self.label, *(name for name, _ in self.others)]
-        if self.others and (not all(names) or len(set(names)) < len(names)):
-            raise ValueError(f"label and others are {names}: each is told once, and none is empty")
+        names = [self.label, *(name for name, _ in self.alternatives)]
+        if self.alternatives and (not all(names) or len(set(names)) < len(names)):
+            raise ValueError(
+                f"label and alternatives are {names}: each is told once, and none is empty"
+            )
 
 
-class LabelAdd(Message, frozen=True, kw_only=True):
+class AddLabel(Message, frozen=True, kw_only=True):
     """label/add: asked of the labeller, to choose from one more name. stamp_ns tells requests
     apart."""
 
@@ -77,7 +79,7 @@ class LabelNames(Message, frozen=True, kw_only=True):
     """label/names: after each label/add, whose stamp_ns it has."""
 
     names: tuple[str, ...]  # that the labeller chooses from; empty: any, or there is none
-    refused: str = ""  # why what was asked last was not done; empty: it was
+    error: str = ""  # why what was asked last was not done; empty: it was
 
     def check(self) -> None:
         if len(self.names) > MAX_NAMES:

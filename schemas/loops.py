@@ -38,7 +38,7 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
     keyframe: int  # the newest keyframe of the newer subgraph
     reference: int  # that of the older one
     keyframes: tuple[int, ...]  # of the newer subgraph
-    references: tuple[int, ...]  # of the older one
+    reference_keyframes: tuple[int, ...]  # of the older one
     similarity: float  # cosine of what they hold (TF-IDF), 0..1
     appearance: float  # how alike their images are, 0..1
     evidence: Evidence = ""  # what the pose was found from; "": none was found
@@ -47,7 +47,7 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
     entropy: float = 0.0  # nats, their mean
     overlap: float = 0.0  # as of a closure
     rmse_m: float = 0.0
-    refused: str = ""  # why; "": it became a closure
+    rejected_reason: str = ""  # why; "": it became a closure
 
     def check(self) -> None:
         for name in ("keyframe", "reference", "inliers"):
@@ -56,11 +56,11 @@ class LoopCandidate(Message, frozen=True, kw_only=True):
             require_fraction(name, getattr(self, name))
         for name in ("divergence", "entropy", "rmse_m"):
             require_not_negative(name, getattr(self, name))
-        if len(self.refused) > MAX_REASON_LENGTH:
+        if len(self.rejected_reason) > MAX_REASON_LENGTH:
             raise ValueError(
-                f"a reason of {len(self.refused)} characters: at most {MAX_REASON_LENGTH}"
+                f"a reason of {len(self.rejected_reason)} characters: at most {MAX_REASON_LENGTH}"
             )
-        if not self.refused and not self.evidence:
+        if not self.rejected_reason and not self.evidence:
             raise ValueError("a candidate without evidence cannot be accepted")
 
 

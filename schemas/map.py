@@ -1,9 +1,9 @@
 """The map of Gaussians: what it looks like, what changed in it, and the whole of it.
 
 A follower keeps arrays equal to the mapper's like this: take a snapshot of version v (all its
-parts), then apply every delta with `since >= v` in order: first `motions`, then `removed`, then
-`changed`, then `added` at the end. A delta whose `since` is not the version held means one was
-missed: take a snapshot again.
+parts), then apply every delta with `base_version >= v` in order: first `motions`, then `removed`,
+then `changed`, then `added` at the end. A delta whose `base_version` is not the version held means
+one was missed: take a snapshot again.
 """
 
 import msgspec
@@ -58,9 +58,9 @@ class AnchorMotion(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MapDelta(Message, frozen=True, kw_only=True):
-    """map/delta: how version `since` becomes version `version`."""
+    """map/delta: how version `base_version` becomes version `version`."""
 
-    since: int
+    base_version: int
     version: int
     graph_version: int  # of the keyframe poses that the means are expressed through
     motions: tuple[AnchorMotion, ...]
@@ -74,8 +74,8 @@ class MapDelta(Message, frozen=True, kw_only=True):
         require_names(self.label_names)
         self.removed.require("removed", "i8", (None,))
         self.removed.require_ascending("removed")
-        if not 0 <= self.since < self.version:
-            raise ValueError(f"delta from version {self.since} to {self.version} goes back")
+        if not 0 <= self.base_version < self.version:
+            raise ValueError(f"delta from version {self.base_version} to {self.version} goes back")
 
 
 NO_KEYFRAMES = Array.of(np.zeros(0, np.int64))
@@ -109,7 +109,7 @@ class MapSnapshot(Message, frozen=True, kw_only=True):
             raise ValueError(f"part {self.part} of {self.parts} does not exist")
 
 
-class ModelView(Message, frozen=True, kw_only=True):
+class MapRendering(Message, frozen=True, kw_only=True):
     """map/view: the map as rendered at the pose of `keyframe`."""
 
     keyframe: int
@@ -134,20 +134,20 @@ class ModelView(Message, frozen=True, kw_only=True):
 MAX_ITERATIONS = 500  # half a minute in which no keyframe is mapped
 
 
-class MapRefine(Message, frozen=True, kw_only=True):
+class RefineMap(Message, frozen=True, kw_only=True):
     """map/refine: asked of the mapper, to fit the map further to the keyframes it has."""
 
     iterations: int
-    first_rate: float = 1.0  # factor on the length of the first step
-    last_rate: float = 1.0  # and of the last one; geometric between
+    initial_rate: float = 1.0  # factor on the length of the first step
+    final_rate: float = 1.0  # and of the last one; geometric between
 
     def check(self) -> None:
         require_count("iterations", self.iterations)
         if self.iterations > MAX_ITERATIONS:
             raise ValueError(f"{self.iterations} iterations: ask for {MAX_ITERATIONS} at a time")
-        require_finite("rates", (self.first_rate, self.last_rate))
-        if not (0 < self.first_rate <= 1 and 0 < self.last_rate <= 1):
-            raise ValueError(f"rates {self.first_rate} and {self.last_rate} must be in (0, 1]")
+        require_finite("rates", (self.initial_rate, self.final_rate))
+        if not (0 < self.initial_rate <= 1 and 0 < self.final_rate <= 1):
+            raise ValueError(f"rates {self.initial_rate} and {self.final_rate} must be in (0, 1]")
 
 
 MAX_NAMES = 256  # what one byte can number

@@ -63,14 +63,14 @@ class MapObject(msgspec.Struct, frozen=True, kw_only=True):
     size: Vector3  # of the box along these axes, metres
     distribution: Distribution
     entropy: float  # nats, see `ObjectObservation`
-    seen: int  # keyframes
-    missed: int  # keyframes that ought to have seen it
+    observation_count: int  # keyframes
+    miss_count: int  # keyframes that ought to have seen it
     first_keyframe: int  # that saw it
     last_keyframe: int
     views: tuple[ObjectView, ...] = ()  # best first
 
     def __post_init__(self) -> None:
-        for name in ("id", "seen", "missed", "first_keyframe", "last_keyframe"):
+        for name in ("id", "observation_count", "miss_count", "first_keyframe", "last_keyframe"):
             require_count(name, getattr(self, name))
         if not 0 < len(self.name) <= MAX_LABEL_LENGTH:
             raise ValueError(f"a name of {len(self.name)} characters: 1 to {MAX_LABEL_LENGTH}")

@@ -7,4 +7,4 @@ from ldo_service.schemas.pose import Pose
 class OdometryPrior(Message, frozen=True, kw_only=True):
     """odometry/prior: where the robot's base was at `stamp_ns`, by the clock that stamps frames."""
 
-    T_odom_base: Pose  # `odom` is the source's own: only the motion between two messages is used
+    T_prior_base: Pose  # `odom` is the source's own: only the motion between two messages is used

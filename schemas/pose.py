@@ -56,11 +56,11 @@ class TrackedPose(Message, frozen=True, kw_only=True):
     residual_depth: float = 0.0  # robust sigma over that of the sensor model
     overlap: float = 0.0  # share of the reference's surface that this frame sees
     iterations: int = 0
-    # the guess that won: direct, prior, features, shape, relocalised, returned; first; none
-    method: str = ""
-    disagreement: float = 0.0  # between where several guesses led, rad of image motion
+    # the guess that won: direct, prior, features, gicp, relocalized, reused; first; none
+    pose_source: str = ""
+    hypothesis_spread_rad: float = 0.0  # between where several guesses led, rad of image motion
     T_base_camera: Pose = IDENTITY  # T_odom_base = T_odom_camera @ inverse(T_base_camera)
-    segment: int = 0  # whose frame T_map_odom leads to: 0 is the map's; others are not joined yet
+    submap: int = 0  # whose frame T_map_odom leads to: 0 is the map's; others are not joined yet
 
     def check(self) -> None:
         require_count("frame", self.frame)
@@ -68,12 +68,12 @@ class TrackedPose(Message, frozen=True, kw_only=True):
         require_count("reference", self.reference or 0)
         require_count("keyframe", self.keyframe or 0)
         require_count("iterations", self.iterations)
-        require_count("segment", self.segment)
+        require_count("submap", self.submap)
         require_matrix6("covariance", self.covariance)
         require_finite(
             "tracking quality",
             (
                 *(self.inlier_fraction, self.residual_color, self.residual_depth, self.overlap),
-                self.disagreement,
+                self.hypothesis_spread_rad,
             ),
         )

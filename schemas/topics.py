@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from ldo_service.schemas.control import ControlAnswer, ControlRequest
 from ldo_service.schemas.detections import DetectionBoxes
 from ldo_service.schemas.frames import CameraColor, CameraDepth, CameraRgbd, FrameRgbd
-from ldo_service.schemas.graph import Correction
+from ldo_service.schemas.graph import GraphCorrection
 from ldo_service.schemas.health import Health
 from ldo_service.schemas.keyframe import Keyframe, KeyframeRefinement
-from ldo_service.schemas.labels import LabelAdd, LabelNames, LabelOpen, LabelRequest
+from ldo_service.schemas.labels import AddLabel, LabelNames, LabelRequest, LabelResult
 from ldo_service.schemas.loops import LoopCandidate, LoopClosure
-from ldo_service.schemas.map import MapDelta, MapRefine, MapSnapshot, ModelView
+from ldo_service.schemas.map import MapDelta, MapRendering, MapSnapshot, RefineMap
 from ldo_service.schemas.message import Message
 from ldo_service.schemas.objects import MapObjects, ObjectObservation
 from ldo_service.schemas.odometry import OdometryPrior
@@ -61,14 +61,16 @@ DETECTION_BOXES = Topic(
 LABEL_REQUEST = Topic(
     "label/request", LabelRequest, "image crops of a region to be named", key="region"
 )
-LABEL_OPEN = Topic("label/open", LabelOpen, "the name of a region, late by design", key="region")
-LABEL_ADD = Topic("label/add", LabelAdd, "asked: choose from this name too")
+LABEL_RESULT = Topic(
+    "label/result", LabelResult, "the name of a region, late by design", key="region"
+)
+LABEL_ADD = Topic("label/add", AddLabel, "asked: choose from this name too")
 LABEL_NAMES = Topic("label/names", LabelNames, "what the labeller chooses from", is_state=True)
-MAP_VIEW = Topic("map/view", ModelView, "the map rendered at the newest keyframe")
+MAP_VIEW = Topic("map/view", MapRendering, "the map rendered at the newest keyframe")
 MAP_DELTA = Topic("map/delta", MapDelta, "what changed in the map since the last version")
 MAP_SNAPSHOT = Topic("map/snapshot", MapSnapshot, "the whole map, in parts", is_state=True)
-MAP_REFINE = Topic("map/refine", MapRefine, "asked: so many iterations more")
-GRAPH_CORRECTION = Topic("graph/correction", Correction, "all keyframe poses", is_state=True)
+MAP_REFINE = Topic("map/refine", RefineMap, "asked: so many iterations more")
+GRAPH_CORRECTION = Topic("graph/correction", GraphCorrection, "all keyframe poses", is_state=True)
 HEALTH = Topic(
     "health", Health, "counters and latency of an actor (health/<actor>)", is_per_actor=True
 )
@@ -93,7 +95,7 @@ TOPICS: tuple[Topic, ...] = (
     KEYFRAME_NEW,
     DETECTION_BOXES,
     LABEL_REQUEST,
-    LABEL_OPEN,
+    LABEL_RESULT,
     LABEL_ADD,
     LABEL_NAMES,
     MAP_VIEW,

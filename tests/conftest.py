@@ -49,7 +49,7 @@ def room_folder(room: Sequence, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 @pytest.fixture(scope="session")
 def finished_run(room_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What `ldo run --hold-out 5` writes of `room_folder`; not to be changed."""
+    """What `ldo run --hold-out-every 5` writes of `room_folder`; not to be changed."""
     folder = tmp_path_factory.mktemp("run") / "room"
     prepare(folder, overwrite=False)
     config = load_config(settings=("tracker.hold_out=5", "mapper.threads=1"))

@@ -191,7 +191,7 @@ objects of at least 0.04 % that fill an eighth of their box.
 |---|---|---|
 {totals}
 
-Regions of the rooms kept apart, as `semantics/segments.py` finds them:
+Regions of the rooms kept apart, as `regions/geometric_segmentation.py` finds them:
 
 | | rooms |
 |---|---|

@@ -12,7 +12,7 @@ from wear import degrade
 from ldo_service.geometry import Camera
 from ldo_service.regions.geometric_segmentation import segment_geometry
 from ldo_service.regions.region_proposals import RegionProposalConfig, regions_of_image
-from ldo_service.synthetic.flat.render import Rendering
+from ldo_service.synthetic.flat.render import FlatRendering
 from ldo_service.synthetic.flat.sensor import measured_depth_m
 
 # of frames half as wide as those that it is made for
@@ -23,7 +23,7 @@ OWN = 0.7  # share of a region that one thing has, to be that thing
 SHOWN = 0.1  # share of what is seen of the thing: a smaller piece shows nobody what it is
 
 
-def regions(frame: Rendering, lens: Camera, rng: np.random.Generator) -> Iterator[tuple]:
+def regions(frame: FlatRendering, lens: Camera, rng: np.random.Generator) -> Iterator[tuple]:
     """Class, instance, box and pixels of the thing, of each region that shows one, or no thing. By
     colors and depth as a camera measures them; where it measures none, depth is exact, as a map has
     it."""

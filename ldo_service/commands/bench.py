@@ -20,7 +20,7 @@ def bench(
         tyro.conf.arg(help="an iteration of the optimiser: rendering, loss, gradients, Adam"),
     ],
     gaussians: Annotated[int, tyro.conf.arg(help="in view")] = 100_000,
-    elsewhere: Annotated[int, tyro.conf.arg(help="Gaussians more, out of view")] = 0,
+    gaussians_out_of_view: Annotated[int, tyro.conf.arg(help="Gaussians more, out of view")] = 0,
     size: Annotated[str, tyro.conf.arg(metavar="WxH", help="of the image, pixels")] = "640x480",
     threads: Annotated[int, tyro.conf.arg(help="of the kernels")] = 1,
     repeats: Annotated[int, tyro.conf.arg(help="that the medians are taken of")] = 20,
@@ -33,15 +33,17 @@ def bench(
     is forward, loss and the pass with it. LDO_ISA=avx512, avx2 or baseline picks the instructions.
     """
     width, height = _pixels(size)
-    if not min(gaussians, threads, repeats) >= 1 or elsewhere < 0:
-        raise ConfigError("gaussians, threads and repeats must be 1 or more, elsewhere 0 or more.")
+    if not min(gaussians, threads, repeats) >= 1 or gaussians_out_of_view < 0:
+        raise ConfigError(
+            "gaussians, threads and repeats must be 1 or more, gaussians-out-of-view 0 or more."
+        )
     camera = bench_camera(width, height)
-    iteration = Iteration(gaussians, camera, threads=threads, elsewhere=elsewhere)
+    iteration = Iteration(gaussians, camera, threads=threads, elsewhere=gaussians_out_of_view)
     times = asdict(iteration_times(iteration, repeats))
     facts = {
         "isa": kernels.isa(),
         "gaussians": gaussians,
-        "elsewhere": elsewhere,
+        "gaussians_out_of_view": gaussians_out_of_view,
         "width": width,
         "height": height,
         "threads": threads,

@@ -33,11 +33,14 @@ verbs:
 
 `ldo VERB --help` explains a verb. `--debug` shows the traceback of an error."""
 
+# Options under their names of version 0.1, accepted for one more version.
+OLD_OPTIONS = {"--localise": "--localize"}
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
-    words = [word for word in words if word != "--debug"]
+    words = [OLD_OPTIONS.get(word, word) for word in words if word != "--debug"]
     logging.basicConfig(
         level=logging.DEBUG if debug else logging.INFO,
         format="%(asctime)s %(levelname).1s %(name)s: %(message)s",

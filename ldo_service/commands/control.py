@@ -71,5 +71,5 @@ def run_control_verb(service: Client, verb: str) -> None:
     """Raises StageError when an actor does not."""
     answer = service.control(verb)
     if not answer.ok:
-        raise StageError(answer.text)
-    print(answer.text)
+        raise StageError(answer.message)
+    print(answer.message)

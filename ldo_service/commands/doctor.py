@@ -192,7 +192,7 @@ def _in_numbers(health: Health) -> str:
     dropped = sum(i.dropped for i in health.inputs)
     lost = sum(i.lost for i in health.inputs)
     rejected = sum(i.rejected for i in health.inputs)
-    state = "held" if health.held else health.state
+    state = "paused" if health.paused else health.state
     return (
         f"{health.actor} (process {health.pid}): {state}, {health.steps} steps of "
         f"{health.step_ms_p50:.1f} ms p50, {health.step_ms_p95:.1f} ms p95, {dropped} dropped, "

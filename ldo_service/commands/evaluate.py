@@ -100,10 +100,10 @@ def evaluate(
     map calls things by the labels of the source.
 
     Prints the protocol above the figures, and draws trajectory.png, rendering.png and labels.png
-    into DIR. `ldo run --hold-out 5` leaves frames to judge the map by that it was not made from. Of
-    a source without ground truth the map alone is judged.
+    into DIR. `ldo run --hold-out-every 5` keeps every fifth frame out of the map, to judge it by.
+    Without ground truth only the map is judged.
 
-      ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out 5
+      ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out-every 5
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
     """
     config = run_config(folder)

@@ -32,7 +32,7 @@ class New:
 
 
 @dataclass(frozen=True)
-class Add:
+class AddKeys:
     """Make keys: a folder to copy to the machine of that name, for --keys.
 
     ldo keys add DIR service mule --robot mule --host mule.local
@@ -62,14 +62,14 @@ class Add:
 
 
 @dataclass(frozen=True)
-class List:
+class ListKeys:
     """Show who has keys, what they may do and until when."""
 
     folder: Folder
 
 
 @dataclass(frozen=True)
-class Remove:
+class RevokeKeys:
     """Let keys do nothing any more, and delete their folder here.
 
     That holds at a router that has the new `access.yaml` and was started anew.
@@ -91,10 +91,10 @@ class Router:
 
 
 Verb = (
-    Annotated[New, tyro.conf.subcommand("new")]
-    | Annotated[Add, tyro.conf.subcommand("add")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Remove, tyro.conf.subcommand("remove")]
+    Annotated[New, tyro.conf.subcommand("init")]
+    | Annotated[AddKeys, tyro.conf.subcommand("add")]
+    | Annotated[ListKeys, tyro.conf.subcommand("list")]
+    | Annotated[RevokeKeys, tyro.conf.subcommand("remove")]
     | Annotated[Router, tyro.conf.subcommand("router")]
 )
 
@@ -104,7 +104,7 @@ def keys(verb: Verb) -> None:
 
     Without keys the service listens on this machine alone:
 
-      ldo keys new DIR
+      ldo keys init DIR
       ldo keys add DIR service mule --host mule.local
       ldo keys add DIR viewer desk
       ldo serve --endpoint tls/0.0.0.0:7447 --keys DIR/mule
@@ -119,14 +119,14 @@ def keys(verb: Verb) -> None:
         case New():
             CertificateAuthority.new(verb.folder, verb.days)
             print(f"{verb.folder} is an authority: `ldo keys add` makes keys. ca.key stays here.")
-        case Add():
+        case AddKeys():
             authority = CertificateAuthority(verb.folder)
             made = authority.add(verb.name, verb.role, verb.robot, verb.days, verb.host)
             print(f"{made} is what {verb.name} needs: copy it there, for --keys.")
-        case List():
+        case ListKeys():
             table = _table(CertificateAuthority(verb.folder))
             Console(highlight=False, markup=False, soft_wrap=True).print(table)
-        case Remove():
+        case RevokeKeys():
             CertificateAuthority(verb.folder).remove(verb.name)
             print(
                 f"{verb.name} may do nothing any more, where services have the new {ACCESS} and "

@@ -23,10 +23,10 @@ Name = Annotated[
 
 
 @dataclass(frozen=True)
-class Add:
+class AddModel:
     """Check a network in ONNX, copy and register it.
 
-    ldo models add nano yolox_nano.onnx --licence Apache-2.0
+    ldo models add nano yolox_nano.onnx --license Apache-2.0
 
     With a text encoder or embeddings FILE is the image encoder of a pair in CLIP's layout, which
     names regions:
@@ -48,7 +48,7 @@ class Add:
             help="its classes, one a line; otherwise those it carries, or the 80 of COCO",
         ),
     ] = ""
-    licence: Annotated[
+    license: Annotated[
         str, tyro.conf.arg(metavar="FILE|TEXT", help="what you may do with it, kept beside it")
     ] = ""
     text: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="text encoder in ONNX")] = None
@@ -75,21 +75,21 @@ class Add:
 
 
 @dataclass(frozen=True)
-class List:
+class ListModels:
     """Show the registered networks."""
 
 
 @dataclass(frozen=True)
-class Remove:
+class RemoveModel:
     """Forget a registered network and delete its copy."""
 
     name: Name
 
 
 Verb = (
-    Annotated[Add, tyro.conf.subcommand("add")]
-    | Annotated[List, tyro.conf.subcommand("list")]
-    | Annotated[Remove, tyro.conf.subcommand("remove")]
+    Annotated[AddModel, tyro.conf.subcommand("add")]
+    | Annotated[ListModels, tyro.conf.subcommand("list")]
+    | Annotated[RemoveModel, tyro.conf.subcommand("remove")]
 )
 
 
@@ -103,16 +103,16 @@ def models(verb: Verb) -> None:
       ldo run SOURCE --out DIR --set detector.model=nano
     """
     match verb:
-        case Add():
+        case AddModel():
             add(verb)
-        case List():
+        case ListModels():
             show(Console(highlight=False, markup=False, soft_wrap=True))
-        case Remove():
+        case RemoveModel():
             Models().remove(verb.name)
             print(f"{verb.name} is removed.")
 
 
-def add(verb: Add) -> None:
+def add(verb: AddModel) -> None:
     """Raises ConfigError for what cannot be used."""
     model = _add_pair(verb) if verb.is_pair else _add_detector(verb)
     about = model.about
@@ -122,29 +122,29 @@ def add(verb: Add) -> None:
     )
 
 
-def _add_detector(verb: Add) -> Model:
+def _add_detector(verb: AddModel) -> Model:
     config = NetworkConfig(layout=verb.layout or "", names=verb.names)
-    return Models().add(verb.name, verb.file.expanduser(), config, _license(verb.licence))
+    return Models().add(verb.name, verb.file.expanduser(), config, _license(verb.license))
 
 
-def _add_pair(verb: Add) -> Model:
+def _add_pair(verb: AddModel) -> Model:
     if verb.layout:
         raise ConfigError(f"--layout {verb.layout} is of a detector, and a pair was named.")
     names = read_names(Path(verb.names).expanduser()) if verb.names else ()
-    license = _license(verb.licence)
+    license = _license(verb.license)
     return Models().add_pair(verb.name, verb.pair(), DualEncoderConfig(), names, license)
 
 
 def show(console: Console) -> None:
     """Raises LdoError when one of them is damaged."""
     registered, damaged = Models(), 0
-    table = Table("name", "layout", "classes", "licence", "sha256", "")
+    table = Table("name", "layout", "classes", "license", "sha256", "")
     for name in registered.names:
         try:
             model = registered.get(name)
             model.verify()
             about = model.about
-            license = (about.licence.strip().splitlines() or ["not stated"])[0]
+            license = (about.license.strip().splitlines() or ["not stated"])[0]
             table.add_row(
                 *(name, about.layout, str(len(about.classes)), license[:40]),
                 *(about.sha256[:12], "ok"),
@@ -171,4 +171,4 @@ def _license(text: str) -> str:
     try:
         return path.read_text("utf-8") if is_file else text
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"--licence {text} cannot be read: {error}.") from error
+        raise ConfigError(f"--license {text} cannot be read: {error}.") from error

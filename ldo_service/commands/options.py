@@ -14,7 +14,7 @@ from ldo_service.actors.detector import require_detector
 from ldo_service.actors.vlm_labeller import require_labeller
 from ldo_service.config import Config, actor_parameters
 from ldo_service.runs.job import Advance
-from ldo_service.tracking.keyframe_database import places_of
+from ldo_service.tracking.keyframe_database import load_keyframe_database
 
 LINES = 10  # in a log file
 
@@ -47,7 +47,7 @@ Recording = Annotated[
     tyro.conf.Positional,
     tyro.conf.arg(metavar="DIR", help="folder that `ldo record` wrote"),
 ]
-Only = Annotated[
+ActorNames = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="ACTOR",
@@ -90,11 +90,11 @@ Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing e
 
 
 def localizing(config: Config, folder: Path | None) -> Config:
-    """The configuration with --localise. Raises DataError for a folder without a map."""
+    """The configuration with --localize. Raises DataError for a folder without a map."""
     if folder is None:
         return config
     folder = folder.expanduser().resolve()
-    places_of(folder)
+    load_keyframe_database(folder)
     tracker = replace(config.tracker, localization_map=str(folder))
     return replace(config, tracker=tracker)
 

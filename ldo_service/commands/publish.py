@@ -98,7 +98,7 @@ def publish(
         progress("publish", len(indices), console) as advance,
     ):
         service.wait_for_subscriber()
-        camera = Camera(service, sequence, restamp, console.print)
+        camera = SequencePublisher(service, sequence, restamp, console.print)
         for done, index in enumerate(paced(sequence, indices, rate), 1):
             camera.send(index)
             advance(done)
@@ -107,7 +107,7 @@ def publish(
         raise DataError(f"{camera.bad} of {len(indices)} frames could not be read.")
 
 
-class Camera:
+class SequencePublisher:
     """Sends frames of a sequence; tells once of bad ones, and of each time that nobody listens."""
 
     def __init__(

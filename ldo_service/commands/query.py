@@ -84,7 +84,7 @@ def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.
     eye = None
     for pose in poses:
         assert isinstance(pose, TrackedPose)
-        if pose.segment:
+        if pose.submap:
             continue  # where that is in the map is not known
         eye = (pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera))[:3, 3]
     return found, eye

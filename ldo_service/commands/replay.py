@@ -73,8 +73,8 @@ def _life(row: ReplayReport) -> Iterator[str]:
         yield f"{row.restored} restored"
     if row.failures:
         yield f"{row.failures} failed"
-    if row.set_aside:
-        yield f"{row.set_aside} set aside"
+    if row.dead_lettered:
+        yield f"{row.dead_lettered} set aside"
 
 
 def _counts(messages: Counter[str]) -> str:

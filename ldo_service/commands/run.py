@@ -42,7 +42,7 @@ def run(
     set: Settings = (),
     max_frames: MaxFrames = None,
     stride: Stride = 1,
-    hold_out: Annotated[
+    hold_out_every: Annotated[
         int | None,
         tyro.conf.arg(metavar="N", help="track every n-th frame and never map it; 0: map all"),
     ] = None,
@@ -53,14 +53,14 @@ def run(
             help="of the renderer; 0: all cores, but one for the tracker where frames do not wait",
         ),
     ] = None,
-    refine: Annotated[
+    refine_iterations: Annotated[
         int,
         tyro.conf.arg(
             metavar="N", help="fit the map for N more iterations at the end, into DIR/refined"
         ),
     ] = 0,
-    localise: Localize = None,
-    prior: Annotated[
+    localize: Localize = None,
+    odometry_prior: Annotated[
         Path | None,
         tyro.conf.arg(
             metavar="FILE",
@@ -72,7 +72,7 @@ def run(
         bool,
         tyro.conf.arg(help="keep what tracker and detector say in DIR/front_end.mcap, images too"),
     ] = False,
-    front_end: Annotated[
+    reuse_front_end: Annotated[
         Path | None,
         tyro.conf.arg(
             metavar="RUN",
@@ -92,36 +92,44 @@ def run(
 
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
-      ldo run ~/data/desk_again --out runs/again --localise runs/desk
-      ldo run synthetic:flat --out runs/half --front-end runs/flat --set mapper.iterations=7
+      ldo run ~/data/desk_again --out runs/again --localize runs/desk
+      ldo run synthetic:flat --out runs/half --reuse-front-end runs/flat --set mapper.iterations=7
     """
-    over_file = {"--refine": refine, "--front-end": front_end, "--keep-front-end": keep_front_end}
-    looking = {"--prior": prior, "--localise": localise, "--keep-front-end": keep_front_end}
+    over_file = {
+        "--refine-iterations": refine_iterations,
+        "--reuse-front-end": reuse_front_end,
+        "--keep-front-end": keep_front_end,
+    }
+    looking = {
+        "--odometry-prior": odometry_prior,
+        "--localize": localize,
+        "--keep-front-end": keep_front_end,
+    }
     require_none_of("--realtime", realtime, over_file)
-    require_none_of("--front-end", front_end, looking)
-    require_none_of("--localise", localise, {"--keep-front-end": keep_front_end})
-    require_separate(localise, out, refine)
+    require_none_of("--reuse-front-end", reuse_front_end, looking)
+    require_none_of("--localize", localize, {"--keep-front-end": keep_front_end})
+    require_separate(localize, out, refine_iterations)
     console = Console(stderr=True)
-    settings = with_options(load_config(config, set), hold_out, threads)
-    settings = localizing(settings, localise)
+    settings = with_options(load_config(config, set), hold_out_every, threads)
+    settings = localizing(settings, localize)
     with_usable_networks(settings)
     selection = Selection(stride, max_frames)
     require_held_out(stride, settings.tracker.hold_out)
     sequence = open_source(source, settings.dataset.options())
     job = RunOptions(
         *(sequence, out, settings, selection, console.print),
-        refine=refine,
-        prior=Trajectory.load(prior) if prior else None,
-        front_end=kept_front_end(front_end, out, settings, sequence, selection),
+        refine=refine_iterations,
+        prior=Trajectory.load(odometry_prior) if odometry_prior else None,
+        front_end=kept_front_end(reuse_front_end, out, settings, sequence, selection),
         keep_front_end=keep_front_end,
     )
     prepare(out, overwrite)
     record = execute(job, run_realtime if realtime else run_offline, console)
     Console().print(summary_table(record.summary, out))
-    if record.summary["gaussians_apart"]:
-        Console().print(format_unmerged(record.summary["gaussians_apart"]), style="dim")
-    if localise:
-        Console().print(format_localization(record.statuses, localise), style="dim")
+    if record.summary["gaussians_unmerged"]:
+        Console().print(format_unmerged(record.summary["gaussians_unmerged"]), style="dim")
+    if localize:
+        Console().print(format_localization(record.statuses, localize), style="dim")
 
 
 def execute(
@@ -183,17 +191,17 @@ def require_none_of(option: str, is_given: object, others: Mapping[str, object])
 def require_separate(localize: Path | None, out: Path, refine: int) -> None:
     """A map that is localised in stays as it is."""
     if localize and refine:
-        raise ConfigError("--localise leaves the map as it is: leave out --refine.")
+        raise ConfigError("--localize leaves the map as it is: leave out --refine-iterations.")
     if localize and localize.expanduser().resolve() == out.expanduser().resolve():
-        raise ConfigError(f"--out {out} would replace the map to localise in: choose another.")
+        raise ConfigError(f"--out {out} would replace the map to localize in: choose another.")
 
 
 def require_held_out(stride: int, hold_out: int) -> None:
     """Held-out frames are counted in the sequence: with a common factor some would never come."""
     if hold_out and gcd(stride, hold_out) > 1:
         raise ConfigError(
-            f"--stride {stride} and --hold-out {hold_out} share a factor, so other frames would be "
-            "held out than asked for. Choose one without."
+            f"--stride {stride} and --hold-out-every {hold_out} share a factor, so other frames "
+            "would be held out than asked for. Choose one without."
         )
 
 

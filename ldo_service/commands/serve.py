@@ -13,22 +13,22 @@ from ldo_service.transport.endpoint import DEFAULT_ENDPOINT, Endpoint
 from ldo_service.transport.keys import TlsKeys
 
 from .options import (
+    ActorNames,
     ConfigFile,
     EndpointAddress,
     KeysFolder,
     Localize,
-    Only,
     Robot,
     Settings,
     StateFolder,
     localizing,
 )
 
-WithoutKeys = Annotated[
+Insecure = Annotated[
     bool, tyro.conf.arg(help="listen on a network where everybody may do everything")
 ]
-Join = Annotated[bool, tyro.conf.arg(help="be a client of the router at ADDRESS, and open none")]
-Metrics = Annotated[
+Client = Annotated[bool, tyro.conf.arg(help="be a client of the router at ADDRESS, and open none")]
+MetricsPort = Annotated[
     int | None,
     tyro.conf.arg(
         metavar="PORT",
@@ -40,19 +40,19 @@ Metrics = Annotated[
 def serve(
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
-    only: Only = (),
+    actor: ActorNames = (),
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
-    localise: Localize = None,
+    localize: Localize = None,
     record: Annotated[
         Path | None,
         tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
     ] = None,
     keys: KeysFolder = None,
-    without_keys: WithoutKeys = False,
-    join: Join = False,
-    metrics: Metrics = None,
+    insecure: Insecure = False,
+    client: Client = False,
+    metrics_port: MetricsPort = None,
 ) -> None:
     """Run the service: camera frames in on camera/rgbd; poses, map and health out.
 
@@ -61,11 +61,11 @@ def serve(
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
-    settings = localizing(load_config(config, set), localise)
+    settings = localizing(load_config(config, set), localize)
     folder_of_keys = TlsKeys.of(keys or settings.service.keys or None)
     network = Endpoint(robot, endpoint, folder_of_keys, settings.service.max_message_mb)
-    is_router = not (only or join)
-    if is_router and not without_keys:
+    is_router = not (actor or client)
+    if is_router and not insecure:
         network.require_safe()
     with ExitStack() as stack:
         folder = state_folder(state, stack)
@@ -73,10 +73,10 @@ def serve(
             settings,
             network,
             folder,
-            tuple(only),
+            tuple(actor),
             is_router=is_router,
             is_state_kept=state is not None,
-            metrics_port=metrics,
+            metrics_port=metrics_port,
             recording=record,
         ).run()
 
@@ -89,15 +89,15 @@ def record(
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
-    only: Only = (),
+    actor: ActorNames = (),
     config: ConfigFile = None,
     set: Settings = (),
     state: StateFolder = None,
-    localise: Localize = None,
+    localize: Localize = None,
     keys: KeysFolder = None,
-    without_keys: WithoutKeys = False,
-    join: Join = False,
-    metrics: Metrics = None,
+    insecure: Insecure = False,
+    client: Client = False,
+    metrics_port: MetricsPort = None,
 ) -> None:
     """Run the service as `ldo serve` does, and record what every actor takes.
 
@@ -111,10 +111,10 @@ def record(
       ldo publish synthetic:room --rate 15      (in another terminal)
     """
     serve(
-        *(robot, endpoint, only, config, set, state, localise),
+        *(robot, endpoint, actor, config, set, state, localize),
         record=out,
         keys=keys,
-        without_keys=without_keys,
-        join=join,
-        metrics=metrics,
+        insecure=insecure,
+        client=client,
+        metrics_port=metrics_port,
     )

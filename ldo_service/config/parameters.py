@@ -151,7 +151,7 @@ def _tracker(config: Config) -> TrackerConfig:
                 across_scales=tracker.relocalization.sift_candidates,
             ),
             returning=KeyframeReuseConfig(after=tracker.keyframes.reuse_after),
-            segments=SubmapConfig(begin_after_s=tracker.submaps.start_after_lost_s),
+            submaps=SubmapConfig(begin_after_s=tracker.submaps.start_after_lost_s),
             judgement=TrackingQualityConfig(
                 min_overlap=tracker.quality.weak_overlap,
                 weak_residual=tracker.quality.weak_residual_ratio,

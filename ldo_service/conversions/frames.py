@@ -16,7 +16,7 @@ from ldo_service.schemas import (
 )
 from ldo_service.schemas.frames import ImageEncoding
 from ldo_service.schemas.keyframe import NO_MASK
-from ldo_service.tracking.keyframes import Keyframe as TrackedKeyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.motion_segmentation import resized
 from ldo_service.tracking.pyramid import PyramidConfig, pyramid_of
 from ldo_service.tracking.tracking_result import NewKeyframe, TrackingResult
@@ -84,10 +84,10 @@ def tracked_pose_message(
         residual_depth=result.depth_noise_scale,
         overlap=result.overlap,
         iterations=result.iterations,
-        method=result.method,
-        disagreement=result.hypothesis_spread_rad,
+        pose_source=result.pose_source,
+        hypothesis_spread_rad=result.hypothesis_spread_rad,
         T_base_camera=pose_to_message(T_base_camera),
-        segment=result.submap,
+        submap=result.submap,
     )
 
 
@@ -106,22 +106,22 @@ def keyframe_message(frame: RgbdFrame, result: TrackingResult, keyframe: NewKeyf
         information=matrix6_to_message(result.information),
         T_odom_keyframe=pose_to_message(result.T_odom_camera),
         overlap=result.overlap,
-        window=tuple(map(relative_pose_to_message, keyframe.window)),
-        is_moving=mask_to_array(result.dynamic_mask, frame.camera),
-        segment=keyframe.submap,
-        joins=() if merge is None else (relative_pose_to_message(merge),),
+        window_measurements=tuple(map(relative_pose_to_message, keyframe.window)),
+        dynamic_mask=mask_to_array(result.dynamic_mask, frame.camera),
+        submap=keyframe.submap,
+        submap_measurements=() if merge is None else (relative_pose_to_message(merge),),
     )
 
 
-def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> TrackedKeyframe:
+def keyframe_from_message(message: Keyframe, config: PyramidConfig) -> ReferenceKeyframe:
     """A keyframe that others can be aligned to, without what moves in it."""
     view = pyramid_of(frame_from_message(message), config)
-    return TrackedKeyframe(
+    return ReferenceKeyframe(
         view,
         pose_from_message(message.T_odom_keyframe),
         message.keyframe,
-        message.segment,
-        ignore_mask=resized(mask_from_array(message.is_moving), view.levels[0].depth_m.shape),
+        message.submap,
+        ignore_mask=resized(mask_from_array(message.dynamic_mask), view.levels[0].depth_m.shape),
     )
 
 

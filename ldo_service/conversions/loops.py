@@ -32,7 +32,7 @@ def loop_candidate_to_message(finding: LoopCandidateResult) -> LoopCandidate:
         keyframe=new.keyframes[-1],
         reference=old.keyframes[-1],
         keyframes=new.keyframes,
-        references=old.keyframes,
+        reference_keyframes=old.keyframes,
         similarity=finding.likeness.similarity,
         appearance=finding.likeness.appearance,
         evidence=proposal.evidence,
@@ -41,5 +41,5 @@ def loop_candidate_to_message(finding: LoopCandidateResult) -> LoopCandidate:
         entropy=proposal.semantics.entropy,
         overlap=check.overlap,
         rmse_m=check.rmse_m,
-        refused=check.rejected_reason,
+        rejected_reason=check.rejected_reason,
     )

@@ -119,8 +119,8 @@ def _object_to_message(
         size=_vector3(landmark["size"]),
         distribution=_distribution_to_message(p, names),
         entropy=max(entropy, 0.0),
-        seen=int(landmark["seen"]),
-        missed=int(landmark["missed"]),
+        observation_count=int(landmark["seen"]),
+        miss_count=int(landmark["missed"]),
         first_keyframe=int(landmark["first"]),
         last_keyframe=int(landmark["last"]),
         views=tuple(

@@ -10,7 +10,7 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.geometry.se3 import quaternions
 from ldo_service.schemas import (
     Array,
-    Correction,
+    GraphCorrection,
     GraphLandmark,
     Keyframe,
     MeasuredPose,
@@ -55,7 +55,7 @@ def relative_pose_from_message(message: MeasuredPose) -> RelativePose:
 
 def measurements_from_message(keyframe: Keyframe) -> list[RelativePose]:
     """All that a keyframe was measured from, its reference first; none for the first keyframe."""
-    window = [relative_pose_from_message(pose) for pose in keyframe.window]
+    window = [relative_pose_from_message(pose) for pose in keyframe.window_measurements]
     if keyframe.reference is None:
         return window
     T_reference_keyframe = pose_from_message(keyframe.T_reference_keyframe)
@@ -74,24 +74,24 @@ def correction_to_message(
     closures: Iterable[tuple[int, int]] = (),
     not_believed: Iterable[tuple[int, int]] = (),
     landmarks: Iterable[GraphLandmark] = (),
-) -> Correction:
+) -> GraphCorrection:
     T = np.array(list(T_map_keyframe.values())).reshape(-1, 4, 4)
     rows = np.concatenate([T[:, :3, 3], quaternions(T[:, :3, :3])], axis=1)
-    return Correction(
+    return GraphCorrection(
         stamp_ns=stamp_ns,
         graph_version=graph_version,
         keyframes=Array.of(np.array(list(T_map_keyframe), np.int64)),
         T_map_keyframe=Array.of(rows),
-        refinements=refinements,
-        joined=tuple(sorted((joined or {}).items())),
-        closures=tuple(closures),
-        not_believed=tuple(not_believed),
+        last_refinement=refinements,
+        merged_submaps=tuple(sorted((joined or {}).items())),
+        accepted_closures=tuple(closures),
+        rejected_closures=tuple(not_believed),
         landmarks=tuple(landmarks),
     )
 
 
 def keyframe_poses_from_correction(
-    correction: Correction, only: Iterable[int] | None = None
+    correction: GraphCorrection, only: Iterable[int] | None = None
 ) -> dict[int, np.ndarray]:
     """T_map_keyframe [4, 4] by keyframe id; of `only` those and the newest one it names."""
     keyframes = correction.keyframes.numpy()
@@ -105,10 +105,10 @@ def keyframe_poses_from_correction(
     return dict(zip(keyframes.tolist(), T, strict=True))
 
 
-def map_correction_of(correction: Correction) -> MapCorrection:
+def map_correction_of(correction: GraphCorrection) -> MapCorrection:
     """Return a correction as tracking follows it; its poses are converted when asked for."""
     return MapCorrection(
         version=correction.graph_version,
-        roots=dict(correction.joined),
+        roots=dict(correction.merged_submaps),
         read_poses=partial(keyframe_poses_from_correction, correction),
     )

@@ -16,7 +16,7 @@ NOTHING = ("wall", "floor", "ceiling", "background")  # names of the table that 
 __all__ = [
     "DETECTOR",
     "IMAGE_ENCODER",
-    "LICENCE",
+    "LICENSE",
     "NAME",
     "NOTHING",
     "TEXT_EMBEDDINGS",

@@ -1,7 +1,7 @@
 """Networks that the user has registered: `ldo models`. Only `demo` comes with the package.
 
     <folder>/<name>/model.onnx    a copy of the file: a detector, or the image encoder of a pair
-    <folder>/<name>/about.json    checksum, layout, classes, licence
+    <folder>/<name>/about.json    checksum, layout, classes, license
 
 and of a pair that names regions (CLIP's layout) a text encoder with its byte pairs, or embeddings:
 
@@ -17,6 +17,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -46,7 +47,7 @@ class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
     sha256: str
     layout: str
     classes: tuple[str, ...]
-    licence: str = ""  # its text; empty: not stated
+    license: str = ""  # its text; empty: not stated
     source: str = ""  # name of the file it was copied from
     parts: dict[str, str] = {}  # checksums of the other files of a pair, by name
 
@@ -136,7 +137,10 @@ class Models:
         self._require_known(name)
         folder = self.folder / name
         try:
-            about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=ModelInfo)
+            values = msgspec.json.decode((folder / ABOUT).read_bytes(), type=dict[str, Any])
+            if "licence" in values:  # Written by version 0.1.
+                values["license"] = values.pop("licence")
+            about = msgspec.convert(values, ModelInfo)
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ModelError(
                 f"{folder / ABOUT} cannot be read ({error}): `ldo models remove {name}` and add it "
@@ -249,7 +253,7 @@ def _fill_pair(
         sha256=checksums.pop(FILE),
         layout=CLIP,
         classes=labeller.words,
-        licence=license,
+        license=license,
         source=pair.image.name,
         parts=checksums,
     )
@@ -266,7 +270,7 @@ def _fill(folder: Path, file: Path, config: NetworkConfig, license: str) -> Mode
         sha256=sha256(folder / FILE),
         layout=detector.layout,
         classes=detector.names,
-        licence=license,
+        license=license,
         source=file.name,
     )
     (folder / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=1))

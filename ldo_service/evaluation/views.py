@@ -28,7 +28,7 @@ Gaussian of 1.5 px, windows inside the image; some published systems print MS-SS
 Depth L1: mean depth of the rendering, over pixels with measured depth and rendered opacity above
 0.5; "of measured" is the share of measured pixels that these are. Cells: mean / median of frames.
 online: the map at the end of the stream, fitted again where corrections had torn it; refined: after
-the further iterations of --refine.
+the further iterations of --refine-iterations.
 A: held-out frames, tracked and never mapped; every pixel. The map has one brightness, the camera's
 changes: its gain and bias per channel are interpolated between the keyframes before and after.
 Exposure fitted: to each judged frame itself, by least squares. No exposure: the map as it is.
@@ -214,7 +214,7 @@ class EvaluatedFrames:
     def counts(self) -> str:
         """How many, as a line below the protocol."""
         if not self.held_out:
-            a = "A: none, since the run mapped every frame; `ldo run --hold-out 5` keeps some."
+            a = "A: none, since all frames were mapped; `ldo run --hold-out-every 5` keeps some."
         else:
             a = f"A: {_counted(self.held_out)}."
         return f"{a} B: {_counted(self.training)}."

@@ -122,8 +122,8 @@ class LoopRefit:
 
     def metrics(self) -> dict[str, float]:
         return {
-            "keyframes_to_mend": len(self._to_mend),
-            "gaussians_mended": self._mended,  # held twice after a correction, and removed
+            "keyframes_to_deduplicate": len(self._to_mend),
+            "gaussians_deduplicated": self._mended,  # held twice after a correction, and removed
             # to fit the map again where corrections have torn it
-            "iterations_due": self.pending_iterations,
+            "iterations_pending": self.pending_iterations,
         }

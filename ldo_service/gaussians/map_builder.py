@@ -99,21 +99,21 @@ class MapBuilder:
         T_map_camera: np.ndarray,
         keyframe: int,
         iterations: int,
-        is_moving: np.ndarray | None = None,
+        dynamic_mask: np.ndarray | None = None,
     ) -> None:
         """Take in a keyframe, later than all before, and fit the map to its window.
 
         T_map_camera [4, 4]; `iterations` of the optimiser that reach the usual number of Gaussians:
         fewer where more are in view, so that a keyframe costs the same however dense the map is;
-        `is_moving` [H, W] bool: pixels that are neither mapped nor fitted.
+        `dynamic_mask` [H, W] bool: pixels that are neither mapped nor fitted.
         Its Gaussians hang on it.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._shown = None
         before = self.render_from(frame.camera, T_map_camera)
-        exposure = self._exposure(frame, before, is_moving)
-        self._insert(frame, T_map_camera, keyframe, before, exposure, is_moving)
-        counts = None if is_moving is None else (~is_moving).astype(np.uint8)
+        exposure = self._exposure(frame, before, dynamic_mask)
+        self._insert(frame, T_map_camera, keyframe, before, exposure, dynamic_mask)
+        counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
         view = replace(
             TrainingView.of(frame, T_map_camera, keyframe), exposure=exposure, mask=counts
         )
@@ -151,11 +151,11 @@ class MapBuilder:
         return self._shown[1]
 
     def _exposure(
-        self, frame: RgbdFrame, before: Rendering, is_moving: np.ndarray | None
+        self, frame: RgbdFrame, before: Rendering, dynamic_mask: np.ndarray | None
     ) -> Exposure:
         """Against the map; where too little of it is in view, as the keyframe before."""
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
-        counts = None if is_moving is None else (~is_moving).astype(np.uint8)
+        counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
         estimated = estimate_exposure(rendered, before.opacity, seen, counts)
         if estimated is not None or self._newest is None:
             return estimated or Exposure()
@@ -168,7 +168,7 @@ class MapBuilder:
         keyframe: int,
         before: Rendering,
         exposure: Exposure,
-        is_moving: np.ndarray | None,
+        dynamic_mask: np.ndarray | None,
     ) -> None:
         color = exposure.removed(frame.color * np.float32(1 / 255))
         densify(
@@ -178,12 +178,12 @@ class MapBuilder:
             keyframe,
             self.config.insertion,
             before=before,
-            left_out=is_moving,
+            left_out=dynamic_mask,
             threads=self._threads,
         )
         self._log.mark_added(self.gaussians)
 
-    def mask_pixels(self, keyframe: int, pixels: np.ndarray) -> int:
+    def remove_masked(self, keyframe: int, pixels: np.ndarray) -> int:
         """What a keyframe shows there, [H, W] bool, turned out not to belong to the map: it is
         fitted no more, and the Gaussians that the keyframe put there go. How many did.
 
@@ -393,8 +393,8 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self._fitting.iterations,
-            "keyframes_unusable": self._fitting.unusable,  # chosen; gone, or see what sleeps
-            "gaussians_over_cap": self._excess,  # they may be looked at, so they do not sleep
+            "keyframes_skipped": self._fitting.unusable,  # chosen; gone, or see what sleeps
+            "gaussians_over_limit": self._excess,  # they may be looked at, so they do not sleep
             **self.sleeping.metrics(),
             **self.views.store.metrics(),
         }

@@ -241,10 +241,10 @@ class OffloadedGaussians:
 
     def metrics(self) -> dict[str, float]:
         return {
-            "gaussians_asleep": len(self),
-            "chunks_asleep": len(self._entries),
-            "gaussians_fell_asleep": self._slept,
-            "gaussians_woken": self._awoken,
+            "gaussians_offloaded": len(self),
+            "chunks_offloaded": len(self._entries),
+            "gaussians_offloaded_total": self._slept,
+            "gaussians_loaded_total": self._awoken,
             "gaussians_lost_on_disk": self._damaged,
             "chunks_not_written": self._files.not_written,
         }

@@ -102,7 +102,7 @@ class GaussianOptimizerConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Step:
+class IterationResult:
     """What one iteration found, before it changed the map; `view` is as it left it."""
 
     loss: ImageLoss
@@ -172,7 +172,7 @@ class GaussianOptimizer:
         *,
         rate: float = 1.0,
         is_fixed: bool = False,
-    ) -> Step:
+    ) -> IterationResult:
         """One iteration against one view.
 
         rate      factor on all steps
@@ -209,7 +209,7 @@ class GaussianOptimizer:
         )
         if not is_fixed:
             view = self._placed(view, reached.xi, rate)
-        return Step(loss, view, len(reached.indices))
+        return IterationResult(loss, view, len(reached.indices))
 
     def _room_for(self, planes: np.ndarray) -> np.ndarray:
         if self._by_planes.shape != planes.shape:

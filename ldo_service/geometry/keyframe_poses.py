@@ -13,13 +13,13 @@ import numpy as np
 from . import se3
 from .point_records import RecordTable
 
-APART_M = 100.0  # between segments that are not joined: farther than depth cameras see
+APART_M = 100.0  # between submaps that are not joined: farther than depth cameras see
 NO_REFERENCE = -1
 KEYFRAME = np.dtype(
     [
         ("id", np.int64),
         ("reference", np.int64),  # that it was measured from
-        ("segment", np.int64),
+        ("submap", np.int64),
         ("T_map", float, (4, 4)),
         ("T_reference", float, (4, 4)),  # T_reference_keyframe
         ("T_odom", float, (4, 4)),  # T_odom_keyframe
@@ -27,14 +27,14 @@ KEYFRAME = np.dtype(
 )
 
 
-def T_map_segment(segment: int) -> np.ndarray:
-    """Where the odometry frame of a segment is put [4, 4] until it is joined to an older one.
+def T_map_submap(submap: int) -> np.ndarray:
+    """Where the odometry frame of a submap is put [4, 4] until it is joined to an older one.
 
     Below, for a building goes on sideways, and far from all others, so that their surfaces do not
     meet; float32 still resolves 0.1 mm in the tenth of them.
     """
     T = np.eye(4)
-    T[1, 3] = segment * APART_M
+    T[1, 3] = submap * APART_M
     return T
 
 
@@ -77,16 +77,16 @@ class KeyframePoses:
         reference: int | None,
         T_reference_keyframe: np.ndarray,
         T_odom_keyframe: np.ndarray,
-        segment: int = 0,
+        submap: int = 0,
     ) -> np.ndarray:
         """Place a new keyframe; its T_map_keyframe.
 
-        A reference that is not known was missed: odometry to the newest known one of the segment
+        A reference that is not known was missed: odometry to the newest known one of the submap
         stands in.
         """
         measured_from = NO_REFERENCE if reference is None else reference
-        measured = (measured_from, segment, np.eye(4), T_reference_keyframe, T_odom_keyframe)
-        newest = self._newest(segment)
+        measured = (measured_from, submap, np.eye(4), T_reference_keyframe, T_odom_keyframe)
+        newest = self._newest(submap)
         self._known.put(keyframe, *measured)
         record = self._record(keyframe)
         record["T_map"] = self._placed(record, newest)
@@ -121,8 +121,8 @@ class KeyframePoses:
         T_new = np.array(list(T_map.values()))[order[is_known]]
         records["T_map"][rows[~is_held[rows]]] = T_new[~is_held[rows]]
         for record in records[(records["id"] > named.max()) | is_held]:
-            keyframe, segment = int(record["id"]), int(record["segment"])
-            placed = self._placed(record, self._newest(segment, keyframe))
+            keyframe, submap = int(record["id"]), int(record["submap"])
+            placed = self._placed(record, self._newest(submap, keyframe))
             self._record(keyframe)["T_map"] = placed
 
     def _record(self, keyframe: int) -> np.void:
@@ -140,13 +140,13 @@ class KeyframePoses:
         elif newest is not None:
             T_map = self.T_map_odom(newest) @ record["T_odom"]
         else:
-            T_map = T_map_segment(int(record["segment"])) @ record["T_odom"]
+            T_map = T_map_submap(int(record["submap"])) @ record["T_odom"]
         return se3.orthonormalize(T_map)
 
-    def _newest(self, segment: int, before: float = math.inf) -> int | None:
-        """The newest keyframe of a segment among those older than `before`."""
+    def _newest(self, submap: int, before: float = math.inf) -> int | None:
+        """The newest keyframe of a submap among those older than `before`."""
         records = self._known.all
-        known = records["id"][(records["id"] < before) & (records["segment"] == segment)]
+        known = records["id"][(records["id"] < before) & (records["submap"] == submap)]
         return int(known[-1]) if len(known) else None
 
     def keep_only(self, keyframes: Iterable[int]) -> None:

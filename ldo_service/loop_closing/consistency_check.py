@@ -38,8 +38,8 @@ class ConsistencyCheckConfig:
 
 
 class ConsistencyChecker:
-    """Judges by poses of the keyframes that are known; `joined` are segments, each with the older
-    one whose frame it is in. Of two segments that are apart nothing is known."""
+    """Judges by poses of the keyframes that are known; `joined` are submaps, each with the older
+    one whose frame it is in. Of two submaps that are apart nothing is known."""
 
     def __init__(
         self, poses: KeyframePoses, joined: Mapping[int, int], config: ConsistencyCheckConfig
@@ -53,9 +53,9 @@ class ConsistencyChecker:
         that are farther or turned more than drift and the width of a view explain."""
         if new.keyframe not in self._poses:
             return np.ones(len(old), bool)
-        root = self._root(new.place.segment)
+        root = self._root(new.place.submap)
         known = self._poses.are_known([view.keyframe for view in old])
-        known &= np.array([self._root(view.place.segment) == root for view in old], bool)
+        known &= np.array([self._root(view.place.submap) == root for view in old], bool)
         may = ~known
         at = np.flatnonzero(known)
         views, config = [old[k] for k in at.tolist()], self._config
@@ -89,7 +89,7 @@ class ConsistencyChecker:
     def reject_aliased(self, proposals: Sequence[LoopHypothesis]) -> list[LoopHypothesis]:
         """Those refused whose view another place far elsewhere explains nearly as well."""
         return [
-            replace(proposal, rejected_reason="a twin elsewhere fits as well")
+            replace(proposal, rejected_reason="ambiguous: another place fits as well")
             if not proposal.rejected_reason
             and any(self._is_aliased(proposal, o) for o in proposals)
             else proposal
@@ -122,10 +122,10 @@ class ConsistencyChecker:
         """Whether the map says where both are to each other."""
         if old.keyframe not in self._poses or new.keyframe not in self._poses:
             return False
-        return self._root(old.place.segment) == self._root(new.place.segment)
+        return self._root(old.place.submap) == self._root(new.place.submap)
 
-    def _root(self, segment: int) -> int:
-        return self._joined.get(segment, segment)
+    def _root(self, submap: int) -> int:
+        return self._joined.get(submap, submap)
 
     def _drift(
         self, old: SubgraphKeyframe, new: SubgraphKeyframe, T_old_new: np.ndarray

@@ -139,7 +139,7 @@ class LoopDetector:
         self._memory = PlaceDatabase(config.words.count, config.stages, config.retrieval)
         self._open: list[SubgraphKeyframe] = []  # of the subgraph that is not whole yet
         self._path_m = 0.0
-        self._last: tuple[int, np.ndarray] | None = None  # segment and T_odom_keyframe
+        self._last: tuple[int, np.ndarray] | None = None  # submap and T_odom_keyframe
         self._verifier = Verifier(
             config.pyramid, config.align, config.features, config.verification
         )
@@ -166,7 +166,7 @@ class LoopDetector:
 
         sightings   None where no detector looked
         poses       T_map_keyframe of the keyframes kept; those that are not known are not judged by
-        joined      segments, each with the older one whose frame it is in
+        joined      submaps, each with the older one whose frame it is in
         """
         findings: list[LoopCandidateResult] = []
         if self._open and not follows(self._open[-1].place, place, self._config.subgraphs):
@@ -198,7 +198,7 @@ class LoopDetector:
         self, place: KeyframeRecord, frame: int, stamp_ns: int, sightings: DetectionPoints | None
     ) -> SubgraphKeyframe:
         self._path_m += self._step_m(place)
-        self._last = place.segment, place.T_odom_keyframe
+        self._last = place.submap, place.T_odom_keyframe
         self._words.learn(place.descriptors)
         words = self._words.histogram(place.descriptors)
         looked = sightings is not None
@@ -208,7 +208,7 @@ class LoopDetector:
 
     def _step_m(self, place: KeyframeRecord) -> float:
         """From the keyframe before; how far a lost camera went, nobody knows."""
-        if self._last is None or self._last[0] != place.segment:
+        if self._last is None or self._last[0] != place.submap:
             return 0.0
         return float(np.linalg.norm(place.T_odom_keyframe[:3, 3] - self._last[1][:3, 3]))
 
@@ -223,7 +223,7 @@ class LoopDetector:
             last_frame=max(view.frame for view in views),
             stamp_ns=views[-1].stamp_ns,
             path_m=views[-1].path_m,
-            was_looked_at=any(view.was_looked_at for view in views),
+            has_detections=any(view.has_detections for view in views),
             landmarks=landmarks,
             names=np.sum([sightings.histogram() for sightings in seen], axis=0),
             layout=layout_histogram(landmarks),

@@ -86,7 +86,7 @@ def locate_detections(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SubgraphLandmarks:
-    """Points [K, 3] m in the odometry frame of a segment, with what they are: sparse distributions,
+    """Points [K, 3] m in the odometry frame of a submap, with what they are: sparse distributions,
     labels [K, 8] uint8 and weights [K, 8] float32."""
 
     p_odom: np.ndarray

@@ -50,7 +50,7 @@ class SubgraphKeyframe:
     frame: int  # of the camera
     stamp_ns: int
     path_m: float
-    was_looked_at: bool  # by a detector
+    has_detections: bool  # by a detector
     sightings: DetectionPoints
     words: np.ndarray
 
@@ -87,15 +87,15 @@ class Subgraph:
     last_frame: int
     stamp_ns: int  # of its newest keyframe
     path_m: float  # likewise
-    was_looked_at: bool
+    has_detections: bool
     landmarks: SubgraphLandmarks
     names: np.ndarray
     layout: np.ndarray
     words: np.ndarray
 
     @property
-    def segment(self) -> int:
-        return self.views[0].place.segment
+    def submap(self) -> int:
+        return self.views[0].place.submap
 
     @cached_property
     def packed(self) -> dict[str, Any]:
@@ -120,11 +120,11 @@ def follows(before: KeyframeRecord, place: KeyframeRecord, config: SubgraphConfi
     made long ago."""
     moved = se3.inverse(before.T_odom_keyframe) @ place.T_odom_keyframe
     is_near = image_motion_rad(moved, before.median_depth_m) <= config.gap_rad
-    return is_near and before.segment == place.segment
+    return is_near and before.submap == place.submap
 
 
 def is_complete(views: Sequence[SubgraphKeyframe], config: SubgraphConfig) -> bool:
-    """Whether keyframes of one segment make a subgraph: enough of them, or far enough apart."""
+    """Whether keyframes of one submap make a subgraph: enough of them, or far enough apart."""
     if len(views) < config.least:
         return False
     first, last = views[0].place, views[-1].place

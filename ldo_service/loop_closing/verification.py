@@ -18,7 +18,7 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.tracking.alignment import AlignConfig, Alignment, align
 from ldo_service.tracking.features import FeatureConfig, estimate_pose
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.motion import image_motion_rad
 from ldo_service.tracking.pyramid import PyramidConfig
 
@@ -155,7 +155,7 @@ class Verifier:
             return best
         if any(self._is_confirmed_by(best, view) for view in new.views if view is not best.new):
             return best
-        return replace(best, rejected_reason="one keyframe alone says so")
+        return replace(best, rejected_reason="not confirmed by a second keyframe")
 
     def _is_confirmed_by(self, best: LoopHypothesis, view: SubgraphKeyframe) -> bool:
         """Whether the image and surface of another new keyframe are as a pose predicts."""
@@ -206,7 +206,7 @@ class Verifier:
                 if self._is_confirmed_by_any(met, found, self._config.map_witness_rad):
                     return self._with_semantics(met, old, new)
                 found.append(met)
-        refused = "the map alone says so" if found else "the map does not bring them together"
+        refused = "not confirmed by images" if found else "no overlap at the mapped pose"
         return LoopHypothesis(old.views[0], new.views[0], np.eye(4), rejected_reason=refused)
 
     def _check_overlap(self, proposal: LoopHypothesis) -> VerificationResult | None:
@@ -252,7 +252,9 @@ class Verifier:
         closure = RelativePose(a, b, proposal.T_old_new, np.diag(sigmas**-2))
         return VerificationResult(proposal, closure=closure)
 
-    def _fit(self, old: Keyframe, new: Keyframe, T_old_new: np.ndarray) -> DepthConsistency:
+    def _fit(
+        self, old: ReferenceKeyframe, new: ReferenceKeyframe, T_old_new: np.ndarray
+    ) -> DepthConsistency:
         level = min(FIT_LEVEL, len(old.view.levels) - 1, len(new.view.levels) - 1)
         points, there = new.reference.points[level], old.view.levels[level]
         return check_depth_consistency(
@@ -269,7 +271,7 @@ class Verifier:
         if image_motion_rad(moved, _depth(proposal)) > limit:
             return "images and " + proposal.evidence + " disagree"
         if alignment.condition > config.max_condition:
-            return "the images do not fix the pose"
+            return "degenerate alignment"
         if abs(np.log(max(alignment.gain, 1e-6))) > np.log(config.max_gain):
             return f"brightness differs {alignment.gain:.2f} times"
         by_features = proposal.evidence == "features"

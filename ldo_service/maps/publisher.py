@@ -93,7 +93,7 @@ class MapPublisher:
         self.version += 1
         return MapDelta(
             stamp_ns=now.stamp_ns,
-            since=self.version - 1,
+            base_version=self.version - 1,
             version=self.version,
             graph_version=now.graph_version,
             motions=motions,

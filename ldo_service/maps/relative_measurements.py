@@ -32,7 +32,7 @@ class RelativeMeasurements:
 
     def add(self, message: Keyframe) -> None:
         links = {} if message.reference is None else {message.reference: message.information}
-        links |= {pose.reference: pose.information for pose in message.window}
+        links |= {pose.reference: pose.information for pose in message.window_measurements}
         if links:
             self._recent[message.keyframe] = links
         while len(self._recent) > self._most_recent:

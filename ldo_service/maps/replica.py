@@ -65,11 +65,11 @@ class MapReplica:
 
     # --- changes ----------------------------------------------------------------------------------
     def _apply_delta(self, delta: MapDelta) -> bool:
-        if delta.since == 0 and self.version:
+        if delta.base_version == 0 and self.version:
             self.reset()  # the mapper started again
         if delta.version <= self.version:
             return False
-        if delta.since != self.version:
+        if delta.base_version != self.version:
             self.is_behind = True
             if self._max_gaussians is None:
                 return False

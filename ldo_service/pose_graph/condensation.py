@@ -26,18 +26,18 @@ from .solver import graph_of, values_of, variables_of
 
 @dataclass(frozen=True, slots=True)
 class CondensedKeyframes:
-    """F keyframes, each between the variables `heads` and `tails`, ids [F].
+    """F keyframes, each between the variables `heads` and `end_variables`, ids [F].
 
-    T_head [F, 4, 4] is T_head_keyframe and T_tail T_tail_keyframe, as measured; `shares` [F] how
+    T_head [F, 4, 4] is T_head_keyframe and T_tail T_tail_keyframe, as measured; `fractions` [F] how
     far along it is: what corrections change between head and tail is spread over them.
     """
 
     keyframes: np.ndarray  # ascending within a group
-    heads: np.ndarray
-    tails: np.ndarray
+    start_variables: np.ndarray
+    end_variables: np.ndarray
     T_head: np.ndarray
     T_tail: np.ndarray
-    shares: np.ndarray
+    fractions: np.ndarray
 
     @staticmethod
     def none() -> "CondensedKeyframes":
@@ -58,7 +58,7 @@ class CondensedKeyframes:
 
     def interpolated_poses(self, T_heads: np.ndarray, T_tails: np.ndarray) -> np.ndarray:
         """T_map_keyframe [F, 4, 4], from where heads and tails [F, 4, 4] are in the map."""
-        return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.shares)
+        return interpolate(T_heads @ self.T_head, T_tails @ self.T_tail, self.fractions)
 
     def moved(self, row: int, T_head_keyframe: np.ndarray) -> "CondensedKeyframes":
         """One measured anew."""
@@ -69,21 +69,23 @@ class CondensedKeyframes:
 
     def without_split(self, row: int) -> "CondensedKeyframes":
         """Without one, which is a variable again: those of its group lie before or behind it."""
-        of_group = (self.heads == self.heads[row]) & (self.tails == self.tails[row])
-        share = self.shares[row]
-        before, behind = of_group & (self.shares < share), of_group & (self.shares > share)
+        of_group = (self.start_variables == self.start_variables[row]) & (
+            self.end_variables == self.end_variables[row]
+        )
+        share = self.fractions[row]
+        before, behind = of_group & (self.fractions < share), of_group & (self.fractions > share)
         to_head, to_tail = np.linalg.inv(self.T_head[row]), np.linalg.inv(self.T_tail[row])
         one = self.keyframes[row]
         parted = replace(
             self,
-            heads=np.where(behind, one, self.heads),
-            tails=np.where(before, one, self.tails),
+            start_variables=np.where(behind, one, self.start_variables),
+            end_variables=np.where(before, one, self.end_variables),
             T_head=np.where(behind[:, None, None], to_head @ self.T_head, self.T_head),
             T_tail=np.where(before[:, None, None], to_tail @ self.T_tail, self.T_tail),
-            shares=np.select(
+            fractions=np.select(
                 [before, behind],
-                [self.shares / share, (self.shares - share) / (1 - share)],
-                self.shares,
+                [self.fractions / share, (self.fractions - share) / (1 - share)],
+                self.fractions,
             ),
         )
         return parted.without(row)

@@ -115,8 +115,11 @@ class FactorStore:
         """Make a follower a variable again, between the two that it lies between: what is known
         from one to the other is spread over both parts, each by its share."""
         row = self.rows[keyframe]
-        head, tail = int(self.followers.heads[row]), int(self.followers.tails[row])
-        share, T_head = float(self.followers.shares[row]), self.followers.T_head[row]
+        head, tail = (
+            int(self.followers.start_variables[row]),
+            int(self.followers.end_variables[row]),
+        )
+        share, T_head = float(self.followers.fractions[row]), self.followers.T_head[row]
         edge = self.condensed.pop((head, tail))
         T_tail = se3.inverse(T_head) @ edge.T_a_b
         covariance, adjoint = np.linalg.inv(edge.information), se3.adjoint(T_tail)
@@ -134,9 +137,12 @@ class FactorStore:
         if row is None:
             return 0.0
         follower = self.followers.only(row)
-        T_head, T_tail = variables[int(follower.heads[0])], variables[int(follower.tails[0])]
+        T_head, T_tail = (
+            variables[int(follower.start_variables[0])],
+            variables[int(follower.end_variables[0])],
+        )
         by_head, by_tail = T_head @ follower.T_head[0], T_tail @ follower.T_tail[0]
-        off, share = np.abs(se3.log(se3.inverse(by_head) @ by_tail)), float(follower.shares[0])
+        off, share = np.abs(se3.log(se3.inverse(by_head) @ by_tail)), float(follower.fractions[0])
         sigmas = np.repeat([self._noise.sigma_loop_rad, self._noise.sigma_loop_m], 3)
         return min(share, 1 - share) * float((off / sigmas).max())
 
@@ -153,15 +159,15 @@ class FactorStore:
         row = self.rows.get(keyframe)
         if row is None:
             return keyframe, np.eye(4)
-        return int(self.followers.heads[row]), self.followers.T_head[row]
+        return int(self.followers.start_variables[row]), self.followers.T_head[row]
 
     def relative_to_variable(self, keyframe: int) -> tuple[int, np.ndarray]:
         """The variable that stands for a keyframe, the nearer of the two that it lies between, and
         T_variable_keyframe [4, 4]."""
         row = self.rows.get(keyframe)
-        if row is None or self.followers.shares[row] <= 0.5:
+        if row is None or self.followers.fractions[row] <= 0.5:
             return self.relative_to_start(keyframe)
-        return int(self.followers.tails[row]), self.followers.T_tail[row]
+        return int(self.followers.end_variables[row]), self.followers.T_tail[row]
 
     def ends(self, m: RelativePose) -> tuple[tuple[int, np.ndarray], tuple[int, np.ndarray]]:
         """The variables that stand for both: another one where that would be the same."""
@@ -184,8 +190,8 @@ class FactorStore:
         for keyframe, (variable, _), T in zip((m.a, m.b), self.ends(m), T_b_end, strict=True):
             if (row := self.rows.get(keyframe)) is None:
                 continue
-            pair = int(self.followers.heads[row]), int(self.followers.tails[row])
-            share = self.followers.shares[row]
+            pair = int(self.followers.start_variables[row]), int(self.followers.end_variables[row])
+            share = self.followers.fractions[row]
             away = share if variable == pair[0] else 1 - share
             adjoint = se3.adjoint(T @ se3.inverse(self.followers.T_tail[row]))  # of T_b_tail
             covariance = np.linalg.inv(self.condensed[pair].information)

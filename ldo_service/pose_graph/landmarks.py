@@ -74,7 +74,7 @@ class ObjectLandmarkConfig:
 
 
 @dataclass(frozen=True, slots=True)
-class Observation:
+class LandmarkObservation:
     """An object in a keyframe, or missing there."""
 
     keyframe: int
@@ -101,11 +101,11 @@ class Observation:
         return values | {"distribution": (labels, self.distribution[labels])}
 
     @staticmethod
-    def unpack(packed: Mapping[str, Any]) -> "Observation":
+    def unpack(packed: Mapping[str, Any]) -> "LandmarkObservation":
         labels, weights = packed["distribution"]
         distribution = np.zeros(MAX_CLASSES)
         distribution[labels] = weights
-        return Observation(**{**packed, "distribution": distribution})
+        return LandmarkObservation(**{**packed, "distribution": distribution})
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,12 +134,12 @@ class ObjectLandmarks:
     def __init__(self, config: ObjectLandmarkConfig, noise: NoiseConfig) -> None:
         self._config, self._noise = config, noise
         self.known: dict[int, Landmark] = {}
-        self._waiting: list[Observation] = []
+        self._waiting: list[LandmarkObservation] = []
         self._pairs: set[Pair] = set()  # that a keyframe shows together
         self._saved: dict[str, Any] = {}  # what is known, until it changes
         self.skipped = 0  # keyframes at which the graph was left alone
 
-    def observe(self, seen: Observation) -> None:
+    def observe(self, seen: LandmarkObservation) -> None:
         """To be taken in at the next `update_graph`."""
         self._waiting.append(seen)
 
@@ -170,7 +170,7 @@ class ObjectLandmarks:
         self._fuse({seen.landmark for seen in waiting if not seen.is_miss})
         self._remove_lost(graph)
 
-    def _take(self, seen: Observation) -> None:
+    def _take(self, seen: LandmarkObservation) -> None:
         old = self.known.get(seen.landmark)
         if seen.is_miss:
             if old is not None:
@@ -185,7 +185,7 @@ class ObjectLandmarks:
             old, evidence=evidence, sights=sights, misses=0, last=seen.keyframe
         )
 
-    def _sight(self, seen: Observation) -> BoxObservation:
+    def _sight(self, seen: LandmarkObservation) -> BoxObservation:
         x0, y0, x1, y1 = seen.box_px
         share_px = self._noise.sigma_box_share * max(x1 - x0, y1 - y0)
         return BoxObservation(
@@ -197,7 +197,7 @@ class ObjectLandmarks:
             self.weight(seen.entropy),
         )
 
-    def _pair(self, waiting: Iterable[Observation]) -> None:
+    def _pair(self, waiting: Iterable[LandmarkObservation]) -> None:
         """Those that a keyframe shows together."""
         shown: dict[int, set[int]] = {}
         for seen in waiting:
@@ -320,5 +320,5 @@ class ObjectLandmarks:
             for k, weight, log_sum, p, misses in zip(*columns, strict=True)
         }
         self._pairs = {(i, j) for i, j in packed["pairs"]}
-        self._waiting = [Observation.unpack(values) for values in state["waiting"]]
+        self._waiting = [LandmarkObservation.unpack(values) for values in state["waiting"]]
         self.skipped = state["skipped"]

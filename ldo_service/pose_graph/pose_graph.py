@@ -183,7 +183,7 @@ class PoseGraph:
             is_room = len(known.condensed) * config.keyframes_each < len(self)
             if is_room and known.interpolation_error_sigmas(keyframe, variables) > config.most_bent:
                 follower = known.followers.only(known.rows[keyframe])
-                ends = int(follower.heads[0]), int(follower.tails[0])
+                ends = int(follower.start_variables[0]), int(follower.end_variables[0])
                 T_head, T_tail = (variables[k][None] for k in ends)
                 known.restore_variable(keyframe)
                 variables = {**variables, keyframe: follower.interpolated_poses(T_head, T_tail)[0]}
@@ -260,7 +260,7 @@ class PoseGraph:
         if row is None:
             return self._solver.pose(keyframe)
         follower = self._known.followers.only(row)
-        ends = int(follower.heads[0]), int(follower.tails[0])
+        ends = int(follower.start_variables[0]), int(follower.end_variables[0])
         T_head, T_tail = (self._solver.pose(k)[None] for k in ends)
         return follower.interpolated_poses(T_head, T_tail)[0]
 
@@ -274,7 +274,10 @@ class PoseGraph:
         variables, followers = self._solver.variables(), self._known.followers
         keys = np.array([k for k in variables if k in self], np.int64)
         T_map = np.array([variables[k] for k in keys.tolist()]).reshape(-1, 4, 4)
-        heads, tails = (np.searchsorted(keys, ids) for ids in (followers.heads, followers.tails))
+        heads, tails = (
+            np.searchsorted(keys, ids)
+            for ids in (followers.start_variables, followers.end_variables)
+        )
         keyframes = np.concatenate([keys, followers.keyframes])
         order = np.argsort(keyframes)
         every = np.concatenate([T_map, followers.interpolated_poses(T_map[heads], T_map[tails])])

@@ -41,6 +41,9 @@ UNREADABLE = (
 )
 
 ABOUT = "ldo/recording"  # name of the metadata record
+# Version of the messages, states and journal entries in a recording, a field of that record. A
+# change after which an older recording no longer replays increments it. Version 1 had no number.
+RECORDING_VERSION = 2
 CHECK_EVERY_BYTES = 64_000_000  # limits are looked at so often: 10 ms of a fast disk
 
 
@@ -115,6 +118,17 @@ class McapIndex:
             self.metadata[metadata.name] = metadata.metadata
 
 
+def require_version(index: McapIndex) -> None:
+    """Raise DataError if a recording has another version than this service replays."""
+    version = index.metadata.get(ABOUT, {}).get("version", "1")
+    if version != str(RECORDING_VERSION):
+        raise DataError(
+            f"{index.path} has version={version}, and this service replays {RECORDING_VERSION}: "
+            "another version of the service recorded it. Replay it with that version; its camera "
+            "frames remain a SOURCE of `ldo run`."
+        )
+
+
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
     """Opcode, place and length of every whole record; the stream is at its content."""
     while size - stream.tell() >= RECORD.size:
@@ -160,7 +174,7 @@ class RecordingFile:
         self._file: BinaryIO = path.open("xb")
         self._writer = Writer(self._file, compression=CompressionType.NONE, use_chunking=False)
         self._writer.start(profile="ldo", library="ldo-slam")
-        self._writer.add_metadata(ABOUT, dict(about))
+        self._writer.add_metadata(ABOUT, {**about, "version": str(RECORDING_VERSION)})
         self._file.flush()
         self._channels: dict[str, int] = {}
         self._log_ns = 0  # of the last record

@@ -16,7 +16,7 @@ from ldo_service.runtime.journal import (
     Journal,
     Kind,
     Started,
-    Step,
+    StepRecord,
     checksum,
     digest_of,
     outputs_of,
@@ -96,12 +96,12 @@ class Recorder(Journal):
         if taken is None and (not takes_none or self._lost):
             return  # its message is not recorded
         made = tuple(produced)
-        step = Step(
+        step = StepRecord(
             step=self._steps,
             kind=kind,
             taken=-1 if taken is None else taken.number,
-            room=_by_name(situation.credits),
-            waiting=_by_name(situation.backlog),
+            credits=_by_name(situation.credits),
+            backlog=_by_name(situation.backlog),
             error=error,
         )
         self._steps += 1
@@ -118,7 +118,7 @@ class Recorder(Journal):
         return {
             "journal_is_open": float(self._file.is_open),
             "journal_steps": self._steps,
-            "journal_lost": self._lost_before + self._lost,
+            "journal_messages_dropped": self._lost_before + self._lost,
             "journal_waiting_mb": self._waiting / 1e6,
         }
 
@@ -162,7 +162,9 @@ class Recorder(Journal):
         topic, body = taken.delivery.port.topic, taken.delivery.body
         self._file.add(topic.name, topic.message, body, taken.number, taken.stamp_ns)
 
-    def _write_step(self, step: Step, taken: Taken | None, produced: tuple[Produced, ...]) -> None:
+    def _write_step(
+        self, step: StepRecord, taken: Taken | None, produced: tuple[Produced, ...]
+    ) -> None:
         if not self._file.is_open:
             return
         outputs = outputs_of(produced)

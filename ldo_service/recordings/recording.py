@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 
 from ldo_service.errors import ConfigError, DataError
-from ldo_service.runtime.journal import CHANNELS, Entry, Step
+from ldo_service.runtime.journal import CHANNELS, Entry, StepRecord
 from ldo_service.schemas import decode
 
-from .mcap_file import ABOUT, McapIndex, MessageLocation
+from .mcap_file import ABOUT, McapIndex, MessageLocation, require_version
 
 NAME = re.compile(r"(?P<actor>\w+?)(\.(?P<number>\d+))?\.mcap")
 ENTRIES: Mapping[str, Any] = {channel: kind for kind, channel in CHANNELS.items()}
@@ -32,6 +32,10 @@ class JournalFile:
         """Actor, robot, configuration, instruction set, versions."""
         return self._index.metadata.get(ABOUT, {})
 
+    def require_version(self) -> None:
+        """Raise DataError if another version recorded what this service cannot replay."""
+        require_version(self._index)
+
     @property
     def is_whole(self) -> bool:
         """It was closed in peace."""
@@ -39,7 +43,7 @@ class JournalFile:
 
     @property
     def steps(self) -> int:
-        return sum(place.topic == CHANNELS[Step] for place in self._entries)
+        return sum(place.topic == CHANNELS[StepRecord] for place in self._entries)
 
     def entries(self) -> Iterator[Entry]:
         for place in self._entries:
@@ -51,7 +55,7 @@ class JournalFile:
     def body(self, message: MessageLocation) -> bytes:
         return self._index.body(message)
 
-    def taken(self, step: Step) -> bytes:
+    def taken(self, step: StepRecord) -> bytes:
         """The message of a step."""
         if step.taken not in self._by_number:
             raise DataError(f"{self.path}: the message of step {step.step} is missing.")

@@ -13,7 +13,15 @@ import msgspec
 from ldo_service.errors import DataError, ReplayDiverged
 from ldo_service.runtime.actor import Actor, FlowStatus
 from ldo_service.runtime.delivery_state import RestoredState, counts_by_topic, restore_actor
-from ldo_service.runtime.journal import Gap, Output, Started, Step, checksum, digest_of, outputs_of
+from ldo_service.runtime.journal import (
+    Gap,
+    Output,
+    Started,
+    StepRecord,
+    checksum,
+    digest_of,
+    outputs_of,
+)
 from ldo_service.runtime.step import Produced, produce
 from ldo_service.schemas import Message, decode
 from ldo_service.storage.state_codec import decode_state
@@ -33,7 +41,7 @@ class ReplayReport:
     steps: int = 0
     failures: int = 0
     failures_repeated: int = 0
-    set_aside: int = 0
+    dead_lettered: int = 0
     taken: Counter[str] = field(default_factory=Counter)  # messages by topic
     made: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
@@ -74,16 +82,16 @@ class ReplaySession:
     def __init__(self, file: JournalFile, make: Make, replayed: ReplayReport) -> None:
         self._file, self._make, self._replayed = file, make, replayed
         self._actor: Actor | None = None  # None: nothing is known until the next start
-        self._last: Step | None = None
+        self._last: StepRecord | None = None
 
-    def steps(self) -> Iterator[Step]:
+    def steps(self) -> Iterator[StepRecord]:
         for entry in self._file.entries():
             match entry:
                 case Started():
                     self._start(entry)
                 case Gap():
                     self._skip(entry)
-                case Step() if self._actor is not None:
+                case StepRecord() if self._actor is not None:
                     self._replayed.steps += 1
                     self._step(self._actor, entry)
                     self._last = entry
@@ -133,12 +141,12 @@ class ReplaySession:
         self._replayed.notes.append(f"{self._file.path.name} {text}")
 
     # --- one step ---------------------------------------------------------------------------------
-    def _step(self, actor: Actor, step: Step) -> None:
+    def _step(self, actor: Actor, step: StepRecord) -> None:
         if actor.talks_outside:
             return
         actor.situation = FlowStatus(
-            credits=counts_by_topic(step.room, (out.topic for out in actor.outputs)),
-            backlog=counts_by_topic(step.waiting, (port.topic for port in actor.inputs)),
+            credits=counts_by_topic(step.credits, (out.topic for out in actor.outputs)),
+            backlog=counts_by_topic(step.backlog, (port.topic for port in actor.inputs)),
         )
         match step.kind:
             case "done":
@@ -148,8 +156,8 @@ class ReplaySession:
                 actor.on_saved()
             case "failed":
                 self._fail(step, actor, self._message(actor, step))
-            case "set_aside":
-                self._replayed.set_aside += 1
+            case "dead_lettered":
+                self._replayed.dead_lettered += 1
             case "resumed":
                 self._compare(step, self._produce(step, actor, actor.on_restored()))
                 actor.checkpoint()
@@ -157,7 +165,7 @@ class ReplaySession:
             case "finished":
                 self._compare(step, self._produce(step, actor, actor.on_stop()))
 
-    def _message(self, actor: Actor, step: Step) -> Message:
+    def _message(self, actor: Actor, step: StepRecord) -> Message:
         self._replayed.taken[step.topic] += 1
         body = self._file.taken(step)
         if checksum(body) != step.checksum:
@@ -172,13 +180,15 @@ class ReplaySession:
         except msgspec.DecodeError as error:
             raise self._diverged(step, step.topic, "readable", f"not: {error}") from error
 
-    def _produce(self, step: Step, actor: Actor, messages: Iterable[Message]) -> list[Produced]:
+    def _produce(
+        self, step: StepRecord, actor: Actor, messages: Iterable[Message]
+    ) -> list[Produced]:
         try:
             return produce(actor, messages)
         except Exception as error:
             raise self._diverged(step, "the step", "done", f"a failure, {error!r},") from error
 
-    def _fail(self, step: Step, actor: Actor, message: Message) -> None:
+    def _fail(self, step: StepRecord, actor: Actor, message: Message) -> None:
         self._actor = None  # a start follows
         self._replayed.failures += 1
         try:
@@ -188,14 +198,16 @@ class ReplaySession:
         else:
             self._note(f"step {step.step} failed when recorded ({step.error}) and does not now.")
 
-    def _compare(self, step: Step, produced: list[Produced]) -> None:
+    def _compare(self, step: StepRecord, produced: list[Produced]) -> None:
         self._replayed.made.update(made.topic.name for made in produced)
         outputs = outputs_of(produced)
         if outputs != step.outputs:
             what = f"the digest of what it made ({first_difference(step.outputs, outputs)})"
             raise self._diverged(step, what, step.digest, digest_of(outputs))
 
-    def _diverged(self, step: Step, what: str, recorded: str, replayed: str) -> ReplayDiverged:
+    def _diverged(
+        self, step: StepRecord, what: str, recorded: str, replayed: str
+    ) -> ReplayDiverged:
         cause = f", {step.topic} #{step.seq}" if step.topic else ""
         where = f"step {step.step} ({self._file.path.name}{cause})"
         return ReplayDiverged(self._replayed.actor, where, what, recorded, replayed)

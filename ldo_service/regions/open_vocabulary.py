@@ -219,13 +219,13 @@ class OpenVocabularyLabeling:
 
     def metrics(self) -> dict[str, float]:
         return {
-            "regions_to_name": len(self._regions),
+            "regions_tracked": len(self._regions),
             "questions": self._questions,
-            "questions_open": len(self._open),
-            "questions_overdue": self._overdue,  # given up for newer ones
+            "label_requests_pending": len(self._open),
+            "label_requests_expired": self._overdue,  # given up for newer ones
             "answers_named": self._named,
             "answers_unnamed": self._unnamed,  # no opinion, or nobody could look
-            "answers_outvoted": self._outvoted,  # boxes of the region say otherwise
+            "label_results_overruled": self._outvoted,  # boxes of the region say otherwise
             "answers_unknown": self._unknown,  # to questions given up, or said again
         }
 

@@ -133,7 +133,7 @@ class Region:
     questions: int = 0
     quality: float = 0.0
     answer: RegionLabelResult | None = None
-    is_standing: bool = False
+    is_supported: bool = False
 
     def view_quality_gain(self) -> float:
         """How much better its views are than when it was asked about."""
@@ -193,7 +193,7 @@ def merge_observation(region: Region, seen: RegionObservation, most_boxes: float
         score=surer.score,
         votes=with_box(region.votes, said.label, said.score, most_boxes),
         seen=region.seen + 1,
-        is_standing=region.is_standing or said.kind == "standing",
+        is_supported=region.is_supported or said.kind == "standing",
     )
 
 

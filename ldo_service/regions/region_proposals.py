@@ -4,7 +4,7 @@ The paper asks when the best detector is less than 0.6 sure of a region, or give
 label. So a candidate is a box of a hesitant detector that no sure box explains; or a region that
 depth, creases or colour set apart, see `segments`, which neither a sure box nor the map's labels
 explain. What stands on a thing is not explained by the name of that thing. A candidate is followed
-from keyframe to keyframe by where it is, see `regions_to_name`.
+from keyframe to keyframe by where it is, see `regions_tracked`.
 """
 
 from collections.abc import Sequence

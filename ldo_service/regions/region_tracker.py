@@ -236,7 +236,7 @@ class RegionTracker:
         for (region, of), row in zip(named, overlaps, strict=True):
             votes: Votes = ()
             for (other, _), share in zip(named, row.tolist(), strict=True):
-                if share > 0 and other.is_standing == region.is_standing:
+                if share > 0 and other.is_supported == region.is_supported:
                     votes = with_votes_of(votes, other.votes, share)
             label, sure = winning_label(votes, self.config.least_votes)
             opinions.append(RegionLabel(of, label, sure))

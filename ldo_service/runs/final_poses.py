@@ -11,14 +11,14 @@ from ldo_service.geometry.se3 import interpolate
 
 
 @dataclass(frozen=True, slots=True)
-class TrackedFrame:
+class FramePose:
     """What the final trajectory needs of a frame."""
 
     stamp_ns: int
     reference: int | None
     T_reference_camera: np.ndarray
     T_map_camera_online: np.ndarray
-    segment: int
+    submap: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class FinalPoses:
         if reference in self._measured:
             self._measured[reference].append(measured)
 
-    def of(self, frames: Sequence[TrackedFrame], T_map: Mapping[int, np.ndarray]) -> np.ndarray:
+    def of(self, frames: Sequence[FramePose], T_map: Mapping[int, np.ndarray]) -> np.ndarray:
         """T_map_camera [N, 4, 4]; as published where a frame had no reference that is known."""
         before, after, shares = [], [], []
         for frame in frames:
@@ -64,7 +64,7 @@ class FinalPoses:
         return interpolate(T_a, T_b, np.array(shares, float))
 
     def _around(
-        self, frame: TrackedFrame
+        self, frame: FramePose
     ) -> tuple[MeasuredKeyframe | None, MeasuredKeyframe | None, float]:
         """The keyframes before and after, and how far from one to the other it is."""
         measured = self._measured.get(frame.reference, []) if frame.reference is not None else []
@@ -79,7 +79,7 @@ class FinalPoses:
 
     @staticmethod
     def _seen_from(
-        keyframe: MeasuredKeyframe | None, frame: TrackedFrame, T_map: Mapping[int, np.ndarray]
+        keyframe: MeasuredKeyframe | None, frame: FramePose, T_map: Mapping[int, np.ndarray]
     ) -> np.ndarray:
         if keyframe is None:
             return frame.T_map_camera_online

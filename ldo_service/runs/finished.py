@@ -46,7 +46,7 @@ def vlm_calls(folder: Path) -> int | None:
     """How often the labeller was asked; None where summary.json does not say."""
     path = folder / "summary.json"
     try:
-        found = json.loads(path.read_text())["vlm_calls"] if path.is_file() else None
+        found = json.loads(path.read_text())["labeller_requests"] if path.is_file() else None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
     return found if isinstance(found, int) else None
@@ -82,7 +82,7 @@ class MapFolder:
         if not (self.folder / "map.ply").is_file():
             raise DataError(
                 f"{self.folder} has no map.ply: name the folder of a finished `ldo run`; one with "
-                "--localise makes no map."
+                "--localize makes no map."
             )
 
     def gaussians(self) -> np.ndarray:
@@ -128,8 +128,13 @@ def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
     """Where the keyframes were taken that are in the map's frame, by id; needs keyframes.json
     alone."""
     with _keyframes(folder) as (path, keyframes):
-        mapped = [k for k in keyframes if "segment" not in k or k["segment"] == 0]
+        mapped = [k for k in keyframes if _submap(k) == 0]
         return {int(k["keyframe"]): _viewpoint(path, k) for k in mapped}
+
+
+def _submap(keyframe: dict[str, Any]) -> int:
+    """Return the submap of a keyframe. Version 0.1 wrote `segment`, and earlier ones neither."""
+    return next((keyframe[name] for name in ("submap", "segment") if name in keyframe), 0)
 
 
 @contextmanager

@@ -2,22 +2,22 @@
 
 trajectory_online.txt   what was published at the time, a line per frame that is not LOST
 trajectory.txt          the same frames after the last correction
-                        (frames of segments that are not joined to the first are in neither)
-frames.csv              every frame: status, residuals, milliseconds, segment
+                        (frames of submaps that are not joined to the first are in neither)
+frames.csv              every frame: status, residuals, milliseconds, submap
 keyframes.json          id, frame, stamp, camera and pose of every keyframe
 map.ply                 the Gaussians that hang on keyframes in the map's frame
-                        (those of segments that are not joined to the first are nowhere: left out)
+                        (those of submaps that are not joined to the first are nowhere: left out)
 semantics.npz           what those Gaussians are, if a detector looked: `semantics.semantics_file`
 objects.json            the objects among them, if a detector looked: see `runs.records`
-places.msgpack          what `--localise` finds the camera by, at the newest poses
+keyframe_database.msgpack  what `--localize` finds the camera by, at the newest poses
 loops.json              places that were compared, and why each pair was refused: `runs.records`
 front_end.mcap          what tracker and detector said, if it was to be kept: see `runs.front_end`
 config.yaml             the effective configuration
 summary.json            counts, speed, memory, versions
 refined/                trajectory, keyframes and map after more iterations, if they were asked for
 
-A run with `--localise` makes no map: keyframes.json, map.ply and places.msgpack stay in the folder
-that config.yaml names in tracker.localization_map.
+A run with `--localize` makes no map: keyframes.json, map.ply and keyframe_database.msgpack stay in
+the folder that config.yaml names in tracker.localization_map.
 """
 
 import csv
@@ -39,10 +39,10 @@ from ldo_service.geometry import Trajectory
 from ldo_service.geometry.keyframe_poses import KeyframePoses
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
-    Correction,
     DetectionBoxes,
+    GraphCorrection,
     Keyframe,
-    LabelOpen,
+    LabelResult,
     LoopCandidate,
     LoopClosure,
     MapDelta,
@@ -58,11 +58,12 @@ from ldo_service.storage.state_codec import encode_state
 from ldo_service.tracking import OdometryConfig
 from ldo_service.tracking.keyframe_database import (
     DATABASE_FILE,
+    OLD_DATABASE_FILE,
     KeyframeDatabase,
     make_keyframe_record,
 )
 
-from .final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
+from .final_poses import FinalPoses, FramePose, MeasuredKeyframe
 from .front_end import FRONT_END
 from .records import LOOPS, OBJECTS, LoopRecord, write_objects
 
@@ -83,6 +84,7 @@ WRITTEN = frozenset(
         *("trajectory_online.txt", "frames.csv", "config.yaml", "summary.json", *MAP_FILES),
         *(
             DATABASE_FILE,
+            OLD_DATABASE_FILE,
             OBJECTS,
             LOOPS,
             FRONT_END,
@@ -100,7 +102,7 @@ CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # of a keyframe, in pixels
 COLUMNS = (
     *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
-    *("segment", "method", "disagreement"),
+    *("submap", "pose_source", "hypothesis_spread_rad"),
 )
 
 
@@ -121,9 +123,9 @@ class DatabaseWriter:
     def save(self, path: Path, poses: KeyframePoses, joined: dict[int, int]) -> None:
         """Those that are in the map's frame, with T_map_keyframe for T_odom_keyframe."""
         places = [
-            replace(place, segment=0, T_odom_keyframe=np.array(poses[place.id]))
+            replace(place, submap=0, T_odom_keyframe=np.array(poses[place.id]))
             for place in self._places.all
-            if joined.get(place.segment, place.segment) == 0
+            if joined.get(place.submap, place.submap) == 0
         ]
         path.write_bytes(encode_state({"places": [place.packed for place in places]}))
 
@@ -162,9 +164,9 @@ class RunWriter:
         self._csv_file = (folder / "frames.csv").open("w", newline="")
         self._csv = csv.writer(self._csv_file)
         self._csv.writerow(COLUMNS)
-        self._tracked: list[TrackedFrame] = []
+        self._tracked: list[FramePose] = []
         self._poses, self._final_poses = KeyframePoses(), FinalPoses()
-        self._joined: dict[int, int] = {}  # segments placed in an older one
+        self._joined: dict[int, int] = {}  # submaps placed in an older one
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.follower = MapReplica()
         self._objects: MapObjects | None = None
@@ -186,13 +188,13 @@ class RunWriter:
                 self._observe_pose(message, step_ms)
             case Keyframe():
                 self._observe_keyframe(message)
-            case Correction():
+            case GraphCorrection():
                 self.loops.observe(message, step_ms)
                 self._poses.correct(message.graph_version, keyframe_poses_from_correction(message))
-                self._joined = dict(message.joined)
+                self._joined = dict(message.merged_submaps)
             case DetectionBoxes():
                 self.boxes += len(message.detections)
-            case LabelOpen():
+            case LabelResult():
                 self.labeller_calls += bool(message.labeller)
             case MapObjects():
                 self._objects = message
@@ -210,19 +212,19 @@ class RunWriter:
                 *(pose.frame, pose.stamp_ns, pose.status, pose.reference, pose.keyframe),
                 int(held_out),
                 *(f"{value:.4f}" for value in quality),
-                *(pose.iterations, f"{step_ms:.3f}", pose.segment),
-                *(pose.method, f"{pose.disagreement:.4f}"),
+                *(pose.iterations, f"{step_ms:.3f}", pose.submap),
+                *(pose.pose_source, f"{pose.hypothesis_spread_rad:.4f}"),
             )
         )
         if pose.status != "LOST":
             online = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
             self._tracked.append(
-                TrackedFrame(
+                FramePose(
                     pose.stamp_ns,
                     pose.reference,
                     pose_from_message(pose.T_reference_camera),
                     online,
-                    pose.segment,
+                    pose.submap,
                 )
             )
 
@@ -232,7 +234,7 @@ class RunWriter:
             keyframe.reference,
             pose_from_message(keyframe.T_reference_keyframe),
             pose_from_message(keyframe.T_odom_keyframe),
-            keyframe.segment,
+            keyframe.submap,
         )
         T_reference_keyframe = pose_from_message(keyframe.T_reference_keyframe)
         measured = MeasuredKeyframe(keyframe.stamp_ns, keyframe.keyframe, T_reference_keyframe)
@@ -243,7 +245,7 @@ class RunWriter:
             "keyframe": keyframe.keyframe,
             "frame_index": keyframe.frame,
             "stamp_ns": keyframe.stamp_ns,
-            "segment": keyframe.segment,
+            "submap": keyframe.submap,
             "camera": {name: getattr(keyframe.camera, name) for name in CAMERA},
         }
 
@@ -258,7 +260,7 @@ class RunWriter:
 
     def in_map(self) -> np.ndarray:
         """Which Gaussians [N] bool hang on keyframes in the map's frame."""
-        placed = [k for k, facts in self._keyframes.items() if self._root(facts["segment"]) == 0]
+        placed = [k for k, facts in self._keyframes.items() if self._root(facts["submap"]) == 0]
         return np.isin(self.follower.map.anchors, placed)
 
     def objects(self) -> tuple[MapObject, ...]:
@@ -293,24 +295,24 @@ class RunWriter:
 
     def online(self) -> Trajectory:
         """T_map_camera as published at the time."""
-        frames = [frame for frame in self._tracked if frame.segment == 0]
+        frames = [frame for frame in self._tracked if frame.submap == 0]
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
         """T_map_camera from where the keyframes around each frame are now."""
-        frames = [frame for frame in self._tracked if self._root(frame.segment) == 0]
+        frames = [frame for frame in self._tracked if self._root(frame.submap) == 0]
         T_map = {keyframe: self._poses[keyframe] for keyframe in self._poses}
         return _trajectory(frames, self._final_poses.of(frames, T_map))
 
-    def _root(self, segment: int) -> int:
+    def _root(self, submap: int) -> int:
         """The oldest that it is joined to, itself where there is none."""
-        return self._joined.get(segment, segment)
+        return self._joined.get(submap, submap)
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:
         return [
             {
                 **facts,
-                "segment": self._root(facts["segment"]),
+                "submap": self._root(facts["submap"]),
                 "T_map_camera": self._poses[keyframe].tolist(),
                 "exposure": self.follower.exposure(keyframe).tolist(),
             }
@@ -321,15 +323,13 @@ class RunWriter:
         """Those first seen from a keyframe in the map's frame."""
         keyframes = self._keyframes
         placed = tuple(
-            one
-            for one in found.objects
-            if self._root(keyframes[one.first_keyframe]["segment"]) == 0
+            one for one in found.objects if self._root(keyframes[one.first_keyframe]["submap"]) == 0
         )
         return msgspec.structs.replace(found, objects=placed)
 
 
 def _trajectory(
-    frames: Sequence[TrackedFrame], T_map_camera: Sequence[np.ndarray] | np.ndarray
+    frames: Sequence[FramePose], T_map_camera: Sequence[np.ndarray] | np.ndarray
 ) -> Trajectory:
     stamps_s = np.array([frame.stamp_ns for frame in frames]) * 1e-9
     return Trajectory(stamps_s, np.array(T_map_camera).reshape(-1, 4, 4))

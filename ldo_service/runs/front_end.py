@@ -25,7 +25,13 @@ from ldo_service.actors.tracker import Tracker
 from ldo_service.config import Config, recording_parameters
 from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry.sequence import Sequence
-from ldo_service.recordings.mcap_file import ABOUT, McapIndex, MessageLocation, RecordingFile
+from ldo_service.recordings.mcap_file import (
+    ABOUT,
+    McapIndex,
+    MessageLocation,
+    RecordingFile,
+    require_version,
+)
 from ldo_service.schemas import Message, decode
 from ldo_service.schemas.topics import DETECTION_BOXES, KEYFRAME_NEW, POSE_TRACKED
 
@@ -107,6 +113,7 @@ class FrontEnd:
         index = McapIndex(path)
         if not index.is_whole:
             raise DataError(f"{path} is not whole: its run was killed. Make that run again.")
+        require_version(index)
         about = index.metadata.get(ABOUT, {})
         _require_settings(path, about, config)
         frames = len(selection.indices(sequence))
@@ -168,5 +175,5 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
         if was[name] != value:
             raise ConfigError(
                 f"{name} is {value} and was {was[name]} when {path} was made: the front end does "
-                "not run again. Leave it as it was, or leave out --front-end."
+                "not run again. Leave it as it was, or leave out --reuse-front-end."
             )

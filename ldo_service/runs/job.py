@@ -41,7 +41,7 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         if self.refine < 0:
-            raise ConfigError(f"--refine {self.refine} must not be negative.")
+            raise ConfigError(f"--refine-iterations {self.refine} must not be negative.")
         if self.prior is not None:
             require_overlap(self.prior, self.sequence, self.selection.indices(self.sequence))
 

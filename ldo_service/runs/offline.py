@@ -11,7 +11,7 @@ from ldo_service.actors.topology import make_actors
 from ldo_service.config import Config, actor_parameters, config_yaml, latency_frames
 from ldo_service.errors import DataError
 from ldo_service.runtime.logical_clock import LogicalClock
-from ldo_service.schemas import MapRefine, Message
+from ldo_service.schemas import Message, RefineMap
 
 from .folder import RunWriter
 from .front_end import ACTORS, FrontEnd, FrontEndRecord
@@ -85,7 +85,7 @@ class OfflineRun:
 
     def repair(self) -> None:
         """Fit the map again where corrections have torn it."""
-        if due := int(self._actors["mapper"].metrics()["iterations_due"]):
+        if due := int(self._actors["mapper"].metrics()["iterations_pending"]):
             self._work += requests(due)
             self._run(refinements(due, self.record.newest_stamp_ns))
         self._is_finished = True
@@ -139,17 +139,17 @@ def with_all_cores(config: Config) -> Config:
     return replace(config, mapper=replace(config.mapper, threads=threads))
 
 
-def refinements(iterations: int, stamp_ns: int) -> Iterator[MapRefine]:
+def refinements(iterations: int, stamp_ns: int) -> Iterator[RefineMap]:
     """Requests of a bounded size, with steps that shrink from the first to the last."""
     starts = range(0, iterations, REFINE_ITERATIONS)
     ends = [min(start + REFINE_ITERATIONS, iterations) for start in starts]
     rates = LAST_RATE ** (np.array([0, *ends]) / iterations)
     for start, end, first, last in zip(starts, ends, rates[:-1], rates[1:], strict=True):
-        yield MapRefine(
+        yield RefineMap(
             stamp_ns=stamp_ns,
             iterations=end - start,
-            first_rate=float(first),
-            last_rate=float(last),
+            initial_rate=float(first),
+            final_rate=float(last),
         )
 
 

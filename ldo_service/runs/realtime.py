@@ -32,7 +32,7 @@ def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
     ConfigError when the map is to be refined: live, `map/refine` asks for that.
     """
     if job.refine:
-        raise ConfigError("--refine needs a run over a file: leave out --realtime.")
+        raise ConfigError("--refine-iterations needs a run over a file: leave out --realtime.")
     with TemporaryDirectory(prefix="ldo-map-") as folder:
         return asyncio.run(_RealTimeRun(job, Path(folder), advance).go())
 
@@ -108,7 +108,7 @@ class _RealTimeRun:
 
     def _close(self, used: Usage, healths: Ordered[Health]) -> RunWriter:
         rejected = self._reader.rejected + sum(
-            int(health.facts.get("frames_rejected", 0)) for health in healths
+            int(health.metrics.get("frames_rejected", 0)) for health in healths
         )
         stage_ms = {h.actor: {"p50": h.step_ms_p50, "p95": h.step_ms_p95} for h in healths}
         drops = {f"{h.actor} {i.topic}": i.dropped for h in healths for i in h.inputs if i.dropped}
@@ -117,7 +117,7 @@ class _RealTimeRun:
             name: value
             for health in healths
             if health.actor in ("optimizer", "mapper")
-            for name, value in health.facts.items()
+            for name, value in health.metrics.items()
         }
         self._record.close(summarize(self._record, used, frames, rejected, stage_ms, drops, facts))
         require_usable(self._record, self._config.offline.max_rejected_ratio)

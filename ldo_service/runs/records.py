@@ -34,7 +34,7 @@ import numpy as np
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.errors import DataError
 from ldo_service.evaluation.loops import ComparedPair, FoundLoops, LoopClosed
-from ldo_service.schemas import Correction, LoopCandidate, LoopClosure, MapObjects
+from ldo_service.schemas import GraphCorrection, LoopCandidate, LoopClosure, MapObjects
 
 LOOPS = "loops.json"
 
@@ -49,12 +49,14 @@ class LoopRecord:
         self._closures: list[LoopClosure] = []
         self._not_believed: set[tuple[int, int]] = set()  # reference and keyframe
 
-    def observe(self, message: LoopCandidate | LoopClosure | Correction, step_ms: float) -> None:
+    def observe(
+        self, message: LoopCandidate | LoopClosure | GraphCorrection, step_ms: float
+    ) -> None:
         match message:
-            case Correction():
+            case GraphCorrection():
                 # a correction names the newest of them, and all that came to be believed again
-                self._not_believed |= set(message.not_believed)
-                self._not_believed -= set(message.closures)
+                self._not_believed |= set(message.rejected_closures)
+                self._not_believed -= set(message.accepted_closures)
             case LoopClosure():
                 self._closures.append(message)
             case LoopCandidate():
@@ -68,7 +70,7 @@ class LoopRecord:
     @property
     def rejected(self) -> int:
         """By the loop closer, or by the graph."""
-        refused = sum(bool(candidate.refused) for candidate, _ in self._candidates)
+        refused = sum(bool(candidate.rejected_reason) for candidate, _ in self._candidates)
         return refused + len(self._closures) - self.accepted
 
     def _is_believed(self, closure: LoopClosure) -> bool:
@@ -127,8 +129,8 @@ def read_loops(folder: Path) -> FoundLoops | None:
 
 
 def _compared(row: dict[str, Any]) -> ComparedPair:
-    subgraphs = tuple(map(int, row["keyframes"])), tuple(map(int, row["references"]))
-    return ComparedPair(*subgraphs, is_closure=not row["refused"], ms=row["ms"])
+    subgraphs = tuple(map(int, row["keyframes"])), tuple(map(int, row["reference_keyframes"]))
+    return ComparedPair(*subgraphs, is_closure=not row["rejected_reason"], ms=row["ms"])
 
 
 def _closed(row: dict[str, Any]) -> LoopClosed:

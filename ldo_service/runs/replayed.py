@@ -98,6 +98,9 @@ def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedAct
         for name, paths in found.items()
         if not only or name in only
     ]
+    for actor in actors:
+        for file in actor.files:
+            file.require_version()
     if not any(actor.steps for actor in actors):
         raise DataError(f"{folder} holds no step of {', '.join(only) or 'any actor'}.")
     return actors

@@ -101,7 +101,7 @@ def interleave_prior(
 
 
 def _prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
-    return OdometryPrior(stamp_ns=round(1e9 * stamp_s), T_odom_base=pose_to_message(T_odom_base))
+    return OdometryPrior(stamp_ns=round(1e9 * stamp_s), T_prior_base=pose_to_message(T_odom_base))
 
 
 def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> None:
@@ -139,7 +139,7 @@ class RecordedMessage:
 
 
 @dataclass(frozen=True, slots=True)
-class StoredFrame:
+class RecordedFrame:
     """depth: None where colour is a whole frame."""
 
     color: RecordedMessage
@@ -165,7 +165,7 @@ class RecordingSequence(Sequence):
 
     def __init__(self, folder: Path) -> None:
         paths = recorded_actors(folder).get(FrameSource.name, [])
-        self._frames: list[StoredFrame] = []
+        self._frames: list[RecordedFrame] = []
         files = map(JournalFile, paths)
         for frame in _frames(
             RecordedMessage(file, place) for file in files for place in file.messages
@@ -195,7 +195,7 @@ class RecordingSequence(Sequence):
         return None  # nobody told the robot
 
 
-def _frames(messages: Iterator[RecordedMessage]) -> Iterator[StoredFrame]:
+def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
     config = FrameSourceConfig()
     skew_ns = round(config.max_skew_s * 1e9)
     pairing: StreamPairer[RecordedMessage, RecordedMessage] = StreamPairer(
@@ -205,10 +205,10 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[StoredFrame]:
         try:
             match stored.place.topic:
                 case CAMERA_RGBD.name:
-                    yield StoredFrame(stored)
+                    yield RecordedFrame(stored)
                 case CAMERA_COLOR.name:
-                    yield from (StoredFrame(*pair) for pair in pairing.add_a(stored))
+                    yield from (RecordedFrame(*pair) for pair in pairing.add_a(stored))
                 case CAMERA_DEPTH.name:
-                    yield from (StoredFrame(*pair) for pair in pairing.add_b(stored))
+                    yield from (RecordedFrame(*pair) for pair in pairing.add_b(stored))
         except FrameError:  # its stamp goes back: taken again after a crash
             continue

@@ -52,7 +52,7 @@ def summarize(
         "status": record.statuses,
         "keyframes": record.keyframes,
         "gaussians": int(in_map.sum()),
-        "gaussians_apart": int((~in_map).sum()),  # of segments never joined: in no file
+        "gaussians_unmerged": int((~in_map).sum()),  # of submaps never joined: in no file
         "gaussians_labelled": record.labelled(),  # as something else than background
         "boxes": record.boxes,
         "objects": len(record.objects()),
@@ -64,11 +64,11 @@ def summarize(
         "drops": drops,
         "loops_accepted": record.loops.accepted,
         "loops_rejected": record.loops.rejected,
-        "vlm_calls": record.labeller_calls,
+        "labeller_requests": record.labeller_calls,
         "optimizations": int(facts.get("optimizations", 0)),
-        "optimizations_saved": int(facts.get("optimizations_saved", 0)),  # left for later
+        "optimizations_skipped": int(facts.get("optimizations_skipped", 0)),  # left for later
         "iterations": int(facts.get("iterations", 0)),  # of the map's optimiser
-        "iterations_due": int(facts.get("iterations_due", 0)),  # still, after corrections
+        "iterations_pending": int(facts.get("iterations_pending", 0)),  # still, after corrections
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
         "versions": versions(),

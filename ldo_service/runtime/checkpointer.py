@@ -73,4 +73,4 @@ class Checkpointer:
         """Nothing where every save succeeded."""
         if not self._failed:
             return {}
-        return {"is_unsaved": float(self.is_unsaved), "saves_failed": self._failed}
+        return {"checkpoint_failing": float(self.is_unsaved), "checkpoints_failed": self._failed}

@@ -1,8 +1,8 @@
 """What a stage keeps beside its actor's state, and in one write with it.
 
-    stage.links      where it stands on each lossless topic: number of the next message
-    stage.sent T N   message N of topic T, which some expected consumer has not handled
-    stage.taken N    what an actor took whose state lags behind, since that state
+    stage.offsets      where it stands on each lossless topic: number of the next message
+    stage.outbox T N   message N of topic T, which some expected consumer has not handled
+    stage.wal N    what an actor took whose state lags behind, since that state
 
 So a successor is where the last finished step was: what it took is not taken again, what it made is
 sent once more until it was handled, and nothing else was sent.
@@ -23,7 +23,7 @@ from .step import produce
 
 log = logging.getLogger(__name__)
 
-LINKS, SENT, TAKEN = "stage.links", "stage.sent", "stage.taken"
+OFFSETS, OUTBOX, WAL = "stage.offsets", "stage.outbox", "stage.wal"
 # messages that a lagging actor's successor handles again, some seconds of work
 MAX_WAL_ENTRIES = 64
 
@@ -33,19 +33,19 @@ class LoggedInput(NamedTuple):
 
     topic: str
     body: bytes
-    room: Mapping[str, int]
-    waiting: Mapping[str, int]
+    credits: Mapping[str, int]
+    backlog: Mapping[str, int]
 
     @classmethod
     def of(cls, topic: str, body: bytes | memoryview, situation: FlowStatus) -> "LoggedInput":
-        room = {topic.name: count for topic, count in situation.credits.items()}
-        waiting = {topic.name: count for topic, count in situation.backlog.items()}
-        return cls(topic, bytes(body), room, waiting)
+        credits = {topic.name: count for topic, count in situation.credits.items()}
+        backlog = {topic.name: count for topic, count in situation.backlog.items()}
+        return cls(topic, bytes(body), credits, backlog)
 
     def situation(self, actor: Actor) -> FlowStatus:
         return FlowStatus(
-            credits=counts_by_topic(self.room, (out.topic for out in actor.outputs)),
-            backlog=counts_by_topic(self.waiting, (port.topic for port in actor.inputs)),
+            credits=counts_by_topic(self.credits, (out.topic for out in actor.outputs)),
+            backlog=counts_by_topic(self.backlog, (port.topic for port in actor.inputs)),
         )
 
 
@@ -63,7 +63,7 @@ class RestoredState:
     def of(cls, state: State | None) -> "RestoredState":
         if not state:
             return cls(is_none=True)
-        links = state.get(LINKS, {"in": {}, "out": {}})  # none: no lossless neighbours
+        links = state.get(OFFSETS, {"in": {}, "out": {}})  # none: no lossless neighbours
         return cls(
             own={part: value for part, value in state.items() if not part.startswith("stage.")},
             inputs={topic: InletPosition(*past) for topic, past in links["in"].items()},
@@ -71,13 +71,13 @@ class RestoredState:
                 topic: OutletPosition(epoch, seq, tuple(_sent(state, topic)))
                 for topic, (epoch, seq) in links["out"].items()
             },
-            taken=tuple(LoggedInput(*state[part]) for part in _numbered(state, TAKEN)),
+            taken=tuple(LoggedInput(*state[part]) for part in _numbered(state, WAL)),
         )
 
     @property
     def of_actor(self) -> State:
         """All that decides what it does next."""
-        return {**self.own, **{f"{TAKEN} {n}": one for n, one in enumerate(self.taken)}}
+        return {**self.own, **{f"{WAL} {n}": one for n, one in enumerate(self.taken)}}
 
     @property
     def has_passed(self) -> bool:
@@ -106,7 +106,7 @@ class DeliveryState:
         if is_new or whole:
             self._own, self._taken = own, {}
         elif taken is not None:
-            self._taken[f"{TAKEN} {self._number}"] = taken
+            self._taken[f"{WAL} {self._number}"] = taken
             self._number += 1
         return {**own, **self._taken}
 
@@ -127,7 +127,7 @@ class DeliveryState:
             for topic, past in outputs.items()
             for sent in past.unhandled
         }
-        return {LINKS: self._links, **sent}
+        return {OFFSETS: self._links, **sent}
 
 
 def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) -> Actor:
@@ -167,7 +167,7 @@ def counts_by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[
 
 
 def _sent_part(topic: str) -> str:
-    return f"{SENT} {topic.replace('/', '.')}"
+    return f"{OUTBOX} {topic.replace('/', '.')}"
 
 
 def _sent(state: State, topic: str) -> Iterator[UnackedMessage]:

@@ -91,9 +91,9 @@ class Inlet:
             dropped=self.dropped,
             rejected=self.rejected,
             gaps=self.gaps,
-            waiting=len(self.waiting),
-            peak=self.peak,
-            paused=self.paused,
+            queued=len(self.waiting),
+            peak_queued=self.peak,
+            dropped_paused=self.paused,
             lost=self.numbers.lost,
         )
 

@@ -25,7 +25,7 @@ from .step import Produced
 Kind: TypeAlias = Literal[
     "done",
     "failed",  # the handler raised: its outputs are dropped, and a successor started
-    "set_aside",  # after failing twice
+    "dead_lettered",  # after failing twice
     "resumed",  # first words of a successor: no message was taken
     "finished",  # last words: none either
 ]
@@ -41,7 +41,7 @@ class Started(msgspec.Struct, frozen=True, kw_only=True):
     state: dict[str, bytes] | None  # parts as `state_store` encodes them; None: begins anew
 
 
-class Step(msgspec.Struct, frozen=True, kw_only=True):
+class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
     step: int
     kind: Kind
     taken: int  # number of the message in this file; -1: none
@@ -50,11 +50,11 @@ class Step(msgspec.Struct, frozen=True, kw_only=True):
     epoch: int = 0
     seq: int = 0
     checksum: str = ""  # of the message
-    room: dict[str, int] = {}  # by topic: what the actor could send without waiting
+    credits: dict[str, int] = {}  # by topic: what the actor could send without waiting
     outputs: tuple[Output, ...] = ()
     digest: str = ""  # of all outputs in order
     error: str = ""  # of a step that failed
-    waiting: dict[str, int] = {}  # by topic: what waited behind the message
+    backlog: dict[str, int] = {}  # by topic: what waited behind the message
 
 
 class Gap(msgspec.Struct, frozen=True, kw_only=True):
@@ -63,10 +63,10 @@ class Gap(msgspec.Struct, frozen=True, kw_only=True):
     lost: int = 0  # messages taken and not recorded; 0: unknown
 
 
-Entry: TypeAlias = Started | Step | Gap
+Entry: TypeAlias = Started | StepRecord | Gap
 CHANNELS: Mapping[type[Entry], str] = {
     Started: "journal/start",
-    Step: "journal/step",
+    StepRecord: "journal/step",
     Gap: "journal/gap",
 }
 

@@ -267,9 +267,9 @@ class Outlet:
         return OutputCount(
             topic=self.topic.name,
             sent=self.sent,
-            waited=self.waited,
-            evicted=self.evicted,
-            repeated=self.repeated,
+            backpressure_waits=self.waited,
+            evicted_consumers=self.evicted,
+            retransmitted=self.repeated,
         )
 
     def close(self) -> None:

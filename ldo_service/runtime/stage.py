@@ -197,8 +197,8 @@ class Stage:
         for _attempt in range(2):
             if await self._try(message, delivery):
                 return
-        self._vitals.set_aside += 1
-        self._journal.record_step("set_aside", FlowStatus())
+        self._vitals.dead_lettered += 1
+        self._journal.record_step("dead_lettered", FlowStatus())
         await self._save(delivery)
         log.error(
             "%s: %s of stamp %d failed twice and is set aside",
@@ -317,11 +317,11 @@ class Stage:
     async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
         try:
             match order.what:
-                case "hold":
+                case "pause":
                     mailbox.pause()
-                case "release":
+                case "resume":
                     mailbox.resume()
-                case "renew":
+                case "reset":
                     await self._renew(mailbox)
                 case "save":
                     await self._worker.run(self._save_whole, self._links())
@@ -392,7 +392,7 @@ class Stage:
         return self._vitals.health(
             actor=self.name,
             epoch=self._epoch,
-            held=self._mailbox is not None and self._mailbox.is_held,
+            paused=self._mailbox is not None and self._mailbox.is_held,
             inputs=self._mailbox.counts() if self._mailbox else (),
             outputs=self._outlets.counts(),
         )

@@ -5,9 +5,9 @@ The service sends commands to its stages over a network that may lose messages:
 Order    service -> stage   "do this", between two steps; repeated until reported
 Report   stage -> service   "order n is done", or why not; repeated for each repetition
 
-hold      take nothing; messages that arrive at a Latest input are dropped and counted as paused
-release   take again
-renew     start with an empty state and a new epoch
+pause     take nothing; messages that arrive at a Latest input are dropped and counted as paused
+resume    take again
+reset     start with an empty state and a new epoch
 save      write the whole state now
 
 `Control` gives one answer for the whole service when all its actors have reported. `reset` first
@@ -31,13 +31,13 @@ from ldo_service.transport.interface import Transport, call_soon
 
 log = logging.getLogger(__name__)
 
-ORDER_KEY, REPORT_KEY = "link/order", "link/report"
+COMMAND_KEY, REPLY_KEY = "link/command", "link/reply"
 REPEAT_AFTER_S = 0.25  # an order or its report got lost; a stage at work is asked again in vain
 
 MIN_S = 2.0  # 3x the slowest step measured
 
 
-What = Literal["hold", "release", "renew", "save"]
+What = Literal["pause", "resume", "reset", "save"]
 
 
 class StageCommand(msgspec.Struct, frozen=True, array_like=True):
@@ -62,8 +62,8 @@ class CommandReceiver:
         self._loop = asyncio.get_running_loop()
         self._under_way = 0
         self._done: StageReply | None = None
-        self._reports = transport.publisher(REPORT_KEY)
-        transport.subscribe(ORDER_KEY, self._arrived)
+        self._reports = transport.publisher(REPLY_KEY)
+        transport.subscribe(COMMAND_KEY, self._arrived)
 
     def report(self, order: StageCommand, error: str) -> None:
         self._done = StageReply(order.number, self._stage, error)
@@ -93,8 +93,8 @@ class CommandSender:
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()
         self._reports: dict[int, asyncio.Future[str]] = {}
-        self._orders = transport.publisher(ORDER_KEY)
-        transport.subscribe(REPORT_KEY, self._arrived)
+        self._orders = transport.publisher(COMMAND_KEY)
+        transport.subscribe(REPLY_KEY, self._arrived)
 
     async def order(self, what: What, stage: str, timeout_s: float) -> str:
         """Empty when it is done, else why it is not; does not raise for what a stage does."""
@@ -160,17 +160,17 @@ class Control:
             request = decode(body, ControlRequest)
         except msgspec.DecodeError as error:
             return encode(_answer(0, False, f"this is no ControlRequest: {error}."))
-        verb = self._verbs.get(request.verb)
+        verb = self._verbs.get(request.command)
         if verb is None:
             known = ", ".join(self._verbs)
-            text = f"there is no {request.verb[:40]!r} in this version. There are {known}."
+            text = f"there is no {request.command[:40]!r} in this version. There are {known}."
             return encode(_answer(request.stamp_ns, False, text))
         async with self._one_at_a_time:
             try:
                 ok, text = True, await verb()
             except ControlError as failed:
                 ok, text = False, str(failed)
-        log.log(logging.INFO if ok else logging.ERROR, "%s: %s", request.verb, text)
+        log.log(logging.INFO if ok else logging.ERROR, "%s: %s", request.command, text)
         return encode(_answer(request.stamp_ns, ok, text))
 
     def close(self) -> None:
@@ -179,12 +179,12 @@ class Control:
     # --- verbs ------------------------------------------------------------------------------------
     async def _pause(self) -> str:
         self._is_paused = True
-        await self._each("hold", self._sources)
+        await self._each("pause", self._sources)
         return "frames are left out and counted until `resume`."
 
     async def _resume(self) -> str:
         self._is_paused = False
-        await self._each("release", self._sources)
+        await self._each("resume", self._sources)
         return "frames are taken again."
 
     async def _save(self) -> str:
@@ -193,11 +193,11 @@ class Control:
 
     async def _reset(self) -> str:
         try:
-            await self._each("hold", self._actors)
-            await self._each("renew", self._actors)
+            await self._each("pause", self._actors)
+            await self._each("reset", self._actors)
         finally:
             held = self._sources if self._is_paused else ()
-            await self._each("release", [actor for actor in self._actors if actor not in held])
+            await self._each("resume", [actor for actor in self._actors if actor not in held])
         still = " Frames stay paused." if self._is_paused else ""
         return f"{', '.join(self._actors)} began anew.{still}"
 
@@ -220,10 +220,10 @@ class Control:
     def _presence(self, name: str, alive: bool) -> None:
         """A process that comes back does not know of the pause."""
         if alive and self._is_paused and name in self._sources:
-            task = asyncio.ensure_future(self._commander.order("hold", name, self._timeout_s))
+            task = asyncio.ensure_future(self._commander.order("pause", name, self._timeout_s))
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
 
 
 def _answer(stamp_ns: int, ok: bool, text: str) -> ControlAnswer:
-    return ControlAnswer(stamp_ns=stamp_ns, ok=ok, text=text)
+    return ControlAnswer(stamp_ns=stamp_ns, ok=ok, message=text)

@@ -23,7 +23,7 @@ class StageMetrics:
     steps: int = 0
     failures: int = 0
     restarts: int = 0
-    set_aside: int = 0
+    dead_lettered: int = 0
     step_ms: deque[float] = field(
         default_factory=lambda: deque(maxlen=200)
     )  # as `record_step` has it
@@ -67,12 +67,12 @@ class StageMetrics:
             steps=self.steps,
             failures=self.failures,
             restarts=self.restarts,
-            set_aside=self.set_aside,
+            dead_lettered=self.dead_lettered,
             step_age_s=time.monotonic() - self.finished_at_s,
-            busy_s=self.busy_s,
+            current_step_s=self.busy_s,
             step_ms_p50=float(np.percentile(step_ms, 50)),
             step_ms_p95=float(np.percentile(step_ms, 95)),
             rss_mb=resident_mb(),
-            facts=self.facts,
+            metrics=self.facts,
             **of_the_stage,
         )

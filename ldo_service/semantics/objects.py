@@ -83,7 +83,7 @@ class ObjectsConfig:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Observation:
+class ObjectSighting:
     """An object in a keyframe: the box that shows it, or where one was missed.
 
     box [4] px, x0 y0 x1 y1; distribution [C] and entropy (nats) of the Gaussians in its region, of
@@ -101,7 +101,7 @@ class Observation:
 class ObjectUpdate:
     """What a keyframe made of the objects: ids that came, that went, and that became another."""
 
-    observations: tuple[Observation, ...] = ()
+    observations: tuple[ObjectSighting, ...] = ()
     born: tuple[int, ...] = ()
     merged: tuple[tuple[int, int], ...] = ()  # this one is that one now
     retired: tuple[int, ...] = ()
@@ -196,7 +196,7 @@ class Objects:
         rows: np.ndarray,
         shown: np.ndarray,
         regions: RegionStatistics,
-    ) -> list[Observation]:
+    ) -> list[ObjectSighting]:
         seen, p_seen = self._table[which], regions.distributions[r]
         differs = divergence(distributions(seen), p_seen) >= self.config.max_divergence
         begins = differs & (seen["id"] == CANDIDATE)
@@ -212,7 +212,7 @@ class Objects:
         self._table[which] = seen
         entropies_seen = entropy(p_seen)
         return [
-            Observation(
+            ObjectSighting(
                 int(seen["id"][i]), regions.boxes[r[i]], p_seen[i], entropies_seen[i], False
             )
             for i in np.flatnonzero(seen["id"] != CANDIDATE)
@@ -255,13 +255,13 @@ class Objects:
             is_visible &= ~spared[labels_of(self._table[near])]
         return np.flatnonzero((is_visible | (looks.through >= self.config.min_visible)) & ~excused)
 
-    def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[Observation]:
+    def _miss(self, which: np.ndarray, boxes: np.ndarray) -> list[ObjectSighting]:
         for name in ("missed", "misses"):
             self._table[name][which] += 1
         missed = self._table[which]
         p = distributions(missed)
         return [
-            Observation(int(missed["id"][i]), boxes[i], p[i], float(entropy(p[i])), True)
+            ObjectSighting(int(missed["id"][i]), boxes[i], p[i], float(entropy(p[i])), True)
             for i in np.flatnonzero(missed["id"] != CANDIDATE)
         ]
 
@@ -380,7 +380,7 @@ class Objects:
             "object_candidates": len(self._table) - len(self),
             "objects_merged": self._merged,
             "objects_retired": self._retired,
-            "objects_refused": self._refused,  # there are max_objects
+            "objects_rejected": self._refused,  # there are max_objects
         }
 
 

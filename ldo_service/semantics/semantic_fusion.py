@@ -180,7 +180,7 @@ class FusionResult:
     disagreement: Disagreement
 
 
-def label_keyframe(
+def fuse_detections(
     rows: np.ndarray,
     labels: np.ndarray,
     indices: np.ndarray,

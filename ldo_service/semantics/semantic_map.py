@@ -19,7 +19,12 @@ from ldo_service.regions.region import Region, RegionLabelResult
 from .data_association import MapView
 from .gaussian_labels import BACKGROUND, MAX_LABELS, Disagreement, top_labels
 from .objects import Objects, ObjectsConfig, ObjectUpdate
-from .semantic_fusion import FusionResult, SemanticFusionConfig, label_keyframe, reliable_label_mask
+from .semantic_fusion import (
+    FusionResult,
+    SemanticFusionConfig,
+    fuse_detections,
+    reliable_label_mask,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +145,7 @@ class SemanticMap:
             self._without_images += 1
             return None
         # who may walk away
-        found = found and self._without_movable(keyframe, found)
+        found = found and self._remove_dynamic(keyframe, found)
         # who makes its image
         view, made_by = self._seen(keyframe)
         # what is said of it, and what is to be asked
@@ -165,7 +170,7 @@ class SemanticMap:
             depth_m *= view.mask > 0
         return replace(view, depth_m=depth_m), made_by
 
-    def _without_movable(self, keyframe: int, found: RegionDetections) -> RegionDetections:
+    def _remove_dynamic(self, keyframe: int, found: RegionDetections) -> RegionDetections:
         """What may walk away belongs to no map: neither its surface nor its name."""
         names, sure = self.config.movable.classes, self.config.movable_confidence
         said = [self.vocabulary.name(int(label)) for label in found.labels]
@@ -174,7 +179,7 @@ class SemanticMap:
             boxes = [Box(said[i], *(found.boxes[i] + 0.5)) for i in np.flatnonzero(is_movable)]
             depth_m = self._map.views[keyframe].depth_m
             pixels = dynamic_class_mask(boxes, depth_m, self.config.movable)
-            self._movable += self._map.mask_pixels(keyframe, pixels)
+            self._movable += self._map.remove_masked(keyframe, pixels)
         return found.where(~is_movable)
 
     def _with_names(
@@ -215,7 +220,7 @@ class SemanticMap:
         self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
         gaussians = self._map.gaussians
         before = gaussians.labels[indices]
-        labelled = label_keyframe(
+        labelled = fuse_detections(
             gaussians.rows,
             gaussians.labels,
             indices,
@@ -321,13 +326,13 @@ class SemanticMap:
             "keyframes_labelled": self._labelled,
             "boxes": self._boxes,
             "boxes_repeated": self._repeated,  # messages, said again after a restart
-            "boxes_too_early": self._too_early,  # messages, of keyframes that never came in time
+            "detections_too_early": self._too_early,  # Their keyframe came too late.
             "boxes_without_images": self._without_images,  # messages, of keyframes forgotten
-            "gaussians_movable": self._movable,  # left out again: of what may walk away
+            "gaussians_dynamic_removed": self._movable,  # left out again: of what may walk away
             "label_disagreement_literal": self._disagreement.literal,
             "label_disagreement_expected": self._disagreement.expected,
             "label_names": len(self.names),
-            "label_names_refused": self.vocabulary.refused,
+            "label_names_rejected": self.vocabulary.refused,
             **self.objects.metrics(),
             **(self.naming.metrics() if self.naming else {}),
             "answers_without_images": self._answers_without_images,  # of keyframes forgotten

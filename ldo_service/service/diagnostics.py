@@ -67,14 +67,14 @@ def _silent(how_long: str) -> Problem:
 
 def _of_steps(health: Health) -> Iterator[Problem]:
     waiting = _waiting(health)
-    if health.busy_s > SLOW_STEP_S:
+    if health.current_step_s > SLOW_STEP_S:
         if _waits_for_server(health):
             return
         yield Problem(
-            f"has been busy with one message for {health.busy_s:.0f} s",
+            f"has been busy with one message for {health.current_step_s:.0f} s",
             "give it less work per message; beyond supervision.step_timeout_s it is given up",
         )
-    elif waiting and not health.busy_s and health.step_age_s > IDLE_S and not health.held:
+    elif waiting and not health.current_step_s and health.step_age_s > IDLE_S and not health.paused:
         yield Problem(
             f"took none of {waiting} waiting messages for {health.step_age_s:.0f} s",
             "it waits for room at a consumer: look at the actors that take what it makes",
@@ -82,25 +82,25 @@ def _of_steps(health: Health) -> Iterator[Problem]:
 
 
 def _waiting(health: Health) -> int:
-    return sum(count.waiting for count in health.inputs)
+    return sum(count.queued for count in health.inputs)
 
 
 def _waits_for_server(health: Health) -> bool:
     """A labeller's server may take its time: patience_s bounds that, and the map goes on."""
-    return "attempts" in health.facts
+    return "attempts" in health.metrics
 
 
 def _of_failures(health: Health) -> Iterator[Problem]:
-    if health.set_aside or health.restarts:
+    if health.dead_lettered or health.restarts:
         yield Problem(
             f"failed {health.failures} times, was restarted {health.restarts} times and set "
-            f"{health.set_aside} messages aside",
+            f"{health.dead_lettered} messages aside",
             "the log of `ldo serve` has each failure",
         )
 
 
 def _of_disk(health: Health) -> Iterator[Problem]:
-    if health.facts.get("is_unsaved"):
+    if health.metrics.get("checkpoint_failing"):
         yield Problem(
             "cannot save its last step, and takes no more keyframes until it can",
             "free some disk space, or start the service with another folder for --state",
@@ -109,7 +109,7 @@ def _of_disk(health: Health) -> Iterator[Problem]:
 
 def _of_models(health: Health) -> Iterator[Problem]:
     """Networks and labellers that an actor was told to use."""
-    facts = health.facts
+    facts = health.metrics
     for what in ("network", "labeller"):
         if facts.get(f"{what}s_missing"):
             yield Problem(
@@ -135,7 +135,7 @@ def notes(seen: ActorStatus) -> Iterator[str]:
     if health is None:
         return
     from_camera = [count for count in health.inputs if count.topic.startswith("camera/")]
-    if health.held:
+    if health.paused:
         yield "is paused: `ldo control resume` ends it"
     elif from_camera and sum(count.delivered for count in from_camera) == 0:
         topics = ", ".join(count.topic for count in from_camera)
@@ -145,9 +145,9 @@ def notes(seen: ActorStatus) -> Iterator[str]:
         )
     elif from_camera and health.step_age_s > IDLE_S:
         yield f"had its last frame {health.step_age_s:.0f} s ago"
-    if health.facts.get("networks") == 0 and not health.facts.get("networks_missing"):
+    if health.metrics.get("networks") == 0 and not health.metrics.get("networks_missing"):
         yield "has no model: nothing is detected until detector.model names one of `ldo models`"
-    if due := health.facts.get("iterations_due"):
+    if due := health.metrics.get("iterations_pending"):
         yield (
             f"is due {due:.0f} iterations since a correction tore the map: keyframes bring some, "
             f"`ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` at once"
@@ -156,18 +156,18 @@ def notes(seen: ActorStatus) -> Iterator[str]:
 
 
 def _of_answers(health: Health) -> Iterator[str]:
-    if _waits_for_server(health) and health.busy_s > SLOW_STEP_S:
+    if _waits_for_server(health) and health.current_step_s > SLOW_STEP_S:
         yield (
-            f"has asked its server about one region for {health.busy_s:.0f} s, and "
+            f"has asked its server about one region for {health.current_step_s:.0f} s, and "
             f"{_waiting(health)} wait: names come late, and the map goes on without"
         )
-    if refused := health.facts.get("answers_refused"):
-        questions = health.facts.get("questions", 0)
+    if refused := health.metrics.get("answers_refused"):
+        questions = health.metrics.get("questions", 0)
         yield f"refused {refused:.0f} of {questions:.0f} answers: no name, or not one asked for"
-    if untold := health.facts.get("answers_without_logprobs"):
+    if untold := health.metrics.get("answers_without_logprobs"):
         yield (
             f"had {untold:.0f} answers without log-probabilities, which count as "
             "vlm_labeller.http.default_confidence sure"
         )
-    if refused := health.facts.get("names_refused"):
+    if refused := health.metrics.get("names_refused"):
         yield f"refused {refused:.0f} names that were to be added: the log says why"

@@ -1,4 +1,4 @@
-"""`ldo serve --metrics PORT`: the actors' health for those who watch over them, by default on
+"""`ldo serve --metrics-port PORT`: the actors' health for those who watch over them, by default on
 loopback.
 
 /metrics  what health messages say, for Prometheus. Counters restart from 0 with their actor's
@@ -40,26 +40,34 @@ OF_ACTOR: dict[Row, Callable[[Health], float]] = {
     (CounterMetricFamily, "restarts", "times the actor was rebuilt within its process"): lambda h: (
         h.restarts
     ),
-    (CounterMetricFamily, "set_aside", "messages that failed twice"): lambda h: h.set_aside,
+    (CounterMetricFamily, "dead_letters", "messages that failed twice"): lambda h: h.dead_lettered,
     (GaugeMetricFamily, "step_age_seconds", "since the last step ended"): lambda h: h.step_age_s,
-    (GaugeMetricFamily, "busy_seconds", "age of the step under way"): lambda h: h.busy_s,
+    (GaugeMetricFamily, "current_step_seconds", "age of the step under way"): lambda h: (
+        h.current_step_s
+    ),
     (GaugeMetricFamily, "resident_bytes", "memory of its process"): lambda h: h.rss_mb * 1e6,
-    (GaugeMetricFamily, "held", "1: takes nothing, on request"): lambda h: h.held,
+    (GaugeMetricFamily, "paused", "1 while the actor is paused"): lambda h: h.paused,
 }
 OF_INPUT: dict[Row, Callable[[InputCount], float]] = {
-    (CounterMetricFamily, "input_delivered", "handled by the actor"): lambda i: i.delivered,
+    (CounterMetricFamily, "input_messages", "handled by the actor"): lambda i: i.delivered,
     (CounterMetricFamily, "input_dropped", "displaced by newer ones"): lambda i: i.dropped,
     (CounterMetricFamily, "input_rejected", "no valid message"): lambda i: i.rejected,
-    (CounterMetricFamily, "input_paused", "left out while paused"): lambda i: i.paused,
+    (CounterMetricFamily, "input_dropped_paused", "left out while paused"): lambda i: (
+        i.dropped_paused
+    ),
     (CounterMetricFamily, "input_lost", "never came, by number"): lambda i: i.lost,
     (CounterMetricFamily, "input_gaps", "came out of order"): lambda i: i.gaps,
-    (GaugeMetricFamily, "input_waiting", "in the mailbox now"): lambda i: i.waiting,
+    (GaugeMetricFamily, "input_queued", "in the mailbox now"): lambda i: i.queued,
 }
 OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
-    (CounterMetricFamily, "output_sent", "messages sent"): lambda o: o.sent,
-    (CounterMetricFamily, "output_waited", "times it waited for room"): lambda o: o.waited,
-    (CounterMetricFamily, "output_evicted", "consumers given up"): lambda o: o.evicted,
-    (CounterMetricFamily, "output_repeated", "sent again after a loss"): lambda o: o.repeated,
+    (CounterMetricFamily, "output_messages", "messages sent"): lambda o: o.sent,
+    (CounterMetricFamily, "output_backpressure_waits", "times it waited for room"): lambda o: (
+        o.backpressure_waits
+    ),
+    (CounterMetricFamily, "output_evicted", "consumers given up"): lambda o: o.evicted_consumers,
+    (CounterMetricFamily, "output_retransmitted", "sent again after a loss"): lambda o: (
+        o.retransmitted
+    ),
 }
 
 
@@ -167,9 +175,11 @@ def _step_seconds(actors: list[Health]) -> Metric:
 
 
 def _facts(actors: list[Health]) -> Metric:
-    metric = GaugeMetricFamily("ldo_fact", "what the actor counts itself", labels=["actor", "fact"])
+    metric = GaugeMetricFamily(
+        "ldo_actor_metric", "metric of the actor", labels=["actor", "metric"]
+    )
     for health in actors:
-        for name, value in health.facts.items():
+        for name, value in health.metrics.items():
             metric.add_metric([health.actor, name], value)
     return metric
 
@@ -190,7 +200,7 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
     Raises ConfigError when the port or the address cannot be had.
     """
     if not 0 < port < 65536:
-        raise ConfigError(f"--metrics {port}: a port is a number in 1..65535.")
+        raise ConfigError(f"--metrics-port {port}: a port is a number in 1..65535.")
     registry = CollectorRegistry()
     registry.register(collector)
     metrics = make_wsgi_app(registry)
@@ -206,8 +216,8 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
         server = make_server(address, port, answer, kind, _Quiet)
     except OSError as error:
         raise ConfigError(
-            f"--metrics {port}: cannot listen on {address}:{port} ({error.strerror}). Is another "
-            "service exporting there? Choose another port, or service.metrics_address."
+            f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). Is "
+            "another service exporting there? Choose another port, or service.metrics_address."
         ) from error
     thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
     thread.start()

@@ -1,7 +1,7 @@
 """The live service: every actor as a stage in this process, or in one of its own.
 
 The main process opens the router that all others connect to. An actor in a process of its own is
-`ldo serve --only ACTOR`, started and watched by the main process with the same configuration and
+`ldo serve --actor ACTOR`, started and watched by the main process with the same configuration and
 the same folder for its state.
 """
 
@@ -202,7 +202,7 @@ class Service:
         config = self.state / "config.yaml"
         config.write_text(config_yaml(self.config))
         command = python_command(
-            *("serve", "--only", box.name, "--robot", self.network.robot),
+            *("serve", "--actor", box.name, "--robot", self.network.robot),
             *("--endpoint", self.network.local_endpoint),
             *(("--keys", str(self.network.keys.folder)) if self.network.keys else ()),
             *("--config", str(config), "--state", str(self.state)),

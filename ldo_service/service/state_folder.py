@@ -30,7 +30,7 @@ def state_folder(folder: Path | None, stack: ExitStack) -> Path:
     if "state" not in found and "frames.csv" in found:
         raise ConfigError(
             f"{folder} is what `ldo run` wrote, and holds no state of a service: choose another "
-            f"folder with --state. To track in its map: --localise {folder}."
+            f"folder with --state. To track in its map: --localize {folder}."
         )
     if "state" not in found and any(name.endswith(".mcap") for name in found):
         raise ConfigError(

@@ -25,6 +25,16 @@ log = logging.getLogger(__name__)
 # change since the last step is the same object: only new objects are written.
 State = Mapping[str, Any]
 CONTENTS = "contents.msgpack"
+# Version of what the parts hold. A change of any actor's state that an older state does not fit
+# increments it. Version 1 had no number.
+STATE_VERSION = 2
+
+
+class _Contents(msgspec.Struct, frozen=True):
+    """The files of an actor's state, by part, and the version of what they hold."""
+
+    files: dict[str, str]
+    version: int = STATE_VERSION
 
 
 class StateStore(Protocol):
@@ -86,7 +96,7 @@ class FolderStore:
         new = {part: new[part] for part in state}
         if new != old:
             self._saved.pop(actor, None)  # these files may be named from now on, whatever fails
-            body = msgspec.msgpack.encode(new)
+            body = msgspec.msgpack.encode(_Contents(new))
             write_atomically(folder / CONTENTS, body, syncs=self._syncs)
         for file in set(old.values()) - set(new.values()):
             _remove(folder / file)
@@ -101,7 +111,8 @@ class FolderStore:
         """None when nothing was saved, or what was saved makes no sense: said in the log, and
         kept beside it, the last time it happened, for whoever can make something of it.
 
-        Raises DataError where there is something and the disk, or a limit, does not let it be read.
+        Raises DataError where there is something and the disk, or a limit, does not let it be read,
+        or where another version of the service wrote it.
         """
         folder = self._folder / actor
         try:
@@ -151,11 +162,28 @@ def _remove(file: Path) -> None:
 
 
 def _read_contents(folder: Path) -> dict[str, str]:
+    """Return the files of a state, by part; none where nothing was saved.
+
+    Raises:
+        DataError: Another version of the service wrote the state.
+        msgspec.DecodeError: The contents are damaged.
+    """
     try:
         body = (folder / CONTENTS).read_bytes()
     except FileNotFoundError:
         return {}
-    return msgspec.msgpack.decode(body, type=dict[str, str])
+    try:
+        contents = msgspec.msgpack.decode(body, type=_Contents)
+    except msgspec.ValidationError:
+        msgspec.msgpack.decode(body, type=dict[str, str])  # As version 1 wrote it, or damaged.
+        contents = _Contents({}, version=1)
+    if contents.version != STATE_VERSION:
+        raise DataError(
+            f"{folder / CONTENTS} has version={contents.version}, and this service reads "
+            f"{STATE_VERSION}: another version of the service wrote this state. Choose another "
+            "folder with --state, or go on with the version that wrote it."
+        )
+    return contents.files
 
 
 def _read_contents_or_nothing(folder: Path) -> dict[str, str]:

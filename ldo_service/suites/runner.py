@@ -94,7 +94,7 @@ class SuiteRunner:
         ]
         run = ("run", entry.source, "--out", str(folder), "--overwrite", *self.suite.options())
         if entry.front_end_folder:
-            run += ("--front-end", str(self.out / entry.front_end_folder))
+            run += ("--reuse-front-end", str(self.out / entry.front_end_folder))
         elif self.suite.front_end:
             run += ("--keep-front-end",)
         for name in (TOLD, RESULTS):  # `ldo run` replaces what it wrote, and nothing else

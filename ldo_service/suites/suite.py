@@ -188,7 +188,14 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     def options(self) -> list[str]:
         """Of `ldo run`, alike for all."""
-        words = ["--hold-out", self.hold_out, "--refine", self.refine, "--stride", self.stride]
+        words = [
+            "--hold-out-every",
+            self.hold_out,
+            "--refine-iterations",
+            self.refine,
+            "--stride",
+            self.stride,
+        ]
         if self.max_frames is not None:
             words += ["--max-frames", self.max_frames]
         return [str(word) for word in words]

@@ -17,7 +17,7 @@ QUARTERS_PX = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))
 
 
 @dataclass(frozen=True, slots=True)
-class Rendering:
+class RoomRendering:
     """color [H, W, 3] uint8; depth_m [H, W] float64, z, exact at pixel centres; is_visitor [H, W]
     bool, whether the pixel shows a visitor."""
 
@@ -35,7 +35,7 @@ class Renderer:
 
     def render(
         self, camera: Camera, T_world_camera: np.ndarray, visitors: tuple[Solid, ...] = ()
-    ) -> Rendering:
+    ) -> RoomRendering:
         """Pixels on an outline average four rays in colour; depth never mixes surfaces. `visitors`
         are solids beside the furniture; they cast no shadow."""
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
@@ -48,7 +48,7 @@ class Renderer:
         image = np.floor(color * 255 + 0.5).astype(np.uint8)
         size = (camera.height, camera.width)
         is_visitor = hits.surface >= SHELL_FACES + len(self._room.furniture)
-        return Rendering(
+        return RoomRendering(
             image.reshape(*size, 3), hits.depth_m.reshape(size), is_visitor.reshape(size)
         )
 

@@ -12,7 +12,7 @@ from ldo_service.geometry.sequence import Sequence
 from . import path
 from .person import person_at
 from .room import furnished_room
-from .room_render import Renderer, Rendering
+from .room_render import Renderer, RoomRendering
 
 # Khoshelham and Elberink, Sensors 2012: depth is 1 / (step * disparity), with disparity in whole
 # steps, so a step in depth is 2.85e-3 z^2 m; the matching errs by half a step.
@@ -112,7 +112,7 @@ class SyntheticSequence(Sequence):
         """Whether each pixel [H, W] of frame `index` shows the person, exact at pixel centres."""
         return self._rendering(index).is_visitor
 
-    def _rendering(self, index: int) -> Rendering:
+    def _rendering(self, index: int) -> RoomRendering:
         visitors = person_at(index / RATE_HZ) if self.config.person else ()
         return self._renderer.render(self.raw_camera, self._T_world_camera[index], visitors)
 

@@ -18,8 +18,8 @@ from ldo_service.geometry import RgbdFrame, se3
 from .alignment import AlignConfig, Alignment
 from .features import FeatureConfig, GicpConfig
 from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, make_thumbnail
-from .keyframes import Keyframe, KeyframeConfig, needs_keyframe, needs_mapping_keyframe
-from .motion import Motion
+from .keyframes import KeyframeConfig, ReferenceKeyframe, needs_keyframe, needs_mapping_keyframe
+from .motion import ConstantVelocity
 from .motion_segmentation import MotionSegmentationConfig, grow_mask, segment_motion
 from .odometry_prior import DeadReckoningStart, PriorConfig, PriorPose
 from .pose_candidates import InitialGuessAligner, PoseHypothesis, PoseHypothesisConfig
@@ -51,7 +51,7 @@ class OdometryConfig:
     places: KeyframeDatabaseConfig = field(default_factory=KeyframeDatabaseConfig)
     relocalisation: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     returning: KeyframeReuseConfig = field(default_factory=KeyframeReuseConfig)
-    segments: SubmapConfig = field(default_factory=SubmapConfig)
+    submaps: SubmapConfig = field(default_factory=SubmapConfig)
     judgement: TrackingQualityConfig = field(default_factory=TrackingQualityConfig)
     moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
@@ -134,7 +134,7 @@ class FrameTracker:
         Odometry goes on where tracking was lost, so its frame never jumps, and the motion missed
         meanwhile is its error. A prior supplies that motion.
         """
-        submap = len(self.state.segments.roots)
+        submap = len(self.state.submaps.roots)
         log.info("tracker: starts submap %d with frame %d.", submap, frame.index)
         T_odom_camera = self._dead_reckoned_pose()
         if T_odom_camera is None:
@@ -151,19 +151,19 @@ class FrameTracker:
         """Begin a submap with the frame just tracked, at a pose [4, 4] in odometry."""
         self.state = replace(
             self.state,
-            motion=Motion(T_odom_camera, stamp_ns=frame.stamp_ns),
+            motion=ConstantVelocity(T_odom_camera, stamp_ns=frame.stamp_ns),
             status=TrackingStatus.OK,
             trusted_thumbnail=make_thumbnail(self.view(frame)),
             history=ResidualHistory(),
-            segments=self.state.segments.started(),
-            is_moving=None,
+            submaps=self.state.submaps.started(),
+            dynamic_mask=None,
             motion_evidence=None,
             dead_reckoning_start=self._prior and DeadReckoningStart(T_odom_camera, self._prior),
         )
 
     def relocalize_in(
         self, frame: RgbdFrame, places: KeyframeDatabase
-    ) -> tuple[Keyframe, Alignment] | None:
+    ) -> tuple[ReferenceKeyframe, Alignment] | None:
         """Return the keyframe of `places` that the frame just tracked shows, and the alignment."""
         found = self._relocalize(self.view(frame), places, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
@@ -191,7 +191,9 @@ class FrameTracker:
         measured = float(np.mean(view.levels[0].depth_m > 0))
         return measured >= self.config.judgement.min_paired
 
-    def _track_against(self, keyframe: Keyframe, view: Pyramid, stamp_ns: int) -> PoseHypothesis:
+    def _track_against(
+        self, keyframe: ReferenceKeyframe, view: Pyramid, stamp_ns: int
+    ) -> PoseHypothesis:
         """Align from the predicted pose, and from all other guesses when that is not sure."""
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
@@ -231,7 +233,7 @@ class FrameTracker:
 
     def _relocalize(
         self, view: Pyramid, places: KeyframeDatabase, *, is_lost: bool
-    ) -> tuple[Keyframe, PoseHypothesis] | None:
+    ) -> tuple[ReferenceKeyframe, PoseHypothesis] | None:
         if not self._is_usable(view):
             return None
         state = self.state
@@ -243,26 +245,26 @@ class FrameTracker:
     def _places_of_other_submaps(self, submap: int) -> KeyframeDatabase:
         """Return the places of all submaps that are not merged with one."""
         state = self.state
-        are_merged = state.segments.are_merged
+        are_merged = state.submaps.are_merged
         return KeyframeDatabase(
-            tuple(p for p in state.places.all if not are_merged(p.segment, submap))
+            tuple(p for p in state.places.all if not are_merged(p.submap, submap))
         )
 
     def _search_other_submaps(
-        self, tracked: TrackedFrame, keyframe: Keyframe, view: Pyramid
+        self, tracked: TrackedFrame, keyframe: ReferenceKeyframe, view: Pyramid
     ) -> TrackedFrame:
         """Search other submaps at intervals; a confirmed match makes the frame a keyframe."""
-        before, config = self.state.segments, self.config.segments
+        before, config = self.state.submaps, self.config.submaps
         if tracked.status is not TrackingStatus.OK or not before.is_search_due(config):
             return tracked
-        places = self._places_of_other_submaps(keyframe.segment)
+        places = self._places_of_other_submaps(keyframe.submap)
         found = self._relocalize(view, places, is_lost=False)
         look = measurement = None
         if found is not None:
             there, alignment = found[0], found[1].alignment
             look = SubmapMatch.at(there, alignment, tracked.submap, tracked.T_odom_camera)
             measurement = SubmapMeasurement.of(there, alignment)
-        self.state = replace(self.state, segments=before.with_search_result(look, config))
+        self.state = replace(self.state, submaps=before.with_search_result(look, config))
         if look is None or not before.is_confirmed_by(look, config):
             return tracked
         needed = KeyframeKind.REFERENCE
@@ -270,11 +272,11 @@ class FrameTracker:
 
     # --- results ----------------------------------------------------------------------------------
     def _lost_result(
-        self, frame: RgbdFrame, keyframe: Keyframe, alignment: Alignment
+        self, frame: RgbdFrame, keyframe: ReferenceKeyframe, alignment: Alignment
     ) -> TrackedFrame:
         motion = self.state.motion.without_velocity()
         self._remember(frame, keyframe, motion, self.state.history, TrackingStatus.LOST)
-        self.state = replace(self.state, is_moving=None, motion_evidence=None)
+        self.state = replace(self.state, dynamic_mask=None, motion_evidence=None)
         T_keyframe_camera = se3.inverse(keyframe.T_odom_keyframe) @ motion.T_odom_camera
         lost = TrackedFrame.of(
             replace(alignment, T_reference_camera=T_keyframe_camera, information=np.zeros((6, 6))),
@@ -283,14 +285,14 @@ class FrameTracker:
             TrackingStatus.LOST,
             "none",
         )
-        is_long_lost = self.state.segments.should_start(frame.stamp_ns, self.config.segments)
+        is_long_lost = self.state.submaps.should_start(frame.stamp_ns, self.config.submaps)
         should_start = is_long_lost and self._is_usable(self.view(frame))
         return replace(lost, should_start_submap=should_start)
 
     def _accepted_result(
         self,
         frame: RgbdFrame,
-        keyframe: Keyframe,
+        keyframe: ReferenceKeyframe,
         candidate: PoseHypothesis,
         status: TrackingStatus,
     ) -> TrackedFrame:
@@ -312,7 +314,7 @@ class FrameTracker:
         if self.state.origin is KeyframeOrigin.KNOWN:
             # What was put there since the keyframe was made does not move.
             dynamic_mask = None
-            self.state = replace(self.state, is_moving=None)
+            self.state = replace(self.state, dynamic_mask=None)
         needed = (
             self._needed_keyframe(T_odom_camera, candidate) if status is TrackingStatus.OK else None
         )
@@ -321,9 +323,9 @@ class FrameTracker:
             T_odom_camera,
             keyframe,
             status,
-            candidate.method,
+            candidate.pose_source,
             needed_keyframe=needed,
-            hypothesis_spread_rad=candidate.disagreement_rad,
+            hypothesis_spread_rad=candidate.hypothesis_spread_rad,
             dynamic_mask=dynamic_mask,
         )
 
@@ -344,7 +346,7 @@ class FrameTracker:
         return None
 
     def _segment_motion(
-        self, keyframe: Keyframe, view: Pyramid, alignment: Alignment
+        self, keyframe: ReferenceKeyframe, view: Pyramid, alignment: Alignment
     ) -> np.ndarray | None:
         """Return the moving pixels of a frame [H, W] bool.
 
@@ -363,18 +365,20 @@ class FrameTracker:
             config,
             self.config.align.residuals.noise,
         )
-        self.state = replace(self.state, is_moving=seen.is_moving, motion_evidence=seen.suspicion)
+        self.state = replace(
+            self.state, dynamic_mask=seen.dynamic_mask, motion_evidence=seen.suspicion
+        )
         if seen.has_large_change(keyframe.moved_mask, config):
-            left_out = grow_mask(seen.has_moved, keyframe.view, config)
-            renewed = replace(keyframe, moved_mask=seen.has_moved, ignore_mask=left_out)
+            left_out = grow_mask(seen.moved_mask, keyframe.view, config)
+            renewed = replace(keyframe, moved_mask=seen.moved_mask, ignore_mask=left_out)
             self.state = replace(self.state, keyframe=renewed)
-        return grow_mask(seen.is_moving, view, config)
+        return grow_mask(seen.dynamic_mask, view, config)
 
     def _remember(
         self,
         frame: RgbdFrame,
-        keyframe: Keyframe,
-        motion: Motion,
+        keyframe: ReferenceKeyframe,
+        motion: ConstantVelocity,
         history: ResidualHistory,
         status: TrackingStatus,
     ) -> None:
@@ -388,5 +392,5 @@ class FrameTracker:
             history=history,
             status=status,
             frames_since_keyframe=before.frames_since_keyframe + 1,
-            segments=before.segments.after(status is TrackingStatus.LOST, frame.stamp_ns),
+            submaps=before.submaps.after(status is TrackingStatus.LOST, frame.stamp_ns),
         )

@@ -20,7 +20,7 @@ from ldo_service.geometry import Camera, codecs, se3
 from ldo_service.storage.state_codec import decode_state
 
 from .features import FeatureConfig, Features, detect, detect_sift
-from .keyframes import Keyframe
+from .keyframes import ReferenceKeyframe
 from .motion import image_motions_rad
 from .motion_segmentation import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
@@ -31,7 +31,8 @@ CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactl
 DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
 NO_PAST = ResidualHistory()
 
-DATABASE_FILE = "places.msgpack"  # in the folder of a run
+DATABASE_FILE = "keyframe_database.msgpack"  # In the folder of a run.
+OLD_DATABASE_FILE = "places.msgpack"  # Its name up to version 0.1, read for one more version.
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +61,7 @@ class KeyframeRecord:
     """
 
     id: int
-    segment: int
+    submap: int
     T_odom_keyframe: np.ndarray  # [4, 4]
     median_depth_m: float
     intensity_sigma: float  # of frames tracked before it, grey levels; 0: not known
@@ -99,19 +100,22 @@ class KeyframeRecord:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
-        """The inverse of `packed`."""
-        return KeyframeRecord(**{**kept, "camera": Camera.of(kept["camera"])})
+        """The inverse of `packed`. A record of version 0.1 says `segment` for `submap`."""
+        values = {**kept, "camera": Camera.of(kept["camera"])}
+        if "segment" in values:
+            values["submap"] = values.pop("segment")
+        return KeyframeRecord(**values)
 
     @property
     def nbytes(self) -> int:
         arrays = (self.thumbnail, self.points_camera, self.descriptors, self.T_odom_keyframe)
         return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
 
-    def keyframe(self, config: PyramidConfig) -> Keyframe:
+    def keyframe(self, config: PyramidConfig) -> ReferenceKeyframe:
         """The keyframe as frames can be aligned to it; bitwise equal each time."""
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
-        return Keyframe(
-            view, self.T_odom_keyframe, self.id, self.segment, stored_features=self.features
+        return ReferenceKeyframe(
+            view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
         )
 
     def without(self, left_out: np.ndarray) -> "KeyframeRecord":
@@ -140,7 +144,7 @@ class KeyframeRecord:
 
 
 def make_keyframe_record(
-    keyframe: Keyframe,
+    keyframe: ReferenceKeyframe,
     features: FeatureConfig,
     config: KeyframeDatabaseConfig,
     history: ResidualHistory = NO_PAST,
@@ -152,7 +156,7 @@ def make_keyframe_record(
     kept = _are_still(seen.points_camera, level.camera, left_out)
     return KeyframeRecord(
         id=keyframe.id,
-        segment=keyframe.segment,
+        submap=keyframe.submap,
         T_odom_keyframe=keyframe.T_odom_keyframe,
         median_depth_m=keyframe.reference.median_depth_m,
         intensity_sigma=median(history.intensity_sigmas or (0.0,)),
@@ -223,11 +227,9 @@ class KeyframeDatabase:
         places = (p.without(left_out) if p.id == keyframe else p for p in self.all)
         return KeyframeDatabase(tuple(places))
 
-    def in_submap(
-        self, segment: int, without: Set[int] = frozenset()
-    ) -> tuple[KeyframeRecord, ...]:
-        """Those of a segment but for some, by id."""
-        return tuple(p for p in self.all if p.segment == segment and p.id not in without)
+    def in_submap(self, submap: int, without: Set[int] = frozenset()) -> tuple[KeyframeRecord, ...]:
+        """Those of a submap but for some, by id."""
+        return tuple(p for p in self.all if p.submap == submap and p.id not in without)
 
     def _others(
         self, place: KeyframeRecord, config: KeyframeDatabaseConfig
@@ -258,35 +260,33 @@ class KeyframeDatabase:
 def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
     """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`.
 
-    Infinite where they are of two segments.
+    Infinite where they are of two submaps.
     """
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
     apart = image_motions_rad(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
-    segment = np.array([place.segment for place in path])
-    return np.where(segment[:-2] == segment[2:], apart, np.inf)
+    submap = np.array([place.submap for place in path])
+    return np.where(submap[:-2] == submap[2:], apart, np.inf)
 
 
 def _apart(places: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndarray:
-    """[N] rad: how far each is from another one, as `motion.extent`; infinite in other segments."""
+    """[N] rad: how far each is from another one, as `motion.extent`; infinite in other submaps."""
     moved = se3.inverse(_poses(places)) @ other.T_odom_keyframe
-    segment = np.array([place.segment for place in places])
-    return np.where(
-        segment == other.segment, image_motions_rad(moved, other.median_depth_m), np.inf
-    )
+    submap = np.array([place.submap for place in places])
+    return np.where(submap == other.submap, image_motions_rad(moved, other.median_depth_m), np.inf)
 
 
 def _poses(places: Sequence[KeyframeRecord]) -> np.ndarray:
     return np.array([place.T_odom_keyframe for place in places]).reshape(-1, 4, 4)
 
 
-def places_of(folder: Path) -> KeyframeDatabase:
+def load_keyframe_database(folder: Path) -> KeyframeDatabase:
     """Of the map that a finished run left in its folder. Raises DataError when it left none."""
-    path = folder / DATABASE_FILE
-    if not path.is_file():
+    files = [folder / name for name in (DATABASE_FILE, OLD_DATABASE_FILE)]
+    path = next((file for file in files if file.is_file()), None)
+    if path is None:
         raise DataError(
-            f"{folder} has no {DATABASE_FILE}, so nothing can be localised in it. Name the folder "
-            f"that "
-            "`ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
+            f"{folder} has no {DATABASE_FILE}, so nothing can be localized in it. Name the folder "
+            "that `ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
         )
     try:
         kept = decode_state(path.read_bytes())

@@ -48,13 +48,13 @@ class KeyframeConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Keyframe:
+class ReferenceKeyframe:
     """A frame that others are aligned to."""
 
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
     id: int  # ascending, given by the odometry: a camera's frame numbers may start again
-    segment: int = 0  # whose odometry frame T_odom_keyframe leads to
+    submap: int = 0  # whose odometry frame T_odom_keyframe leads to
     moved_mask: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
     ignore_mask: np.ndarray | None = None  # [H, W] bool: what of it was seen to move
     dynamic_class_mask: np.ndarray | None = (
@@ -86,24 +86,24 @@ class Keyframe:
             "camera": asdict(view.camera),
             "T_odom_keyframe": self.T_odom_keyframe,
             "id": self.id,
-            "segment": self.segment,
-            "has_moved": self.moved_mask,
+            "submap": self.submap,
+            "moved_mask": self.moved_mask,
             "left_out": self.ignore_mask,
             "movable": self.dynamic_class_mask,
             "features": None if features is None else asdict(features),
         }
 
     @staticmethod
-    def unpack(kept: dict[str, Any], config: PyramidConfig) -> "Keyframe":
+    def unpack(kept: dict[str, Any], config: PyramidConfig) -> "ReferenceKeyframe":
         """The inverse of `packed`, under the same configuration."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
-        return Keyframe(
+        return ReferenceKeyframe(
             view,
             kept["T_odom_keyframe"],
             kept["id"],
-            kept["segment"],
-            kept["has_moved"],
+            kept["submap"],
+            kept["moved_mask"],
             kept["left_out"],
             kept["movable"],
             features,

@@ -29,28 +29,30 @@ MAP = -1  # Stands for the map in place of the number of a submap.
 class MapFix:
     """Odometry frame in the map, and the last match that speaks for it."""
 
-    segment: int = 0  # Submap of odometry.
+    submap: int = 0  # Submap of odometry.
     T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found.
-    last: SubmapMatch | None = None
-    since_look: int = 0  # Frames since the last search.
+    pending_match: SubmapMatch | None = None
+    frames_since_search: int = 0  # Frames since the last search.
 
     def is_search_due(self, config: SubmapConfig) -> bool:
         """Return whether to search in this frame: in every one until the camera is found."""
-        return self.T_map_odom is None or self.since_look >= config.look_every
+        return self.T_map_odom is None or self.frames_since_search >= config.look_every
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
         """Return the fix one frame later; a new submap of odometry may be anywhere."""
-        if tracked.submap != self.segment:
+        if tracked.submap != self.submap:
             return MapFix(tracked.submap)
-        return replace(self, since_look=self.since_look + 1)
+        return replace(self, frames_since_search=self.frames_since_search + 1)
 
     def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
         """Return the fix after a match, which is accepted when the last one agrees with it."""
-        is_confirmed = self.last is not None and self.last.is_consistent_with(look, config)
+        is_confirmed = self.pending_match is not None and self.pending_match.is_consistent_with(
+            look, config
+        )
         T_map_odom = look.T_there_here if is_confirmed else self.T_map_odom
         # A match that contradicts the last one is followed by another search soon.
         since = 0 if is_confirmed else config.look_every - config.confirm_after
-        return replace(self, T_map_odom=T_map_odom, last=look, since_look=since)
+        return replace(self, T_map_odom=T_map_odom, pending_match=look, frames_since_search=since)
 
     @property
     def packed(self) -> dict[str, Any]:
@@ -60,8 +62,8 @@ class MapFix:
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "MapFix":
         """Return the fix from its packed form."""
-        last = None if kept["last"] is None else SubmapMatch(**kept["last"])
-        return MapFix(**{**kept, "last": last})
+        match = kept["pending_match"]
+        return MapFix(**{**kept, "pending_match": match and SubmapMatch(**match)})
 
 
 class Localizer(Odometry):
@@ -111,7 +113,7 @@ class Localizer(Odometry):
             self._add_reference(frame, tracked)
         # Odometry in the map.
         self._fix = self._fix.after(tracked)
-        if tracked.status is TrackingStatus.OK and self._fix.is_search_due(self.config.segments):
+        if tracked.status is TrackingStatus.OK and self._fix.is_search_due(self.config.submaps):
             self._search(frame, tracked)
         T_map_odom = self._fix.T_map_odom
         if T_map_odom is None:
@@ -138,11 +140,11 @@ class Localizer(Odometry):
         """Search the frame just tracked in the map, and update the fix."""
         found = self._frames.relocalize_in(frame, self._places)
         if found is None:
-            self._fix = replace(self._fix, since_look=0)
+            self._fix = replace(self._fix, frames_since_search=0)
             return
         keyframe, alignment = found
         T_map_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_map_odom = se3.orthonormalize(T_map_camera @ se3.inverse(tracked.T_odom_camera))
         median_depth_m = keyframe.reference.median_depth_m
         look = SubmapMatch(tracked.submap, MAP, T_map_odom, tracked.T_odom_camera, median_depth_m)
-        self._fix = self._fix.with_search_result(look, self.config.segments)
+        self._fix = self._fix.with_search_result(look, self.config.submaps)

@@ -10,7 +10,7 @@ MAX_STEPS = 4.0  # extrapolate over at most this many of the last interval
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class ConstantVelocity:
     """The last trusted pose, and the twist that led to it over `interval_ns`."""
 
     T_odom_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
@@ -28,13 +28,13 @@ class Motion:
         steps = min(elapsed_ns / self.interval_ns, MAX_STEPS) if timed else 1.0
         return se3.orthonormalize(self.T_odom_camera @ se3.exp(self.twist * steps))
 
-    def moved_to(self, T_odom_camera: np.ndarray, stamp_ns: int) -> "Motion":
+    def moved_to(self, T_odom_camera: np.ndarray, stamp_ns: int) -> "ConstantVelocity":
         twist = se3.log(se3.inverse(self.T_odom_camera) @ T_odom_camera)
-        return Motion(T_odom_camera, twist, stamp_ns - self.stamp_ns, stamp_ns)
+        return ConstantVelocity(T_odom_camera, twist, stamp_ns - self.stamp_ns, stamp_ns)
 
-    def without_velocity(self) -> "Motion":
+    def without_velocity(self) -> "ConstantVelocity":
         """The same place without velocity: after a loss, nothing is known of it."""
-        return Motion(self.T_odom_camera, np.zeros(6), 0, self.stamp_ns)
+        return ConstantVelocity(self.T_odom_camera, np.zeros(6), 0, self.stamp_ns)
 
 
 def image_motion_rad(T: np.ndarray, median_depth_m: float) -> float:

@@ -80,16 +80,16 @@ class MotionEvidence:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MotionMasks:
-    """is_moving [H, W] bool of the frame and has_moved [H, W] bool of the keyframe, both at
+    """dynamic_mask [H, W] bool of the frame and moved_mask [H, W] bool of the keyframe, both at
     working resolution."""
 
-    is_moving: np.ndarray
-    has_moved: np.ndarray
+    dynamic_mask: np.ndarray
+    moved_mask: np.ndarray
     suspicion: MotionEvidence
 
     def has_large_change(self, known: np.ndarray | None, config: MotionSegmentationConfig) -> bool:
         """Whether much has moved beside what is known, [H, W] bool; None: nothing is."""
-        news = self.has_moved if known is None else self.has_moved & ~known
+        news = self.moved_mask if known is None else self.moved_mask & ~known
         return bool(np.mean(news) > config.renewed_share)
 
 
@@ -109,11 +109,11 @@ class _Pair:
         sigma_m = self.noise_scale * self.noise.sigma_m(level.depth_m)
         return self.config.least_m + self.config.sigmas * sigma_m
 
-    def came(self, has_moved: np.ndarray) -> np.ndarray:
+    def came(self, moved_mask: np.ndarray) -> np.ndarray:
         """Pixels [h, w] bool of the frame in front of what the keyframe saw, or on what moved."""
         ahead_m = depth_gap_m(self.now, self.then, self.T_then_now, self.config)
         limit_m = self.limit_m(self.now)
-        on_moved = _lies_on(has_moved, self.now, self.then, self.T_then_now)
+        on_moved = _lies_on(moved_mask, self.now, self.then, self.T_then_now)
         return (ahead_m > limit_m) | (on_moved & (ahead_m > -limit_m))
 
     def gone(self, before: MotionEvidence | None) -> np.ndarray:
@@ -128,7 +128,7 @@ class _Pair:
 def segment_motion(
     view: Pyramid,
     keyframe: Pyramid,
-    has_moved: np.ndarray | None,
+    moved_mask: np.ndarray | None,
     T_keyframe_camera: np.ndarray,
     noise_scale: float,
     before: MotionEvidence | None,
@@ -137,7 +137,7 @@ def segment_motion(
 ) -> MotionMasks:
     """What moved between a keyframe and an aligned frame.
 
-    has_moved          [H, W] bool of the keyframe as known so far, None: nothing
+    moved_mask          [H, W] bool of the keyframe as known so far, None: nothing
     T_keyframe_camera  [4, 4]
     noise_scale        of the depth noise, as the alignment estimated it
     before             of the frame before, against this keyframe or, by `of_new_keyframe`, an
@@ -146,36 +146,38 @@ def segment_motion(
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
-    known = resized(has_moved, then.depth_m.shape)
+    known = resized(moved_mask, then.depth_m.shape)
     if before is not None and not before.fits(now, then):
         before = None  # another camera
     came, gone = pair.came(known), pair.gone(before)
-    is_moving = _in_pieces(came, None if before is None else before.contradicts, config)
+    dynamic_mask = _in_pieces(came, None if before is None else before.contradicts, config)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
     return MotionMasks(
-        resized(is_moving, view.levels[0].depth_m.shape),
+        resized(dynamic_mask, view.levels[0].depth_m.shape),
         resized(known, keyframe.levels[0].depth_m.shape),
         MotionEvidence(came, gone),
     )
 
 
-def grow_mask(is_moving: np.ndarray, view: Pyramid, config: MotionSegmentationConfig) -> np.ndarray:
+def grow_mask(
+    dynamic_mask: np.ndarray, view: Pyramid, config: MotionSegmentationConfig
+) -> np.ndarray:
     """Pixels [H, W] bool to leave out: what moves, all that is as far away beside it, and a rim.
 
-    is_moving [H, W] bool at working resolution, as `segment_motion` gives it. What this adds must
+    dynamic_mask [H, W] bool at working resolution, from `segment_motion`. What this adds must
     not be given to `segment_motion` again, or it would spread on from frame to frame.
     """
-    if not is_moving.any():
-        return is_moving
+    if not dynamic_mask.any():
+        return dynamic_mask
     depth_m = _level(view, config).depth_m
-    seed = resized(is_moving, depth_m.shape)
+    seed = resized(dynamic_mask, depth_m.shape)
     window = (2 * config.spread_px + 1,) * 2
     measured = (seed & (depth_m > 0)).astype(np.float32)
     share = cv2.boxFilter(measured, -1, window, normalize=False)
     usual_m = cv2.boxFilter(measured * depth_m, -1, window, normalize=False) / np.maximum(share, 1)
     is_beside = (share > 0) & (np.abs(depth_m - usual_m) < config.spread_m)
     whole = cv2.dilate(_bytes(seed | is_beside), _square(config.rim_px)) > 0
-    return resized(whole, is_moving.shape)
+    return resized(whole, dynamic_mask.shape)
 
 
 def depth_gap_m(
@@ -199,13 +201,13 @@ def depth_gap_m(
 
 
 def _lies_on(
-    has_moved: np.ndarray, view: Level, keyframe: Level, T_keyframe_view: np.ndarray
+    moved_mask: np.ndarray, view: Level, keyframe: Level, T_keyframe_view: np.ndarray
 ) -> np.ndarray:
     """Pixels [h, w] bool of `view` whose ray meets what moved in the keyframe."""
-    if not has_moved.any():
+    if not moved_mask.any():
         return np.zeros(view.depth_m.shape, bool)
     u, v, _ = _seen_from(view, keyframe, T_keyframe_view)
-    return cv2.remap(_bytes(has_moved), u, v, cv2.INTER_NEAREST) > 0
+    return cv2.remap(_bytes(moved_mask), u, v, cv2.INTER_NEAREST) > 0
 
 
 def _seen_from(

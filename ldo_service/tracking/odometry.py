@@ -32,7 +32,7 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from .alignment import BrightnessModel
 from .frame_tracking import FrameTracker, OdometryConfig
 from .keyframe_database import KeyframeRecord, make_keyframe_record
-from .keyframes import Keyframe, keyframe_dynamic_class_mask
+from .keyframes import ReferenceKeyframe, keyframe_dynamic_class_mask
 from .map_frame import MapCorrection, MapFrame
 from .odometry_prior import OdometryPriorBuffer, PriorPose
 from .relocalization import KeyframeReuse, ReusedKeyframe, find_nearby_keyframes
@@ -95,7 +95,7 @@ class Odometry:
         # Pose against the reference keyframe; relocalization may have found another reference.
         reading = self._read(prior, frame)
         tracked = self._frames.track(frame, reading)
-        if tracked.method == "relocalised" and tracked.reference not in self._map:
+        if tracked.pose_source == "relocalized" and tracked.reference not in self._map:
             self._map.place_reference(tracked)
         # First keyframe of a new submap, after a long loss.
         needed = KeyframeKind.FIRST if tracked.should_start_submap else tracked.needed_keyframe
@@ -126,7 +126,7 @@ class Odometry:
             keyframe=keyframe,
             reused_keyframe=reused,
             denied_keyframe=denied,
-            awaits_mapping=denied is not None and tracked.method == "first",
+            awaits_mapping=denied is not None and tracked.pose_source == "first",
         )
 
     def correct(self, correction: MapCorrection) -> bool:
@@ -208,7 +208,7 @@ class Odometry:
             place
             for place in state.places.all
             if place.id != tracked.reference
-            and state.segments.are_merged(place.segment, tracked.submap)
+            and state.submaps.are_merged(place.submap, tracked.submap)
         ]
         near = find_nearby_keyframes(
             known, self._map.T_map_keyframe, T_map_camera, self.config.keyframes
@@ -224,13 +224,17 @@ class Odometry:
         T_odom_keyframe = se3.orthonormalize(
             tracked.T_odom_camera @ se3.inverse(alignment.T_reference_camera)
         )
-        here = {"T_odom_keyframe": T_odom_keyframe, "segment": tracked.submap}
+        here = {"T_odom_keyframe": T_odom_keyframe, "submap": tracked.submap}
         place, keyframe = replace(known.place, **here), replace(known.keyframe, **here)
         self._frames.state = self._frames.state.with_reused_keyframe(
             keyframe, place, tracked.T_odom_camera
         )
         switched = TrackedFrame.of(
-            alignment, tracked.T_odom_camera, keyframe, TrackingStatus.OK, known.candidate.method
+            alignment,
+            tracked.T_odom_camera,
+            keyframe,
+            TrackingStatus.OK,
+            known.candidate.pose_source,
         )
         self._map.place_reference(switched)
         return switched
@@ -277,12 +281,12 @@ class Odometry:
             is_connected: The keyframe is measured from a known one, which may be reused then.
         """
         frames = self._frames
-        if tracked.method == "first":
+        if tracked.pose_source == "first":
             frames.restart_at(frame, tracked.T_odom_camera)
         if tracked.submap_measurement is not None:
-            other = tracked.submap_measurement.segment
-            submaps = frames.state.segments.with_merge(tracked.submap, other)
-            frames.state = replace(frames.state, segments=submaps)
+            other = tracked.submap_measurement.submap
+            submaps = frames.state.submaps.with_merge(tracked.submap, other)
+            frames.state = replace(frames.state, submaps=submaps)
         keyframe = self._keyframe_of(frame, tracked)
         place = self._place_of(keyframe)
         frames.state = frames.state.with_new(
@@ -310,25 +314,25 @@ class Odometry:
         if keyframe is None or tracked.reference is None:
             return []
         without = {keyframe.id, tracked.reference}
-        places = self._frames.state.places.in_submap(keyframe.segment, without)
+        places = self._frames.state.places.in_submap(keyframe.submap, without)
         earlier = self._earlier.newest_first(places, self.config.window.reach)
         usual = BrightnessModel(
             intensity_sigma=tracked.intensity_sigma, depth_noise_scale=tracked.depth_noise_scale
         )
         return measure_against(earlier, keyframe, usual, self.config.align, self.config.window)
 
-    def _keyframe_of(self, frame: RgbdFrame, tracked: TrackedFrame) -> Keyframe:
+    def _keyframe_of(self, frame: RgbdFrame, tracked: TrackedFrame) -> ReferenceKeyframe:
         view = self._frames.view(frame)
         view = replace(view, depth_m=view.depth_m.copy())  # A camera may reuse its buffer.
-        return Keyframe(
+        return ReferenceKeyframe(
             view,
             tracked.T_odom_camera,
             self._frames.state.next_id,
             tracked.submap,
-            moved_mask=self._frames.state.is_moving,
+            moved_mask=self._frames.state.dynamic_mask,
             ignore_mask=tracked.dynamic_mask,
         )
 
-    def _place_of(self, keyframe: Keyframe) -> KeyframeRecord:
+    def _place_of(self, keyframe: ReferenceKeyframe) -> KeyframeRecord:
         history = self._frames.state.history
         return make_keyframe_record(keyframe, self.config.features, self.config.places, history)

@@ -71,7 +71,7 @@ class PriorPose:
 
     stamp_ns: int
     T_prior_camera: np.ndarray  # [4, 4]
-    stretch: int
+    session: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +79,7 @@ class OdometryPriorBuffer:
     """The last poses of the current stretch, ascending."""
 
     poses: tuple[StampedPose, ...] = ()
-    stretch: int = 0
+    session: int = 0
 
     def added(
         self, stamp_ns: int, T_prior_base: np.ndarray, config: PriorConfig
@@ -91,7 +91,7 @@ class OdometryPriorBuffer:
             return self, verdict
         if verdict is PriorCheck.FOLLOWS:
             return replace(self, poses=(*self.poses[1 - KEPT :], pose)), verdict
-        return OdometryPriorBuffer((pose,), self.stretch + 1), verdict
+        return OdometryPriorBuffer((pose,), self.session + 1), verdict
 
     def _judged(self, pose: StampedPose, config: PriorConfig) -> PriorCheck:
         if not np.isfinite(pose.T_prior_base).all():
@@ -118,7 +118,7 @@ class OdometryPriorBuffer:
             T_prior_base = self._beyond(stamp_ns, config)
         if T_prior_base is None:
             return None
-        return PriorPose(stamp_ns, T_prior_base @ T_base_camera, self.stretch)
+        return PriorPose(stamp_ns, T_prior_base @ T_base_camera, self.session)
 
     def _between(self, following: int, stamp_ns: int, config: PriorConfig) -> np.ndarray | None:
         after = self.poses[following]
@@ -147,7 +147,7 @@ class OdometryPriorBuffer:
         return {
             "stamps_ns": [pose.stamp_ns for pose in self.poses],
             "T_prior_base": [pose.T_prior_base for pose in self.poses],
-            "stretch": self.stretch,
+            "stretch": self.session,
         }
 
     @staticmethod
@@ -180,7 +180,7 @@ class DeadReckoningStart:
         T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
         """
         then, elapsed_s = self.reading, (now.stamp_ns - self.reading.stamp_ns) * 1e-9
-        if now.stretch != then.stretch or not 0 <= elapsed_s <= config.max_carried_s:
+        if now.session != then.session or not 0 <= elapsed_s <= config.max_carried_s:
             return None
         moved = se3.inverse(then.T_prior_camera) @ now.T_prior_camera
         return se3.orthonormalize(self.T_odom_camera @ moved)

@@ -13,7 +13,7 @@ from ldo_service.geometry import se3
 
 from .alignment import AlignConfig, Alignment, align, evaluate
 from .features import FeatureConfig, GicpConfig, detect, estimate_pose, register_gicp
-from .keyframes import Keyframe
+from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
 from .pyramid import Pyramid
 
@@ -36,32 +36,34 @@ class PoseHypothesis:
     """`is_confirmed` is None where there was no second opinion, or the images refute it."""
 
     alignment: Alignment
-    # "direct" from a motion guess, "prior" from another odometry, "features" from ORB, "shape" from
+    # "direct" from a motion guess, "prior" from another odometry, "features" from ORB, "gicp" from
     # point clouds
-    method: str
+    pose_source: str
     median_depth_m: float  # of the keyframe
     is_confirmed: bool | None = None
-    disagreement_rad: float = 0.0  # from the farthest rival that the images support
+    hypothesis_spread_rad: float = 0.0  # from the farthest rival that the images support
     agrees_with_prior: bool = False  # a prior has the camera there too
 
 
 def align_hypothesis(
-    keyframe: Keyframe,
+    keyframe: ReferenceKeyframe,
     view: Pyramid,
     T_keyframe_camera: np.ndarray,
-    method: str,
+    pose_source: str,
     config: AlignConfig,
 ) -> PoseHypothesis:
     """Direct alignment from a guessed pose."""
     guess = se3.inverse(T_keyframe_camera)
     reference = keyframe.reference
-    return PoseHypothesis(align(reference, view, guess, config), method, reference.median_depth_m)
+    return PoseHypothesis(
+        align(reference, view, guess, config), pose_source, reference.median_depth_m
+    )
 
 
 def support(
     candidate: PoseHypothesis,
     others: Sequence[PoseHypothesis],
-    keyframe: Keyframe,
+    keyframe: ReferenceKeyframe,
     view: Pyramid,
     config: AlignConfig,
 ) -> float:
@@ -86,7 +88,7 @@ def support(
 def select_hypothesis(
     candidates: Sequence[PoseHypothesis],
     T_keyframe_second: np.ndarray | None,
-    keyframe: Keyframe,
+    keyframe: ReferenceKeyframe,
     view: Pyramid,
     config: PoseHypothesisConfig,
     align_config: AlignConfig,
@@ -103,7 +105,7 @@ def select_hypothesis(
         for c in candidates
     ]
     farthest = max(a for a, supported in zip(apart, supports, strict=True) if supported >= least)
-    chosen = replace(candidates[winner], disagreement_rad=farthest)
+    chosen = replace(candidates[winner], hypothesis_spread_rad=farthest)
     if T_keyframe_second is None:
         return chosen
     *unled, led = apart
@@ -131,17 +133,17 @@ class InitialGuessAligner:
 
     def align_from_guess(
         self,
-        keyframe: Keyframe,
+        keyframe: ReferenceKeyframe,
         view: Pyramid,
         T_keyframe_camera: np.ndarray,
-        method: str = "direct",
+        pose_source: str = "direct",
     ) -> PoseHypothesis:
-        return align_hypothesis(keyframe, view, T_keyframe_camera, method, self.align)
+        return align_hypothesis(keyframe, view, T_keyframe_camera, pose_source, self.align)
 
     def align_from_all_guesses(
         self,
         predicted: PoseHypothesis,
-        keyframe: Keyframe,
+        keyframe: ReferenceKeyframe,
         view: Pyramid,
         resting: np.ndarray,
         carried: np.ndarray | None,
@@ -154,9 +156,9 @@ class InitialGuessAligner:
         candidates = [predicted, self.align_from_guess(keyframe, view, resting)]
         if carried is not None:
             candidates.append(self.align_from_guess(keyframe, view, carried, "prior"))
-        second, method = self._independent_estimate(keyframe, view, resting)
+        second, pose_source = self._independent_estimate(keyframe, view, resting)
         if second is not None:
-            candidates.append(align_hypothesis(keyframe, view, second, method, self.align))
+            candidates.append(align_hypothesis(keyframe, view, second, pose_source, self.align))
         chosen = select_hypothesis(candidates, second, keyframe, view, self.candidates, self.align)
         if carried is None:
             return chosen
@@ -170,11 +172,11 @@ class InitialGuessAligner:
         return shift_rad * view.camera.fx > self.large_motion * view.camera.width
 
     def _independent_estimate(
-        self, keyframe: Keyframe, view: Pyramid, resting: np.ndarray
+        self, keyframe: ReferenceKeyframe, view: Pyramid, resting: np.ndarray
     ) -> tuple[np.ndarray | None, str]:
         """T_keyframe_camera [4, 4] by features; by shape, where there is too little texture."""
         known, seen = keyframe.features(self.features), detect(view, self.features)
         pose = estimate_pose(known, seen, view.camera, self.features)
         if pose is not None:
             return se3.inverse(pose.T_camera_reference), "features"
-        return register_gicp(keyframe.reference, view, resting, self.shape), "shape"
+        return register_gicp(keyframe.reference, view, resting, self.shape), "gicp"

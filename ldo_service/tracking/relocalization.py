@@ -6,7 +6,7 @@ chance. Where its fast features find nothing, SIFT looks at others in turn, and 
 knows a room again from twice as far, for ten times the price. A place counts as found when features
 and images agree on it; no prediction speaks for it, so it is judged more strictly than tracking.
 Where two places a room apart both explain the view, neither does: the ends of a corridor may be
-furnished alike. Only places of one segment are compared so; where segments are to each other is not
+furnished alike. Only places of one submap are compared so; where submaps are to each other is not
 known here.
 
 A camera that makes keyframes wherever it goes fills a map with time, not with rooms: a robot on
@@ -37,7 +37,7 @@ from .features import (
     estimate_pose,
 )
 from .keyframe_database import KeyframeDatabase, KeyframeRecord, make_thumbnail
-from .keyframes import Keyframe, KeyframeConfig, left_keyframe_view, limit_ratios
+from .keyframes import KeyframeConfig, ReferenceKeyframe, left_keyframe_view, limit_ratios
 from .motion import image_motion_rad
 from .pose_candidates import PoseHypothesis, align_hypothesis, hypothesis_distance_rad
 from .pyramid import Pyramid, PyramidConfig
@@ -100,7 +100,7 @@ class Relocalizer:
         history: ResidualHistory,
         *,
         is_lost: bool = True,
-    ) -> tuple[Keyframe, PoseHypothesis] | None:
+    ) -> tuple[ReferenceKeyframe, PoseHypothesis] | None:
         """The keyframe that a view surely shows, and its alignment to it.
 
         `turn` counts the searches; it decides whose turn it is beside the likely places. A camera
@@ -161,12 +161,12 @@ class Relocalizer:
 
     def _first_verified(
         self, view: Pyramid, poses: Sequence[PosedPlace], history: ResidualHistory
-    ) -> tuple[PosedPlace, tuple[Keyframe, PoseHypothesis]] | None:
+    ) -> tuple[PosedPlace, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
         """The first that the images confirm."""
         for place, pose in poses[: self.config.attempts]:
             keyframe = place.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
-            candidate = align_hypothesis(keyframe, view, guess, "relocalised", self.align)
+            candidate = align_hypothesis(keyframe, view, guess, "relocalized", self.align)
             if self._is_sure(candidate, guess, place.history(history)):
                 return (place, pose), (keyframe, replace(candidate, is_confirmed=True))
         return None
@@ -186,7 +186,7 @@ class Relocalizer:
         """Whether another place explains the view nearly as well, from far elsewhere."""
         T_odom_camera = _seen_from(place, pose)
         return any(
-            other.segment == place.segment
+            other.submap == place.submap
             and rival.inliers > self.config.rival_inliers * pose.inliers
             and image_motion_rad(
                 se3.inverse(T_odom_camera) @ _seen_from(other, rival), place.median_depth_m
@@ -214,7 +214,7 @@ def _seen_from(place: KeyframeRecord, pose: FeaturePose) -> np.ndarray:
 def _is_apart(place: KeyframeRecord, other: KeyframeRecord, limit_rad: float) -> bool:
     T_other_place = se3.inverse(other.T_odom_keyframe) @ place.T_odom_keyframe
     is_far = image_motion_rad(T_other_place, other.median_depth_m) > limit_rad
-    return is_far or place.segment != other.segment
+    return is_far or place.submap != other.submap
 
 
 Nearby = tuple[KeyframeRecord, np.ndarray]  # a place, and T_place_camera [4, 4] as the map has it
@@ -246,7 +246,7 @@ class ReusedKeyframe:
     """A place, the keyframe that it was, and the alignment of a view to that."""
 
     place: KeyframeRecord
-    keyframe: Keyframe
+    keyframe: ReferenceKeyframe
     candidate: PoseHypothesis
 
     def measures(self, keyframe: int) -> RelativePose:
@@ -274,7 +274,7 @@ class KeyframeReuse:
         """
         for place, T_place_camera in near[: self.config.tries]:
             keyframe = place.keyframe(self.pyramid)
-            candidate = align_hypothesis(keyframe, view, T_place_camera, "returned", self.align)
+            candidate = align_hypothesis(keyframe, view, T_place_camera, "reused", self.align)
             histories = history, place.history(history)
             if self._is_sure(candidate, T_place_camera, histories):
                 return ReusedKeyframe(place, keyframe, candidate)

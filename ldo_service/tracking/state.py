@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from .keyframe_database import KeyframeDatabase, KeyframeDatabaseConfig, KeyframeRecord
-from .keyframes import Keyframe
-from .motion import Motion
+from .keyframes import ReferenceKeyframe
+from .motion import ConstantVelocity
 from .motion_segmentation import MotionEvidence
 from .odometry_prior import DeadReckoningStart
 from .pyramid import PyramidConfig
@@ -27,11 +27,11 @@ class KeyframeOrigin(StrEnum):
 @dataclass(frozen=True, slots=True)
 class OdometryState:
     places: KeyframeDatabase = field(default_factory=KeyframeDatabase)  # for relocalisation
-    keyframe: Keyframe | None = None  # the one tracked against, usually the newest
+    keyframe: ReferenceKeyframe | None = None  # the one tracked against, usually the newest
     mapping_keyframe: KeyframeRecord | None = (
         None  # the last frame mapped, where it is none of these
     )
-    motion: Motion = field(default_factory=Motion)
+    motion: ConstantVelocity = field(default_factory=ConstantVelocity)
     history: ResidualHistory = field(default_factory=ResidualHistory)
     status: TrackingStatus = TrackingStatus.OK
     frames_since_keyframe: int = 0
@@ -39,11 +39,11 @@ class OdometryState:
     origin: KeyframeOrigin = KeyframeOrigin.NEW
     trusted_thumbnail: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
     relocalization_count: int = 0  # frames that were looked for among the places
-    segments: Submaps = field(default_factory=Submaps)
+    submaps: Submaps = field(default_factory=Submaps)
     T_odom_last_mapped: np.ndarray = field(
         default_factory=lambda: np.eye(4)
     )  # the last frame mapped
-    is_moving: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
+    dynamic_mask: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
     motion_evidence: MotionEvidence | None = None
     dead_reckoning_start: DeadReckoningStart | None = (
         None  # the last OK frame, where a prior says where it was too
@@ -51,7 +51,7 @@ class OdometryState:
 
     def with_new(
         self,
-        keyframe: Keyframe,
+        keyframe: ReferenceKeyframe,
         place: KeyframeRecord,
         config: KeyframeDatabaseConfig,
         *,
@@ -66,17 +66,17 @@ class OdometryState:
         )
 
     def with_reused_keyframe(
-        self, keyframe: Keyframe, place: KeyframeRecord, T_odom_camera: np.ndarray
+        self, keyframe: ReferenceKeyframe, place: KeyframeRecord, T_odom_camera: np.ndarray
     ) -> "OdometryState":
         """Tracking against a keyframe of old, seen from T_odom_camera [4, 4] by the last frame."""
         return replace(
             self._against(keyframe, T_odom_camera),
             places=self.places.with_reused(place),
             origin=KeyframeOrigin.KNOWN,
-            is_moving=None,
+            dynamic_mask=None,
         )
 
-    def _against(self, keyframe: Keyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
+    def _against(self, keyframe: ReferenceKeyframe, T_odom_mapped: np.ndarray) -> "OdometryState":
         return replace(
             self,
             keyframe=keyframe,
@@ -101,9 +101,9 @@ def pack(state: OdometryState) -> dict[str, Any]:
         "origin": state.origin.value,
         "trusted": state.trusted_thumbnail,
         "searches": state.relocalization_count,
-        "segments": state.segments.packed,
+        "submaps": state.submaps.packed,
         "T_odom_mapped": state.T_odom_last_mapped,
-        "is_moving": _bits(state.is_moving),
+        "dynamic_mask": _bits(state.dynamic_mask),
         "suspicion": state.motion_evidence
         and (_bits(state.motion_evidence.contradicts), state.motion_evidence.gone),
         "anchor": state.dead_reckoning_start and state.dead_reckoning_start.packed,
@@ -112,13 +112,17 @@ def pack(state: OdometryState) -> dict[str, Any]:
 
 def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
     """The inverse of `packed`, under the same configuration."""
-    keyframe, suspicion, is_moving = values["keyframe"], values["suspicion"], values["is_moving"]
+    keyframe, suspicion, dynamic_mask = (
+        values["keyframe"],
+        values["suspicion"],
+        values["dynamic_mask"],
+    )
     supporting, anchor = values["supporting"], values["anchor"]
     return OdometryState(
         places=KeyframeDatabase(tuple(KeyframeRecord.unpack(place) for place in values["places"])),
-        keyframe=None if keyframe is None else Keyframe.unpack(keyframe, config),
+        keyframe=None if keyframe is None else ReferenceKeyframe.unpack(keyframe, config),
         mapping_keyframe=None if supporting is None else KeyframeRecord.unpack(supporting),
-        motion=Motion(**values["motion"]),
+        motion=ConstantVelocity(**values["motion"]),
         history=ResidualHistory(
             **{name: tuple(noise) for name, noise in values["history"].items()}
         ),
@@ -128,9 +132,9 @@ def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
         origin=KeyframeOrigin(values["origin"]),
         trusted_thumbnail=values["trusted"],
         relocalization_count=values["searches"],
-        segments=Submaps.unpack(values["segments"]),
+        submaps=Submaps.unpack(values["submaps"]),
         T_odom_last_mapped=values["T_odom_mapped"],
-        is_moving=None if is_moving is None else _mask(is_moving),
+        dynamic_mask=None if dynamic_mask is None else _mask(dynamic_mask),
         motion_evidence=None
         if suspicion is None
         else MotionEvidence(_mask(suspicion[0]), suspicion[1]),

@@ -1,7 +1,7 @@
 """Stretches of tracking without a loss, and which of them are known to meet.
 
-A camera that stays lost begins a new segment, with a first keyframe of its own. Where that is
-among the older ones is found out when keyframes of another segment are recognised, twice and to
+A camera that stays lost begins a new submap, with a first keyframe of its own. Where that is
+among the older ones is found out when keyframes of another submap are recognised, twice and to
 the same effect, in views that share nothing: a corridor's ends may look alike, and a false join
 would fold two places into one. Conventions: `ldo_service.geometry`.
 """
@@ -16,14 +16,14 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import Alignment
-from .keyframes import Keyframe
+from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
 
 
 @dataclass(frozen=True, slots=True)
 class SubmapConfig:
     begin_after_s: float = 3.0  # LOST without a break: ORB-SLAM3's patience; 0: never
-    # Frames between looks for the other segments: twice a second at 30 Hz. A prime, so that it
+    # Frames between looks for the other submaps: twice a second at 30 Hz. A prime, so that it
     # does not meet a frame held out from mapping each time.
     look_every: int = 17
     confirm_after: int = 7  # frames between looks while a find is to be confirmed
@@ -46,19 +46,19 @@ class SubmapConfig:
 
 @dataclass(frozen=True, slots=True)
 class SubmapMeasurement:
-    """The camera as a keyframe of another segment sees it; `information` as in `TrackingResult`."""
+    """The camera as a keyframe of another submap sees it; `information` as in `TrackingResult`."""
 
     keyframe: int
-    segment: int  # of the keyframe
+    submap: int  # of the keyframe
     T_keyframe_camera: np.ndarray  # [4, 4]
     information: np.ndarray  # [6, 6]
 
     @staticmethod
-    def of(keyframe: Keyframe, alignment: Alignment) -> "SubmapMeasurement":
+    def of(keyframe: ReferenceKeyframe, alignment: Alignment) -> "SubmapMeasurement":
         """By the alignment of the camera's frame to that keyframe."""
         T_keyframe_camera = alignment.T_reference_camera
         return SubmapMeasurement(
-            keyframe.id, keyframe.segment, T_keyframe_camera, alignment.information
+            keyframe.id, keyframe.submap, T_keyframe_camera, alignment.information
         )
 
     def measures(self, keyframe: int) -> RelativePose:
@@ -68,7 +68,7 @@ class SubmapMeasurement:
 
 @dataclass(frozen=True, slots=True)
 class SubmapMatch:
-    """One segment as seen from another: where their odometry frames are to each other."""
+    """One submap as seen from another: where their odometry frames are to each other."""
 
     here: int
     there: int
@@ -78,13 +78,13 @@ class SubmapMatch:
 
     @staticmethod
     def at(
-        keyframe: Keyframe, alignment: Alignment, here: int, T_here_camera: np.ndarray
+        keyframe: ReferenceKeyframe, alignment: Alignment, here: int, T_here_camera: np.ndarray
     ) -> "SubmapMatch":
-        """By the alignment of a frame at T_here_camera [4, 4] to a keyframe of another segment."""
+        """By the alignment of a frame at T_here_camera [4, 4] to a keyframe of another submap."""
         T_there_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_there_here = T_there_camera @ se3.inverse(T_here_camera)
         median_depth_m = keyframe.reference.median_depth_m
-        return SubmapMatch(here, keyframe.segment, T_there_here, T_here_camera, median_depth_m)
+        return SubmapMatch(here, keyframe.submap, T_there_here, T_here_camera, median_depth_m)
 
     def is_consistent_with(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
         if (self.here, self.there) != (other.here, other.there):
@@ -100,12 +100,12 @@ class SubmapMatch:
 
 @dataclass(frozen=True, slots=True)
 class Submaps:
-    """`roots[s]` is the oldest segment that s is joined to, itself where there is none."""
+    """`roots[s]` is the oldest submap that s is joined to, itself where there is none."""
 
     roots: tuple[int, ...] = ()
     lost_since_ns: int | None = None  # stamp of the first frame of those LOST in a row
-    since_look: int = 0  # frames
-    last: SubmapMatch | None = None  # the find that is to be confirmed
+    frames_since_search: int = 0  # frames
+    pending_match: SubmapMatch | None = None  # the find that is to be confirmed
     missed: int = 0  # looks in a row since it that found nothing
 
     def started(self) -> "Submaps":
@@ -116,7 +116,9 @@ class Submaps:
         known = self.lost_since_ns
         since_ns = stamp_ns if known is None else min(known, stamp_ns)
         return replace(
-            self, lost_since_ns=since_ns if is_lost else None, since_look=self.since_look + 1
+            self,
+            lost_since_ns=since_ns if is_lost else None,
+            frames_since_search=self.frames_since_search + 1,
         )
 
     def should_start(self, stamp_ns: int, config: SubmapConfig) -> bool:
@@ -126,16 +128,16 @@ class Submaps:
         return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Whether any segments are apart, and the last look was long enough ago."""
-        wait = config.look_every if self.last is None else config.confirm_after
-        return len(set(self.roots)) > 1 and self.since_look >= wait
+        """Whether any submaps are apart, and the last look was long enough ago."""
+        wait = config.look_every if self.pending_match is None else config.confirm_after
+        return len(set(self.roots)) > 1 and self.frames_since_search >= wait
 
-    def are_merged(self, segment: int, other: int) -> bool:
-        return self.roots[segment] == self.roots[other]
+    def are_merged(self, submap: int, other: int) -> bool:
+        return self.roots[submap] == self.roots[other]
 
     def is_confirmed_by(self, look: SubmapMatch, config: SubmapConfig) -> bool:
         """Whether both say the same of different views."""
-        last = self.last
+        last = self.pending_match
         return (
             last is not None
             and last.is_consistent_with(look, config)
@@ -147,15 +149,25 @@ class Submaps:
         if found is None:
             is_kept = self.missed < config.misses
             return replace(
-                self, since_look=0, last=self.last if is_kept else None, missed=self.missed + 1
+                self,
+                frames_since_search=0,
+                pending_match=self.pending_match if is_kept else None,
+                missed=self.missed + 1,
             )
-        is_same = self.last is not None and self.last.is_consistent_with(found, config)
-        return replace(self, since_look=0, last=self.last if is_same else found, missed=0)
+        is_same = self.pending_match is not None and self.pending_match.is_consistent_with(
+            found, config
+        )
+        return replace(
+            self,
+            frames_since_search=0,
+            pending_match=self.pending_match if is_same else found,
+            missed=0,
+        )
 
-    def with_merge(self, segment: int, other: int) -> "Submaps":
-        older, younger = sorted((self.roots[segment], self.roots[other]))
+    def with_merge(self, submap: int, other: int) -> "Submaps":
+        older, younger = sorted((self.roots[submap], self.roots[other]))
         roots = tuple(older if root == younger else root for root in self.roots)
-        return replace(self, roots=roots, last=None)
+        return replace(self, roots=roots, pending_match=None)
 
     @property
     def packed(self) -> dict[str, Any]:
@@ -164,5 +176,11 @@ class Submaps:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "Submaps":
-        last = None if kept["last"] is None else SubmapMatch(**kept["last"])
-        return Submaps(**{**kept, "roots": tuple(kept["roots"]), "last": last})
+        match = kept["pending_match"]
+        return Submaps(
+            **{
+                **kept,
+                "roots": tuple(kept["roots"]),
+                "pending_match": match and SubmapMatch(**match),
+            }
+        )

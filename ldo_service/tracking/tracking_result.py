@@ -9,7 +9,7 @@ from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import Alignment
-from .keyframes import Keyframe
+from .keyframes import ReferenceKeyframe
 from .submaps import SubmapMeasurement
 from .tracking_quality import TrackingStatus
 
@@ -33,7 +33,9 @@ class TrackedFrame:
     """
 
     status: TrackingStatus
-    method: str  # The initial guess that won: "first", "direct", "prior", "features", "shape", ...
+    pose_source: (
+        str  # The initial guess that won: "first", "direct", "prior", "features", "gicp", ...
+    )
     T_odom_camera: np.ndarray  # [4, 4]
     T_reference_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
     reference: int | None = None  # Keyframe that the frame was aligned to; None before the first.
@@ -54,9 +56,9 @@ class TrackedFrame:
     def of(
         alignment: Alignment,
         T_odom_camera: np.ndarray,
-        keyframe: Keyframe,
+        keyframe: ReferenceKeyframe,
         status: TrackingStatus,
-        method: str,
+        pose_source: str,
         *,
         needed_keyframe: KeyframeKind | None = None,
         hypothesis_spread_rad: float = 0.0,
@@ -69,18 +71,18 @@ class TrackedFrame:
             T_odom_camera: Pose of the camera, [4, 4].
             keyframe: The reference keyframe.
             status: Tracking status of the frame.
-            method: The initial guess that the alignment started from.
+            pose_source: The initial guess that the alignment started from.
             needed_keyframe: The keyframe that the frame should become.
             hypothesis_spread_rad: Spread of the outcomes of all initial guesses.
             dynamic_mask: Moving pixels, [H, W] bool at working resolution.
         """
         return TrackedFrame(
             status,
-            method,
+            pose_source,
             T_odom_camera,
             alignment.T_reference_camera,
             keyframe.id,
-            keyframe.segment,
+            keyframe.submap,
             information=alignment.information,
             overlap=alignment.overlap,
             inlier_fraction=min(alignment.photometric_inliers, alignment.geometric_inliers),
@@ -114,7 +116,9 @@ class TrackingResult:
 
     # Pose.
     status: TrackingStatus
-    method: str  # The initial guess that won: "first", "direct", "prior", "features", "shape", ...
+    pose_source: (
+        str  # The initial guess that won: "first", "direct", "prior", "features", "gicp", ...
+    )
     T_odom_camera: np.ndarray  # [4, 4]
     T_map_odom: np.ndarray  # [4, 4]
     graph_version: int  # Version of the pose graph that T_map_odom follows.
@@ -168,7 +172,7 @@ def make_tracking_result(
     """
     return TrackingResult(
         status=tracked.status,
-        method=tracked.method,
+        pose_source=tracked.pose_source,
         T_odom_camera=tracked.T_odom_camera,
         T_map_odom=se3.orthonormalize(T_map_odom),
         graph_version=graph_version,

@@ -15,7 +15,7 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 
 from .alignment import AlignConfig, Alignment, BrightnessModel, align
 from .keyframe_database import KeyframeRecord
-from .keyframes import Keyframe
+from .keyframes import ReferenceKeyframe
 from .pyramid import PyramidConfig
 
 
@@ -48,9 +48,11 @@ class RecentKeyframeCache:
 
     def __init__(self, config: PyramidConfig) -> None:
         self._config = config
-        self._rebuilt: dict[int, tuple[KeyframeRecord, Keyframe]] = {}
+        self._rebuilt: dict[int, tuple[KeyframeRecord, ReferenceKeyframe]] = {}
 
-    def newest_first(self, places: Sequence[KeyframeRecord], reach: int) -> Iterator[Keyframe]:
+    def newest_first(
+        self, places: Sequence[KeyframeRecord], reach: int
+    ) -> Iterator[ReferenceKeyframe]:
         """The last `reach` of places, which come oldest first."""
         last = places[-reach:]
         ids = {place.id for place in last}
@@ -63,8 +65,8 @@ class RecentKeyframeCache:
 
 
 def measure_against(
-    earlier: Iterable[Keyframe],
-    keyframe: Keyframe,
+    earlier: Iterable[ReferenceKeyframe],
+    keyframe: ReferenceKeyframe,
     usual: BrightnessModel,
     align_config: AlignConfig,
     config: WindowConfig,
@@ -85,7 +87,9 @@ def measure_against(
     return poses
 
 
-def _aligned(other: Keyframe, keyframe: Keyframe, config: AlignConfig, levels: int) -> Alignment:
+def _aligned(
+    other: ReferenceKeyframe, keyframe: ReferenceKeyframe, config: AlignConfig, levels: int
+) -> Alignment:
     reference = replace(other.reference, points=other.reference.points[:levels])
     guess = se3.inverse(keyframe.T_odom_keyframe) @ other.T_odom_keyframe
     return align(reference, keyframe.view, guess, config)

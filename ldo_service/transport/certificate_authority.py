@@ -64,7 +64,7 @@ class CertificateAuthority:
         except (OSError, ValueError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             raise ConfigError(
-                f"{folder} holds no authority ({why}): `ldo keys new` makes one, in a new folder."
+                f"{folder} holds no authority ({why}): `ldo keys init` makes one, in a new folder."
             ) from error
         self._access = read_access(folder / ACCESS)
 

@@ -65,7 +65,7 @@ class Endpoint:
             raise ConfigError(
                 f"on {self.endpoint} everybody on the network could read the map and control the "
                 "robot. Use tls/ADDRESS:PORT with --keys (`ldo keys` makes them), or say "
-                "--without-keys where the network is yours alone."
+                "--insecure where the network is yours alone."
             )
 
 

@@ -10,8 +10,8 @@ from ldo_service.client import Client
 from ldo_service.conversions.frames import camera_from_message
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
-    Correction,
     DetectionBoxes,
+    GraphCorrection,
     Health,
     Keyframe,
     LoopClosure,
@@ -79,7 +79,7 @@ class LiveScene:
         self.scene = Scene(camera=self.scene.camera)
         self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
         self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
-        self._correction: Correction | None = None
+        self._correction: GraphCorrection | None = None
         self._pose: panel.HeardPose | None = None
         self._changed: set[Layer] = set(get_args(Layer)) - {"facts"}
 
@@ -91,7 +91,7 @@ class LiveScene:
         match message:
             case TrackedPose():
                 self._take_pose(message)
-            case Correction():
+            case GraphCorrection():
                 self._take_correction(message)
             case Keyframe():
                 self.scene.camera = camera_from_message(message.camera)
@@ -119,11 +119,11 @@ class LiveScene:
             self._keyframes.add(pose, self.scene.T_map_camera)
             self._changed.add("keyframes")
 
-    def _take_correction(self, correction: Correction) -> None:
+    def _take_correction(self, correction: GraphCorrection) -> None:
         if self._correction and correction.graph_version <= self._correction.graph_version:
             return
         self._correction = correction
-        for loop in correction.not_believed:  # the newest of them: older ones are gone already
+        for loop in correction.rejected_closures:  # the newest of them: older ones are gone already
             self._loops.pop(loop, None)
         self._keyframes.correct(correction)
         self._changed |= {"keyframes", "final", "loops"}
@@ -152,7 +152,7 @@ class LiveScene:
         self._changed.add("loops")
 
     def _take_map(self, message: MapDelta | MapSnapshot) -> None:
-        if isinstance(message, MapDelta) and message.since == 0 and self._gaussians.version:
+        if isinstance(message, MapDelta) and message.base_version == 0 and self._gaussians.version:
             self.reset()  # on request, see `ldo control reset`
         if self._gaussians.apply(message):
             self._changed.add("gaussians")
@@ -191,8 +191,8 @@ class LiveScene:
         """Heard of or in the newest correction, but for those that it does not believe."""
         if self._correction is None:
             return tuple(self._loops)
-        named = dict.fromkeys((*self._loops, *self._correction.closures))
-        refused = set(self._correction.not_believed)
+        named = dict.fromkeys((*self._loops, *self._correction.accepted_closures))
+        refused = set(self._correction.rejected_closures)
         return tuple(loop for loop in named if loop not in refused)
 
     def _facts(self) -> str:

@@ -4,7 +4,7 @@ import numpy as np
 
 from ldo_service.conversions.poses import keyframe_poses_from_correction, pose_from_message
 from ldo_service.geometry import se3
-from ldo_service.schemas import Correction, TrackedPose
+from ldo_service.schemas import GraphCorrection, TrackedPose
 
 NOWHERE = np.full(3, np.nan)
 
@@ -23,7 +23,7 @@ class LiveKeyframes:
         self.T_map = {**self.T_map, pose.keyframe: T_map_camera}
         self._newer[pose.keyframe] = pose.reference, pose_from_message(pose.T_reference_camera)
 
-    def correct(self, correction: Correction) -> None:
+    def correct(self, correction: GraphCorrection) -> None:
         T_map = keyframe_poses_from_correction(correction)
         newest = max(T_map, default=-1)
         self._newer = {k: link for k, link in self._newer.items() if k > newest}
@@ -52,11 +52,11 @@ class LivePath:
         return len(self._online)
 
     def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
-        """Not a LOST one. The online position is that of the map's own segment alone."""
+        """Not a LOST one. The online position is that of the map's own submap alone."""
         self._heard += 1
         if self._heard % self._every:
             return
-        self._online.append(NOWHERE if pose.segment else T_map_camera[:3, 3])
+        self._online.append(NOWHERE if pose.submap else T_map_camera[:3, 3])
         self._references.append(-1 if pose.reference is None else pose.reference)
         self._p_reference.append(np.array(pose.T_reference_camera.translation))
         if len(self) > self._most:

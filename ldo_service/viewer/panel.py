@@ -96,7 +96,7 @@ def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
     if heard is None:
         return "no pose yet"
     pose, silent_s = heard.pose, now_s - heard.at_s
-    where = f", segment {pose.segment} not joined" if pose.segment else ""
+    where = f", submap {pose.submap} not joined" if pose.submap else ""
     if silent_s > SILENT_AFTER_S:
         silent = f"**no pose for {silent_s:.0f} s**"
         return f"{silent}; the last was {pose.status} at frame {pose.frame:,}{where}"
@@ -114,7 +114,7 @@ def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
 
 def _row(one: HeartbeatRecord, now_s: float) -> str:
     health, silent_s = one.health, now_s - one.at_s
-    state = "held" if health.held else health.state
+    state = "paused" if health.paused else health.state
     state = f"**silent {silent_s:.0f} s**" if silent_s > SILENT_AFTER_S else state
     cells = (
         escaped(health.actor[:MAX_NAME]),

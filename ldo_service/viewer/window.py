@@ -200,7 +200,9 @@ class Window:
 
     def _shown_objects(self) -> list[MapObject]:
         found = self._scene.objects
-        by_sights = sorted(found.objects if found else (), key=lambda one: (-one.seen, one.id))
+        by_sights = sorted(
+            found.objects if found else (), key=lambda one: (-one.observation_count, one.id)
+        )
         return by_sights[: self._config.most_objects]
 
     def _draw_name(self, one: MapObject) -> None:

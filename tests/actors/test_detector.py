@@ -22,7 +22,7 @@ def keyframe_of(keyframe: Keyframe, image: np.ndarray, number: int = 4) -> Keyfr
         keyframe,
         keyframe=number,
         reference=None,
-        window=(),
+        window_measurements=(),
         camera=CameraModel(width=width, height=height, fx=100, fy=100, cx=64, cy=48),
         color=Array.of(image),
         depth_m=Array.of(np.ones((height, width), np.float32)),

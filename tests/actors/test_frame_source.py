@@ -151,7 +151,7 @@ def test_halves_further_apart_than_the_allowed_skew_are_lost_and_counted(room: S
     ]
     assert frames_of(source, *halves) == []
     facts = source.metrics()
-    assert (facts["pairs"], facts["lost_color"], facts["lost_depth"]) == (0, 5, 4)
+    assert (facts["pairs"], facts["color_unpaired"], facts["depth_unpaired"]) == (0, 5, 4)
 
 
 def test_two_clocks_are_said_once(room: Sequence, caplog: pytest.LogCaptureFixture) -> None:

@@ -143,7 +143,7 @@ def test_where_features_do_not_match_the_map_says_where_to_look(there, room) -> 
     said = handled(without_features(), told([*there, *drifted_by(room, 0.04)]))
     found = closures(said)
     assert len(found) >= 2
-    assert {c.evidence for c in candidates(said) if not c.refused} == {"map"}
+    assert {c.evidence for c in candidates(said) if not c.rejected_reason} == {"map"}
     for closure in found:
         old, new = closure.pose.reference, closure.pose.keyframe - len(FIRST_WALK)
         T_true = se3.inverse(true_pose(room, FIRST_WALK[old])) @ true_pose(room, SECOND_WALK[new])
@@ -163,13 +163,13 @@ def test_the_map_is_not_believed_without_two_images_near_to_where_it_says(
 
 def test_every_candidate_is_told_with_its_scores_and_a_reason(said) -> None:
     found = candidates(said)
-    assert sum(not candidate.refused for candidate in found) == len(closures(said))
+    assert sum(not candidate.rejected_reason for candidate in found) == len(closures(said))
     for candidate in found:
         assert 3 <= len(candidate.keyframes) <= 5
-        assert candidate.references[-1] == candidate.reference < candidate.keyframe
+        assert candidate.reference_keyframes[-1] == candidate.reference < candidate.keyframe
         assert candidate.similarity == 0, "nobody looked"
         assert candidate.appearance >= RetrievalConfig().min_appearance
-        assert candidate.evidence == "features" or candidate.refused
+        assert candidate.evidence == "features" or candidate.rejected_reason
 
 
 def test_what_was_seen_a_moment_ago_is_no_loop(there, room) -> None:
@@ -184,13 +184,13 @@ def test_a_twin_where_no_drift_leads_is_refused(there, room) -> None:
         elsewhere = keyframes_of(room, SECOND_WALK, len(FIRST_WALK), LONG_AFTER, T_away)
         found = handled(LoopCloser(), told([*there, *elsewhere]))
         assert closures(found) == []
-        assert any("of drift after" in candidate.refused for candidate in candidates(found))
+        assert any("of drift after" in candidate.rejected_reason for candidate in candidates(found))
 
 
-def test_of_a_segment_that_is_apart_the_map_says_nothing(there, room) -> None:
+def test_of_a_submap_that_is_apart_the_map_says_nothing(there, room) -> None:
     far = se3.exp(np.array([0, 1.0, 0, 30.0, 0, 0]))
     other = [
-        msgspec.structs.replace(k, segment=1)
+        msgspec.structs.replace(k, submap=1)
         for k in keyframes_of(room, SECOND_WALK, len(FIRST_WALK), LONG_AFTER, far)
     ]
     assert closures(handled(LoopCloser(), told([*there, *other])))
@@ -200,7 +200,7 @@ def test_of_a_segment_that_is_apart_the_map_says_nothing(there, room) -> None:
 def test_what_was_seen_before_a_break_is_a_place(there, last, subgraphs) -> None:
     actor = LoopCloser()
     before = there[:last]
-    after = msgspec.structs.replace(there[5], segment=1)
+    after = msgspec.structs.replace(there[5], submap=1)
     handled(actor, told([*before, after]))
     assert len(actor.recognizer.subgraphs) == subgraphs
     for subgraph in actor.recognizer.subgraphs:
@@ -218,7 +218,7 @@ def test_a_place_that_two_old_ones_explain_is_closed_with_neither(there, room) -
     handled(actor, told([*there, *twin]))
     found = handled(actor, told(again))
     assert closures(found) == []
-    assert any("twin" in candidate.refused for candidate in candidates(found))
+    assert any("ambiguous" in candidate.rejected_reason for candidate in candidates(found))
 
 
 def test_planted_poses_are_refused(there, back) -> None:
@@ -303,11 +303,12 @@ def test_boxes_that_never_come_hold_nobody_up(there, back) -> None:
     lost = [m for m in messages if not (isinstance(m, DetectionBoxes) and m.keyframe == 4)]
     actor = LoopCloser()
     assert len(closures(handled(actor, lost))) >= 2
-    assert actor.metrics()["keyframes_without_boxes"] == 1
+    assert actor.metrics()["keyframes_without_detections"] == 1
     alone = LoopCloser()
     handled(alone, [*there, *back])
     assert (
-        alone.metrics()["keyframes_without_boxes"] == len([*there, *back]) - MAX_PENDING_KEYFRAMES
+        alone.metrics()["keyframes_without_detections"]
+        == len([*there, *back]) - MAX_PENDING_KEYFRAMES
     )
 
 

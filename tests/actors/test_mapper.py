@@ -37,9 +37,9 @@ from ldo_service.schemas import (
     Keyframe,
     KeyframeRefinement,
     MapDelta,
-    MapRefine,
+    MapRendering,
     MapSnapshot,
-    ModelView,
+    RefineMap,
     encode,
 )
 from ldo_service.schemas.topics import KEYFRAME_NEW
@@ -103,7 +103,7 @@ def correction(keyframes):
 
 def test_the_view_shows_what_the_camera_saw(keyframes) -> None:
     for message in handled(Mapper(CONFIG), keyframes):
-        if isinstance(message, ModelView):
+        if isinstance(message, MapRendering):
             frame = frame_from_message(keyframes[message.keyframe])
             assert psnr(message.color.numpy(), frame.color) > 25
             seen = (message.depth_m.numpy() > 0) & (frame.depth_m > 0)
@@ -142,8 +142,8 @@ def test_followers_hold_to_the_bit_what_sleeps_and_wakes(keyframes) -> None:
         }
         correction = correction_to_message(0, version, poses)
         followed(deltas_of(handled(mapper, [keyframe, correction])), follower)
-    assert mapper.metrics()["gaussians_asleep"] > 1000
-    assert mapper.metrics()["gaussians_woken"] > 1000
+    assert mapper.metrics()["gaussians_offloaded"] > 1000
+    assert mapper.metrics()["gaussians_loaded_total"] > 1000
     assert_equal_maps(follower, mapper)
 
 
@@ -185,7 +185,7 @@ def test_a_request_to_refine_makes_the_map_better_and_is_told(keyframes) -> None
     messages = handled(mapper, keyframes[:4])
     before = followed(deltas_of([*messages, *mapper.on_stop()]))
     rows = before.map.rows.copy()
-    asked = MapRefine(stamp_ns=0, iterations=40, first_rate=1.0, last_rate=0.2)
+    asked = RefineMap(stamp_ns=0, iterations=40, initial_rate=1.0, final_rate=0.2)
     deltas = deltas_of(mapper.handle(asked))
     after = followed(deltas, before)
     assert_equal_maps(after, mapper)
@@ -198,7 +198,7 @@ def test_what_was_refined_is_in_the_checkpoint_at_once(keyframes) -> None:
     handled(mapper, keyframes[:2])
     before = mapper.snapshot()
     assert mapper.snapshot()["map"] is before["map"], "no keyframe was added"
-    list(mapper.handle(MapRefine(stamp_ns=0, iterations=5)))
+    list(mapper.handle(RefineMap(stamp_ns=0, iterations=5)))
     assert mapper.snapshot()["map"] is not before["map"]
 
 
@@ -234,14 +234,14 @@ def test_a_correction_that_knows_nothing_of_a_refinement_does_not_undo_it(keyfra
         assert list(mapper.handle(before)) == [], "it was on its way when the renderer moved them"
         for refinement in refinements:
             (after,) = optimizer.handle(refinement)
-            assert after.refinements == refinement.number
+            assert after.last_refinement == refinement.number
             assert list(mapper.handle(after)) == [], "the graph agrees with the renderer"
-    assert after.refinements > 1
+    assert after.last_refinement > 1
     turned = {
         k: se3.exp(np.array([0, 0, 0, 0.1, 0, 0])) @ T
         for k, T in keyframe_poses_from_correction(after).items()
     }
-    far = correction_to_message(0, after.graph_version + 1, turned, after.refinements)
+    far = correction_to_message(0, after.graph_version + 1, turned, after.last_refinement)
     (delta,) = mapper.handle(far)
     assert len(delta.motions) == 4
 
@@ -303,7 +303,7 @@ def around_again(keyframes, T_drift: np.ndarray, first: int) -> list[Keyframe]:
                 reference=before,
                 T_reference_keyframe=pose_to_message(se3.inverse(T_before) @ T),
                 T_odom_keyframe=pose_to_message(T),
-                window=(),
+                window_measurements=(),
             )
         )
         before, T_before = first + k.keyframe, T
@@ -325,9 +325,9 @@ def test_surface_that_a_correction_lays_over_itself_is_held_once(keyframes) -> N
         messages += handled(mapper, [*second, closed])
         held_twice = mapper.metrics()["gaussians"]
         messages += mapper.on_stop()
-        assert mapper.metrics()["keyframes_to_mend"] == 3 * (mended == 0)
+        assert mapper.metrics()["keyframes_to_deduplicate"] == 3 * (mended == 0)
         held = mapper.metrics()["gaussians"]
-        assert held_twice - held >= mapper.metrics()["gaussians_mended"]
+        assert held_twice - held >= mapper.metrics()["gaussians_deduplicated"]
         added[mended] = held - once
         follower = followed(messages)
         assert follower.map.rows.tobytes() == mapper._map.gaussians.all().rows.tobytes()
@@ -359,12 +359,12 @@ def test_what_a_correction_has_torn_fits_as_before_after_the_iterations_that_are
     handled(whole, keyframes[:3])
     mapper = torn(keyframes, CONFIG)
     facts = mapper.metrics()
-    assert facts["iterations_due"] == 3 * CONFIG.due_iterations
+    assert facts["iterations_pending"] == 3 * CONFIG.due_iterations
     assert psnr_of(mapper, keyframes[1]) < psnr_of(whole, keyframes[1]) - 1
-    handled(mapper, [MapRefine(stamp_ns=0, iterations=30)])
-    assert mapper.metrics()["iterations_due"] == 6
-    handled(mapper, [MapRefine(stamp_ns=0, iterations=6)])
-    assert mapper.metrics()["iterations_due"] == 0
+    handled(mapper, [RefineMap(stamp_ns=0, iterations=30)])
+    assert mapper.metrics()["iterations_pending"] == 6
+    handled(mapper, [RefineMap(stamp_ns=0, iterations=6)])
+    assert mapper.metrics()["iterations_pending"] == 0
     assert mapper.metrics()["iterations"] == facts["iterations"] + 36
     assert psnr_of(mapper, keyframes[1]) > psnr_of(whole, keyframes[1])
 
@@ -377,7 +377,7 @@ def test_a_keyframe_is_due_no_more_however_often_it_moves(keyframes) -> None:
         T_turned = se3.exp(np.array([0, 0.02 * version, 0, 0, 0, 0]))
         moved = {k: T if k < 2 else T_turned @ T for k, T in poses.items()}
         handled(mapper, [correction_to_message(0, version, moved)])
-        assert mapper.metrics()["iterations_due"] == 2 * CONFIG.due_iterations
+        assert mapper.metrics()["iterations_pending"] == 2 * CONFIG.due_iterations
 
 
 def test_a_map_that_moves_as_a_whole_is_as_good_as_before(keyframes) -> None:
@@ -385,8 +385,8 @@ def test_a_map_that_moves_as_a_whole_is_as_good_as_before(keyframes) -> None:
     moved = {k.keyframe: T_moved @ pose_from_message(k.T_odom_keyframe) for k in keyframes}
     mapper = Mapper(CONFIG)
     handled(mapper, [*keyframes, correction_to_message(0, 1, moved)])
-    assert mapper.metrics()["iterations_due"] == 0
-    assert mapper.metrics()["keyframes_to_mend"] == len(keyframes)
+    assert mapper.metrics()["iterations_pending"] == 0
+    assert mapper.metrics()["keyframes_to_deduplicate"] == len(keyframes)
 
 
 def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes, tmp_path) -> None:
@@ -405,11 +405,11 @@ def test_iterations_that_are_due_are_done_while_no_keyframe_waits(keyframes, tmp
         done, usual = (
             m.metrics()["iterations"] - n for m, n in zip((mapper, never), before, strict=True)
         )
-        due.append(mapper.metrics()["iterations_due"])
+        due.append(mapper.metrics()["iterations_pending"])
         more.append(done - usual)
     assert due == [6, 6, 0, 0]
     assert more == [6, 0, 6, 0]
-    assert never.metrics()["iterations_due"] == 12
+    assert never.metrics()["iterations_pending"] == 12
 
 
 def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
@@ -417,8 +417,8 @@ def test_a_state_that_knows_of_no_iterations_is_gone_on_from(keyframes) -> None:
     del state["map"]["due"]
     mapper = Mapper(CONFIG)
     mapper.restore(state)
-    assert mapper.metrics()["iterations_due"] == 0
-    assert mapper.metrics()["keyframes_to_mend"] == 3
+    assert mapper.metrics()["iterations_pending"] == 0
+    assert mapper.metrics()["keyframes_to_deduplicate"] == 3
 
 
 def test_a_correction_that_moves_nothing_says_nothing(keyframes) -> None:
@@ -561,14 +561,16 @@ def assert_equal_maps(follower: MapReplica, mapper: Mapper) -> None:
 
 def test_what_a_keyframe_says_is_moving_does_not_count_in_the_map(keyframes) -> None:
     first = keyframes[0]
-    is_moving = np.zeros((first.camera.height, first.camera.width), bool)
-    is_moving[40:80, 30:70] = True
+    dynamic_mask = np.zeros((first.camera.height, first.camera.width), bool)
+    dynamic_mask[40:80, 30:70] = True
     camera = frame_from_message(first).camera
-    said = msgspec.structs.replace(first, is_moving=mask_to_array(is_moving[::2, ::2], camera))
+    said = msgspec.structs.replace(
+        first, dynamic_mask=mask_to_array(dynamic_mask[::2, ::2], camera)
+    )
     mapper = Mapper(CONFIG)
     handled(mapper, [said])
     (view,) = (mapper._map.views[k] for k in mapper._map.views.poses)
-    np.testing.assert_array_equal(view.mask == 0, is_moving)
+    np.testing.assert_array_equal(view.mask == 0, dynamic_mask)
 
 
 def test_nothing_that_moves_travels_as_an_empty_mask(keyframes) -> None:

@@ -23,22 +23,22 @@ from ldo_service.schemas import (
     Detection,
     DetectionBoxes,
     Keyframe,
-    LabelOpen,
     LabelRequest,
+    LabelResult,
     MapDelta,
     MapObjects,
-    MapRefine,
+    MapRendering,
     MapSnapshot,
     Message,
-    ModelView,
     ObjectObservation,
+    RefineMap,
     encode,
 )
 from ldo_service.semantics.gaussian_labels import top_labels
 from ldo_service.semantics.semantic_fusion import FusionConfig, SemanticFusionConfig
 from ldo_service.semantics.semantic_map import SemanticMapConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
-from tests.semantics.staged import CAMERA, THINGS, Shot, Thing, poses, shoot, true_things
+from tests.semantics.scenes import CAMERA, THINGS, Shot, Thing, poses, shoot, true_things
 
 # of an image of 128x96, where walls hold a fifth each and the ball is 20 px wide
 TRIGGER = RegionProposalConfig(min_side_px=10)
@@ -127,7 +127,7 @@ def test_objects_are_told_with_each_keyframe_that_was_looked_at() -> None:
     assert ball.name == "sports ball"
     center = np.array(ball.T_map_object.translation)
     assert np.linalg.norm(center - BALL.solid.center_m) < 0.15
-    assert (ball.seen, ball.first_keyframe, ball.last_keyframe) == (5, 0, 4)
+    assert (ball.observation_count, ball.first_keyframe, ball.last_keyframe) == (5, 0, 4)
     seen = of(ObjectObservation, made)
     assert [(one.keyframe, one.object, one.is_miss) for one in seen] == [
         (3, 0, False),
@@ -150,7 +150,7 @@ def test_where_nobody_looked_nothing_is_said_of_objects_and_no_bit_differs() -> 
     for number, T in enumerate(WAY[:4]):
         alone += plain.handle(keyframe_of(shoot(THINGS, T, number), number))
     made = walk(mapper, WAY[:4], known=(), network="")
-    ask = MapRefine(stamp_ns=0, iterations=2, first_rate=1.0, last_rate=1.0)
+    ask = RefineMap(stamp_ns=0, iterations=2, initial_rate=1.0, final_rate=1.0)
     turned = correction_to_message(0, 1, {0: se3.exp(np.full(6, 0.1)) @ WAY[0]})
     for one, said in ((plain, alone), (mapper, made)):
         for message in (ask, turned):
@@ -177,7 +177,7 @@ def test_corrections_move_objects_with_the_map() -> None:
 def test_the_last_word_on_objects_is_that_of_the_last_map() -> None:
     mapper = Mapper(CONFIG)
     walk(mapper, WAY[:6])
-    refined = list(mapper.handle(MapRefine(stamp_ns=0, iterations=5, first_rate=1, last_rate=1)))
+    refined = list(mapper.handle(RefineMap(stamp_ns=0, iterations=5, initial_rate=1, final_rate=1)))
     assert isinstance(refined[-1], MapObjects)
     *_, last = mapper.on_stop()
     assert isinstance(last, MapObjects)
@@ -216,8 +216,8 @@ def unversioned(message: Message) -> Message:
 
 
 # --- names ----------------------------------------------------------------------------------------
-def answer(request: LabelRequest, label: str, confidence: float = 0.9) -> LabelOpen:
-    return LabelOpen(
+def answer(request: LabelRequest, label: str, confidence: float = 0.9) -> LabelResult:
+    return LabelResult(
         stamp_ns=request.stamp_ns,
         region=request.region,
         keyframe=request.keyframe,
@@ -353,7 +353,7 @@ def test_names_beyond_the_cap_are_other_and_no_opinion_is_no_label() -> None:
     assert set(top_labels(follower.map.labels).tolist()) == {0, 1, 82}
     facts = mapper.metrics()
     assert (facts["answers_named"], facts["answers_unnamed"], facts["answers_unknown"]) == (2, 1, 1)
-    assert facts["label_names_refused"] >= 1
+    assert facts["label_names_rejected"] >= 1
 
 
 def test_walls_and_floors_are_background_whoever_names_them() -> None:
@@ -398,7 +398,9 @@ def test_the_map_looks_the_same_whoever_names_it() -> None:
     alone, made = walk(plain, WAY[:6], known=(BALL,)), walk(asking, WAY[:6], known=(BALL,))
     for request in of(LabelRequest, made):
         made += asking.handle(answer(request, "samovar"))
-    views = [[encode(unversioned(view)) for view in of(ModelView, said)] for said in (alone, made)]
+    views = [
+        [encode(unversioned(view)) for view in of(MapRendering, said)] for said in (alone, made)
+    ]
     assert views[0] == views[1]
     rows = [
         followed([*said, *m.on_stop()]).map.rows for said, m in ((alone, plain), (made, asking))

@@ -10,7 +10,7 @@ from ldo_service.conversions.poses import (
     pose_to_message,
 )
 from ldo_service.geometry import se3
-from ldo_service.geometry.keyframe_poses import T_map_segment
+from ldo_service.geometry.keyframe_poses import T_map_submap
 from ldo_service.schemas import Keyframe, MeasuredPose, Pose
 
 
@@ -20,7 +20,7 @@ def handled(optimizer: Optimizer, keyframes: list[Keyframe]) -> list:
 
 def chained(keyframes: list[Keyframe]) -> list[Keyframe]:
     """Measured from their references alone."""
-    return [msgspec.structs.replace(keyframe, window=()) for keyframe in keyframes]
+    return [msgspec.structs.replace(keyframe, window_measurements=()) for keyframe in keyframes]
 
 
 def test_each_keyframe_gives_a_correction_of_all_poses(keyframes) -> None:
@@ -56,7 +56,7 @@ def test_a_missing_reference_is_bridged_by_odometry(keyframes, caplog) -> None:
 def test_a_window_stands_in_for_a_missing_reference(keyframes) -> None:
     optimizer = Optimizer()
     *_, last = keyframes
-    older = last.window[-1]
+    older = last.window_measurements[-1]
     handled(optimizer, [k for k in keyframes if k.keyframe <= older.reference])
     (correction,) = handled(optimizer, [last])
     poses = keyframe_poses_from_correction(correction)
@@ -64,7 +64,7 @@ def test_a_window_stands_in_for_a_missing_reference(keyframes) -> None:
     np.testing.assert_allclose(
         T_older_last, pose_from_message(older.T_reference_keyframe), atol=1e-6
     )
-    assert optimizer.metrics()["keyframes_bridged"] == 0
+    assert optimizer.metrics()["keyframes_odometry_fallback"] == 0
 
 
 def test_windows_bring_the_keyframes_nearer_to_the_truth(keyframes, room) -> None:
@@ -107,14 +107,14 @@ def test_an_information_of_zero_does_not_break_the_graph(keyframes) -> None:
     assert len(handled(Optimizer(), [keyframes[0], blind])) == 2
 
 
-# --- segments -------------------------------------------------------------------------------------
-def in_two_segments(keyframes: list[Keyframe], split: int) -> list[Keyframe]:
+# --- submaps -------------------------------------------------------------------------------------
+def in_two_submaps(keyframes: list[Keyframe], split: int) -> list[Keyframe]:
     """As if tracking had been lost before keyframe `split`, and had begun anew."""
     keyframes = chained(keyframes)
-    second = msgspec.structs.replace(keyframes[split], segment=1, reference=None)
+    second = msgspec.structs.replace(keyframes[split], submap=1, reference=None)
     later = [
         msgspec.structs.replace(
-            k, segment=1, reference=split, T_reference_keyframe=between(second, k)
+            k, submap=1, reference=split, T_reference_keyframe=between(second, k)
         )
         for k in keyframes[split + 1 :]
     ]
@@ -136,43 +136,43 @@ def joining(keyframe: Keyframe, known: Keyframe) -> Keyframe:
         T_reference_keyframe=between(known, keyframe),
         information=keyframe.information,
     )
-    return msgspec.structs.replace(keyframe, joins=(pose,))
+    return msgspec.structs.replace(keyframe, submap_measurements=(pose,))
 
 
-def test_a_new_segment_is_placed_far_from_the_others(keyframes) -> None:
-    (*_, last) = handled(Optimizer(), in_two_segments(keyframes, 3))
-    assert last.joined == ()
+def test_a_new_submap_is_placed_far_from_the_others(keyframes) -> None:
+    (*_, last) = handled(Optimizer(), in_two_submaps(keyframes, 3))
+    assert last.merged_submaps == ()
     for k in keyframes:
         T_odom_keyframe = pose_from_message(k.T_odom_keyframe)
-        T_expected = T_odom_keyframe if k.keyframe < 3 else T_map_segment(1) @ T_odom_keyframe
+        T_expected = T_odom_keyframe if k.keyframe < 3 else T_map_submap(1) @ T_odom_keyframe
         np.testing.assert_allclose(
             keyframe_poses_from_correction(last)[k.keyframe], T_expected, atol=1e-6
         )
 
 
-def test_a_join_brings_the_younger_segment_into_the_older_ones_frame(keyframes, caplog) -> None:
+def test_a_join_brings_the_younger_submap_into_the_older_ones_frame(keyframes, caplog) -> None:
     caplog.set_level("INFO")
-    *before, last = in_two_segments(keyframes, 3)
+    *before, last = in_two_submaps(keyframes, 3)
     first, successor = Optimizer(), Optimizer()
     handled(first, before)
     successor.restore(first.snapshot())
     for optimizer in (first, successor):
         (correction,) = handled(optimizer, [joining(last, keyframes[1])])
-        assert correction.joined == ((1, 0),)
+        assert correction.merged_submaps == ((1, 0),)
         for k in keyframes:
             np.testing.assert_allclose(
                 keyframe_poses_from_correction(correction)[k.keyframe],
                 pose_from_message(k.T_odom_keyframe),
                 atol=1e-5,
             )
-    assert "segment 1 is placed in 0 now" in caplog.text
-    assert first.metrics()["segments_apart"] == 1
+    assert "submap 1 is placed in 0 now" in caplog.text
+    assert first.metrics()["submaps_unmerged"] == 1
 
 
 def test_a_join_to_a_keyframe_that_never_came_is_left_out(keyframes, caplog) -> None:
-    *before, last = in_two_segments(keyframes, 3)
+    *before, last = in_two_submaps(keyframes, 3)
     optimizer = Optimizer()
     handled(optimizer, [k for k in before if k.keyframe != 1])
     (correction,) = handled(optimizer, [joining(last, keyframes[1])])
-    assert correction.joined == ()
+    assert correction.merged_submaps == ()
     assert "joins 1, which is missing" in caplog.text

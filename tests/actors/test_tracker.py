@@ -17,12 +17,12 @@ from ldo_service.conversions.poses import (
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
-from ldo_service.geometry.keyframe_poses import RelativePose, T_map_segment
+from ldo_service.geometry.keyframe_poses import RelativePose, T_map_submap
 from ldo_service.runtime.actor import FlowStatus
 from ldo_service.schemas import (
     Array,
-    Correction,
     FrameRgbd,
+    GraphCorrection,
     Keyframe,
     KeyframeRefinement,
     LoopClosure,
@@ -86,7 +86,7 @@ def test_without_room_no_keyframe_is_made_and_tracking_goes_on(frames, keyframes
     blocked = handled(tracker, frames[1:15])
     assert not any(isinstance(out, Keyframe) for out in blocked)
     assert all(pose.status == "OK" and pose.reference == 0 for pose in poses_of(blocked))
-    assert tracker.metrics()["keyframes_without_room"] > 0
+    assert tracker.metrics()["keyframes_without_credit"] > 0
     assert len(keyframes) > 2, "with room there would have been keyframes"
 
 
@@ -134,7 +134,7 @@ def test_odometry_does_not_jump_when_a_loop_is_closed(frames, tracked) -> None:
         if number == 25:
             newest = poses[-1].reference or 0
             said += optimizer.handle(closure_off_by(0.03, newest, poses[-1].stamp_ns, optimizer))
-            assert said[-1].closures == ((0, newest),)
+            assert said[-1].accepted_closures == ((0, newest),)
         handled(tracker, said)
     assert [p.T_odom_camera for p in poses] == [p.T_odom_camera for p in poses_of(tracked)]
     step_m = np.diff([p.T_map_odom.translation for p in poses], axis=0)
@@ -229,19 +229,19 @@ def test_a_lost_camera_may_make_a_keyframe_from_one_it_had_forgotten(
     handled(tracker, frames)
     tracked, made = poses_of(outs := handled(tracker, frames[2:3]))[0], outs[0]
     assert isinstance(made, Keyframe)
-    assert tracked.method == "relocalised"
+    assert tracked.pose_source == "relocalized"
     assert made.reference == tracked.reference
     assert made.reference < made.keyframe - 20, "long forgotten"
 
 
 def test_a_correction_before_any_frame_is_harmless() -> None:
-    correction: Correction = correction_to_message(0, 1, {0: np.eye(4)})
+    correction: GraphCorrection = correction_to_message(0, 1, {0: np.eye(4)})
     assert list(Tracker().handle(correction)) == []
 
 
-# --- segments -------------------------------------------------------------------------------------
+# --- submaps -------------------------------------------------------------------------------------
 SOON = OdometryConfig(
-    segments=SubmapConfig(begin_after_s=0.06, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
+    submaps=SubmapConfig(begin_after_s=0.06, look_every=3, confirm_after=2, confirm_apart_rad=0.05)
 )
 
 
@@ -255,15 +255,15 @@ def returning(room: Sequence) -> list[FrameRgbd]:
     ]
 
 
-def test_a_lost_camera_begins_a_segment_where_odometry_ended(returning) -> None:
+def test_a_lost_camera_begins_a_submap_where_odometry_ended(returning) -> None:
     made = handled(Tracker(TrackerConfig(odometry=SOON)), returning[:20])
     poses = poses_of(made)
     assert [pose.status for pose in poses[12:15]] == ["LOST", "LOST", "OK"]
     begun = poses[14]
-    assert (begun.segment, poses[11].segment) == (1, 0)
+    assert (begun.submap, poses[11].submap) == (1, 0)
     assert begun.T_odom_camera == poses[11].T_odom_camera, "odometry never jumps"
-    np.testing.assert_allclose(pose_from_message(begun.T_map_odom), T_map_segment(1), atol=1e-12)
-    first = next(k for k in made if isinstance(k, Keyframe) and k.segment == 1)
+    np.testing.assert_allclose(pose_from_message(begun.T_map_odom), T_map_submap(1), atol=1e-12)
+    first = next(k for k in made if isinstance(k, Keyframe) and k.submap == 1)
     assert (first.reference, first.keyframe) == (None, begun.reference)
 
 
@@ -276,15 +276,15 @@ def test_without_room_for_a_first_keyframe_a_camera_stays_lost(returning) -> Non
     assert [pose.status for pose in poses_of(handled(tracker, returning[18:20]))] == ["OK", "OK"]
 
 
-def test_a_segment_is_joined_by_what_both_see_and_moves_with_the_correction(
+def test_a_submap_is_joined_by_what_both_see_and_moves_with_the_correction(
     room: Sequence, returning
 ) -> None:
     tracker = Tracker(TrackerConfig(odometry=SOON))
     made = handled(tracker, returning)
     keyframes = [message for message in made if isinstance(message, Keyframe)]
-    (joining,) = (k for k in keyframes if k.joins)
-    (join,) = joining.joins
-    assert joining.segment == 1
+    (joining,) = (k for k in keyframes if k.submap_measurements)
+    (join,) = joining.submap_measurements
+    assert joining.submap == 1
     truth = room.truth()
     assert truth is not None
     order = [*range(12), *range(60, 4, -2)]
@@ -294,15 +294,15 @@ def test_a_segment_is_joined_by_what_both_see_and_moves_with_the_correction(
     placed = {k: se3.inverse(T_world[0]) @ T for k, T in T_world.items()}
     handled(tracker, [correction_to_message(0, 1, placed, joined={1: 0})])
     (pose,) = poses_of(handled(tracker, returning[-1:]))
-    assert pose.segment == 0
+    assert pose.submap == 0
     T_map_camera = pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
     T_expected = se3.inverse(T_world[0]) @ truth.T_world_camera[order[-1]]
     np.testing.assert_allclose(T_map_camera, T_expected, atol=5e-3)
 
 
 @pytest.mark.parametrize("split", [14, 30])
-def test_a_successor_begins_and_joins_segments_bit_for_bit(returning, split: int) -> None:
-    """From a state taken while LOST, and from one between two looks at the old segment."""
+def test_a_successor_begins_and_joins_submaps_bit_for_bit(returning, split: int) -> None:
+    """From a state taken while LOST, and from one between two looks at the old submap."""
     first, second, third = (Tracker(TrackerConfig(odometry=SOON)) for _ in range(3))
     handled(first, returning[:split])
     state = first.snapshot()
@@ -310,7 +310,7 @@ def test_a_successor_begins_and_joins_segments_bit_for_bit(returning, split: int
     third.restore({name: decode_state(encode_state(part)) for name, part in state.items()})
     after = handled(second, returning[split:])
     assert bodies(after) == bodies(handled(third, returning[split:]))
-    assert any(isinstance(message, Keyframe) and message.joins for message in after)
+    assert any(isinstance(message, Keyframe) and message.submap_measurements for message in after)
 
 
 # --- the robot's base -----------------------------------------------------------------------------
@@ -369,7 +369,9 @@ def helped(room: Sequence, frames) -> list[FrameRgbd | OdometryPrior]:
     messages: list[FrameRgbd | OdometryPrior] = []
     for frame in frames[::2]:
         T_base = T_PRIOR_WORLD @ truth.T_world_camera[frame.frame] @ T_camera_base
-        messages.append(OdometryPrior(stamp_ns=frame.stamp_ns, T_odom_base=pose_to_message(T_base)))
+        messages.append(
+            OdometryPrior(stamp_ns=frame.stamp_ns, T_prior_base=pose_to_message(T_base))
+        )
         is_covered = 10 <= frame.frame < 20
         messages.append(without_anything(frame) if is_covered else frame)
     return messages
@@ -387,7 +389,7 @@ def test_a_prior_says_nothing_by_itself_and_is_read_at_each_frame(helped) -> Non
         assert bool(made) == isinstance(message, FrameRgbd)
     facts = tracker.metrics()
     assert (facts["frames_with_prior"], facts["frames_without_prior"]) == (20, 0)
-    assert (facts["prior_refused"], facts["prior_restarts"]) == (0, 0)
+    assert (facts["prior_rejected"], facts["prior_restarts"]) == (0, 0)
 
 
 def test_a_covered_frame_is_never_ok_by_a_prior(helped) -> None:
@@ -425,9 +427,9 @@ def test_poses_that_cannot_be_used_are_counted_and_the_first_is_said(helped, cap
     prior = [message for message in helped if isinstance(message, OdometryPrior)]
     handled(tracker, [*prior[:5], *prior[:5]])
     jump = pose_to_message(se3.exp(np.array([0.0, 0.0, 0.0, 900.0, 0.0, 0.0])))
-    handled(tracker, [msgspec.structs.replace(prior[6], T_odom_base=jump), prior[7]])
+    handled(tracker, [msgspec.structs.replace(prior[6], T_prior_base=jump), prior[7]])
     facts = tracker.metrics()
-    assert (facts["prior_refused"], facts["prior_restarts"]) == (5, 2)
+    assert (facts["prior_rejected"], facts["prior_restarts"]) == (5, 2)
     warnings = [record.getMessage() for record in caplog.records]
     assert len(warnings) == 2
     assert f"stamp {prior[0].stamp_ns} has a stamp that is not after the last one's" in warnings[0]

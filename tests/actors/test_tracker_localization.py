@@ -13,7 +13,7 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import se3
 from ldo_service.schemas import TrackedPose
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.tracking.keyframe_database import DATABASE_FILE, places_of
+from ldo_service.tracking.keyframe_database import DATABASE_FILE, load_keyframe_database
 
 
 def localizing(finished_run: Path) -> Tracker:
@@ -62,18 +62,18 @@ def test_the_state_of_a_mapping_service_is_refused_and_the_other_way_round(
 
 
 def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no places\.msgpack.*ldo run"):
-        places_of(tmp_path)
+    with pytest.raises(DataError, match=r"no keyframe_database\.msgpack.*ldo run"):
+        load_keyframe_database(tmp_path)
 
 
 @pytest.mark.parametrize("body", [b"", b"nonsense", encode_state({"places": [{"id": 1}]})])
 def test_a_file_that_no_run_wrote_is_refused(tmp_path: Path, body: bytes) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(body)
     with pytest.raises(DataError, match="is not what `ldo run` writes"):
-        places_of(tmp_path)
+        load_keyframe_database(tmp_path)
 
 
 def test_a_run_that_made_no_keyframe_is_refused(tmp_path: Path) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(encode_state({"places": []}))
     with pytest.raises(DataError, match="no place"):
-        places_of(tmp_path)
+        load_keyframe_database(tmp_path)

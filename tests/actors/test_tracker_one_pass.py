@@ -68,7 +68,7 @@ def test_a_frame_that_may_not_be_mapped_enters_tracking_once(frames: Many[FrameR
 def test_a_frame_with_a_prior_enters_tracking_once(frames: Many[FrameRgbd]) -> None:
     tracker = Tracker()
     for frame in frames[:3]:
-        list(tracker.handle(OdometryPrior(stamp_ns=frame.stamp_ns, T_odom_base=IDENTITY)))
+        list(tracker.handle(OdometryPrior(stamp_ns=frame.stamp_ns, T_prior_base=IDENTITY)))
         calls, _ = calls_into_tracking(tracker, frame)
         assert calls == ["Odometry.process"]
     assert tracker.metrics()["frames_with_prior"] == 3

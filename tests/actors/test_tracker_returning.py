@@ -72,9 +72,9 @@ def test_on_the_way_back_one_keyframe_ties_the_new_to_the_known_and_no_more_are_
     tracker, poses, made = round_trip(1, frames, back)
     assert len(otherwise) > 4
     (tie,) = made
-    assert tracker.metrics()["keyframes_returned_to"] > 2
+    assert tracker.metrics()["keyframes_reused"] > 2
     T_odom = {k.keyframe: pose_from_message(k.T_odom_keyframe) for k in keyframes}
-    known = [m for m in tie.window if m.reference < (tie.reference or 0)]
+    known = [m for m in tie.window_measurements if m.reference < (tie.reference or 0)]
     assert known
     for measured in known:
         T_true = se3.inverse(T_odom[measured.reference]) @ pose_from_message(tie.T_odom_keyframe)
@@ -143,7 +143,7 @@ def test_a_restart_after_each_frame_changes_nothing(frames, back) -> None:
     _, poses, made = round_trip(1, frames, back, forgets_at=then)
     _, again, remade = round_trip(1, frames, back, restarts=True, forgets_at=then)
     assert len(made) > 2
-    assert made[-1].window
+    assert made[-1].window_measurements
     encode = msgspec.msgpack.encode
     assert [encode(pose) for pose in poses] == [encode(pose) for pose in again]
     assert [encode(keyframe) for keyframe in made] == [encode(keyframe) for keyframe in remade]
@@ -159,13 +159,13 @@ def test_without_room_nobody_is_tied_and_nobody_returns(frames, back) -> None:
     tracker.situation = FlowStatus(credits={KEYFRAME_NEW: 0})
     poses = [out for frame in back[:12] for out in tracker.handle(frame)]
     assert all(isinstance(pose, TrackedPose) and pose.status == "OK" for pose in poses)
-    assert tracker.metrics()["keyframes_returned_to"] == 0
+    assert tracker.metrics()["keyframes_reused"] == 0
 
 
 def test_without_a_map_nobody_returns(frames, back) -> None:
     tracker = Tracker(configured(1))
     said = [out for frame in [*frames, *back] for out in tracker.handle(frame)]
-    assert tracker.metrics()["keyframes_returned_to"] == 0
+    assert tracker.metrics()["keyframes_reused"] == 0
     assert sum(isinstance(out, Keyframe) for out in said) > 8
 
 

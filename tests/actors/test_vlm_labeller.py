@@ -21,15 +21,15 @@ from ldo_service.runs.replayed import open_recording
 from ldo_service.runtime import Out
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.schemas import Image, LabelAdd, LabelNames, LabelOpen, LabelRequest, decode
+from ldo_service.schemas import AddLabel, Image, LabelNames, LabelRequest, LabelResult, decode
 from ldo_service.schemas.labels import MAX_ALTERNATIVES
-from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_OPEN, LABEL_REQUEST
+from ldo_service.schemas.topics import LABEL_ADD, LABEL_NAMES, LABEL_REQUEST, LABEL_RESULT
 from ldo_service.service.service import open_recorder
 from ldo_service.storage.state_store import MemoryStore
 from ldo_service.transport.interface import MemoryTransport
 from tests.detection.labellers.encoders import ColorPair, embeddings, plain, vocabulary
 from tests.detection.labellers.server import hangs, says, sends, serving
-from tests.runtime.cast import QUICK, eventually, running, send
+from tests.runtime.fake_actors import QUICK, eventually, running, send
 
 
 def crop_message(color: np.ndarray) -> Image:
@@ -52,14 +52,14 @@ def request(region: int = 7, color: str = "red", **fields) -> LabelRequest:
     )
 
 
-def only(messages) -> LabelOpen:
+def only(messages) -> LabelResult:
     (message,) = messages
-    assert isinstance(message, LabelOpen)
+    assert isinstance(message, LabelResult)
     return message
 
 
 def added(actor: VlmLabeller, name: str) -> LabelNames:
-    (answer,) = actor.handle(LabelAdd(stamp_ns=5, name=name))
+    (answer,) = actor.handle(AddLabel(stamp_ns=5, name=name))
     assert isinstance(answer, LabelNames)
     return answer
 
@@ -119,10 +119,11 @@ def test_a_region_gets_its_name(pair: Path, names: Path) -> None:
 def test_it_tells_what_else_a_region_may_be() -> None:
     told = [("cup", 0.5), ("vase", 0.3), ("bowl", 0.1)]
     answer = only(VlmLabeller(labeller=Scripted(told)).handle(request()))
-    assert (answer.label, answer.others) == ("cup", (("vase", 0.3), ("bowl", 0.1)))
+    assert (answer.label, answer.alternatives) == ("cup", (("vase", 0.3), ("bowl", 0.1)))
     many = [(f"name {k}", 0.01) for k in range(99)]
     assert (
-        len(only(VlmLabeller(labeller=Scripted(many)).handle(request())).others) == MAX_ALTERNATIVES
+        len(only(VlmLabeller(labeller=Scripted(many)).handle(request())).alternatives)
+        == MAX_ALTERNATIVES
     )
 
 
@@ -131,7 +132,7 @@ def test_without_a_labeller_it_idles_and_answers_at_once() -> None:
     answer = only(actor.handle(request()))
     assert (answer.label, answer.confidence, answer.labeller) == ("", 0, "")
     assert (actor.metrics()["labellers"], actor.metrics()["labellers_missing"]) == (0, 0)
-    assert "vlm_labeller.model" in added(actor, "teapot").refused
+    assert "vlm_labeller.model" in added(actor, "teapot").error
 
 
 def test_no_opinion_is_told_from_nobody_who_could_look() -> None:
@@ -247,7 +248,7 @@ def test_a_name_that_cannot_be_placed_is_refused_and_later_remembered(
     embeddings(tmp_path / "embeddings.npz")
     cached = VlmLabeller(VlmLabellerConfig(model=str(tmp_path)))
     answer = added(cached, "teapot")
-    assert "--text and --vocabulary" in answer.refused
+    assert "--text and --vocabulary" in answer.error
     assert answer.names == ("red", "green", "blue")
     assert cached.metrics()["names_refused"] == 1
     cached.restore({"added": ["teapot"]})
@@ -264,7 +265,7 @@ def stage(transport: MemoryTransport, labeller: Scripted, **fields) -> Stage:
 
 async def test_a_slow_labeller_keeps_the_newest_of_each_region_and_no_more_than_32() -> None:
     transport, gate, heard = MemoryTransport(), Event(), []
-    transport.subscribe(LABEL_OPEN.name, lambda _, body: heard.append(decode(body, LabelOpen)))
+    transport.subscribe(LABEL_RESULT.name, lambda _, body: heard.append(decode(body, LabelResult)))
     labeller = Scripted([("cup", 0.5)], gate)
     slow = stage(transport, labeller)
     mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
@@ -273,7 +274,7 @@ async def test_a_slow_labeller_keeps_the_newest_of_each_region_and_no_more_than_
         await eventually(lambda: labeller.seen)
         for region in (1, 1, 1, *range(2, 41)):
             await send(mapper, request(region, crops=(crop_message(plain("red")),) * 2))
-        await eventually(lambda: slow.health().inputs[0].waiting == 32)
+        await eventually(lambda: slow.health().inputs[0].queued == 32)
         assert len(heard) == 0, "nobody waited for an answer"
         gate.set()
         await eventually(lambda: len(heard) == 33)
@@ -284,7 +285,7 @@ async def test_a_slow_labeller_keeps_the_newest_of_each_region_and_no_more_than_
 
 async def test_who_adds_a_name_waits_for_one_region_and_not_for_all_that_wait() -> None:
     transport, gate, said = MemoryTransport(), Event(), []
-    for topic in (LABEL_OPEN, LABEL_NAMES):
+    for topic in (LABEL_RESULT, LABEL_NAMES):
         transport.subscribe(topic.name, lambda *_, name=topic.name: said.append(name))
     labeller = Scripted([("cup", 0.5)], gate)
     mapper = Outlet(Out(LABEL_REQUEST), "mapper", 1, transport)
@@ -293,10 +294,10 @@ async def test_who_adds_a_name_waits_for_one_region_and_not_for_all_that_wait() 
         for region in range(5):
             await send(mapper, request(region))
         await eventually(lambda: labeller.seen)
-        await send(operator, LabelAdd(stamp_ns=1, name="teapot"))
+        await send(operator, AddLabel(stamp_ns=1, name="teapot"))
         gate.set()
         await eventually(lambda: len(said) == 6)
-    assert said == [LABEL_OPEN.name, LABEL_NAMES.name, *[LABEL_OPEN.name] * 4]
+    assert said == [LABEL_RESULT.name, LABEL_NAMES.name, *[LABEL_RESULT.name] * 4]
 
 
 async def test_a_state_survives_the_stage(pair: Path, names: Path) -> None:
@@ -307,17 +308,17 @@ async def test_a_state_survives_the_stage(pair: Path, names: Path) -> None:
     for name, count in (("blue", 3), ("teapot", 4)):
         one = Stage(lambda: VlmLabeller(config), transport, config=QUICK, store=store)
         async with running(one) as tasks:
-            await send(operator, LabelAdd(stamp_ns=count, name=name))
+            await send(operator, AddLabel(stamp_ns=count, name=name))
             await eventually(lambda count=count: told and told[-1].stamp_ns == count)
             one.drain()
             await asyncio.gather(*tasks)
         assert len(told[-1].names) == count
 
 
-async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelOpen]:
+async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelResult]:
     """A life with two regions and a name between them."""
     transport, heard = MemoryTransport(), []
-    transport.subscribe(LABEL_OPEN.name, lambda _, body: heard.append(decode(body, LabelOpen)))
+    transport.subscribe(LABEL_RESULT.name, lambda _, body: heard.append(decode(body, LabelResult)))
     settings = VlmLabellerSettings(config.model, config.url, class_names=config.names)
     whole = Config(vlm_labeller=settings)
     journal = open_recorder(folder, "vlm_labeller", "robot", whole)
@@ -327,7 +328,7 @@ async def recorded(folder: Path, config: VlmLabellerConfig) -> list[LabelOpen]:
     async with running(one) as tasks:
         await send(mapper, request(0, "blue"))
         await eventually(lambda: len(heard) == 1)
-        await send(operator, LabelAdd(stamp_ns=1, name="blue"))
+        await send(operator, AddLabel(stamp_ns=1, name="blue"))
         await send(mapper, request(1, "blue"))
         await eventually(lambda: len(heard) == 2)
         one.drain()
@@ -342,9 +343,9 @@ async def test_encoders_replay_with_the_names_that_were_added(
     heard = await recorded(tmp_path / "recording", config)
     assert heard[1].label == "blue"
     (replayed,) = open_recording(tmp_path / "recording")
-    assert replayed.verify().made == {LABEL_OPEN.name: 2, LABEL_NAMES.name: 1}
+    assert replayed.verify().made == {LABEL_RESULT.name: 2, LABEL_NAMES.name: 1}
     names.write_text("red\nblue\n")
-    with pytest.raises(ReplayDiverged, match="label/open"):
+    with pytest.raises(ReplayDiverged, match="label/result"):
         replayed.verify()
 
 

@@ -21,8 +21,8 @@ from ldo_service.gaussians.pruning import find_duplicates
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import KeyframePoses, RelativePose
 from ldo_service.pose_graph.pose_graph import PoseGraph
-from ldo_service.schemas import Correction, decode, encode
-from tests.pose_graph.walks import REFINED, between, odometry, round_trips
+from ldo_service.schemas import GraphCorrection, decode, encode
+from tests.pose_graph.trajectories import REFINED, between, odometry, round_trips
 
 ROOM_M, SPACING_M, OVER_EACH_OTHER = 6.0, 0.02, 12
 EVERY = 200  # keyframes, between measurements of a journey
@@ -55,7 +55,7 @@ def measure_mapper(gaussians: int, keyframes: int, repeats: int) -> None:
         message = correction_to_message(0, number + 1, {k: shift @ T for k, T in T_map.items()})
         body = encode(message)
         start = time.process_time()
-        received = keyframe_poses_from_correction(decode(body, Correction))
+        received = keyframe_poses_from_correction(decode(body, GraphCorrection))
         before = poses.of(T_map)
         poses.correct(number + 1, received)
         T_new_old = poses.of(T_map) @ se3.inverse(before)
@@ -119,7 +119,7 @@ def measure_journey(keyframes: int) -> None:
             closure_ms.append(1e3 * (time.process_time() - start))
         if b % 20 == 0 or b % EVERY > EVERY - 5:
             start = time.process_time()
-            receiver.correct(version, keyframe_poses_from_correction(decode(body, Correction)))
+            receiver.correct(version, keyframe_poses_from_correction(decode(body, GraphCorrection)))
             take_ms.append(1e3 * (time.process_time() - start))
             size_kb = len(body) / 1e3
         if b in (EVERY, 1000, 2000, 5000, keyframes - 1):

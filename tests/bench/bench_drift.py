@@ -33,8 +33,8 @@ from ldo_service.runs.job import RunOptions
 from ldo_service.runs.offline import run_offline, with_all_cores
 from ldo_service.runs.source import Selection
 from ldo_service.runtime import Actor
-from ldo_service.schemas import Correction, Message, TrackedPose
-from tests.runs.mistaken import Drift, DriftingTracker, standing_in
+from ldo_service.schemas import GraphCorrection, Message, TrackedPose
+from tests.runs.false_closures import Drift, DriftingTracker, standing_in
 
 NO_LOOPS = "loop_closer.enabled=false"
 NONE = Drift(scale=0.0, aside=0.0, turn_rad_per_m=0.0)
@@ -54,7 +54,7 @@ class Watched:
         def watching(message: Message) -> Iterator[Message]:
             start_s = time.thread_time()
             made = list(handle(message))
-            if isinstance(message, Correction):
+            if isinstance(message, GraphCorrection):
                 self.pauses_ms.append(1e3 * (time.thread_time() - start_s))
             self.odometry += [
                 (1e-9 * pose.stamp_ns, pose_from_message(pose.T_odom_camera))
@@ -104,7 +104,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=(), metavar="RUN")
     parser.add_argument("--turn", type=float, default=0.5, metavar="DEGREES")
     parser.add_argument("--set", nargs="*", default=(), metavar="KEY=VALUE")
-    parser.add_argument("--hold-out", type=int, default=5)
+    parser.add_argument("--hold-out-every", type=int, default=5)
     options = parser.parse_args()
     sequence = open_sequence(options.source)
     settings = (f"tracker.hold_out={options.hold_out}", *options.set)

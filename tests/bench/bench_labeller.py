@@ -38,8 +38,8 @@ from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.detection.labellers.server import serving
 from tests.service.conftest import LiveService, live_service
-from tests.service.exhibits import Guide, Placed, flat, placed
-from tests.service.heard import Heard
+from tests.service.failure_artifacts import Guide, Placed, flat, placed
+from tests.service.message_inbox import Heard
 
 PART = range(120)  # frames of the flat that are gone through, there and back
 SETTINGS: tuple[str, ...] = ("detector.model=demo",)
@@ -133,7 +133,7 @@ class Outcome:
         return {pose.frame: pose_from_message(pose.T_odom_camera) for pose in self.live.heard.poses}
 
     def row(self, alone: "Outcome") -> str:
-        poses = [p for p in self.live.heard.poses if p.status == "OK" and p.segment == 0]
+        poses = [p for p in self.live.heard.poses if p.status == "OK" and p.submap == 0]
         who = "none" if self.delay_s is None else f"{self.delay_s:g} s a call"
         p50, p95 = np.percentile(self.live.latencies_ms(), (50, 95))
         rate = f"{len(poses) / self.seconds:.1f}"

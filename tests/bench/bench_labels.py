@@ -42,7 +42,7 @@ from ldo_service.geometry.sequence import FrameLabels, TrueLabels
 from ldo_service.regions.foreground import (
     ForegroundConfig,
     RegionDetections,
-    Surfaces,
+    SmoothSurfaces,
     foreground,
     pixels_of,
     surfaces,
@@ -54,8 +54,8 @@ from ldo_service.semantics.label_assignment import AssignmentConfig
 from ldo_service.semantics.semantic_fusion import (
     FusionConfig,
     SemanticFusionConfig,
+    fuse_detections,
     label_image,
-    label_keyframe,
 )
 
 NETWORKS = {"YOLOX-Nano": "yolox_nano.onnx", "YOLOv5n": "yolov5n_480x640_w16.onnx"}
@@ -153,7 +153,7 @@ def asked(
     return out
 
 
-def region(box: np.ndarray, frame: RgbdFrame, found: Surfaces) -> np.ndarray:
+def region(box: np.ndarray, frame: RgbdFrame, found: SmoothSurfaces) -> np.ndarray:
     """[H, W] bool: the foreground in a box; all of the box where there is none."""
     part = foreground(box, frame.depth_m, found, frame.camera, ForegroundConfig())
     mask = part.image(frame.depth_m.shape)
@@ -222,7 +222,7 @@ def grown(scene: Scene, runs: list[Follower], iterations: int) -> MapBuilder:
         for run in runs:
             run.follow(gaussians.ids)
             view = frame.camera, T, frame.depth_m, run.claims[k]
-            label_keyframe(gaussians.rows, run.labels, indices, *view, run.config)
+            fuse_detections(gaussians.rows, run.labels, indices, *view, run.config)
     return builder
 
 

@@ -31,11 +31,11 @@ from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.runtime.stage_metrics import resident_mb
 from ldo_service.schemas import (
     CameraRgbd,
-    Correction,
     DetectionBoxes,
+    GraphCorrection,
     Keyframe,
-    LabelOpen,
-    MapRefine,
+    LabelResult,
+    RefineMap,
 )
 
 COLUMNS = (
@@ -77,9 +77,9 @@ class TimedMapper(Mapper):
         self.mapped: list[Mapped] = []
 
     def handle(
-        self, message: Keyframe | DetectionBoxes | LabelOpen | Correction | MapRefine
+        self, message: Keyframe | DetectionBoxes | LabelResult | GraphCorrection | RefineMap
     ) -> Iterator[Output]:
-        if self._T_world_camera is not None and isinstance(message, Correction):
+        if self._T_world_camera is not None and isinstance(message, GraphCorrection):
             return
         if not isinstance(message, Keyframe):
             yield from super().handle(message)
@@ -105,10 +105,10 @@ class TimedMapper(Mapper):
                 lap=keyframe.frame // self._frames_per_lap,
                 cpu_ms=cpu_ms,
                 gaussians=int(facts["gaussians"]),
-                asleep=int(facts["gaussians_asleep"]),
-                over_cap=int(facts["gaussians_over_cap"]),
+                asleep=int(facts["gaussians_offloaded"]),
+                over_cap=int(facts["gaussians_over_limit"]),
                 pruned=int(facts["gaussians_pruned"]),
-                woken=int(facts["gaussians_woken"]),
+                woken=int(facts["gaussians_loaded_total"]),
                 images_mb=facts["keyframes_cache_mb"],
                 resident_mb=resident_mb(),
             )

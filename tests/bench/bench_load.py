@@ -139,7 +139,7 @@ def _robot(
     name: str, endpoint: str, folder: Path, settings: tuple[str, ...], stack: ExitStack
 ) -> Robot:
     words = [word for setting in (*LIGHT, *settings) for word in ("--set", setting)]
-    command = [sys.executable, "-m", "ldo_service", "serve", "--join", "--robot", name]
+    command = [sys.executable, "-m", "ldo_service", "serve", "--client", "--robot", name]
     process = subprocess.Popen(
         [*command, "--endpoint", endpoint, "--state", str(folder / name), *words],
         stderr=(folder / f"{name}.log").open("w"),
@@ -277,7 +277,7 @@ def _settle(robots: list[Robot]) -> None:
     time.sleep(3.0)
     until_s = time.monotonic() + 60
     while time.monotonic() < until_s and any(
-        count.waiting for robot in robots for h in robot.health.values() for count in h.inputs
+        count.queued for robot in robots for h in robot.health.values() for count in h.inputs
     ):
         time.sleep(0.5)
     time.sleep(2.0)
@@ -323,7 +323,7 @@ def table(outcome: Outcome) -> str:
         )
     counted = [accounts(robot) for robot in outcome.robots]
     total = {name: sum(one[name] for one in counted) for name in counted[0]}
-    facts = [robot.health["mapper"].facts for robot in outcome.robots]
+    facts = [robot.health["mapper"].metrics for robot in outcome.robots]
     total |= {name: round(sum(one[name] for one in facts)) for name in ("keyframes", "gaussians")}
     total["poses"] = sum(robot.judged for robot in outcome.robots)
     total["of them OK"] = sum(robot.judged_ok for robot in outcome.robots)

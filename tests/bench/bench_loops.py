@@ -48,11 +48,11 @@ from ldo_service.loop_closing.object_points import LAYOUT_WORDS
 from ldo_service.loop_closing.place_database import PlaceDatabase, RetrievalConfig, Stages
 from ldo_service.runs.source import FrameReader, Selection
 from ldo_service.runtime.logical_clock import LogicalClock
-from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopClosure, Message
+from ldo_service.schemas import DetectionBoxes, GraphCorrection, Keyframe, LoopClosure, Message
 from ldo_service.semantics.gaussian_labels import MAX_LABELS
 
 SUBGRAPHS = 1000
-Taken = Keyframe | DetectionBoxes | Correction  # by the loop closer
+Taken = Keyframe | DetectionBoxes | GraphCorrection  # by the loop closer
 STAGES: tuple[Stages, ...] = ("two_stage", "geometric", "semantic")
 
 
@@ -63,7 +63,7 @@ def coarse_ms(repeats: int = 20) -> float:
     memory = PlaceDatabase(config.words.count, "two_stage", RetrievalConfig(count=SUBGRAPHS))
 
     def subgraph(number: int) -> Any:
-        place = SimpleNamespace(segment=0, median_depth_m=2.0)
+        place = SimpleNamespace(submap=0, median_depth_m=2.0)
         poses.add(number, None, np.eye(4), se3.exp(rng.normal(size=6)))
         return SimpleNamespace(
             views=[SimpleNamespace(keyframe=number, place=place, path_m=float(number))],
@@ -120,7 +120,9 @@ def closed(messages: list[Taken], seen: dict[int, SeenKeyframe], stages: Stages)
         compared = [one for one in said if not isinstance(one, LoopClosure)]
         closures += [one for one in said if isinstance(one, LoopClosure)]
         candidates += [
-            ComparedPair(one.keyframes, one.references, not one.refused, ms / len(compared))
+            ComparedPair(
+                one.keyframes, one.reference_keyframes, not one.rejected_reason, ms / len(compared)
+            )
             for one in compared
         ]
     poses = [

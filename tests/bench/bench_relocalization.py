@@ -23,7 +23,7 @@ from ldo_service.datasets import Sequence, open_sequence
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking import Odometry, OdometryConfig, pyramid_of
 from ldo_service.tracking.keyframe_database import KeyframeDatabase, make_keyframe_record
-from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig
+from ldo_service.tracking.keyframes import KeyframeConfig, ReferenceKeyframe
 from ldo_service.tracking.relocalization import Relocalizer
 from ldo_service.tracking.tracking_quality import ResidualHistory
 
@@ -82,7 +82,7 @@ def mapped(source: str) -> Mapped:
         result = odometry.process(frame)
         if result.keyframe is not None:
             view = pyramid_of(frame, CONFIG.pyramid)
-            keyframe = Keyframe(view, result.T_odom_camera, frame.index)
+            keyframe = ReferenceKeyframe(view, result.T_odom_camera, frame.index)
             places = places.with_record(
                 make_keyframe_record(keyframe, CONFIG.features, CONFIG.places), CONFIG.places
             )

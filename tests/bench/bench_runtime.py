@@ -70,8 +70,8 @@ async def throughput(network: Endpoint) -> Throughput:
             while stage.health().inputs[0].delivered < MESSAGES:
                 await asyncio.sleep(0.001)
             total_s = time.perf_counter() - started_s
-            deepest = stage.health().inputs[0].peak
-    return Throughput(total_s, deepest, most_mb - before_mb, outlet.counts().repeated)
+            deepest = stage.health().inputs[0].peak_queued
+    return Throughput(total_s, deepest, most_mb - before_mb, outlet.counts().retransmitted)
 
 
 async def release_ms(network: Endpoint) -> float:

@@ -9,10 +9,10 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.security.attack_cases import ATTEMPTS
 from tests.security.attempt import Attempt, Where
-from tests.security.attempts import ATTEMPTS
-from tests.security.lab import lab
-from tests.security.lies import LIES
+from tests.security.forged_messages import LIES
+from tests.security.network_fixture import lab
 
 
 def row(attempt: Attempt[Where], where: Where) -> bool:

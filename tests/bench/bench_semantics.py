@@ -28,7 +28,11 @@ from ldo_service.regions.foreground import (
 )
 from ldo_service.semantics.gaussian_labels import NOT_SEEN, new_labels, observe, smooth_labels
 from ldo_service.semantics.label_assignment import Regions, assign_gaussians
-from ldo_service.semantics.semantic_fusion import SemanticFusionConfig, label_keyframe, observations
+from ldo_service.semantics.semantic_fusion import (
+    SemanticFusionConfig,
+    fuse_detections,
+    observations,
+)
 from tests.reference.assignment import assign_reference
 from tests.reference.consistency import agree_reference
 from tests.reference.foreground import foreground_reference, surfaces_reference
@@ -137,7 +141,7 @@ def main() -> None:
     print(f"{n} Gaussians, {len(touched)} seen, {np.mean(seen.labels >= 0):.0%} in regions")
     print("| step | ms | the twin, of equal work |\n|---|---|---|")
     print(f"| together | {sum(step.told(repeats) for step in steps):.2f} | |")
-    Step("whole", lambda: label_keyframe(*keyframe)).told(repeats)
+    Step("whole", lambda: fuse_detections(*keyframe)).told(repeats)
 
 
 def tables(claims: RegionDetections, parts: Sequence[Foreground]) -> Regions:

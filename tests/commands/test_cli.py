@@ -63,7 +63,7 @@ def test_an_unknown_layout_is_bad_data(capsys, tmp_path: Path) -> None:
     [
         ("--stride", "0"),
         ("--max-frames", "-3"),
-        ("--hold-out", "1"),
+        ("--hold-out-every", "1"),
         ("--set", "mapper.nothing=1"),
         ("--threads", "-1"),
     ],
@@ -154,14 +154,20 @@ def test_a_closed_pipe_is_no_error() -> None:
 
 def test_bench_prints_one_json_object_or_a_table(capsys) -> None:
     small = ("bench", "render", "--gaussians", "300", "--size", "64x48", "--repeats", "2")
-    code, out, _ = ldo(capsys, *small, "--threads", "2", "--elsewhere", "500", "--json")
+    code, out, _ = ldo(capsys, *small, "--threads", "2", "--gaussians-out-of-view", "500", "--json")
     assert code == 0
     facts = json.loads(out)
     steps = [facts[f"{step}_ms"] for step in ("forward", "loss", "backward", "adam")]
     assert all(time_ms >= 0 for time_ms in steps)
     assert facts["iteration_ms"] > 0
     assert facts["isa"] in ("baseline", "avx2", "avx512")
-    wanted = {"gaussians": 300, "elsewhere": 500, "width": 64, "height": 48, "threads": 2}
+    wanted = {
+        "gaussians": 300,
+        "gaussians_out_of_view": 500,
+        "width": 64,
+        "height": 48,
+        "threads": 2,
+    }
     assert wanted.items() <= facts.items()
     code, out, _ = ldo(capsys, *small)
     assert code == 0

@@ -46,7 +46,7 @@ def test_a_run_that_localized_has_no_map_and_its_trajectory_is_judged(
 ) -> None:
     again = tmp_path / "again"
     code, out, _ = ldo(
-        *(capsys, "run", room_folder, "--out", again, "--localise", run, "--max-frames", "6")
+        *(capsys, "run", room_folder, "--out", again, "--localize", run, "--max-frames", "6")
     )
     assert code == 0
     assert f"The map is that of {run}" in " ".join(out.split())
@@ -61,7 +61,7 @@ def test_a_run_that_localized_has_no_map_and_its_trajectory_is_judged(
     assert "PSNR" not in out
     for arguments in (
         ("export", again, "--format", "ply"),
-        ("run", room_folder, "--out", tmp_path / "x", "--localise", again),
+        ("run", room_folder, "--out", tmp_path / "x", "--localize", again),
     ):
         code, _, err = ldo(capsys, *arguments)
         assert code == 3
@@ -72,7 +72,7 @@ def test_a_source_without_truth_says_nothing_about_a_run_without_a_map(
     capsys, run: Path, without_truth: Path, tmp_path: Path
 ) -> None:
     again = tmp_path / "again"
-    ldo(capsys, "run", without_truth, "--out", again, "--localise", run, "--max-frames", "3")
+    ldo(capsys, "run", without_truth, "--out", again, "--localize", run, "--max-frames", "3")
     code, _, err = ldo(capsys, "eval", again, without_truth)
     assert code == 3
     assert "no map, so there is nothing to judge" in " ".join(err.split())
@@ -149,7 +149,7 @@ def test_without_held_out_frames_it_says_how_to_get_some(
     code, out, _ = ldo(capsys, "eval", run, room_folder)
     assert code == 0
     assert "A: none" in out
-    assert "--hold-out 5" in out
+    assert "--hold-out-every 5" in out
     assert "A held out" not in out
     assert "B training" in out
 

@@ -9,7 +9,7 @@ from .test_cli import assert_one_paragraph, ldo
 
 def test_keys_are_made_listed_and_revoked(capsys, tmp_path: Path) -> None:
     keys = tmp_path / "keys"
-    assert ldo(capsys, "keys", "new", keys)[0] == 0
+    assert ldo(capsys, "keys", "init", keys)[0] == 0
     add = ("keys", "add", keys)
     code, out, _ = ldo(capsys, *add, "service", "mule", "--robot", "mule", "--host", "mule.local")
     assert code == 0
@@ -24,7 +24,7 @@ def test_keys_are_made_listed_and_revoked(capsys, tmp_path: Path) -> None:
 
 def test_a_router_of_its_own_gets_the_same_rules(capsys, tmp_path: Path) -> None:
     keys = tmp_path / "keys"
-    ldo(capsys, "keys", "new", keys)
+    ldo(capsys, "keys", "init", keys)
     ldo(capsys, "keys", "add", keys, "camera", "front", "--robot", "mule")
     code, out, _ = ldo(capsys, "keys", "router", keys, "--keys", "/keys", "--port", "7448")
     file = yaml.safe_load(out[out.index("mode:") :])
@@ -37,8 +37,8 @@ def test_a_router_of_its_own_gets_the_same_rules(capsys, tmp_path: Path) -> None
 
 
 def test_what_is_there_is_not_overwritten(capsys, tmp_path: Path) -> None:
-    ldo(capsys, "keys", "new", tmp_path / "keys")
-    code, _, err = ldo(capsys, "keys", "new", tmp_path / "keys")
+    ldo(capsys, "keys", "init", tmp_path / "keys")
+    code, _, err = ldo(capsys, "keys", "init", tmp_path / "keys")
     assert code == 2
     assert_one_paragraph(err)
     assert "never overwritten" in err
@@ -56,4 +56,4 @@ def test_a_service_on_the_network_without_keys_is_refused(capsys) -> None:
     code, _, err = ldo(capsys, "serve", "--endpoint", "tcp/0.0.0.0:7447")
     assert code == 2
     assert_one_paragraph(err)
-    assert "--without-keys" in err
+    assert "--insecure" in err

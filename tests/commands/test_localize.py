@@ -1,4 +1,4 @@
-"""`ldo run --localise DIR`: poses in the map of DIR, which stays as it is."""
+"""`ldo run --localize DIR`: poses in the map of DIR, which stays as it is."""
 
 import csv
 from pathlib import Path
@@ -21,7 +21,7 @@ def test_a_second_run_is_in_the_frame_of_the_first(
     capsys, tmp_path: Path, finished_run: Path, room_folder: Path
 ) -> None:
     before, out = contents(finished_run), tmp_path / "again"
-    arguments = ("run", room_folder, "--out", out, "--localise", finished_run)
+    arguments = ("run", room_folder, "--out", out, "--localize", finished_run)
     code, _, err = ldo(capsys, *arguments)
     assert code == 0, err
     assert contents(finished_run) == before
@@ -43,20 +43,20 @@ def test_where_no_frame_is_recognized_the_map_is_asked_about(ok: int, says: str)
 
 def test_a_folder_that_is_no_run_is_bad_data(capsys, tmp_path: Path, room_folder: Path) -> None:
     for verb in (("run", room_folder, "--out", tmp_path / "out"), ("serve",)):
-        code, _, err = ldo(capsys, *verb, "--localise", room_folder)
+        code, _, err = ldo(capsys, *verb, "--localize", room_folder)
         assert code == 3
         assert_one_paragraph(err)
-        assert "places.msgpack" in err
+        assert "keyframe_database.msgpack" in err
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("options", [("--refine", "5"), ("--overwrite",)])
+@pytest.mark.parametrize("options", [("--refine-iterations", "5"), ("--overwrite",)])
 def test_the_map_cannot_be_changed_or_replaced(
     capsys, tmp_path: Path, finished_run: Path, room_folder: Path, options
 ) -> None:
     before = contents(finished_run)
     out = finished_run if "--overwrite" in options else tmp_path / "out"
-    arguments = ("run", room_folder, "--out", out, "--localise", finished_run, *options)
+    arguments = ("run", room_folder, "--out", out, "--localize", finished_run, *options)
     code, _, err = ldo(capsys, *arguments)
     assert code == 2
     assert_one_paragraph(err)

@@ -24,11 +24,11 @@ def file(tmp_path: Path) -> Path:
 
 def test_add_list_remove(capsys, file: Path, tmp_path: Path) -> None:
     (tmp_path / "LICENSE").write_text("Licence of squares\n\nAll rights reversed.\n")
-    license = ("--licence", tmp_path / "LICENSE")
+    license = ("--license", tmp_path / "LICENSE")
     code, out, _ = ldo(capsys, "models", "add", "mine", file, *license)
     assert code == 0
     assert "mine is registered: yolov5, 3 classes (red, green, blue" in out
-    assert Models().get("mine").about.licence.endswith("All rights reversed.\n")
+    assert Models().get("mine").about.license.endswith("All rights reversed.\n")
     code, out, _ = ldo(capsys, "models", "list")
     assert code == 0
     for word in ("mine", "yolov5", "Licence of squares", Models().get("mine").about.sha256[:12]):
@@ -57,8 +57,8 @@ def test_a_pair_is_added_by_its_files(capsys, tmp_path: Path) -> None:
 
 
 def test_a_license_may_be_a_text(capsys, file: Path) -> None:
-    ldo(capsys, "models", "add", "mine", file, "--licence", "Apache-2.0, of the authors" * 20)
-    assert Models().get("mine").about.licence == "Apache-2.0, of the authors" * 20
+    ldo(capsys, "models", "add", "mine", file, "--license", "Apache-2.0, of the authors" * 20)
+    assert Models().get("mine").about.license == "Apache-2.0, of the authors" * 20
 
 
 def test_garbage_is_refused_in_one_paragraph(capsys, tmp_path: Path, folder: Path) -> None:

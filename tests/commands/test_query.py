@@ -59,20 +59,20 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("segment", [0, 3])
-def test_from_a_segment_that_is_not_joined_no_distance_is_known(
-    capsys, monkeypatch: pytest.MonkeyPatch, segment: int
+@pytest.mark.parametrize("submap", [0, 3])
+def test_from_a_submap_that_is_not_joined_no_distance_is_known(
+    capsys, monkeypatch: pytest.MonkeyPatch, submap: int
 ) -> None:
     here = Pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     nowhere = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     pose = msgspec.structs.replace(
-        EXAMPLES["tracked_pose"], T_odom_camera=here, T_map_odom=nowhere, segment=segment
+        EXAMPLES["tracked_pose"], T_odom_camera=here, T_map_odom=nowhere, submap=submap
     )
     service = Mock(objects=lambda: FOUND, latest=lambda _topic: [pose])
     monkeypatch.setattr(query, "connect", lambda *_: nullcontext(service))
     _, out, _ = ldo(capsys, "query", "live", "couch", "--json")
     (answer,) = json.loads(out)
-    assert answer["distance"] == (None if segment else 2.0)
+    assert answer["distance"] == (None if submap else 2.0)
 
 
 def test_objects_survive_the_file(folder: Path) -> None:

@@ -32,7 +32,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("suite broken.yaml --out s", 2, "is not a suite"),
         ("suite suite.yaml --out s", 3, "none of the sequences of suite.yaml: --data"),
         ("suite suite.yaml --out /proc/x", 2, "/proc/x cannot be written"),
-        ("keys new full", 2, "full is there already"),
+        ("keys init full", 2, "full is there already"),
         ("keys list empty", 2, "empty holds no authority (No such file or directory)"),
         ("keys router empty", 2, "access.yaml cannot be read"),
         ("eval empty synthetic:room", 3, "is it what `ldo run` wrote"),
@@ -48,18 +48,26 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("publish ros2 --color /c --depth /d --stride 0", 2, "stride of 0"),
         ("publish ros2 --color /c --depth /d --max-skew-s -1", 2, "--max-skew-s -1"),
         ("record full", 2, "full is not empty"),
-        ("record r --only nobody", 2, "no actor 'nobody'"),
-        ("record r --endpoint tcp/0.0.0.0:7447", 2, "--without-keys"),
+        ("record r --actor nobody", 2, "no actor 'nobody'"),
+        ("record r --endpoint tcp/0.0.0.0:7447", 2, "--insecure"),
         ("record r --config broken.yaml", 2, "broken.yaml is not valid YAML"),
-        ("record r --localise empty", 3, "no places.msgpack"),
-        ("run synthetic:room --out s --front-end empty", 3, "empty has no front_end.mcap"),
-        ("run synthetic:room --out s --front-end s", 2, "--out s would replace the front end"),
-        ("run synthetic:room --out s --front-end x --keep-front-end", 2, "do not go together"),
+        ("record r --localize empty", 3, "no keyframe_database.msgpack"),
+        ("run synthetic:room --out s --reuse-front-end empty", 3, "empty has no front_end.mcap"),
+        (
+            "run synthetic:room --out s --reuse-front-end s",
+            2,
+            "--out s would replace the front end",
+        ),
+        (
+            "run synthetic:room --out s --reuse-front-end x --keep-front-end",
+            2,
+            "do not go together",
+        ),
         ("run synthetic:room --out s --realtime --keep-front-end", 2, "do not go together"),
         ("simulate empty", 3, "in no known layout"),
         ("simulate junk", 3, "junk holds no camera/rgbd"),
         ("simulate synthetic:room --max-frames 0", 2, "at most 0 frames"),
-        ("serve --localise nowhere", 3, "no places.msgpack"),
+        ("serve --localize nowhere", 3, "no keyframe_database.msgpack"),
         ("serve --state suite.yaml", 2, "cannot be used for state"),
         ("serve --resume ran", 2, "ran is what `ldo run` wrote"),
         ("serve --state junk", 2, "junk is a recording"),
@@ -79,7 +87,7 @@ def test_it_is_said_in_one_paragraph(capsys, here: Path, words: str, code: int, 
 
 @pytest.mark.usefixtures("here")
 def test_a_router_with_keys_needs_a_bridge_of_its_own(capsys) -> None:
-    assert ldo(capsys, "keys", "new", "keys")[0] == 0
+    assert ldo(capsys, "keys", "init", "keys")[0] == 0
     assert ldo(capsys, "keys", "add", "keys", "camera", "front")[0] == 0
     with_keys = "--keys", "keys/front", "--endpoint", "tls/127.0.0.1:1"
     code, _, err = ldo(capsys, *ROS, "--depth", "/d", *with_keys)

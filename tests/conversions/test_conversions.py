@@ -7,7 +7,7 @@ from ldo_service.conversions.poses import pose_from_message
 from ldo_service.maps.publisher import ObjectPublisher
 from ldo_service.schemas import MapObjects, decode, encode
 from ldo_service.semantics.object_landmarks import distributions, entropies
-from tests.semantics.staged import NAMES, THINGS, Stage, poses
+from tests.semantics.scenes import NAMES, THINGS, Stage, poses
 
 
 def test_objects_and_observations_travel_as_they_are() -> None:
@@ -26,7 +26,7 @@ def test_objects_and_observations_travel_as_they_are() -> None:
         np.testing.assert_allclose(
             pose_from_message(one.T_map_object), landmark["T_map_object"], atol=1e-12
         )
-        assert (one.seen, one.missed) == (landmark["seen"], landmark["missed"])
+        assert (one.observation_count, one.miss_count) == (landmark["seen"], landmark["missed"])
         assert 1 <= len(one.views) <= 3
     np.testing.assert_allclose([one.entropy for one in message.objects], entropies(table))
     for keyframe, observed in enumerate(told):

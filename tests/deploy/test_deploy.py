@@ -86,7 +86,7 @@ def test_a_router_of_its_own_serves_those_whom_the_file_names(tmp_path: Path) ->
         connect("mule", here, authority.folder / "wheels") as wheels,
     ):
         for message in follow(desk, wheels):
-            assert message.T_odom_base == IDENTITY
+            assert message.T_prior_base == IDENTITY
             break
 
 
@@ -118,13 +118,13 @@ def test_the_dashboard_shows_every_metric_by_labels_that_it_has() -> None:
         used.add(name)
         labels = set(re.findall(r"(\w+)=", selector))
         assert labels <= known[name], expression
-    assert used == set(known) - {"ldo_held", "ldo_input_delivered_total", "ldo_input_gaps_total"}
+    assert used == set(known) - {"ldo_paused", "ldo_input_messages_total", "ldo_input_gaps_total"}
 
 
 def test_prometheus_asks_where_the_unit_exports() -> None:
     (config,) = documents("prometheus.yaml")
     (target,) = config["scrape_configs"][0]["static_configs"][0]["targets"]
-    assert f"--metrics {target.rpartition(':')[2]}" in UNIT.read_text()
+    assert f"--metrics-port {target.rpartition(':')[2]}" in UNIT.read_text()
 
 
 # --- commands -------------------------------------------------------------------------------------
@@ -165,7 +165,9 @@ def test_containers_are_asked_for_their_health_where_they_tell_it(port: int) -> 
     """The test of compose.yaml itself, against a collector whose actors are silent or not."""
     (compose,) = documents("compose.yaml")
     service = compose["services"]["service"]
-    (metrics,) = [w.partition("=")[2] for w in service["command"] if w.startswith("--metrics=")]
+    (metrics,) = [
+        w.partition("=")[2] for w in service["command"] if w.startswith("--metrics-port=")
+    ]
     *_, program = service["healthcheck"]["test"]
     assert f":{metrics}/" in program
     program = program.replace(f":{metrics}/", f":{port}/")

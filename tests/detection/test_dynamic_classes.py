@@ -86,7 +86,7 @@ def test_boxes_that_come_first_leave_the_same_map(frame, person) -> None:
             semantics.on_keyframe_mapped(0)
         else:
             semantics.add_detections(0, around(person, 0.8))
-        assert semantics.metrics()["gaussians_movable"] > 100
+        assert semantics.metrics()["gaussians_dynamic_removed"] > 100
         maps.append(builder.gaussians.rows.tobytes())
     assert maps[0] == maps[1]
 

@@ -40,7 +40,7 @@ def test_what_is_registered_is_a_copy_with_all_that_is_known(models: Models, fil
     assert models.names == ["squares"]
     about = Models().get("squares").about
     assert (about.layout, about.classes) == ("yolox", ("red", "green", "blue"))
-    assert (about.licence, about.source) == ("do what you like", "squares.onnx")
+    assert (about.license, about.source) == ("do what you like", "squares.onnx")
     detector = open_detector("squares", CONFIG)
     assert len(detector.detect(squares_image([("red", 16, 48, 16)]))) == 1
     assert detector.identity == f"squares {about.sha256[:12]}"

@@ -28,16 +28,16 @@ from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.semantics_file import write_semantics
 from tests.commands.test_cli import ldo
 from tests.runs.jobs import job
-from tests.semantics import staged
+from tests.semantics import scenes
 
 FRAMES, SCALE = 9, 5000
 THINGS = (
     *(
         replace(thing, name="desk") if thing.name == "dining table" else thing
-        for thing in staged.THINGS[:4]
+        for thing in scenes.THINGS[:4]
     ),
-    replace(staged.THINGS[4], name="speaker"),
-    replace(staged.THINGS[5], name="globe"),
+    replace(scenes.THINGS[4], name="speaker"),
+    replace(scenes.THINGS[5], name="globe"),
 )
 CLASSES = ("undefined", "wall", *dict.fromkeys(thing.name for thing in THINGS))
 COCO, ALL_NAMES = range(2)
@@ -49,20 +49,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("data") / "room"
     for kind in ("results", "semantic_class", "instance"):
         (folder / kind).mkdir(parents=True)
-    poses = staged.poses(100)[:FRAMES]
+    poses = scenes.poses(100)[:FRAMES]
     for k, T_world_camera in enumerate(poses):
-        write_shot(folder, k, staged.shoot(THINGS, T_world_camera, k))
+        write_shot(folder, k, scenes.shoot(THINGS, T_world_camera, k))
     np.savetxt(folder / "traj.txt", poses.reshape(FRAMES, 16))
     names = {str(k): name for k, name in enumerate(CLASSES)}
     names[str(CLASSES.index("chair"))] = "undefined"
     (folder / "labels.json").write_text(json.dumps({"classes": names}))
-    camera = {name: getattr(staged.CAMERA, name) for name in ("fx", "fy", "cx", "cy")}
-    params = {"w": staged.CAMERA.width, "h": staged.CAMERA.height, **camera, "scale": SCALE}
+    camera = {name: getattr(scenes.CAMERA, name) for name in ("fx", "fy", "cx", "cy")}
+    params = {"w": scenes.CAMERA.width, "h": scenes.CAMERA.height, **camera, "scale": SCALE}
     (folder / "cam_params.json").write_text(json.dumps({"camera": params}))
     return folder
 
 
-def write_shot(folder: Path, k: int, shot: staged.Shot) -> None:
+def write_shot(folder: Path, k: int, shot: scenes.Shot) -> None:
     classes = np.array([1, *(CLASSES.index(thing.name) for thing in THINGS)], np.uint8)
     images = {
         f"results/frame{k:06d}.png": shot.frame.color[..., ::-1],
@@ -221,7 +221,7 @@ def test_json_has_every_figure_of_every_list(capsys, labelled: Path, folder: Pat
 
 @pytest.mark.parametrize(
     ("summary", "expected"),
-    [('{"vlm_calls": 3}', pytest.approx(1 / 3)), ("{}", None), ("[", None), (None, None)],
+    [('{"labeller_requests": 3}', pytest.approx(1 / 3)), ("{}", None), ("[", None), (None, None)],
 )
 def test_calls_of_the_labeller_are_those_that_the_run_counted(
     capsys, labelled: Path, folder: Path, summary: str | None, expected

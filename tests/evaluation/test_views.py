@@ -88,7 +88,7 @@ def test_without_held_out_frames_the_counts_say_how_to_get_some(
     rows = evaluate(sequence, replace(run, frames=frames))
     assert list(rows) == [("online", B)]
     assert [view.frame for view in rows["online", B].views] == [0, 5, 10, 15]
-    assert "--hold-out 5" in EvaluatedFrames.of(frames).counts()
+    assert "--hold-out-every 5" in EvaluatedFrames.of(frames).counts()
 
 
 def test_a_darker_camera_costs_unless_its_exposure_is_fitted(

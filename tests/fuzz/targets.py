@@ -1,9 +1,9 @@
 """Everything that reads what strangers made."""
 
-from . import of_data_sets, of_runs, of_the_network, of_users
+from . import dataset_targets, message_targets, run_folder_targets, user_input_targets
 
 TARGETS = {
     str(target): target
-    for room in (of_the_network, of_data_sets, of_runs, of_users)
+    for room in (message_targets, dataset_targets, run_folder_targets, user_input_targets)
     for target in room.TARGETS
 }

@@ -105,7 +105,7 @@ def test_keyframes_that_are_gone_from_the_disk_are_left_out(posed: dict, tmp_pat
         file.write_bytes(file.read_bytes()[:-20])
     builder.add(*posed[KEYFRAMES[3]], 3, 20)
     assert builder.views.store.keyframes() == [2, 3]
-    assert builder.metrics()["keyframes_unusable"] >= 2
+    assert builder.metrics()["keyframes_skipped"] >= 2
 
 
 def test_pruning_looks_at_what_was_fitted_alone(posed: dict) -> None:
@@ -161,7 +161,7 @@ def with_sleepers(posed: dict, **options) -> MapBuilder:
 
 def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     builder = with_sleepers(posed)
-    asleep = builder.metrics()["gaussians_asleep"]
+    asleep = builder.metrics()["gaussians_offloaded"]
     assert asleep > 1000
     assert builder.size() == len(builder.gaussians) + asleep
     whole = np.concatenate([piece.ids for piece in builder.batches()])
@@ -173,7 +173,7 @@ def test_what_no_camera_sees_sleeps_and_wakes_as_it_was(posed: dict) -> None:
     assert builder.refine(2, first=see_sleepers[:2]) == 0, "views of what sleeps are left out"
     size = builder.size()
     builder.add(*posed[KEYFRAMES[0]], 2 * len(KEYFRAMES), 0)  # home again
-    assert builder.metrics()["gaussians_woken"] > 1000
+    assert builder.metrics()["gaussians_loaded_total"] > 1000
     assert builder.size() < 1.15 * size, "inserted a second time"
     assert mean_psnr(builder, posed, KEYFRAMES[:1]) > 20
 
@@ -206,13 +206,15 @@ def test_senseless_windows_are_refused(change: dict) -> None:
 
 def test_what_moves_is_neither_mapped_nor_fitted(posed: dict) -> None:
     frame, T_map_camera = posed[0]
-    is_moving = np.zeros(frame.depth_m.shape, bool)
-    is_moving[15:40, 20:50] = True
-    repainted = replace(frame, color=np.where(is_moving[..., None], 255 - frame.color, frame.color))
+    dynamic_mask = np.zeros(frame.depth_m.shape, bool)
+    dynamic_mask[15:40, 20:50] = True
+    repainted = replace(
+        frame, color=np.where(dynamic_mask[..., None], 255 - frame.color, frame.color)
+    )
     maps = []
     for seen in (frame, repainted):
         builder = MapBuilder()
-        builder.add(seen, T_map_camera, 0, 4, is_moving)
+        builder.add(seen, T_map_camera, 0, 4, dynamic_mask)
         maps.append(builder.gaussians.rows)
     assert maps[0].tobytes() == maps[1].tobytes(), "what moves has a say"
     p_camera = se3.transform(se3.inverse(T_map_camera), maps[0][:, :3].astype(float))

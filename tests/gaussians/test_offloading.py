@@ -311,7 +311,7 @@ def test_a_walk_and_back_shows_every_camera_the_whole_map_and_keeps_few_in_memor
         most = max(most, len(gaussians))
     assert len(plain) == 3200
     assert most <= config.max_active
-    assert sleeping.metrics()["gaussians_woken"] > 1000
+    assert sleeping.metrics()["gaussians_loaded_total"] > 1000
     assert pieces_of(gaussians, sleeping)[1].tobytes() == plain.rows.tobytes()
 
 
@@ -464,7 +464,7 @@ def test_statistics_count_who_slept_and_woke(tmp_path: Path) -> None:
     put_to_sleep(gaussians, sleeping, [0, 1])
     sleeping.load_into(gaussians, [1])
     told = sleeping.metrics()
-    assert told["gaussians_asleep"] == 5
-    assert told["chunks_asleep"] == 1
-    assert told["gaussians_fell_asleep"] == 11
-    assert told["gaussians_woken"] == 6
+    assert told["gaussians_offloaded"] == 5
+    assert told["chunks_offloaded"] == 1
+    assert told["gaussians_offloaded_total"] == 11
+    assert told["gaussians_loaded_total"] == 6

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ldo_service.geometry import se3
-from ldo_service.geometry.keyframe_poses import KeyframePoses, T_map_segment
+from ldo_service.geometry.keyframe_poses import KeyframePoses, T_map_submap
 
 
 def random_pose(rng: np.random.Generator, size: float = 0.3) -> np.ndarray:
@@ -97,31 +97,31 @@ def test_snapshot_and_restore_are_exact(steps) -> None:
         np.testing.assert_array_equal(twin.T_map_odom(keyframe), poses.T_map_odom(keyframe))
 
 
-def test_a_new_segment_is_apart_until_a_correction_joins_it(steps) -> None:
+def test_a_new_submap_is_apart_until_a_correction_joins_it(steps) -> None:
     poses = chained(steps)
     T_odom = poses[len(steps) - 1]
-    poses.add(50, None, np.eye(4), T_odom, segment=2)
-    poses.add(51, 50, steps[1], T_odom @ steps[1], segment=2)
-    np.testing.assert_allclose(poses[50], T_map_segment(2) @ T_odom)
+    poses.add(50, None, np.eye(4), T_odom, submap=2)
+    poses.add(51, 50, steps[1], T_odom @ steps[1], submap=2)
+    np.testing.assert_allclose(poses[50], T_map_submap(2) @ T_odom)
     assert min(np.linalg.norm(poses[51][:3, 3] - poses[k][:3, 3]) for k in range(len(steps))) > 100
     poses.correct(1, {0: poses[0], 50: T_odom})
     np.testing.assert_allclose(poses[51], T_odom @ steps[1], atol=1e-12)
 
 
-def test_the_first_of_a_segment_is_joined_though_its_measurement_is_held(steps) -> None:
+def test_the_first_of_a_submap_is_joined_though_its_measurement_is_held(steps) -> None:
     poses = chained(steps)
     T_odom = poses[len(steps) - 1]
-    poses.add(50, None, np.eye(4), T_odom, segment=2)
-    poses.add(51, 50, steps[1], T_odom @ steps[1], segment=2)
+    poses.add(50, None, np.eye(4), T_odom, submap=2)
+    poses.add(51, 50, steps[1], T_odom @ steps[1], submap=2)
     poses.correct(1, {0: poses[0], 50: T_odom, 51: T_odom}, held=(50, 51))
     np.testing.assert_allclose(poses[50], T_odom, atol=1e-12)
     np.testing.assert_allclose(poses[51], T_odom @ steps[1], atol=1e-12)
 
 
-def test_a_missed_keyframe_is_bridged_within_its_segment() -> None:
+def test_a_missed_keyframe_is_bridged_within_its_submap() -> None:
     poses = KeyframePoses()
     poses.add(0, None, np.eye(4), np.eye(4))
-    poses.add(1, None, np.eye(4), np.eye(4), segment=1)
+    poses.add(1, None, np.eye(4), np.eye(4), submap=1)
     T_odom = se3.exp(np.full(6, 0.1))
-    poses.add(3, 2, np.eye(4), T_odom, segment=0)
+    poses.add(3, 2, np.eye(4), T_odom, submap=0)
     np.testing.assert_allclose(poses[3], T_odom)

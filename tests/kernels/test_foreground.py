@@ -8,7 +8,7 @@ import pytest
 
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
-from ldo_service.regions.foreground import ForegroundConfig, Surfaces
+from ldo_service.regions.foreground import ForegroundConfig, SmoothSurfaces
 from tests.reference.foreground import foreground_reference, surfaces_reference
 
 CONFIG = ForegroundConfig()
@@ -17,14 +17,14 @@ SIZES = ((120, 160), (64, 128), (97, 131), (9, 70), (33, 5), (4, 4), (3, 8), (2,
 SIZES += ((40, 1), (1, 1))
 COMPARE_ALL = """
 from ldo_service.geometry import Camera
-from ldo_service.regions.foreground import ForegroundConfig, Surfaces, foreground, surfaces
+from ldo_service.regions.foreground import ForegroundConfig, SmoothSurfaces, foreground, surfaces
 for name in {key.split("/")[0] for key in given}:
     depth_m, plain = given[f"{name}/depth_m"], given[f"{name}/labels"]
     h, w = depth_m.shape
     told = Camera(w, h, 0.9 * w, 1.1 * h, 0.47 * w, 0.51 * h), ForegroundConfig()
     found = surfaces(depth_m, *told)
     result |= {f"{name}/labels": found.labels, f"{name}/sizes": found.sizes}
-    plain = Surfaces(plain, np.bincount(plain.ravel()))
+    plain = SmoothSurfaces(plain, np.bincount(plain.ravel()))
     for k, box in enumerate(given[f"{name}/boxes"]):
         result[f"{name}/mask{k}"] = foreground(box, depth_m, plain, *told).mask
 """
@@ -59,7 +59,7 @@ def boxes(height: int, width: int) -> np.ndarray:
     return np.concatenate([some, [whole, beside]])
 
 
-def plain(height: int, width: int) -> tuple[np.ndarray, Surfaces]:
+def plain(height: int, width: int) -> tuple[np.ndarray, SmoothSurfaces]:
     depth_m = scene(height, width)
     return depth_m, surfaces_reference(depth_m, camera(height, width), CONFIG)
 

@@ -13,8 +13,8 @@ from ldo_service.loop_closing.consistency_check import ConsistencyCheckConfig, C
 CONFIG = ConsistencyCheckConfig()
 
 
-def view(keyframe: int, path_m: float, segment: int = 0) -> Any:
-    place = SimpleNamespace(segment=segment, median_depth_m=2.0)
+def view(keyframe: int, path_m: float, submap: int = 0) -> Any:
+    place = SimpleNamespace(submap=submap, median_depth_m=2.0)
     return SimpleNamespace(keyframe=keyframe, path_m=path_m, place=place)
 
 
@@ -44,7 +44,7 @@ def test_where_the_map_knows_nothing_everything_may_be() -> None:
     new = view(1, 10.0)
     poses = poses_of((0,) * 6, far)
     apart, joined = (ConsistencyChecker(poses, j, CONFIG) for j in ({}, {1: 0}))
-    assert apart.possible_matches([view(0, 0.0, segment=1)], new).tolist() == [True]
-    assert joined.possible_matches([view(0, 0.0, segment=1)], new).tolist() == [False]
+    assert apart.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [True]
+    assert joined.possible_matches([view(0, 0.0, submap=1)], new).tolist() == [False]
     assert apart.possible_matches([view(7, 0.0), view(0, 0.0)], new).tolist() == [True, False]
     assert apart.possible_matches([], new).tolist() == []

@@ -48,7 +48,7 @@ class ChangingMap:
         self.version += 1
         return MapDelta(
             stamp_ns=0,
-            since=self.version - 1,
+            base_version=self.version - 1,
             version=self.version,
             graph_version=0,
             motions=motions,

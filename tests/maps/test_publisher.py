@@ -5,7 +5,7 @@ import numpy as np
 from ldo_service.conversions.objects import map_objects
 from ldo_service.geometry import se3
 from ldo_service.maps.publisher import ObjectPublisher
-from tests.semantics.staged import NAMES, THINGS, Stage, poses
+from tests.semantics.scenes import NAMES, THINGS, Stage, poses
 
 
 def test_what_is_kept_is_what_would_be_made() -> None:

@@ -41,7 +41,7 @@ def keyframe(k: int) -> Keyframe:
         information=OF_REFERENCE,
         T_odom_keyframe=pose_to_message(np.eye(4)),
         overlap=1.0,
-        window=tuple(window),
+        window_measurements=tuple(window),
     )
 
 

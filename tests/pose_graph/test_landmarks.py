@@ -9,16 +9,16 @@ from ldo_service.geometry import Camera, se3
 from ldo_service.pose_graph.factors import NoiseConfig, odometry_information
 from ldo_service.pose_graph.landmarks import (
     MAX_CLASSES,
+    LandmarkObservation,
     ObjectLandmarkConfig,
     ObjectLandmarks,
-    Observation,
     triangulate,
 )
 from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
 from ldo_service.pose_graph.solver import point_key, solve_batch
 from ldo_service.storage.state_codec import decode_state, encode_state
 
-from .walks import ate_m, kitchen, odometry, walked
+from .trajectories import ate_m, kitchen, odometry, walked
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 NUMBERS = np.array([640, 480, 525.0, 525.0, 319.5, 239.5])
@@ -37,7 +37,7 @@ def observed(
     rng: np.random.Generator,
     sigma_px: float = 3.0,
     p: np.ndarray = SURE,
-) -> list[Observation]:
+) -> list[LandmarkObservation]:
     """Boxes of 60 px around where the objects are in the image."""
     out = []
     for k, center in enumerate(OBJECTS):
@@ -45,7 +45,7 @@ def observed(
         u, v = CAMERA.project(seen[None])[0] + rng.normal(scale=sigma_px, size=2)
         if seen[2] > 0.5 and 40 < u < 600 and 40 < v < 440:
             box_px = np.array([u - 30, v - 30, u + 30, v + 30])
-            out.append(Observation(keyframe, k, box_px, p, entropy(p), False, NUMBERS))
+            out.append(LandmarkObservation(keyframe, k, box_px, p, entropy(p), False, NUMBERS))
     return out
 
 
@@ -173,7 +173,7 @@ def test_a_landmark_waits_for_parallax(angle_rad: float, is_known: bool) -> None
 
 def test_a_box_at_the_border_names_and_does_not_place() -> None:
     box_px = np.array([0.0, 100, 60, 160])
-    seen = Observation(0, 5, box_px, SURE, 0.3, False, NUMBERS)
+    seen = LandmarkObservation(0, 5, box_px, SURE, 0.3, False, NUMBERS)
     landmarks, graph = ObjectLandmarks(ObjectLandmarkConfig(), NoiseConfig()), walked(np.eye(4), [])
     landmarks.observe(seen)
     landmarks.update_graph(graph)
@@ -199,7 +199,7 @@ def test_ten_misses_in_a_row_end_a_landmark_and_five_a_vague_one() -> None:
     for p, misses in ((SURE, 10), (VAGUE, 5)):
         graph, landmarks = seen_on_a_walk(truth, ObjectLandmarkConfig(due_weight=0.01), p=p)
         assert graph.has_landmark(0)
-        miss = Observation(59, 0, np.zeros(4), p, entropy(p), True, NUMBERS)
+        miss = LandmarkObservation(59, 0, np.zeros(4), p, entropy(p), True, NUMBERS)
         for count in range(1, misses + 1):
             landmarks.observe(miss)
             landmarks.update_graph(graph)

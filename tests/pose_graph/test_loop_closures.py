@@ -8,7 +8,16 @@ from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.pose_graph.loop_closures import ClosureDecision, LoopClosureConfig, LoopClosureSet
 from ldo_service.pose_graph.pose_graph import PoseGraph
 
-from .walks import REFINED, ate_m, closures, false_closures, kitchen, odometry, round_trips, walked
+from .trajectories import (
+    REFINED,
+    ate_m,
+    closures,
+    false_closures,
+    kitchen,
+    odometry,
+    round_trips,
+    walked,
+)
 
 FALSE_AT = (60, 95, 130, 165)
 

@@ -12,7 +12,7 @@ from ldo_service.pose_graph.factors import NoiseConfig
 from ldo_service.pose_graph.pose_graph import PoseGraph, PoseGraphConfig
 from ldo_service.storage.state_codec import decode_state, encode_state
 
-from .walks import REFINED, ate_m, closures, kitchen, odometry, round_trips, walked
+from .trajectories import REFINED, ate_m, closures, kitchen, odometry, round_trips, walked
 
 INFORMATION = np.diag([1e4, 1e4, 1e4, 1e3, 1e3, 1e3])
 LOOP = np.diag([400.0] * 6)
@@ -306,11 +306,11 @@ def test_a_group_that_is_parted_says_what_it_said() -> None:
     ends = {k: before[k] for k in (10, 14, 20)}
     for keyframe in (11, 12, 13, 15, 16, 17, 18, 19):
         follower = known.followers.only(known.rows[keyframe])
-        pair = int(follower.heads[0]), int(follower.tails[0])
+        pair = int(follower.start_variables[0]), int(follower.end_variables[0])
         assert pair == ((10, 14) if keyframe < 14 else (14, 20))
         placed = follower.interpolated_poses(*(ends[k][None] for k in pair))[0]
         np.testing.assert_allclose(placed, before[keyframe], atol=1e-9)
-    np.testing.assert_allclose(known.followers.shares[[known.rows[12], known.rows[17]]], 0.5)
+    np.testing.assert_allclose(known.followers.fractions[[known.rows[12], known.rows[17]]], 0.5)
 
 
 def test_no_more_than_one_keyframe_in_five_is_a_variable_for_closures() -> None:
@@ -492,7 +492,7 @@ def test_a_keyframe_that_others_follow_never_follows_itself() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_is_measured_of_whom_ties_two_variables_and_is_saved(seed: int) -> None:
-    """Segments, old references, refinements and closures of any pair, one after another."""
+    """Submaps, old references, refinements and closures of any pair, one after another."""
     rng, truth = np.random.default_rng(seed), kitchen(80)
     graph = PoseGraph()
     graph.add_first(0, truth[0])

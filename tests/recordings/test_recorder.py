@@ -24,11 +24,11 @@ from ldo_service.recordings.recording import (
     recorded_actors,
 )
 from ldo_service.runtime import In, Latest
-from ldo_service.runtime.journal import Gap, Started, Step, checksum
+from ldo_service.runtime.journal import Gap, Started, StepRecord, checksum
 from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import encode
 from ldo_service.transport.interface import MemoryTransport
-from tests.runtime.cast import (
+from tests.runtime.fake_actors import (
     DOUBLES,
     LATEST_NUMBER,
     NUMBERS,
@@ -39,15 +39,15 @@ from tests.runtime.cast import (
     running,
 )
 
-from .journals import UNLUCKY, Tally, files, live, recorded
+from .journal_helpers import UNLUCKY, Tally, files, live, recorded
 
 
-def entries(folder: Path) -> list[Started | Step | Gap]:
+def entries(folder: Path) -> list[Started | StepRecord | Gap]:
     return [entry for file in files(folder) for entry in file.entries()]
 
 
-def steps(folder: Path) -> list[Step]:
-    return [entry for entry in entries(folder) if isinstance(entry, Step)]
+def steps(folder: Path) -> list[StepRecord]:
+    return [entry for entry in entries(folder) if isinstance(entry, StepRecord)]
 
 
 def test_every_step_is_there_in_order(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_the_message_is_kept_as_it_came(tmp_path: Path) -> None:
 def test_a_failed_message_is_kept_once_with_both_attempts_and_both_starts(tmp_path: Path) -> None:
     recorded(tmp_path, [1, 2, 3, UNLUCKY, 4])
     kinds = [step.kind for step in steps(tmp_path)]
-    assert kinds == ["done"] * 3 + ["failed", "failed", "set_aside", "done", "finished"]
+    assert kinds == ["done"] * 3 + ["failed", "failed", "dead_lettered", "done", "finished"]
     failed = steps(tmp_path)[3]
     assert failed.error == "ValueError('unlucky')"
     assert failed.outputs == ()
@@ -102,7 +102,7 @@ def test_a_failed_message_is_kept_once_with_both_attempts_and_both_starts(tmp_pa
 
 def test_the_room_that_a_step_saw_is_kept(tmp_path: Path) -> None:
     recorded(tmp_path, [1, 2], expected={PIECES.name: frozenset({"absent"})})
-    assert [step.room for step in steps(tmp_path)] == [{PIECES.name: 0}] * 3
+    assert [step.credits for step in steps(tmp_path)] == [{PIECES.name: 0}] * 3
     assert [output.topic for output in steps(tmp_path)[0].outputs] == [DOUBLES.name]
 
 
@@ -143,7 +143,7 @@ def test_other_programs_read_it(tmp_path: Path) -> None:
         reader = make_reader(stream)
         found = list(reader.iter_messages())
         (about,) = reader.iter_metadata()
-    assert about.metadata == {"robot": "test"}
+    assert about.metadata == {"robot": "test", "version": "2"}
     assert {channel.message_encoding for _, channel, _ in found} == {"msgpack"}
     for schema, _, message in found:
         assert schema is not None
@@ -194,9 +194,9 @@ def test_the_robot_does_not_wait_for_the_disk(tmp_path: Path) -> None:
 async def test_what_is_lost_shows_in_health(tmp_path: Path) -> None:
     tiny = RecordConfig(queue_mb=0.012)
     stage = await live(tmp_path, range(1, 31), config=tiny, meanwhile=BusyDisk(5, 25))
-    facts = stage.health().facts
+    facts = stage.health().metrics
     (gap,) = [entry for entry in entries(tmp_path) if isinstance(entry, Gap)]
-    assert facts["journal_lost"] == gap.lost
+    assert facts["journal_messages_dropped"] == gap.lost
     last_words = 1
     assert facts["journal_steps"] == 30 - gap.lost + last_words
 

@@ -14,9 +14,9 @@ from ldo_service.recordings.mcap_file import McapIndex, RecordConfig
 from ldo_service.runtime.mailbox import Mailbox
 from ldo_service.schemas import Message
 from ldo_service.storage.state_store import State
-from tests.runtime.cast import DOUBLES, NUMBERS, PIECES, Double
+from tests.runtime.fake_actors import DOUBLES, NUMBERS, PIECES, Double
 
-from .journals import UNLUCKY, Tally, files, recorded, replayed
+from .journal_helpers import UNLUCKY, Tally, files, recorded, replayed
 from .test_recorder import BusyDisk
 
 VALUES = [5, 1, 4, 1, 5, 9, 2, 6]
@@ -60,7 +60,7 @@ def test_failures_and_the_states_after_them_are_lived_again(tmp_path: Path) -> N
     recorded(tmp_path, [1, 2, 3, 4, UNLUCKY, 5, 6, UNLUCKY, 7])
     result = replayed(tmp_path)
     result.verify()
-    assert (result.failures, result.failures_repeated, result.set_aside) == (4, 4, 2)
+    assert (result.failures, result.failures_repeated, result.dead_lettered) == (4, 4, 2)
     assert (result.starts, result.restored) == (5, 4)
 
 
@@ -208,7 +208,7 @@ def test_after_a_gap_a_restart_is_replayed_again(tmp_path: Path) -> None:
     recorded(tmp_path, values, config=tiny, meanwhile=BusyDisk(25, 50))
     result = replayed(tmp_path)
     assert result.difference is None
-    assert (result.starts, result.failures, result.set_aside) == (3, 1, 1)
+    assert (result.starts, result.failures, result.dead_lettered) == (3, 1, 1)
     assert not result.is_complete
 
 

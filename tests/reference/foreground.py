@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 
 from ldo_service.geometry import Camera
-from ldo_service.regions.foreground import Foreground, ForegroundConfig, Surfaces, pixels_of
+from ldo_service.regions.foreground import Foreground, ForegroundConfig, SmoothSurfaces, pixels_of
 
 BLUR_PX = 1.5  # before normals are taken: `kernels/smoothness.hpp` says why
 _3X3 = np.ones((3, 3), np.uint8)
 
 
-def surfaces_reference(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> Surfaces:
+def surfaces_reference(
+    depth_m: np.ndarray, camera: Camera, config: ForegroundConfig
+) -> SmoothSurfaces:
     """Pieces of depth [H, W] without steps and creases, connected by their sides."""
     inverse = _inverse(depth_m)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
@@ -23,13 +25,13 @@ def surfaces_reference(depth_m: np.ndarray, camera: Camera, config: ForegroundCo
     smooth[:, 2:-2] &= across > config.min_cosine
     smooth[2:-2] &= down > config.min_cosine
     _, labels = cv2.connectedComponents(smooth.astype(np.uint8), connectivity=4)
-    return Surfaces(labels, np.bincount(labels.ravel()))
+    return SmoothSurfaces(labels, np.bincount(labels.ravel()))
 
 
 def foreground_reference(
     box: np.ndarray,
     depth_m: np.ndarray,
-    found: Surfaces,
+    found: SmoothSurfaces,
     camera: Camera,
     config: ForegroundConfig,
 ) -> Foreground:

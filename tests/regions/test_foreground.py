@@ -11,7 +11,7 @@ from ldo_service.geometry import Camera
 from ldo_service.regions import foreground as foreground_module
 from ldo_service.regions.foreground import (
     ForegroundConfig,
-    Surfaces,
+    SmoothSurfaces,
     foreground,
     pixels_of,
     surfaces,
@@ -87,9 +87,9 @@ def test_the_many_pixels_in_the_middle_are_the_thing_and_not_the_near_ones() -> 
     assert np.mean(found[CUBE]) > 0.8
 
 
-def one_piece(depth_m: np.ndarray) -> Surfaces:
+def one_piece(depth_m: np.ndarray) -> SmoothSurfaces:
     """All on edges."""
-    return Surfaces(np.zeros(depth_m.shape, np.int32), np.array([depth_m.size]))
+    return SmoothSurfaces(np.zeros(depth_m.shape, np.int32), np.array([depth_m.size]))
 
 
 @pytest.mark.parametrize("settings", [{"min_cosine": 1.5}, {"depth_bin": 0}, {"grow_px": -1}])
@@ -104,7 +104,7 @@ def test_surfaces_and_images_that_do_not_fit_are_refused() -> None:
         surfaces(depth_m[:-1], CAMERA, CONFIG)
     with pytest.raises(ValueError, match="shape"):
         foreground(box, depth_m[:-1], one_piece(depth_m), CAMERA, CONFIG)
-    unknown = Surfaces(np.full(depth_m.shape, 7, np.int32), np.array([depth_m.size]))
+    unknown = SmoothSurfaces(np.full(depth_m.shape, 7, np.int32), np.array([depth_m.size]))
     with pytest.raises(ValueError, match="labels"):
         foreground(box, depth_m, unknown, CAMERA, CONFIG)
 

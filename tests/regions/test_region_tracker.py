@@ -321,7 +321,7 @@ def test_what_stood_on_a_thing_once_does_so_for_good() -> None:
     walk.see(thing(side=31))
     region = walk.regions.get(0)
     assert region is not None
-    assert (region.shape.candidate.kind, region.is_standing) == ("", True)
+    assert (region.shape.candidate.kind, region.is_supported) == ("", True)
 
 
 def test_few_names_are_carried_over_in_a_keyframe() -> None:

@@ -20,7 +20,7 @@ from ldo_service.schemas import OdometryPrior
 from ldo_service.schemas.topics import CAMERA_RGBD, ODOMETRY_PRIOR
 from ldo_service.service.service import open_recorder
 from ldo_service.transport.interface import MemoryTransport
-from tests.runtime.cast import eventually, running, send
+from tests.runtime.fake_actors import eventually, running, send
 
 FRAMES = 30
 ROUGH = "mapper.iterations=2"  # so few that it is quick, so many that keyframes move
@@ -67,7 +67,7 @@ async def live(
             if prior is not None:
                 stamp_ns = round(1e9 * prior.stamps_s[index])
                 pose = pose_to_message(prior.T_world_camera[index])
-                await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_odom_base=pose))
+                await send(odometry, OdometryPrior(stamp_ns=stamp_ns, T_prior_base=pose))
             await send(camera, raw_frame_to_message(sequence.read(index)))
             await eventually(lambda frames=index + 1: frames_of(tracker) == frames)
         await eventually(lambda: until({stage.name: stage for stage in actors}))

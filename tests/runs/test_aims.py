@@ -26,7 +26,7 @@ def ldo(*words: str | Path) -> str:
 @pytest.mark.timeout(3600)
 def test_the_flat_is_mapped_named_and_closed_as_well_as_was_aimed_at(tmp_path: Path) -> None:
     folder = tmp_path / "flat"
-    ldo("run", "synthetic:flat", "--out", folder, "--hold-out", "5", *NETWORKS)
+    ldo("run", "synthetic:flat", "--out", folder, "--hold-out-every", "5", *NETWORKS)
     judged: dict[str, Any] = json.loads(ldo("eval", folder, "synthetic:flat", "--json"))
     (labels,), loops = judged["labels"], judged["loops"]
     assert judged["trajectory"]["final"]["ate_m"]["rmse"] < 0.005

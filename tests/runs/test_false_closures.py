@@ -13,8 +13,8 @@ from ldo_service.evaluation.trajectory import evaluate_trajectory
 from ldo_service.geometry import Trajectory
 from ldo_service.runs.offline import run_offline
 
+from .false_closures import MistakenLoopCloser, standing_in
 from .jobs import ROUGH, job
-from .mistaken import MistakenLoopCloser, standing_in
 
 SHARES = (0.3, 0.5, 0.75, 0.98)  # of the way, where a loop is closed that is none
 APART_FRAMES, APART_M = 100, 0.5

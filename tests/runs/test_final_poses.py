@@ -3,7 +3,7 @@
 import numpy as np
 
 from ldo_service.geometry import se3
-from ldo_service.runs.final_poses import FinalPoses, MeasuredKeyframe, TrackedFrame
+from ldo_service.runs.final_poses import FinalPoses, FramePose, MeasuredKeyframe
 
 SECOND = 10**9
 T_STEP = se3.exp(np.array([0, 0.05, 0, 0.02, 0, 0.1]))  # per second
@@ -14,10 +14,10 @@ def at(seconds: float) -> np.ndarray:
     return se3.exp(seconds * se3.log(T_STEP))
 
 
-def frame(seconds: float, reference: int | None) -> TrackedFrame:
+def frame(seconds: float, reference: int | None) -> FramePose:
     """Keyframe k was made at second k."""
     T_reference_camera = se3.inverse(at(reference or 0)) @ at(seconds)
-    return TrackedFrame(int(seconds * SECOND), reference, T_reference_camera, at(seconds), 0)
+    return FramePose(int(seconds * SECOND), reference, T_reference_camera, at(seconds), 0)
 
 
 def final(*references: int | None) -> FinalPoses:

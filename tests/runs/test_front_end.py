@@ -66,7 +66,7 @@ def opened(whole: Path, sequence: Sequence, *settings: str, frames: int | None =
 
 def loops_of(folder: Path) -> list[tuple[list[int], list[int]]]:
     found = json.loads((folder / "loops.json").read_text())
-    return [(one["keyframes"], one["references"]) for one in found["candidates"]]
+    return [(one["keyframes"], one["reference_keyframes"]) for one in found["candidates"]]
 
 
 def test_what_is_made_of_it_is_what_the_whole_run_made(whole: Path, alike: Path) -> None:

@@ -18,7 +18,7 @@ from ldo_service.runs.job import RunOptions
 from ldo_service.runs.offline import run_offline
 from ldo_service.runs.source import Selection
 
-from .mistaken import Drift, DriftingTracker, standing_in
+from .false_closures import Drift, DriftingTracker, standing_in
 
 LEAVES, RETURNS = range(2, 10), range(154, 160)  # frames of the apartment that show one place
 # 1 % of the way, to one side of the world: of its length a loop says nothing

@@ -79,7 +79,14 @@ def test_the_summary_has_what_tools_rely_on(finished: Path) -> None:
     summary = json.loads((finished / "summary.json").read_text())
     expected = {
         *("frames", "frames_rejected", "keyframes", "gaussians", "fps", "wall_s", "cpu_s"),
-        *("peak_rss_mb", "stage_ms", "drops", "loops_accepted", "loops_rejected", "vlm_calls"),
+        *(
+            "peak_rss_mb",
+            "stage_ms",
+            "drops",
+            "loops_accepted",
+            "loops_rejected",
+            "labeller_requests",
+        ),
         *("optimizations", "isa", "threads", "versions", "gaussians_labelled", "boxes"),
     }
     assert expected <= set(summary)

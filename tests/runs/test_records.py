@@ -44,14 +44,14 @@ def test_what_the_loop_closer_says_is_read_back(tmp_path: Path) -> None:
     found = read_loops(tmp_path)
     assert found is not None
     (compared,), (closed,) = found.candidates, found.closures
-    assert (compared.newer, compared.older) == (refused.keyframes, refused.references)
-    assert compared.is_closure == (not refused.refused)
+    assert (compared.newer, compared.older) == (refused.keyframes, refused.reference_keyframes)
+    assert compared.is_closure == (not refused.rejected_reason)
     assert compared.ms == 60.0
     assert (closed.keyframe, closed.reference) == (closure.pose.keyframe, closure.pose.reference)
     np.testing.assert_allclose(
         closed.T_reference_keyframe[:3, 3], closure.pose.T_reference_keyframe.translation
     )
-    assert (record.accepted, record.rejected) == (1, bool(refused.refused))
+    assert (record.accepted, record.rejected) == (1, bool(refused.rejected_reason))
 
 
 def test_a_closure_that_the_graph_does_not_believe_is_no_accepted_one(tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_a_closure_that_the_graph_does_not_believe_is_no_accepted_one(tmp_path: 
         ((pair,), (), 0),
     ):
         correction = msgspec.structs.replace(
-            EXAMPLES["correction"], not_believed=not_believed, closures=closures
+            EXAMPLES["graph_correction"], rejected_closures=not_believed, accepted_closures=closures
         )
         record.observe(correction, 1.0)
         assert (record.accepted, record.rejected) == (accepted, 1 - accepted)

@@ -16,8 +16,9 @@ from ldo_service import kernels
 from ldo_service.actors.topology import GRAPH
 from ldo_service.datasets import Sequence
 from ldo_service.errors import ConfigError, DataError, ReplayDiverged
+from ldo_service.recordings import mcap_file
 from ldo_service.runs.replayed import open_recording
-from ldo_service.runtime.journal import Step, checksum
+from ldo_service.runtime.journal import StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, decode, encode
 from ldo_service.testing import replay_recording
 from tests.commands.test_cli import assert_one_paragraph, ldo
@@ -86,7 +87,7 @@ def rewrite(path: Path, flip_a_pixel_of: int, mend_checksum: bool = False) -> No
             if topic == "camera/rgbd" and message.sequence == flip_a_pixel_of:
                 body = flipped = encode(with_a_flipped_bit(decode(body, CameraRgbd)))
             if topic == "journal/step" and message.sequence == flip_a_pixel_of and mend_checksum:
-                step = msgspec.msgpack.decode(body, type=Step)
+                step = msgspec.msgpack.decode(body, type=StepRecord)
                 mended = msgspec.structs.replace(step, checksum=checksum(flipped))
                 body = msgspec.msgpack.encode(mended)
             if topic not in channels:
@@ -151,6 +152,16 @@ def test_a_recording_is_never_written_over(recording: Path, capsys) -> None:
 
 
 # --- as a test ------------------------------------------------------------------------------------
+def test_a_recording_of_another_version_is_refused(
+    recording: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mcap_file, "RECORDING_VERSION", 3)
+    code, _, err = ldo(capsys, "replay", recording)
+    assert code == DataError.exit_code
+    assert_one_paragraph(err)
+    assert "has version=2, and this service replays 3" in err
+
+
 def test_only_some_actors_may_be_opened(recording: Path, tmp_path: Path) -> None:
     assert [actor.name for actor in open_recording(recording, ("tracker",))] == ["tracker"]
     with pytest.raises(ConfigError, match="no actor 'nobody'"):

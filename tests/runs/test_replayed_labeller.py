@@ -9,9 +9,9 @@ from ldo_service.config import load_config
 from ldo_service.datasets import Sequence
 from ldo_service.regions.region_tracker import RegionTrackerConfig
 from ldo_service.runs.replayed import open_recording
-from ldo_service.runtime.journal import Step
+from ldo_service.runtime.journal import StepRecord
 from ldo_service.runtime.stage import Stage
-from ldo_service.schemas import LabelOpen, decode
+from ldo_service.schemas import LabelResult, decode
 from ldo_service.testing import replay_recording
 from tests.detection.labellers.server import says, serving
 from tests.runs.conftest import live
@@ -24,15 +24,15 @@ IMPATIENT = partial(RegionTrackerConfig, patience=0)
 
 def has_answers(stages: dict[str, Stage]) -> bool:
     inputs = stages["mapper"].health().inputs
-    return any(port.delivered for port in inputs if port.topic == "label/open")
+    return any(port.delivered for port in inputs if port.topic == "label/result")
 
 
 def names_taken(folder: Path) -> list[str]:
     """By the mapper."""
     (mapper,) = open_recording(folder, ("mapper",))
-    steps = [(f, s) for f in mapper.files for s in f.entries() if isinstance(s, Step)]
-    answers = [f.taken(step) for f, step in steps if step.topic == "label/open"]
-    return [decode(body, LabelOpen).label for body in answers]
+    steps = [(f, s) for f in mapper.files for s in f.entries() if isinstance(s, StepRecord)]
+    answers = [f.taken(step) for f, step in steps if step.topic == "label/result"]
+    return [decode(body, LabelResult).label for body in answers]
 
 
 def test_the_mapper_replays_with_the_answers_that_it_got(room: Sequence, tmp_path: Path) -> None:

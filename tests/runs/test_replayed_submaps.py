@@ -1,4 +1,4 @@
-"""A lost camera that begins a segment and joins it, recorded and lived again."""
+"""A lost camera that begins a submap and joins it, recorded and lived again."""
 
 import asyncio
 from pathlib import Path
@@ -14,7 +14,7 @@ from tests.runs.jobs import AWAY, BACK, HERE, ROUGH, SOON, Rearranged, quick_sub
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_lost_and_joined_segment_replays(room: Sequence, tmp_path: Path) -> None:
+def test_a_lost_and_joined_submap_replays(room: Sequence, tmp_path: Path) -> None:
     order = [*HERE, *AWAY, *BACK]
     config = load_config(settings=(ROUGH, *SOON))
     with quick_submaps():

@@ -42,7 +42,7 @@ def test_after_the_first_round_no_keyframe_is_made(rows) -> None:
     assert made[0] >= 8
     assert made[1:] == [0, 0]
     assert {row["status"] for row in rows} == {"OK"}
-    assert sum(row["method"] == "returned" for row in rows[ROUND:]) > 4
+    assert sum(row["pose_source"] == "reused" for row in rows[ROUND:]) > 4
 
 
 def test_poses_are_right_online_and_in_the_end(finished: Path, rounds: Rearranged) -> None:

@@ -19,8 +19,8 @@ from ldo_service.service.diagnostics import ActorStatus, diagnose, notes
 from ldo_service.synthetic.flat import FlatSequence
 from tests.detection.labellers.server import serving
 from tests.service.conftest import PATIENCE, live_service, wait_until
-from tests.service.exhibits import Guide, flat, placed
-from tests.service.heard import Heard
+from tests.service.failure_artifacts import Guide, flat, placed
+from tests.service.message_inbox import Heard
 
 FRAMES = range(0, 84, 2)
 SILENT = 20  # of these frames, before the first answer

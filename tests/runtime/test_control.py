@@ -9,7 +9,7 @@ from ldo_service.runtime.stage_commands import Control
 from ldo_service.schemas import ControlAnswer, ControlRequest, Health, Message, decode, encode
 from ldo_service.storage.state_store import MemoryStore, StateStore
 from ldo_service.transport.interface import MemoryTransport
-from tests.runtime.cast import (
+from tests.runtime.fake_actors import (
     LATEST_NUMBER,
     NUMBERS,
     QUICK,
@@ -53,7 +53,7 @@ class Scene:
             yield
 
     async def ask(self, verb: str) -> ControlAnswer:
-        request = encode(ControlRequest(stamp_ns=7, verb=verb))
+        request = encode(ControlRequest(stamp_ns=7, command=verb))
         return decode(await self.control.answer(request), ControlAnswer)
 
     def send(self, *values: int) -> None:
@@ -74,7 +74,7 @@ async def test_paused_frames_are_left_out_until_resume() -> None:
         assert (await scene.ask("resume")).ok
         scene.send(4)
         await eventually(lambda: scene.seen == [1, 4])
-        assert scene.health()[0].inputs[0].paused == 2
+        assert scene.health()[0].inputs[0].dropped_paused == 2
 
 
 async def test_a_reset_begins_every_epoch_anew_and_the_stream_goes_on() -> None:
@@ -94,9 +94,9 @@ async def test_a_reset_while_paused_stays_paused() -> None:
     scene = Scene()
     async with scene.played():
         await scene.ask("pause")
-        assert "stay paused" in (await scene.ask("reset")).text
+        assert "stay paused" in (await scene.ask("reset")).message
         source, collector = scene.health()
-        assert (source.held, collector.held) == (True, False)
+        assert (source.paused, collector.paused) == (True, False)
 
 
 async def test_an_actor_that_cannot_save_is_named() -> None:
@@ -104,7 +104,7 @@ async def test_an_actor_that_cannot_save_is_named() -> None:
     async with scene.played():
         answer = await scene.ask("save")
         assert not answer.ok
-        assert "source OSError: disk full" in answer.text
+        assert "source OSError: disk full" in answer.message
 
 
 async def test_an_actor_that_does_not_answer_is_named_and_the_others_go_on() -> None:
@@ -113,8 +113,8 @@ async def test_an_actor_that_does_not_answer_is_named_and_the_others_go_on() -> 
         scene.control._actors = ("source", "absent", "collector")
         answer = await scene.ask("reset")
         assert not answer.ok
-        assert "absent did not answer" in answer.text
-        assert not any(health.held for health in scene.health())
+        assert "absent did not answer" in answer.message
+        assert not any(health.paused for health in scene.health())
 
 
 async def test_another_verb_is_answered_with_those_there_are() -> None:
@@ -122,7 +122,7 @@ async def test_another_verb_is_answered_with_those_there_are() -> None:
     async with scene.played():
         answer = await scene.ask("localise-only")
         assert not answer.ok
-        assert "pause, resume, save, reset" in answer.text
+        assert "pause, resume, save, reset" in answer.message
 
 
 async def test_bytes_that_are_no_request_are_answered_all_the_same() -> None:
@@ -131,7 +131,7 @@ async def test_bytes_that_are_no_request_are_answered_all_the_same() -> None:
         for body in (b"", b"\xc1", encode(number(1))):
             answer = decode(await scene.control.answer(body), ControlAnswer)
             assert not answer.ok
-            assert "no ControlRequest" in answer.text
+            assert "no ControlRequest" in answer.message
 
 
 async def test_a_source_that_was_restarted_is_told_of_the_pause() -> None:
@@ -140,4 +140,4 @@ async def test_a_source_that_was_restarted_is_told_of_the_pause() -> None:
         await scene.ask("pause")
     successor = Stage(Source, scene.transport, config=QUICK)
     async with running(successor):
-        await eventually(lambda: successor.health().held)
+        await eventually(lambda: successor.health().paused)

@@ -28,7 +28,7 @@ from ldo_service.transport.flow_control import (
 )
 from ldo_service.transport.interface import MemoryTransport
 
-from .cast import (
+from .fake_actors import (
     DOUBLES,
     LATEST_NUMBER,
     NUMBERS,
@@ -149,8 +149,8 @@ class Company:
         healths = [stage.health() for stage in self.stages.values()]
         outlets = self.stages["giver"]._outlets[Number], self.stages["adder"]._outlets[Double]
         unhandled = [past.unhandled for outlet in outlets if (past := outlet.position())]
-        waiting = [count.waiting for health in healths for count in health.inputs]
-        return not any((*unhandled, *waiting, *(health.busy_s for health in healths)))
+        waiting = [count.queued for health in healths for count in health.inputs]
+        return not any((*unhandled, *waiting, *(health.current_step_s for health in healths)))
 
     def saved(self, name: str) -> State:
         return RestoredState.of(FolderStore(self.folder).load(name)).own
@@ -210,7 +210,7 @@ async def test_a_step_that_is_not_saved_is_neither_acknowledged_nor_told() -> No
         store.is_full = False
         await eventually(lambda: keeper.health().steps == 2)
         assert adder.health().steps == 1
-        assert adder.health().facts["saves_failed"] >= 1
+        assert adder.health().metrics["checkpoints_failed"] >= 1
     assert RestoredState.of(store.load("adder")).inputs[NUMBERS.name].handled == 1
 
 
@@ -297,7 +297,7 @@ async def test_a_state_that_cannot_be_made_is_no_full_disk(caplog) -> None:
         for value in (1, 2, 3):
             await send(numbers, number(value))
         await eventually(lambda: adder.health().steps == 2)
-        assert adder.health().set_aside == 1
+        assert adder.health().dead_lettered == 1
         assert cast(Adder, adder._actor).values == [1, 3]
     assert "no state" in caplog.text
     assert "free some disk space" not in caplog.text
@@ -346,9 +346,9 @@ def test_a_state_is_taken_apart_as_it_was_put_together() -> None:
     sent = tuple(UnackedMessage(seq, b"header", b"body %d" % seq) for seq in (9, 10, 11))
     state = {
         "values": [1],
-        "stage.links": {"in": {NUMBERS.name: (5, 3)}, "out": {DOUBLES.name: (7, 12)}},
-        **{f"stage.sent test.double {one.seq}": one for one in reversed(sent)},
-        "stage.taken 4": taken(8),
+        "stage.offsets": {"in": {NUMBERS.name: (5, 3)}, "out": {DOUBLES.name: (7, 12)}},
+        **{f"stage.outbox test.double {one.seq}": one for one in reversed(sent)},
+        "stage.wal 4": taken(8),
     }
     past = RestoredState.of(state)
     assert past.own == {"values": [1]}

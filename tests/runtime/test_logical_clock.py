@@ -13,7 +13,7 @@ from ldo_service.runtime import Actor, In, Latest, Lossless, Out
 from ldo_service.runtime.logical_clock import LogicalClock
 from ldo_service.schemas import Message
 
-from .cast import DOUBLES, NUMBERS, PIECES, Double, Doubler, Number, Piece, number
+from .fake_actors import DOUBLES, NUMBERS, PIECES, Double, Doubler, Number, Piece, number
 
 
 class Sleepy(Doubler):

@@ -7,7 +7,7 @@ from ldo_service.schemas import encode as encode_message
 from ldo_service.transport.flow_control import Header, encode_link
 from ldo_service.transport.interface import MemoryTransport
 
-from .cast import DOUBLES, NUMBERS, collector, eventually, number, running
+from .fake_actors import DOUBLES, NUMBERS, collector, eventually, number, running
 
 
 class Feed:
@@ -41,7 +41,7 @@ async def test_latest_drops_the_oldest_and_counts() -> None:
         feed.send(value)
     assert await take_all(mailbox) == [("", 8), ("", 9)]
     (counted,) = mailbox.counts()
-    assert (counted.delivered, counted.dropped, counted.peak, counted.waiting) == (2, 8, 2, 0)
+    assert (counted.delivered, counted.dropped, counted.peak_queued, counted.queued) == (2, 8, 2, 0)
 
 
 async def test_what_goes_first_is_taken_before_all_that_waits_and_in_its_own_order() -> None:
@@ -115,7 +115,7 @@ async def test_a_flood_into_a_lossless_input_stays_within_its_window() -> None:
     for value in range(100):
         feed.send(value)
     (counted,) = mailbox.counts()
-    assert (counted.waiting, counted.peak) == (3, 3)
+    assert (counted.queued, counted.peak_queued) == (3, 3)
     assert await take_all(mailbox) == [("", 0), ("", 1), ("", 2)]
 
 
@@ -138,7 +138,7 @@ async def test_a_message_over_the_size_limit_is_rejected_before_it_is_decoded() 
     transport.deliver(NUMBERS.name, b"", bytes(101))
     transport.deliver(NUMBERS.name, b"", bytes(100))  # no message either, but that shows later
     (counted,) = mailbox.counts()
-    assert (counted.rejected, counted.waiting) == (1, 1)
+    assert (counted.rejected, counted.queued) == (1, 1)
 
 
 async def test_rejections_are_said_once_an_episode_and_counted_each(caplog) -> None:

@@ -28,7 +28,7 @@ from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.transport.interface import MemoryTransport
 from ldo_service.transport.zenoh_transport import Endpoint, ZenohTransport
 
-from .cast import NUMBERS, eventually, number, running, send
+from .fake_actors import NUMBERS, eventually, number, running, send
 
 PROGRAM = Path(__file__).with_name("collector_process.py")
 

@@ -16,7 +16,7 @@ from ldo_service.schemas import Health, Message, decode
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 from ldo_service.transport.interface import MemoryTransport
 
-from .cast import (
+from .fake_actors import (
     DOUBLES,
     LATEST_NUMBER,
     NUMBERS,
@@ -95,7 +95,7 @@ async def run_adder(trouble: Trouble, values: list[int], **options: Any) -> tupl
         for value in values:
             await send(numbers, number(value))
         await numbers.flush()
-        await eventually(lambda: adder.health().steps + adder.health().set_aside == len(values))
+        await eventually(lambda: adder.health().steps + adder.health().dead_lettered == len(values))
         await eventually(lambda: len(sums) == adder.health().steps)
     return sums, adder
 
@@ -119,14 +119,14 @@ async def test_after_a_failure_a_successor_goes_on_from_the_last_state() -> None
     sums, stage = await run_adder(Trouble(value=3, times=1), [1, 2, 3, 4])
     assert sums == [1, 3, 6, 10]  # the half step before the failure left no trace
     health = stage.health()
-    assert (health.steps, health.failures, health.restarts, health.set_aside) == (4, 1, 1, 0)
+    assert (health.steps, health.failures, health.restarts, health.dead_lettered) == (4, 1, 1, 0)
 
 
 async def test_a_message_that_fails_twice_is_set_aside_and_the_rest_is_handled() -> None:
     sums, stage = await run_adder(Trouble(value=3, times=99), [1, 2, 3, 4])
     assert sums == [1, 3, 7]
     health = stage.health()
-    assert (health.steps, health.failures, health.restarts, health.set_aside) == (3, 2, 2, 1)
+    assert (health.steps, health.failures, health.restarts, health.dead_lettered) == (3, 2, 2, 1)
 
 
 @pytest.mark.parametrize("error", [StopIteration(), SystemExit(1), KeyboardInterrupt()])
@@ -158,7 +158,7 @@ async def test_a_message_that_is_none_of_the_outputs_is_a_failure_of_the_actor()
     numbers = source(transport, "doubler")
     async with running(stage):
         await send(numbers, number(1))
-        await eventually(lambda: stage.health().set_aside == 1)
+        await eventually(lambda: stage.health().dead_lettered == 1)
 
 
 async def test_too_many_failures_exhaust_the_restarts() -> None:
@@ -254,11 +254,11 @@ async def test_heartbeats_carry_the_counters() -> None:
             await send(numbers, number(value))
         await eventually(lambda: beats[-1].steps == 3 and beats[-1].state == "ready")
         last = beats[-1]
-    assert (last.actor, last.stamp_ns, last.facts) == ("adder", 3, {"sum": 6.0})
+    assert (last.actor, last.stamp_ns, last.metrics) == ("adder", 3, {"sum": 6.0})
     assert (last.inputs[0].topic, last.inputs[0].delivered) == (NUMBERS.name, 3)
     assert (last.outputs[0].topic, last.outputs[0].sent) == (DOUBLES.name, 3)
     assert last.rss_mb > 1
-    assert last.busy_s == 0
+    assert last.current_step_s == 0
     assert last.step_ms_p95 >= last.step_ms_p50 >= 0
 
 
@@ -271,7 +271,9 @@ async def test_a_busy_stage_says_so_in_its_heartbeat() -> None:
     numbers = source(transport, "collector")
     async with running(stage):
         await send(numbers, number(0))
-        await eventually(lambda: beats and beats[-1].state == "busy" and beats[-1].busy_s > 0)
+        await eventually(
+            lambda: beats and beats[-1].state == "busy" and beats[-1].current_step_s > 0
+        )
         stuck.set()
         await eventually(lambda: beats[-1].state == "ready" and beats[-1].steps == 1)
 
@@ -302,7 +304,7 @@ async def test_an_output_that_never_waits_is_made_only_where_there_is_room() -> 
             for value in range(1, 21):
                 await send(feed, number(value))
             await eventually(lambda: stage.health().steps == 21)  # it never waited
-            assert stage.health().outputs[0].waited == 0
+            assert stage.health().outputs[0].backpressure_waits == 0
             assert stage.health().outputs[0].sent == 4
             stuck.set()
             await eventually(lambda: seen == [1, 2, 3, 4])
@@ -319,7 +321,7 @@ async def test_an_actor_that_ignores_the_room_fails_and_nothing_piles_up() -> No
     feed = Outlet(Out(LATEST_NUMBER), "feed", 1, transport)
     async with running(stage):
         await send(feed, number(0))
-        await eventually(lambda: stage.health().set_aside == 1)
+        await eventually(lambda: stage.health().dead_lettered == 1)
         assert stage.health().outputs[0].sent == 0
 
 

@@ -12,14 +12,14 @@ from ldo_service.runtime import stage_commands as orders_module
 from ldo_service.runtime.delivery_state import RestoredState
 from ldo_service.runtime.outlet import Outlet
 from ldo_service.runtime.stage import Stage
-from ldo_service.runtime.stage_commands import ORDER_KEY, CommandSender, StageCommand
+from ldo_service.runtime.stage_commands import COMMAND_KEY, CommandSender, StageCommand
 from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
 from ldo_service.storage.state_store import FolderStore, MemoryStore, State
 from ldo_service.transport.flow_control import EXTERNAL_HEADER, encode_link
 from ldo_service.transport.interface import MemoryTransport
 
-from .cast import (
+from .fake_actors import (
     DOUBLES,
     LATEST_NUMBER,
     NUMBERS,
@@ -82,15 +82,15 @@ async def test_a_held_stage_leaves_out_what_comes_and_counts_it() -> None:
     async with running(stage):
         arrive(1)
         await eventually(lambda: seen == [1])
-        assert await commander.order("hold", "collector", 60) == ""
-        assert stage.health().held
+        assert await commander.order("pause", "collector", 60) == ""
+        assert stage.health().paused
         arrive(2, 3, 4)
-        assert await commander.order("release", "collector", 60) == ""
+        assert await commander.order("resume", "collector", 60) == ""
         arrive(5)
         await eventually(lambda: seen == [1, 5] and stage.health().inputs[0].delivered == 2)
         (counted,) = stage.health().inputs
-        assert (counted.paused, counted.dropped) == (3, 0)
-        assert not stage.health().held
+        assert (counted.dropped_paused, counted.dropped) == (3, 0)
+        assert not stage.health().paused
 
 
 async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
@@ -98,13 +98,13 @@ async def test_a_held_stage_loses_nothing_of_a_lossless_input() -> None:
     stage, commander = collector(transport, seen), CommandSender(transport)
     numbers = Outlet(Out(NUMBERS), "source", 1, transport, {"collector"})
     async with running(stage):
-        await commander.order("hold", "collector", 60)
+        await commander.order("pause", "collector", 60)
         for value in range(4):
             await send(numbers, number(value))
         waiting = asyncio.create_task(send(numbers, number(4)))
         await asyncio.sleep(0.05)
         assert (seen, waiting.done()) == ([], False)
-        await commander.order("release", "collector", 60)
+        await commander.order("resume", "collector", 60)
         await eventually(lambda: seen == [0, 1, 2, 3, 4])
         await waiting
 
@@ -116,7 +116,7 @@ async def test_a_hold_waits_for_the_step_under_way() -> None:
     async with running(stage):
         transport.deliver(NUMBERS.name, encode_link(EXTERNAL_HEADER), encode_message(number(1)))
         await eventually(lambda: stage.health().state == "busy")
-        holding = asyncio.create_task(commander.order("hold", "collector", 60))
+        holding = asyncio.create_task(commander.order("pause", "collector", 60))
         await asyncio.sleep(0.05)
         assert not holding.done()
         go.set()
@@ -128,7 +128,7 @@ async def test_a_soft_stop_ends_a_held_stage() -> None:
     transport, seen = MemoryTransport(), []
     stage, commander = collector(transport, seen), CommandSender(transport)
     async with running(stage) as (task,):
-        await commander.order("hold", "collector", 60)
+        await commander.order("pause", "collector", 60)
         stage.drain()
         await asyncio.wait_for(task, 60)
 
@@ -145,7 +145,7 @@ async def test_a_renewed_stage_begins_anew_and_its_consumer_follows() -> None:
         await eventually(lambda: seen == [1, 2])
         await commander.order("save", "counter", 60)
         epoch = counter.health().epoch
-        for what in ("hold", "renew", "release"):
+        for what in ("pause", "reset", "resume"):
             assert await commander.order(what, "counter", 5) == ""
         assert counter.health().epoch != epoch
         assert RestoredState.of(store.load("counter")).own == {}
@@ -162,7 +162,7 @@ async def test_a_renewed_consumer_joins_its_producer_again() -> None:
     async with running(stage):
         await send(numbers, number(0))
         await eventually(lambda: seen == [0])
-        assert await commander.order("renew", "collector", 60) == ""
+        assert await commander.order("reset", "collector", 60) == ""
         for value in range(1, 9):
             await send(numbers, number(value))
         await eventually(lambda: seen == list(range(9)))
@@ -175,11 +175,11 @@ async def test_nothing_of_the_time_before_is_handled_after_a_renewal() -> None:
     old = Outlet(Out(DOUBLES), "source", 7, transport)
     async with running(stage):
         await eventually(lambda: "double_collector" in old._consumers)
-        await commander.order("hold", "double_collector", 60)
+        await commander.order("pause", "double_collector", 60)
         await send(old, Double(stamp_ns=1, value=1))
         old.reset(8)
-        await commander.order("renew", "double_collector", 60)
-        await commander.order("release", "double_collector", 60)
+        await commander.order("reset", "double_collector", 60)
+        await commander.order("resume", "double_collector", 60)
         await eventually(lambda: old.credits() == 2)
         await send(old, Double(stamp_ns=2, value=2))
         await eventually(lambda: seen == [2])
@@ -230,7 +230,7 @@ async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
     counter, commander = Stage(Counter, transport, config=QUICK), CommandSender(transport)
     epochs = [counter.health().epoch]
     async with running(counter):
-        assert await commander.order("renew", "counter", 60) == ""
+        assert await commander.order("reset", "counter", 60) == ""
         epochs.append(counter.health().epoch)
         await asyncio.sleep(0.05)
         assert counter.health().epoch == epochs[1] != epochs[0]
@@ -238,7 +238,7 @@ async def test_an_order_is_obeyed_once_though_orders_and_reports_get_lost(
 
 async def test_who_does_not_answer_is_said() -> None:
     commander = CommandSender(MemoryTransport())
-    assert await commander.order("hold", "nobody", 0.01) == "did not answer within 0 s"
+    assert await commander.order("pause", "nobody", 0.01) == "did not answer within 0 s"
 
 
 async def test_bytes_that_are_no_order_are_left_alone() -> None:
@@ -248,7 +248,7 @@ async def test_bytes_that_are_no_order_are_left_alone() -> None:
             b"",
             b"\xc1",
             encode_link(("x", 1)),
-            encode_link(StageCommand(1, "hold", "another")),
+            encode_link(StageCommand(1, "pause", "another")),
         ):
-            transport.deliver(ORDER_KEY, b"", body)
+            transport.deliver(COMMAND_KEY, b"", body)
         await asyncio.sleep(0.01)

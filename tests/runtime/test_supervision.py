@@ -15,7 +15,7 @@ from ldo_service.runtime.supervision import StopRequest, supervise
 from ldo_service.transport.flow_control import data_key
 from ldo_service.transport.interface import MemoryTransport
 
-from .cast import (
+from .fake_actors import (
     DOUBLES,
     NUMBERS,
     QUICK,

@@ -11,7 +11,7 @@ import pytest
 
 from ldo_service.runtime.supervision import Watchdog
 
-from .cast import eventually
+from .fake_actors import eventually
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 
 from ldo_service.schemas import (
+    AddLabel,
     AnchorMotion,
     Array,
     CameraColor,
@@ -22,36 +23,35 @@ from ldo_service.schemas import (
     CameraRgbd,
     ControlAnswer,
     ControlRequest,
-    Correction,
     Detection,
     DetectionBoxes,
     FrameRgbd,
     Gaussians,
+    GraphCorrection,
     GraphLandmark,
     Health,
     Image,
     InputCount,
     Keyframe,
     KeyframeRefinement,
-    LabelAdd,
     LabelNames,
-    LabelOpen,
     LabelRequest,
+    LabelResult,
     LoopCandidate,
     LoopClosure,
     MapDelta,
     MapObject,
     MapObjects,
-    MapRefine,
+    MapRendering,
     MapSnapshot,
     MeasuredPose,
     Message,
-    ModelView,
     ObjectObservation,
     ObjectView,
     OdometryPrior,
     OutputCount,
     Pose,
+    RefineMap,
     TrackedPose,
     encode,
 )
@@ -99,7 +99,7 @@ EXAMPLES: dict[str, Message] = {
         label="vase",
         score=0.375,
     ),
-    "label_open": LabelOpen(
+    "label_result": LabelResult(
         stamp_ns=1_700_000_000_000_000_032,
         region=12,
         keyframe=40,
@@ -107,18 +107,18 @@ EXAMPLES: dict[str, Message] = {
         confidence=0.8125,
         labeller="clip 0123456789ab",
     ),
-    "label_open_with_others": LabelOpen(
+    "label_result_with_alternatives": LabelResult(
         stamp_ns=1_700_000_000_000_000_032,
         region=12,
         keyframe=40,
         label="samovar",
         confidence=0.5,
         labeller="clip 0123456789ab",
-        others=(("teapot", 0.25), ("vase", 0.125)),
+        alternatives=(("teapot", 0.25), ("vase", 0.125)),
     ),
-    "label_add": LabelAdd(stamp_ns=1_700_000_000_000_000_033, name="samovar"),
+    "add_label": AddLabel(stamp_ns=1_700_000_000_000_000_033, name="samovar"),
     "label_names": LabelNames(
-        stamp_ns=1_700_000_000_000_000_033, names=("cup", "samovar"), refused="why not"
+        stamp_ns=1_700_000_000_000_000_033, names=("cup", "samovar"), error="why not"
     ),
     "camera_rgbd": CameraRgbd(
         stamp_ns=1_700_000_000_000_000_001,
@@ -144,7 +144,7 @@ EXAMPLES: dict[str, Message] = {
         depth_scale=1000.0,
         T_color_depth=POSE,
     ),
-    "odometry_prior": OdometryPrior(stamp_ns=1_700_000_000_000_000_004, T_odom_base=POSE),
+    "odometry_prior": OdometryPrior(stamp_ns=1_700_000_000_000_000_004, T_prior_base=POSE),
     "frame_rgbd": FrameRgbd(stamp_ns=2, frame=8, camera=CAMERA, color=COLOR, depth_m=DEPTH),
     "keyframe": Keyframe(
         stamp_ns=3,
@@ -170,7 +170,7 @@ EXAMPLES: dict[str, Message] = {
         T_reference_keyframe=POSE,
         information=INFORMATION,
         T_odom_keyframe=OTHER_POSE,
-        window=(
+        window_measurements=(
             MeasuredPose(
                 reference=1, keyframe=4, T_reference_keyframe=OTHER_POSE, information=INFORMATION
             ),
@@ -188,7 +188,7 @@ EXAMPLES: dict[str, Message] = {
         information=INFORMATION,
         T_odom_keyframe=OTHER_POSE,
         overlap=0.75,
-        is_moving=Array.of((DEPTH.numpy() > 0).astype(np.uint8)),
+        dynamic_mask=Array.of((DEPTH.numpy() > 0).astype(np.uint8)),
     ),
     "keyframe_that_joins": Keyframe(
         stamp_ns=3,
@@ -202,30 +202,30 @@ EXAMPLES: dict[str, Message] = {
         information=INFORMATION,
         T_odom_keyframe=OTHER_POSE,
         overlap=0.5,
-        segment=1,
-        joins=(
+        submap=1,
+        submap_measurements=(
             MeasuredPose(
                 reference=2, keyframe=5, T_reference_keyframe=POSE, information=INFORMATION
             ),
         ),
     ),
-    "correction_that_joins": Correction(
+    "graph_correction_that_joins": GraphCorrection(
         stamp_ns=9,
         graph_version=4,
         keyframes=Array.of(np.array([0, 4], np.int64)),
         T_map_keyframe=Array.of(
             np.array([[0, 0, 0, 1, 0, 0, 0], [1, 2, 3, 0.6, 0, 0.8, 0]], float)
         ),
-        refinements=1,
-        joined=((1, 0), (2, 0)),
+        last_refinement=1,
+        merged_submaps=((1, 0), (2, 0)),
     ),
-    "correction_with_landmarks": Correction(
+    "graph_correction_with_landmarks": GraphCorrection(
         stamp_ns=9,
         graph_version=5,
         keyframes=Array.of(np.array([4], np.int64)),
         T_map_keyframe=Array.of(np.array([[1, 2, 3, 0.6, 0, 0.8, 0]], float)),
-        closures=((0, 4), (1, 9)),
-        not_believed=((2, 7),),
+        accepted_closures=((0, 4), (1, 9)),
+        rejected_closures=((2, 7),),
         landmarks=(
             GraphLandmark(
                 object=3,
@@ -263,9 +263,9 @@ EXAMPLES: dict[str, Message] = {
         T_reference_camera=POSE,
         T_base_camera=OTHER_POSE,
     ),
-    "control_request": ControlRequest(stamp_ns=11, verb="reset"),
-    "control_answer": ControlAnswer(stamp_ns=11, ok=False, text="mapper did not answer"),
-    "correction": Correction(
+    "control_request": ControlRequest(stamp_ns=11, command="reset"),
+    "control_answer": ControlAnswer(stamp_ns=11, ok=False, message="mapper did not answer"),
+    "graph_correction": GraphCorrection(
         stamp_ns=5,
         graph_version=3,
         keyframes=Array.of(np.array([0, 4], np.int64)),
@@ -273,7 +273,7 @@ EXAMPLES: dict[str, Message] = {
             np.array([[0, 0, 0, 1, 0, 0, 0], [1, -2, 0.5, 0.5, -0.5, 0.5, 0.5]], np.float64)
         ),
     ),
-    "model_view": ModelView(
+    "map_rendering": MapRendering(
         stamp_ns=6,
         keyframe=4,
         version=5,
@@ -286,7 +286,7 @@ EXAMPLES: dict[str, Message] = {
     ),
     "map_delta": MapDelta(
         stamp_ns=7,
-        since=4,
+        base_version=4,
         version=5,
         graph_version=3,
         motions=(AnchorMotion(keyframe=1, T_new_old=POSE),),
@@ -296,7 +296,7 @@ EXAMPLES: dict[str, Message] = {
     ),
     "map_delta_with_labels": MapDelta(
         stamp_ns=7,
-        since=4,
+        base_version=4,
         version=5,
         graph_version=3,
         motions=(),
@@ -327,7 +327,7 @@ EXAMPLES: dict[str, Message] = {
         keyframes=Array.of(np.array([0, 3], np.int64)),
         exposures=Array.of(np.arange(12, dtype=np.float32).reshape(2, 2, 3)),
     ),
-    "map_refine": MapRefine(stamp_ns=12, iterations=50, first_rate=1.0, last_rate=0.5),
+    "refine_map": RefineMap(stamp_ns=12, iterations=50, initial_rate=1.0, final_rate=0.5),
     "keyframe_refinement": KeyframeRefinement(
         stamp_ns=13,
         poses=(
@@ -370,7 +370,7 @@ EXAMPLES: dict[str, Message] = {
         keyframe=9,
         reference=2,
         keyframes=(7, 8, 9),
-        references=(1, 2),
+        reference_keyframes=(1, 2),
         similarity=0.875,
         appearance=0.5,
         evidence="landmarks",
@@ -379,7 +379,7 @@ EXAMPLES: dict[str, Message] = {
         entropy=0.25,
         overlap=0.125,
         rmse_m=0.0625,
-        refused="overlap 0.12 is under 0.2",
+        rejected_reason="overlap 0.12 is under 0.2",
     ),
     "map_objects": MapObjects(
         stamp_ns=8,
@@ -396,8 +396,8 @@ EXAMPLES: dict[str, Message] = {
                 size=(0.5, 1.0, 2.0),
                 distribution=(("potted plant", 0.75), ("vase", 0.25)),
                 entropy=0.5,
-                seen=7,
-                missed=1,
+                observation_count=7,
+                miss_count=1,
                 first_keyframe=1,
                 last_keyframe=9,
                 views=(ObjectView(keyframe=4, box_px=(0.0, 0.25, 1.5, 1.5)),),
@@ -413,19 +413,33 @@ EXAMPLES: dict[str, Message] = {
         steps=100,
         failures=2,
         restarts=2,
-        set_aside=1,
+        dead_lettered=1,
         step_age_s=0.25,
-        busy_s=0.125,
+        current_step_s=0.125,
         step_ms_p50=20.0,
         step_ms_p95=31.5,
         rss_mb=512.5,
         inputs=(
             InputCount(
-                topic="keyframe/new", delivered=90, dropped=0, rejected=1, gaps=2, waiting=3, peak=8
+                topic="keyframe/new",
+                delivered=90,
+                dropped=0,
+                rejected=1,
+                gaps=2,
+                queued=3,
+                peak_queued=8,
             ),
         ),
-        outputs=(OutputCount(topic="map/view", sent=90, waited=4, evicted=1, repeated=3),),
-        facts={"gaussians": 1000.0},
+        outputs=(
+            OutputCount(
+                topic="map/view",
+                sent=90,
+                backpressure_waits=4,
+                evicted_consumers=1,
+                retransmitted=3,
+            ),
+        ),
+        metrics={"gaussians": 1000.0},
     ),
 }
 

@@ -11,11 +11,11 @@ from ldo_service.schemas import (
     Array,
     CameraModel,
     CameraRgbd,
-    Correction,
     Detection,
     DetectionBoxes,
     FrameRgbd,
     Gaussians,
+    GraphCorrection,
     Image,
     Keyframe,
     LoopClosure,
@@ -250,7 +250,7 @@ def test_a_correction_out_of_order_or_with_impossible_poses_is_refused(
     keyframes: list[int], poses: Any, complaint: str
 ) -> None:
     with pytest.raises(ValueError, match=complaint):
-        Correction(
+        GraphCorrection(
             stamp_ns=0,
             graph_version=1,
             keyframes=array(keyframes, np.int64),
@@ -259,13 +259,13 @@ def test_a_correction_out_of_order_or_with_impossible_poses_is_refused(
 
 
 def test_a_correction_of_no_keyframes_is_a_correction() -> None:
-    empty = Correction(
+    empty = GraphCorrection(
         stamp_ns=0,
         graph_version=0,
         keyframes=array([], np.int64),
         T_map_keyframe=Array.of(np.zeros((0, 7))),
     )
-    assert decode(encode(empty), Correction) == empty
+    assert decode(encode(empty), GraphCorrection) == empty
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ def test_label_names_are_few_and_short(names: tuple[str, ...], complaint: str) -
 @pytest.mark.parametrize("since", [5, 6, -1])
 def test_a_delta_leads_to_a_newer_version(since: int) -> None:
     with pytest.raises(ValueError, match="goes back"):
-        changed("map_delta", since=since)
+        changed("map_delta", base_version=since)
 
 
 @pytest.mark.parametrize(("part", "parts"), [(2, 2), (-1, 2), (0, 0)])
@@ -333,7 +333,7 @@ def test_a_part_of_a_snapshot_is_one_of_its_parts(part: int, parts: int) -> None
 
 def test_a_health_message_with_nan_is_refused() -> None:
     with pytest.raises(ValueError, match="NaN"):
-        changed("health", facts={"loss": NAN})
+        changed("health", metrics={"loss": NAN})
 
 
 def test_every_type_above_is_checked_on_the_way_in_as_well() -> None:
@@ -346,7 +346,7 @@ def test_every_type_above_is_checked_on_the_way_in_as_well() -> None:
             received(EXAMPLES[name], frame=-1)
         assert isinstance(EXAMPLES[name], kind)
     with pytest.raises(msgspec.ValidationError, match="goes back"):
-        received(EXAMPLES["map_delta"], since=5)
+        received(EXAMPLES["map_delta"], base_version=5)
     with pytest.raises(msgspec.ValidationError, match="does not exist"):
         received(EXAMPLES["map_snapshot"], part=2)
     assert isinstance(EXAMPLES["map_delta"], MapDelta)
@@ -422,7 +422,7 @@ def test_an_observation_of_an_object_is_a_box_and_a_distribution(
     ("fields", "complaint"),
     [
         ({"id": -1}, "id is -1"),
-        ({"seen": -1}, "seen is -1"),
+        ({"observation_count": -1}, "observation_count is -1"),
         ({"name": ""}, "0 characters"),
         ({"confidence": 1.5}, "within 0..1"),
         ({"centroid": (0.0, NAN, 0.0)}, "NaN"),
@@ -447,8 +447,8 @@ def test_an_object_that_cannot_be_is_refused(fields: dict, complaint: str) -> No
         ("loop_closure", {"entropy": INF}, "entropy holds NaN or infinity"),
         ("loop_candidate", {"similarity": -0.5}, "similarity is -0.5"),
         ("loop_candidate", {"inliers": -1}, "inliers is -1"),
-        ("loop_candidate", {"refused": "x" * 101}, "a reason of 101 characters"),
-        ("loop_candidate", {"refused": "", "evidence": ""}, "without evidence"),
+        ("loop_candidate", {"rejected_reason": "x" * 101}, "a reason of 101 characters"),
+        ("loop_candidate", {"rejected_reason": "", "evidence": ""}, "without evidence"),
     ],
 )
 def test_an_impossible_loop_is_refused(example: str, fields: dict[str, Any], message: str) -> None:
@@ -480,11 +480,11 @@ def test_objects_come_by_id_and_each_once() -> None:
         ((("", 0.0),), "none is empty"),
         ((("cup", 0.2), ("cup", 0.1)), "told once"),
         ((("samovar", 0.1),), "told once"),
-        (tuple((f"name {k}", 0.1) for k in range(9)), "9 others are over 8"),
+        (tuple((f"name {k}", 0.1) for k in range(9)), "9 alternatives are over 8"),
     ],
 )
 def test_guesses_that_cannot_be_are_refused(others: tuple, complaint: str) -> None:
     with pytest.raises(ValueError, match=complaint):
-        changed("label_open", others=others)
+        changed("label_result", alternatives=others)
     with pytest.raises(ValueError, match="none is empty"):
-        changed("label_open", label="", confidence=0.0, others=(("cup", 0.1),))
+        changed("label_result", label="", confidence=0.0, alternatives=(("cup", 0.1),))

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from .attempts import ATTEMPTS, Attempt
-from .lab import Lab, lab
+from .attack_cases import ATTEMPTS, Attempt
+from .network_fixture import Lab, lab
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from .attempt import Attempt
-from .lies import LIES
+from .forged_messages import LIES
 
 ROOT = Path(__file__).parent.parent.parent
 RUNS_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "joblib"}

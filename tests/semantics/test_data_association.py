@@ -22,7 +22,7 @@ from ldo_service.semantics.data_association import (
 from ldo_service.semantics.gaussian_labels import distribution
 from ldo_service.semantics.object_landmarks import MEMBERS, shuffled
 
-from .staged import THINGS, Stage, poses, shoot
+from .scenes import THINGS, Stage, poses, shoot
 
 tenths = st.integers(0, 10).map(lambda i: i / 10)
 

@@ -12,7 +12,7 @@ from ldo_service.semantics.gaussian_labels import fields
 from ldo_service.semantics.object_landmarks import entropies, reliable_members, rows_of
 from ldo_service.semantics.objects import Objects, ObjectsConfig
 
-from .staged import (
+from .scenes import (
     CAMERA,
     NAMES,
     SHELL,

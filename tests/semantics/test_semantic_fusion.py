@@ -14,8 +14,8 @@ from ldo_service.semantics.label_assignment import AssignmentConfig, Regions
 from ldo_service.semantics.semantic_fusion import (
     FusionConfig,
     SemanticFusionConfig,
+    fuse_detections,
     label_image,
-    label_keyframe,
     regions_of,
     reliable_label_mask,
 )
@@ -61,9 +61,9 @@ def labelled(
     labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
     view = CAMERA, np.eye(4), depth_image()
     for claim in what:
-        label_keyframe(rows, labels, indices, *view, claim, config)
+        fuse_detections(rows, labels, indices, *view, claim, config)
     if late is not None:
-        label_keyframe(rows, labels, indices, *view, late, config, is_late=True)
+        fuse_detections(rows, labels, indices, *view, late, config, is_late=True)
     return rows, labels
 
 
@@ -154,8 +154,8 @@ def test_a_detector_cannot_miss_what_it_does_not_know() -> None:
     lamps, spared = labels.copy(), np.zeros(256, bool)
     spared[LAMP] = True
     for _ in range(9):
-        label_keyframe(rows, lamps, *at, nothing, config, spared=spared)
-        label_keyframe(rows, labels, *at, nothing, config)
+        fuse_detections(rows, lamps, *at, nothing, config, spared=spared)
+        fuse_detections(rows, labels, *at, nothing, config)
     assert np.mean(top_labels(lamps).reshape(64, 96)[thing()] == LAMP) > 0.9
     assert not top_labels(labels).any(), "what it knows, it can miss"
 
@@ -177,7 +177,7 @@ def test_gaussians_that_are_not_finite_stay_without_a_label() -> None:
     broken = np.flatnonzero(thing())[::7]
     rows[broken, 2] = np.nan
     labels, indices = new_labels(len(rows)), np.arange(len(rows), dtype=np.uint32)
-    label_keyframe(rows, labels, indices, CAMERA, np.eye(4), depth_image(), claims(), config)
+    fuse_detections(rows, labels, indices, CAMERA, np.eye(4), depth_image(), claims(), config)
     is_chair = top_labels(labels) == CHAIR
     assert not is_chair[broken].any()
     assert np.mean(is_chair[np.setdiff1d(np.flatnonzero(thing()), broken)]) > 0.95
@@ -218,7 +218,7 @@ def test_a_name_the_detector_cannot_know_is_not_held_back_by_what_it_missed() ->
     spared[LAMP] = True
     for told, which in ((spared, labels), (None, known)):
         said = claims(0, 0.9)
-        label_keyframe(rows, which, *view, said, config, is_late=True, spared=told)
+        fuse_detections(rows, which, *view, said, config, is_late=True, spared=told)
     assert np.mean(top_labels(labels).reshape(64, 96)[thing()] == LAMP) > 0.9
     assert not top_labels(known).any(), "what it knows, it did miss"
 

@@ -105,7 +105,7 @@ def test_few_boxes_wait_for_keyframes_that_never_come(posed) -> None:
     semantics = SemanticMap(builder, replace(BY_BOX, most_waiting=2))
     for keyframe in (7, 8, 9):
         semantics.add_detections(keyframe, claims())
-    assert semantics.metrics()["boxes_too_early"] == 1
+    assert semantics.metrics()["detections_too_early"] == 1
     assert [keyframe for keyframe, _ in semantics.snapshot()["waiting"]] == [8, 9]
 
 
@@ -128,7 +128,7 @@ def test_late_boxes_find_gaussians_that_sleep(posed) -> None:
         builder.add(frame, T, keyframe, 0)
     builder.changes(with_changed=True)
     builder.offload_excess()
-    assert builder.metrics()["gaussians_asleep"] > 100
+    assert builder.metrics()["gaussians_offloaded"] > 100
     semantics.add_detections(0, claims())
     SemanticMap(awake, BY_BOX).add_detections(0, claims())
     assert builder.gaussians.labels.any()

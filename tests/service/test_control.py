@@ -58,21 +58,21 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path, room: Sequen
                 lambda: bool(service.client.latest(MAP_SNAPSHOT, timeout_s=60)), 10, "a new map"
             )
             wait_until(
-                lambda: service.update_health()["optimizer"].facts.get("optimizations", 0) > 0,
+                lambda: service.update_health()["optimizer"].metrics.get("optimizations", 0) > 0,
                 10,
                 "corrections of the new run",
             )
-        assert service.client.control("dance").text.startswith("there is no 'dance'")
+        assert service.client.control("dance").message.startswith("there is no 'dance'")
         assert service.stop() == 0
         assert "Traceback" not in service.log
 
 
 def _paused(service: LiveService) -> int:
-    return sum(count.paused for count in service.update_health()["frame_source"].inputs)
+    return sum(count.dropped_paused for count in service.update_health()["frame_source"].inputs)
 
 
 def _iterations(service: LiveService) -> float:
-    return service.update_health()["mapper"].facts["iterations"]
+    return service.update_health()["mapper"].metrics["iterations"]
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ def test_every_keyframe_is_answered_whatever_the_network_is(
             service.wait_for_poses(20)
             wait_until(lambda: boxes.extend(inbox()) or len(boxes) >= 2, 10, "boxes")
             assert publisher.wait(60) == 0
-            facts = service.update_health()["detector"].facts
+            facts = service.update_health()["detector"].metrics
         assert facts["networks_missing"] == is_garbage
         assert {bool(message.detections) for message in boxes} == {not is_garbage}
         assert service.stop() == 0

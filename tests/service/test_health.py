@@ -48,7 +48,7 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
 @pytest.mark.slow
 def test_prometheus_sees_every_actor_count(tmp_path: Path) -> None:
     port = free_port()
-    with live_service(tmp_path, "--metrics", str(port)) as service:
+    with live_service(tmp_path, "--metrics-port", str(port)) as service:
         service.wait_for_actors()
         publisher = service.publisher("synthetic:room", "--rate", "15", "--max-frames", "30")
         service.wait_for_poses(20)
@@ -67,12 +67,19 @@ def test_prometheus_sees_every_actor_count(tmp_path: Path) -> None:
             assert reply.read() == b"every actor reports\n"
         assert publisher.wait(20) == 0
         second = subprocess.run(
-            [*LDO, "serve", "--endpoint", f"tcp/127.0.0.1:{free_port()}", "--metrics", str(port)],
+            [
+                *LDO,
+                "serve",
+                "--endpoint",
+                f"tcp/127.0.0.1:{free_port()}",
+                "--metrics-port",
+                str(port),
+            ],
             capture_output=True,
             text=True,
         )
         assert second.returncode == 2
-        assert f"--metrics {port}: cannot listen" in second.stderr
+        assert f"--metrics-port {port}: cannot listen" in second.stderr
         assert "Traceback" not in second.stderr
         assert service.stop() == 0
 

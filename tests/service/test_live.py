@@ -122,15 +122,15 @@ def test_a_state_folder_is_gone_on_from_and_never_shared_or_taken_in_part(
             service.pose_of(raw_frame_to_message(room.read(index)))
         state = tmp_path / "s"
         assert "another service keeps its state" in refused(state)
-        wait_until(lambda: service.update_health()["mapper"].facts["keyframes"] > 2, 10, "a map")
+        wait_until(lambda: service.update_health()["mapper"].metrics["keyframes"] > 2, 10, "a map")
         assert service.stop() == 0
-        keyframes = service.health["mapper"].facts["keyframes"]
+        keyframes = service.health["mapper"].metrics["keyframes"]
     with live_service(tmp_path) as service:
         service.wait_for_actors()
         for index in range(30, 60):
             service.pose_of(raw_frame_to_message(room.read(index)))
         wait_until(
-            lambda: service.update_health()["mapper"].facts.get("keyframes", 0) > keyframes,
+            lambda: service.update_health()["mapper"].metrics.get("keyframes", 0) > keyframes,
             10,
             "the map goes on",
         )

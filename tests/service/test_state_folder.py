@@ -19,7 +19,7 @@ def saved(folder: Path, keyframes_made: int, *actors: str) -> Path:
     """As stages leave it that have seen no frame, or whose tracker has made keyframes."""
     for name in actors:
         out = {"keyframe/new": (1, keyframes_made)} if name == "tracker" else {}
-        state = {**ACTORS[name]().snapshot(), "stage.links": {"in": {}, "out": out}}
+        state = {**ACTORS[name]().snapshot(), "stage.offsets": {"in": {}, "out": out}}
         FolderStore(folder / "state").save(name, state)
     return folder
 
@@ -62,7 +62,7 @@ def test_one_whose_tracker_is_of_an_older_copy_is_refused(tmp_path: Path) -> Non
     """The mapper would take new keyframes for old ones that came again."""
     saved(tmp_path, 5, *ACTORS)
     had = {"in": {"keyframe/new": (1, 6)}, "out": {}}
-    state = {**Mapper().snapshot(), "stage.links": had}
+    state = {**Mapper().snapshot(), "stage.offsets": had}
     FolderStore(tmp_path / "state").save("mapper", state)
     with pytest.raises(ConfigError, match="mapper is newer than that of tracker"):
         claim(tmp_path)

@@ -70,7 +70,9 @@ def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
         service.wait_for_actors()
         tracked(service, room, range(20))
         service.client.send(message(room, 20))
-        wait_until(lambda: service.update_health()["tracker"].set_aside == 1, 20, "it is counted")
+        wait_until(
+            lambda: service.update_health()["tracker"].dead_lettered == 1, 20, "it is counted"
+        )
         tracker = service.health["tracker"]
         assert (tracker.failures, tracker.restarts) == (2, 2)
         poses = tracked(service, room, range(21, 30))
@@ -181,7 +183,7 @@ def send_halves(
 
 
 def facts(service: LiveService) -> dict[str, float]:
-    return service.update_health()["frame_source"].facts
+    return service.update_health()["frame_source"].metrics
 
 
 @pytest.mark.slow

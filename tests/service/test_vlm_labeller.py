@@ -36,7 +36,7 @@ def test_a_name_is_added_while_it_runs(tmp_path: Path) -> None:
             service.client.add_label("x" * 101)
 
         def is_counted() -> bool:
-            return service.update_health()["vlm_labeller"].facts.get("names_added") == 1
+            return service.update_health()["vlm_labeller"].metrics.get("names_added") == 1
 
         wait_until(is_counted, 5, "counted")
         assert service.stop() == 0
@@ -93,7 +93,7 @@ def test_a_labeller_that_takes_five_seconds_keeps_nobody_waiting(tmp_path: Path)
             assert {pose.status for pose in poses} == {"OK"}
 
             def is_said() -> bool:
-                return service.update_health()["vlm_labeller"].facts.get("labeller_failing") == 1
+                return service.update_health()["vlm_labeller"].metrics.get("labeller_failing") == 1
 
             wait_until(is_said, 15, "said")
             assert service.client.objects().objects == ()

@@ -14,7 +14,7 @@ from pathlib import Path
 from ldo_service.actors import topology
 from ldo_service.actors.tracker import Tracker
 from ldo_service.commands import cli
-from ldo_service.schemas import Correction, FrameRgbd
+from ldo_service.schemas import FrameRgbd, GraphCorrection
 from ldo_service.service import service
 
 TROUBLE, FRAME = os.environ["TROUBLE"], 20
@@ -22,7 +22,7 @@ HUNG = Path(os.environ["TROUBLE_FOLDER"]) / "has_hung"
 
 
 class TroubledTracker(Tracker):
-    def handle(self, message: FrameRgbd | Correction):
+    def handle(self, message: FrameRgbd | GraphCorrection):
         if isinstance(message, FrameRgbd):
             meet_trouble(message.frame)
         yield from super().handle(message)

@@ -4,6 +4,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -280,3 +281,20 @@ def test_what_must_outlive_a_power_cut_is_synced_before_it_is_named(
     assert new in synced[1][1]
     assert synced[2][1] == [contents, "same.a", "step.a", "step.b"]
     assert FolderStore(tmp_path).load("mapper") == {"same": [0], "step": [2]}
+
+
+@pytest.mark.parametrize(
+    ("contents", "version"),
+    [({"step": "step.a"}, 1), ({"files": {"step": "step.a"}, "version": 99}, 99)],
+)
+def test_a_state_of_another_version_is_refused_and_left_as_it_is(
+    tmp_path: Path, contents: dict, version: int
+) -> None:
+    FolderStore(tmp_path).save("mapper", {"step": [1]})
+    file = tmp_path / "mapper" / state_store.CONTENTS
+    file.write_bytes(msgspec.msgpack.encode(contents))
+    before = {path.name: path.read_bytes() for path in file.parent.iterdir()}
+    for use in (lambda s: s.load("mapper"), lambda s: s.save("mapper", {"step": [2]})):
+        with pytest.raises(DataError, match=f"version={version}, and this service reads 2"):
+            use(FolderStore(tmp_path))
+    assert {path.name: path.read_bytes() for path in file.parent.iterdir()} == before

@@ -384,7 +384,7 @@ def test_a_cache_that_cannot_be_written_only_costs_time(
 def test_the_oldest_sequence_makes_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LDO_CACHE", str(tmp_path))
     monkeypatch.setattr(cache, "LIMIT_BYTES", 1500)
-    frame = cache.StoredFrame(
+    frame = cache.CachedFrame(
         np.zeros((8, 8, 3), np.uint8),
         np.ones((8, 8), np.float32),
         np.zeros((8, 8), np.uint8),

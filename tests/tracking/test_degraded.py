@@ -15,7 +15,7 @@ from ldo_service.synthetic.room import furnished_room
 from ldo_service.synthetic.room_render import Renderer
 from ldo_service.synthetic.room_sequence import kinect_depth
 from ldo_service.tracking import TrackingStatus
-from tests.tracking.degraded import (
+from tests.tracking.image_degradation import (
     Degrader,
     covered,
     dropped,

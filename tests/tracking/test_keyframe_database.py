@@ -14,7 +14,7 @@ from ldo_service.tracking.keyframe_database import (
     make_keyframe_record,
     make_thumbnail,
 )
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.pose_candidates import align_hypothesis
 from ldo_service.tracking.tracking_quality import ResidualHistory
 
@@ -23,9 +23,9 @@ def turned(angle_rad: float) -> np.ndarray:
     return se3.exp(np.array([0.0, angle_rad, 0.0, 0.0, 0.0, 0.0]))
 
 
-def keyframe_at(room, T_odom_keyframe: np.ndarray, number: int = 0) -> Keyframe:
+def keyframe_at(room, T_odom_keyframe: np.ndarray, number: int = 0) -> ReferenceKeyframe:
     view = pyramid_of(room.view(T_odom_keyframe), PyramidConfig())
-    return Keyframe(view, T_odom_keyframe, number)
+    return ReferenceKeyframe(view, T_odom_keyframe, number)
 
 
 def place_at(room, T_odom_keyframe: np.ndarray, number: int = 0) -> KeyframeRecord:
@@ -102,10 +102,10 @@ def test_on_a_round_the_newest_look_at_a_place_stays_and_no_more(room) -> None:
     assert [place.id for place in places.all] == [10, 11, 12, 13, 14]
 
 
-def test_what_is_half_a_step_away_or_in_another_segment_is_another_place(room) -> None:
+def test_what_is_half_a_step_away_or_in_another_submap_is_another_place(room) -> None:
     config = KeyframeDatabaseConfig(recent=0)
     first = place_at(room, np.eye(4), 0)
-    places = KeyframeDatabase((first, replace(first, id=1, segment=1)))
+    places = KeyframeDatabase((first, replace(first, id=1, submap=1)))
     places = places.with_record(place_at(room, turned(config.same + 0.01), 2), config)
     assert [place.id for place in places.all] == [0, 1, 2]
     places = places.with_record(place_at(room, turned(0.01), 3), config)
@@ -131,7 +131,7 @@ def test_a_place_keeps_nothing_of_what_moves(room) -> None:
     left_out = np.zeros(view.levels[0].depth_m.shape, bool)
     left_out[:, :80] = True
     place = make_keyframe_record(
-        Keyframe(view, np.eye(4), 0, ignore_mask=left_out),
+        ReferenceKeyframe(view, np.eye(4), 0, ignore_mask=left_out),
         FeatureConfig(),
         KeyframeDatabaseConfig(),
     )

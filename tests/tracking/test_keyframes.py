@@ -5,7 +5,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import se3
 from ldo_service.tracking import PyramidConfig, pyramid_of
 from ldo_service.tracking.features import FeatureConfig
-from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig, needs_keyframe
+from ldo_service.tracking.keyframes import KeyframeConfig, ReferenceKeyframe, needs_keyframe
 
 CONFIG = KeyframeConfig()
 TURNED = se3.exp(np.array([0, np.radians(16), 0, 0, 0, 0]))
@@ -37,7 +37,7 @@ def test_keyframe_is_due_when_the_view_has_changed(
 
 
 def test_features_are_detected_once(room) -> None:
-    keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
+    keyframe = ReferenceKeyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), 0)
     assert keyframe.features(FeatureConfig()) is keyframe.features(FeatureConfig())
     assert keyframe.reference is keyframe.reference
 

@@ -16,9 +16,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 
 def followed(frames: Iterable[RgbdFrame], patience_s: float = 0) -> list[TrackingResult]:
-    """`patience_s`: how long it is LOST until a new segment begins; 0: none does."""
-    segments = SubmapConfig(begin_after_s=patience_s)
-    config = OdometryConfig(segments=segments, keyframes=KeyframeConfig(supporting=2.0))
+    """`patience_s`: how long it is LOST until a new submap begins; 0: none does."""
+    submaps = SubmapConfig(begin_after_s=patience_s)
+    config = OdometryConfig(submaps=submaps, keyframes=KeyframeConfig(supporting=2.0))
     odometry = Odometry(config)
     return [odometry.process(frame) for frame in frames]
 
@@ -50,7 +50,7 @@ def test_kitchen_after_a_visit_to_an_apartment(data: Path, away: range) -> None:
     assert_found(back, distances_m(back, [r.T_odom_camera for r in undisturbed]))
 
 
-def test_the_apartment_becomes_a_segment_of_its_own_and_the_kitchen_stays(data: Path) -> None:
+def test_the_apartment_becomes_a_submap_of_its_own_and_the_kitchen_stays(data: Path) -> None:
     kitchen = open_sequence(str(data / "tum/kitchen"))
     apartment = open_sequence(str(data / "replica/apartment_floor1"))
     frames = [kitchen[k] for k in range(140, 240)]

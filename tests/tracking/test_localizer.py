@@ -9,13 +9,13 @@ from ldo_service.tracking.keyframe_database import (
     KeyframeDatabaseConfig,
     make_keyframe_record,
 )
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.localizer import Localizer, MapFix
 from ldo_service.tracking.submaps import SubmapConfig
 
 T_MAP_WORLD = se3.exp(np.array([0.1, -0.7, 0.2, 3.0, 1.0, -2.0]))
 T_BEHIND = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-CONFIG = OdometryConfig(segments=SubmapConfig(begin_after_s=0.06, look_every=4, confirm_after=2))
+CONFIG = OdometryConfig(submaps=SubmapConfig(begin_after_s=0.06, look_every=4, confirm_after=2))
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def places(large_room, make_walk) -> KeyframeDatabase:
     made = []
     for number, T_world_camera in enumerate(make_walk(3, 0.15, 0.1)):
         view = pyramid_of(large_room.view(T_world_camera), PyramidConfig())
-        keyframe = Keyframe(view, T_MAP_WORLD @ T_world_camera, number)
+        keyframe = ReferenceKeyframe(view, T_MAP_WORLD @ T_world_camera, number)
         made.append(make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()))
     return KeyframeDatabase(tuple(made))
 
@@ -62,7 +62,7 @@ def test_after_a_kidnap_the_old_fix_is_forgotten(large_room, make_walk, places) 
     here, there = make_walk(6), [T_BEHIND @ T for T in make_walk(8)]
     localizer = Localizer(places, CONFIG)
     errors = located(localizer, large_room, [*here, *there, *here])
-    assert errors[6:14] == [None] * 8, "the new segment of odometry was not found in the map"
+    assert errors[6:14] == [None] * 8, "the new submap of odometry was not found in the map"
     back = [error for error in errors[14:] if error is not None]
     assert len(back) >= 4
     assert max(back) < 5e-3
@@ -73,5 +73,5 @@ def test_a_fix_survives_packing(large_room, make_walk, places) -> None:
     located(localizer, large_room, make_walk(4))
     fix, again = localizer._fix, MapFix.unpack(localizer.snapshot()["fix"])
     np.testing.assert_array_equal(again.T_map_odom, fix.T_map_odom)
-    assert again.last is not None
+    assert again.pending_match is not None
     assert again.since_look == fix.since_look

@@ -57,7 +57,7 @@ class Walked:
         return se3.inverse(self._T_world_camera[a]) @ self._T_world_camera[b]
 
     def watched(
-        self, keyframe: int, frames: list[int], has_moved: np.ndarray | None = None
+        self, keyframe: int, frames: list[int], moved_mask: np.ndarray | None = None
     ) -> MotionMasks:
         """Of the last of several frames."""
         suspicion, seen = None, None
@@ -65,14 +65,14 @@ class Walked:
             seen = segment_motion(
                 self.view(k),
                 self.view(keyframe),
-                has_moved,
+                moved_mask,
                 self.T(keyframe, k),
                 NOISE_SCALE,
                 suspicion,
                 CONFIG,
                 DepthNoise(),
             )
-            suspicion, has_moved = seen.suspicion, seen.has_moved
+            suspicion, moved_mask = seen.suspicion, seen.moved_mask
         assert seen is not None
         return seen
 
@@ -89,30 +89,30 @@ def recall_and_precision(mask: np.ndarray, true: np.ndarray) -> tuple[float, flo
 
 def test_who_came_since_the_keyframe_is_found(walked: Walked) -> None:
     seen = walked.watched(EMPTY, [LATE - 1, LATE])
-    whole = grow_mask(seen.is_moving, walked.view(LATE), CONFIG)
+    whole = grow_mask(seen.dynamic_mask, walked.view(LATE), CONFIG)
     recall, precision = recall_and_precision(whole, walked.person(LATE))
     assert recall > 0.95
     assert precision > 0.7  # the rim is wanted
-    assert not seen.has_moved.any()
+    assert not seen.moved_mask.any()
 
 
 def test_who_has_gone_since_the_keyframe_is_found_in_it(walked: Walked) -> None:
     seen = walked.watched(LATE, [230, 231])
-    recall, precision = recall_and_precision(seen.has_moved, walked.person(LATE))
+    recall, precision = recall_and_precision(seen.moved_mask, walked.person(LATE))
     assert recall > 0.9
     assert precision > 0.9
-    assert not seen.is_moving.any()
+    assert not seen.dynamic_mask.any()
 
 
 def test_one_frame_alone_does_not_make_a_point_gone(walked: Walked) -> None:
-    assert not walked.watched(LATE, [230]).has_moved.any()
+    assert not walked.watched(LATE, [230]).moved_mask.any()
 
 
 def test_what_moved_before_stays_left_out_while_it_stands_still(walked: Walked) -> None:
     person = walked.person(LATE)
-    assert not walked.watched(LATE, [LATE, LATE]).is_moving.any()
+    assert not walked.watched(LATE, [LATE, LATE]).dynamic_mask.any()
     seen = walked.watched(LATE, [LATE, LATE], person)
-    assert recall_and_precision(seen.is_moving, person)[0] > 0.9
+    assert recall_and_precision(seen.dynamic_mask, person)[0] > 0.9
 
 
 @pytest.mark.parametrize(("keyframe", "frame"), [(0, 12), (160, 200), (200, 170)])
@@ -120,8 +120,8 @@ def test_nothing_moves_in_a_room_where_only_the_camera_does(
     walked: Walked, keyframe: int, frame: int
 ) -> None:
     seen = walked.watched(keyframe, [frame, frame + 1])
-    assert not seen.is_moving.any()
-    assert not seen.has_moved.any()
+    assert not seen.dynamic_mask.any()
+    assert not seen.moved_mask.any()
 
 
 def test_gap_is_the_difference_in_depth_where_surfaces_were_measured() -> None:

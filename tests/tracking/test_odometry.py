@@ -37,7 +37,7 @@ def assert_bitwise_equal(a: Sequence[TrackingResult], b: Sequence[TrackingResult
     for x, y in zip(a, b, strict=True):
         assert x.T_odom_camera.tobytes() == y.T_odom_camera.tobytes()
         assert x.information.tobytes() == y.information.tobytes()
-        assert (x.status, x.method) == (y.status, y.method)
+        assert (x.status, x.pose_source) == (y.status, y.pose_source)
         assert became_reference(x) == became_reference(y)
 
 
@@ -70,7 +70,7 @@ def test_before_the_first_keyframe_every_usable_frame_is_the_first(room) -> None
     assert odometry.process(room.blank()).status is TrackingStatus.LOST
     for _ in range(2):
         result = odometry.process(room.view(np.eye(4)), may_map=False)
-        assert (result.status, result.method) == (TrackingStatus.OK, "first")
+        assert (result.status, result.pose_source) == (TrackingStatus.OK, "first")
         assert result.denied_keyframe is KeyframeKind.FIRST
         assert result.awaits_mapping
     result = odometry.process(room.view(np.eye(4)))
@@ -91,7 +91,7 @@ def test_steps_beyond_the_reach_of_direct_alignment_are_found_by_features(large_
     results = track(Odometry(), [large_room.view(T, index=k) for k, T in enumerate(truth)])
     assert largest_error_m(results, truth) < 5e-3
     assert {r.status for r in results} == {TrackingStatus.OK}
-    assert "features" in {r.method for r in results}
+    assert "features" in {r.pose_source for r in results}
 
 
 def test_repeated_frame_stays_where_it_is(room, make_walk) -> None:
@@ -187,7 +187,7 @@ def test_a_place_left_long_ago_is_found_again(large_room) -> None:
     walk = [se3.exp(np.array([0.0, 0.05, 0.0, 0.01 * k, 0.0, 0.02])) for k in range(8)]
     frames = [large_room.view(T) for T in walk]
     back = odometry.process(frames[0], may_map=False)
-    assert (back.status, back.method) == (TrackingStatus.OK, "relocalised")
+    assert (back.status, back.pose_source) == (TrackingStatus.OK, "relocalized")
     assert back.reference in (0, 1)
     np.testing.assert_allclose(back.T_odom_camera, walk[0], atol=0.01)
     restored = Odometry()
@@ -211,7 +211,7 @@ def test_a_lost_camera_is_found_by_the_last_frame_mapped(large_room) -> None:
     restored.restore(decode_state(encode_state(odometry.snapshot())))
     frames = [large_room.blank(), large_room.view(turned[-1])]
     *_, found = track(odometry, frames)
-    assert (found.status, found.method) == (TrackingStatus.OK, "relocalised")
+    assert (found.status, found.pose_source) == (TrackingStatus.OK, "relocalized")
     np.testing.assert_allclose(found.T_odom_camera, turned[-1], atol=0.01)
     assert_bitwise_equal(track(restored, frames)[-1:], [found])
 

@@ -115,7 +115,7 @@ def test_what_does_not_follow_is_refused_or_begins_a_new_stretch(stamp_ns, T, ve
         assert after is before
     else:
         assert [pose.stamp_ns for pose in after.poses] == [stamp_ns]
-        assert after.stretch == before.stretch + 1
+        assert after.session == before.session + 1
 
 
 @pytest.mark.parametrize(
@@ -142,10 +142,10 @@ def test_the_camera_moves_as_the_base_does_whatever_the_frame_and_the_mounting()
 
 
 def test_nothing_is_carried_from_one_stretch_to_another_or_for_too_long() -> None:
-    anchor = DeadReckoningStart(IDENTITY, PriorPose(0, IDENTITY, stretch=1))
-    assert anchor.dead_reckon(PriorPose(10 * MS, IDENTITY, stretch=2), CONFIG) is None
-    assert anchor.dead_reckon(PriorPose(31_000 * MS, IDENTITY, stretch=1), CONFIG) is None
-    assert anchor.dead_reckon(PriorPose(29_000 * MS, IDENTITY, stretch=1), CONFIG) is not None
+    anchor = DeadReckoningStart(IDENTITY, PriorPose(0, IDENTITY, session=1))
+    assert anchor.dead_reckon(PriorPose(10 * MS, IDENTITY, session=2), CONFIG) is None
+    assert anchor.dead_reckon(PriorPose(31_000 * MS, IDENTITY, session=1), CONFIG) is None
+    assert anchor.dead_reckon(PriorPose(29_000 * MS, IDENTITY, session=1), CONFIG) is not None
 
 
 # --- tracking through a covered stretch -----------------------------------------------------------
@@ -229,7 +229,7 @@ def test_a_covered_camera_is_found_at_once_by_a_prior(covered: Covered, name: st
     assert (
         statuses(results)[BEFORE:] == [TrackingStatus.LOST] * COVERED + [TrackingStatus.OK] * AFTER
     )
-    assert "prior" in {tracked.method for tracked in results}
+    assert "prior" in {tracked.pose_source for tracked in results}
     assert largest_error_m(covered, results) < 5e-3
 
 
@@ -247,12 +247,12 @@ def test_no_covered_frame_is_ok_by_a_prior_and_its_pose_stays_the_last_trusted(
     results = covered.followed(covered.T_world_camera)
     last = results[BEFORE - 1].T_odom_camera
     for tracked in results[BEFORE : BEFORE + COVERED]:
-        assert (tracked.status, tracked.method) == (TrackingStatus.LOST, "none")
+        assert (tracked.status, tracked.pose_source) == (TrackingStatus.LOST, "none")
         np.testing.assert_array_equal(tracked.T_odom_camera, last)
         assert not tracked.information.any()
 
 
-def test_a_new_segment_begins_where_a_prior_has_the_camera(room, make_walk) -> None:
+def test_a_new_submap_begins_where_a_prior_has_the_camera(room, make_walk) -> None:
     """Turned around while covered, to where nothing was ever seen."""
     truth, turn = make_walk(BEFORE), np.array([0.0, np.pi, 0.0, 0.3, 0.0, 0.0])
     truth += [truth[-1] @ se3.exp(min(k / COVERED, 1.0) * turn) for k in range(1, COVERED + AFTER)]
@@ -263,7 +263,7 @@ def test_a_new_segment_begins_where_a_prior_has_the_camera(room, make_walk) -> N
         for k, T in enumerate(truth)
     ]
     turned = Covered(frames, truth)
-    config = OdometryConfig(segments=SubmapConfig(begin_after_s=0.3))
+    config = OdometryConfig(submaps=SubmapConfig(begin_after_s=0.3))
     alone, helped = turned.followed(None, config), turned.followed(drifting(truth), config)
     for results in (alone, helped):
         assert {tracked.submap for tracked in results[BEFORE + COVERED :]} == {1}
@@ -302,5 +302,5 @@ def test_a_successor_that_begins_while_covered_resumes_bit_for_bit(covered: Cove
         if k >= BEFORE + 5:
             tracked = second.process(frame, prior)
             assert tracked.T_odom_camera.tobytes() == expected.T_odom_camera.tobytes()
-            assert (tracked.status, tracked.method) == (expected.status, expected.method)
+            assert (tracked.status, tracked.pose_source) == (expected.status, expected.pose_source)
     assert expected.status is TrackingStatus.OK

@@ -14,7 +14,7 @@ from ldo_service.tracking.keyframe_database import (
     make_keyframe_record,
     make_thumbnail,
 )
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.relocalization import RelocalizationConfig, Relocalizer
 from ldo_service.tracking.tracking_quality import ResidualHistory, TrackingQualityConfig
 
@@ -35,7 +35,7 @@ def relocalizer(config: RelocalizationConfig | None = None) -> Relocalizer:
 
 def place_at(room, T_odom_keyframe: np.ndarray, number: int) -> KeyframeRecord:
     view = pyramid_of(room.view(T_odom_keyframe), PyramidConfig())
-    keyframe = Keyframe(view, T_odom_keyframe, number)
+    keyframe = ReferenceKeyframe(view, T_odom_keyframe, number)
     return make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig())
 
 

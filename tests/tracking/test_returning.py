@@ -25,7 +25,7 @@ from ldo_service.tracking.keyframe_database import (
     KeyframeRecord,
     make_keyframe_record,
 )
-from ldo_service.tracking.keyframes import Keyframe, KeyframeConfig
+from ldo_service.tracking.keyframes import KeyframeConfig, ReferenceKeyframe
 from ldo_service.tracking.map_frame import MapCorrection
 from ldo_service.tracking.relocalization import (
     KeyframeReuse,
@@ -44,7 +44,9 @@ def moved(x_m: float = 0.0, turn_rad: float = 0.0) -> np.ndarray:
 
 
 def place_at(room, number: int) -> KeyframeRecord:
-    keyframe = Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number)
+    keyframe = ReferenceKeyframe(
+        pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number
+    )
     return replace(
         make_keyframe_record(keyframe, FeatureConfig(), KeyframeDatabaseConfig()),
         median_depth_m=2.0,
@@ -137,7 +139,7 @@ def test_odometry_goes_on_where_it_is_against_the_known_keyframe(room, make_walk
     assert returned.reused_keyframe is not None
     assert returned.reference == returned.reused_keyframe == back.odometry.reference
     assert returned.reference != otherwise.reference
-    assert (returned.status, returned.method) == (TrackingStatus.OK, "returned")
+    assert (returned.status, returned.pose_source) == (TrackingStatus.OK, "reused")
     assert (returned.keyframe, returned.denied_keyframe) == (None, None)
     np.testing.assert_array_equal(returned.T_odom_camera, otherwise.T_odom_camera)
     again = back.odometry.process(room.view(returned.T_odom_camera))
@@ -306,7 +308,7 @@ def test_a_lost_camera_that_is_found_again_maps_nothing_anew(room, make_walk) ->
     followed(odometry, room, there)
     odometry.process(room.blank())
     found = odometry.process(room.view(there[2]), may_map=False)
-    assert (found.status, found.method) == (TrackingStatus.OK, "relocalised")
+    assert (found.status, found.pose_source) == (TrackingStatus.OK, "relocalized")
     assert found.denied_keyframe in (None, KeyframeKind.REFERENCE)
     assert odometry._is_connected_to_map
 

@@ -79,7 +79,7 @@ def test_the_odometry_follows_large_steps_past_white_walls(large_room) -> None:
     results = walked(large_room, truth)
     assert [r.status for r in results] == [TrackingStatus.OK] * 4
     assert max(error_m(r.T_odom_camera, T) for r, T in zip(results, truth, strict=True)) < 2e-3
-    assert "shape" in {r.method for r in results}
+    assert "gicp" in {r.pose_source for r in results}
     assert max(r.hypothesis_spread_rad for r in results) > 0.1, "where the others led is told"
 
 

@@ -9,13 +9,13 @@ from ldo_service.tracking.keyframe_database import (
     KeyframeDatabaseConfig,
     make_keyframe_record,
 )
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.motion_segmentation import MotionEvidence
 from ldo_service.tracking.state import OdometryState, pack, unpack
 
 
-def keyframe_of(room, number: int = 0) -> Keyframe:
-    return Keyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number)
+def keyframe_of(room, number: int = 0) -> ReferenceKeyframe:
+    return ReferenceKeyframe(pyramid_of(room.view(np.eye(4)), PyramidConfig()), np.eye(4), number)
 
 
 def test_empty_state_survives_packing() -> None:
@@ -42,12 +42,12 @@ def test_what_moved_survives_packing(room) -> None:
     mask = np.eye(120, 160) > 0
     moved = replace(keyframe_of(room), moved_mask=mask, ignore_mask=~mask)
     suspicion = MotionEvidence(mask, mask.astype(np.uint8))
-    state = OdometryState(keyframe=moved, is_moving=~mask, motion_evidence=suspicion)
+    state = OdometryState(keyframe=moved, dynamic_mask=~mask, motion_evidence=suspicion)
     restored = unpack(pack(state), PyramidConfig())
     assert restored.keyframe is not None
     np.testing.assert_array_equal(restored.keyframe.moved_mask, mask)
     np.testing.assert_array_equal(restored.keyframe.ignore_mask, ~mask)
-    np.testing.assert_array_equal(restored.is_moving, ~mask)
+    np.testing.assert_array_equal(restored.dynamic_mask, ~mask)
     np.testing.assert_array_equal(restored.motion_evidence.gone, suspicion.gone)
 
 

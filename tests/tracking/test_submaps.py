@@ -21,29 +21,29 @@ def look(
 
 
 def begun(count: int) -> Submaps:
-    segments = Submaps()
+    submaps = Submaps()
     for _ in range(count):
-        segments = segments.started()
-    return segments
+        submaps = submaps.started()
+    return submaps
 
 
-def after(segments: Submaps, frames: int) -> Submaps:
+def after(submaps: Submaps, frames: int) -> Submaps:
     for k in range(frames):
-        segments = segments.after(is_lost=False, stamp_ns=k * PERIOD_NS)
-    return segments
+        submaps = submaps.after(is_lost=False, stamp_ns=k * PERIOD_NS)
+    return submaps
 
 
 def begins(is_lost: list[bool], stamps_ns: list[int], config: SubmapConfig) -> list[bool]:
-    """Whether a segment may begin with each frame."""
-    segments, may_begin = begun(1), []
+    """Whether a submap may begin with each frame."""
+    submaps, may_begin = begun(1), []
     for lost, stamp_ns in zip(is_lost, stamps_ns, strict=True):
-        segments = segments.after(lost, stamp_ns)
-        may_begin.append(segments.should_start(stamp_ns, config))
+        submaps = submaps.after(lost, stamp_ns)
+        may_begin.append(submaps.should_start(stamp_ns, config))
     return may_begin
 
 
 @pytest.mark.parametrize("rate_hz", [5, 30, 200])
-def test_a_segment_begins_after_so_many_seconds_lost_at_any_rate(rate_hz: int) -> None:
+def test_a_submap_begins_after_so_many_seconds_lost_at_any_rate(rate_hz: int) -> None:
     stamps_ns = [round(1e9 * k / rate_hz) for k in range(4 * rate_hz)]
     expected = [stamp_ns >= 3_000_000_000 for stamp_ns in stamps_ns]
     assert begins([True] * len(stamps_ns), stamps_ns, SubmapConfig()) == expected
@@ -55,7 +55,7 @@ def test_a_frame_that_is_not_lost_ends_the_patience_and_renews_it() -> None:
     assert begins(is_lost, stamps_ns, CONFIG) == [False] * 5 + [True] * 2
 
 
-def test_no_segment_begins_where_none_is_wanted() -> None:
+def test_no_submap_begins_where_none_is_wanted() -> None:
     stamps_ns = [k * 10**9 for k in range(99)]
     assert not any(begins([True] * 99, stamps_ns, SubmapConfig(begin_after_s=0)))
 
@@ -65,7 +65,7 @@ def test_a_camera_that_starts_again_while_lost_is_waited_for_by_its_new_clock() 
     assert begins([True] * 5, stamps_ns, CONFIG) == [False] * 4 + [True]
 
 
-def test_nobody_looks_for_other_segments_where_there_is_none_apart() -> None:
+def test_nobody_looks_for_other_submaps_where_there_is_none_apart() -> None:
     assert not after(begun(1), 99).is_search_due(CONFIG)
     assert after(begun(2), 4).is_search_due(CONFIG)
     assert not after(begun(2).with_merge(1, 0), 99).is_search_due(CONFIG)
@@ -100,26 +100,26 @@ def test_a_find_is_forgotten_after_looks_that_find_nothing() -> None:
     found = begun(2).with_search_result(look(), CONFIG)
     for _ in range(CONFIG.misses):
         found = found.with_search_result(None, CONFIG)
-    assert found.last is not None
-    assert found.with_search_result(None, CONFIG).last is None
+    assert found.pending_match is not None
+    assert found.with_search_result(None, CONFIG).pending_match is None
 
 
-def test_joined_segments_share_the_oldest_as_their_root() -> None:
-    segments = begun(4).with_merge(3, 2).with_merge(2, 1)
-    assert segments.roots == (0, 1, 1, 1)
-    assert segments.are_merged(3, 1)
-    assert not segments.are_merged(3, 0)
+def test_joined_submaps_share_the_oldest_as_their_root() -> None:
+    submaps = begun(4).with_merge(3, 2).with_merge(2, 1)
+    assert submaps.roots == (0, 1, 1, 1)
+    assert submaps.are_merged(3, 1)
+    assert not submaps.are_merged(3, 0)
 
 
 @pytest.mark.parametrize(
-    "segments", [Submaps(), begun(3).with_search_result(look(), CONFIG), begun(2).with_merge(0, 1)]
+    "submaps", [Submaps(), begun(3).with_search_result(look(), CONFIG), begun(2).with_merge(0, 1)]
 )
-def test_segments_survive_packing(segments: Submaps) -> None:
-    again = Submaps.unpack(segments.packed)
-    assert again.roots == segments.roots
-    assert (again.last is None) == (segments.last is None)
-    if again.last is not None:
-        np.testing.assert_array_equal(again.last.T_there_here, T_THERE_HERE)
+def test_submaps_survive_packing(submaps: Submaps) -> None:
+    again = Submaps.unpack(submaps.packed)
+    assert again.roots == submaps.roots
+    assert (again.pending_match is None) == (submaps.pending_match is None)
+    if again.pending_match is not None:
+        np.testing.assert_array_equal(again.pending_match.T_there_here, T_THERE_HERE)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from ldo_service.tracking import AlignConfig, PyramidConfig, pyramid_of
 from ldo_service.tracking.alignment import BrightnessModel
 from ldo_service.tracking.features import FeatureConfig
 from ldo_service.tracking.keyframe_database import KeyframeDatabaseConfig, make_keyframe_record
-from ldo_service.tracking.keyframes import Keyframe
+from ldo_service.tracking.keyframes import ReferenceKeyframe
 from ldo_service.tracking.pyramid import build_pyramid
 from ldo_service.tracking.window import RecentKeyframeCache, WindowConfig, measure_against
 
@@ -24,10 +24,10 @@ def truth(make_walk) -> list[np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def keyframes(room, truth) -> list[Keyframe]:
+def keyframes(room, truth) -> list[ReferenceKeyframe]:
     rng = np.random.default_rng(3)  # of the odometry that their poses come from
     return [
-        Keyframe(
+        ReferenceKeyframe(
             pyramid_of(room.view(T), PyramidConfig()),
             T @ se3.exp(rng.normal(scale=3e-3, size=6)),
             k,
@@ -48,7 +48,7 @@ def test_each_measurement_is_nearer_to_the_truth_than_odometry(keyframes, truth)
 
 def test_keyframes_that_show_another_place_are_passed_over(keyframes, room) -> None:
     turned = se3.exp(np.array([0.0, np.pi, 0.0, 0.0, 0.0, 0.0]))
-    elsewhere = Keyframe(pyramid_of(room.view(turned), PyramidConfig()), turned, 9)
+    elsewhere = ReferenceKeyframe(pyramid_of(room.view(turned), PyramidConfig()), turned, 9)
     *earlier, newest = keyframes
     poses = measure_against(
         [elsewhere, *reversed(earlier)], newest, USUAL, AlignConfig(), WindowConfig()
@@ -79,10 +79,10 @@ def test_a_poor_fit_is_left_out(keyframes) -> None:
     assert not measure_against([frame], newest, USUAL, AlignConfig(), WindowConfig(min_overlap=0.1))
 
 
-def replace_gray(keyframe: Keyframe, gray: np.ndarray) -> Keyframe:
+def replace_gray(keyframe: ReferenceKeyframe, gray: np.ndarray) -> ReferenceKeyframe:
     view = keyframe.view
     noisy = build_pyramid(gray, view.depth_m, view.camera, PyramidConfig())
-    return Keyframe(noisy, keyframe.T_odom_keyframe, keyframe.id)
+    return ReferenceKeyframe(noisy, keyframe.T_odom_keyframe, keyframe.id)
 
 
 def test_none_are_measured_on_request(keyframes) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from ldo_service.demo_networks import NOTHING
 from ldo_service.synthetic.flat import CLASS_NAMES
-from ldo_service.synthetic.flat.render import Rendering
+from ldo_service.synthetic.flat.render import FlatRendering
 
 pytest.importorskip("jax", reason="needs the trainer's libraries: pip install --group train")
 
@@ -32,14 +32,14 @@ def trainer(monkeypatch: pytest.MonkeyPatch) -> Iterator[SimpleNamespace]:
         sys.modules.pop(name, None)
 
 
-def frame(*things: tuple[int, int, int, int, int, int]) -> Rendering:
+def frame(*things: tuple[int, int, int, int, int, int]) -> FlatRendering:
     """A wall at 3 m, and boards before it: class, instance, left, top, right, bottom."""
     light, depth_m = np.full((240, 320, 3), 0.5), np.full((240, 320), 3.0)
     class_ids, instance_ids = np.full((240, 320), WALL), np.zeros((240, 320), np.uint16)
     for class_id, instance, left, top, right, bottom in things:
         at = np.s_[top:bottom, left:right]
         light[at], depth_m[at], class_ids[at], instance_ids[at] = 0.7, 2.0, class_id, instance
-    return Rendering(light, depth_m, class_ids, instance_ids)
+    return FlatRendering(light, depth_m, class_ids, instance_ids)
 
 
 def rows(trainer: SimpleNamespace, *things) -> list[tuple]:

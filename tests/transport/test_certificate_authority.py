@@ -96,7 +96,7 @@ def test_what_cannot_be_leaves_nothing_behind(
 
 
 def test_a_folder_that_is_no_authority_is_said(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="ldo keys new"):
+    with pytest.raises(ConfigError, match="ldo keys init"):
         CertificateAuthority(tmp_path)
 
 

@@ -18,7 +18,7 @@ from ldo_service.transport.flow_control import (
     retransmit_key,
 )
 from ldo_service.transport.interface import MemoryTransport
-from tests.runtime.cast import NUMBERS, collector, eventually, number, running, send
+from tests.runtime.fake_actors import NUMBERS, collector, eventually, number, running, send
 
 KEYS = [key(NUMBERS.name) for key in (data_key, retransmit_key, credit_key, producer_hello_key)]
 
@@ -46,9 +46,9 @@ async def test_a_slow_consumer_gets_everything_in_order_within_its_window() -> N
         await eventually(lambda: stage.health().inputs[0].delivered == 50)
         counted = stage.health().inputs[0]
     assert seen == list(range(50))
-    assert (counted.delivered, counted.dropped, counted.waiting) == (50, 0, 0)
-    assert counted.peak <= 4
-    assert source.counts().waited >= 1
+    assert (counted.delivered, counted.dropped, counted.queued) == (50, 0, 0)
+    assert counted.peak_queued <= 4
+    assert source.counts().backpressure_waits >= 1
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -67,7 +67,7 @@ async def test_a_network_that_loses_a_third_still_delivers_each_message_once_in_
         await source.flush()
         await eventually(lambda: len(one) == len(other) == 60)
     assert one == other == list(range(60))
-    assert source.counts().repeated > 0
+    assert source.counts().retransmitted > 0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -181,7 +181,7 @@ async def test_a_topic_without_lossless_consumers_is_never_waited_for() -> None:
     source = outlet(MemoryTransport())
     for value in range(100):
         await send(source, number(value))
-    assert source.counts().waited == 0
+    assert source.counts().backpressure_waits == 0
 
 
 async def test_a_producer_that_starts_anew_is_followed_from_its_first_message() -> None:

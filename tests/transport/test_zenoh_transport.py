@@ -27,7 +27,7 @@ from ldo_service.transport.zenoh_transport import (
     open_session,
 )
 from tests.ports import free_port
-from tests.runtime.cast import (
+from tests.runtime.fake_actors import (
     DOUBLES,
     NUMBERS,
     PIECES,
@@ -64,7 +64,7 @@ async def test_lossless_images_reach_a_slow_consumer_in_order(
         await eventually(lambda: len(seen) == 60)
         counted = stage.health().inputs[0]
     assert seen == list(range(60))
-    assert counted.peak <= 4
+    assert counted.peak_queued <= 4
     assert counted.dropped == 0
 
 

@@ -17,7 +17,7 @@ from ldo_service.viewer.view_config import ViewerConfig
 from ldo_service.viewer.window import Window, open_window
 from tests.service.conftest import LDO, live_service
 from tests.viewer.browser import Page, browser
-from tests.viewer.staged import GREEN, RED, Staged, chair, scene_of, wall
+from tests.viewer.scenes import GREEN, RED, Staged, chair, scene_of, wall
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 CONFIG = ViewerConfig(port=0, gaussians_s=0.5)

@@ -98,7 +98,7 @@ def test_all_that_it_says_is_seen(robot: Robot, source: LiveSource) -> None:
     robot.says(LOOP_CLOSURE, EXAMPLES["loop_closure"])
     robot.says(MAP_OBJECTS, EXAMPLES["map_objects"])
     robot.says(DETECTION_BOXES, EXAMPLES["detection_boxes"])
-    robot.says(GRAPH_CORRECTION, EXAMPLES["correction"])
+    robot.says(GRAPH_CORRECTION, EXAMPLES["graph_correction"])
     robot.says(HEALTH, EXAMPLES["health"], below="/tracker")
     seen: set[str] = set()
 
@@ -123,7 +123,7 @@ def test_who_comes_late_is_told_what_there_is(
         changing.delta()
     with (
         robot.answers(MAP_SNAPSHOT, *changing.snapshot(parts=3)),
-        robot.answers(GRAPH_CORRECTION, EXAMPLES["correction"]),
+        robot.answers(GRAPH_CORRECTION, EXAMPLES["graph_correction"]),
         robot.answers(MAP_OBJECTS, EXAMPLES["map_objects"]),
         looked_at(network, tmp_path) as source,
     ):
@@ -143,7 +143,7 @@ def test_a_service_that_is_started_again_with_an_empty_map_is_followed(
     old, new = ChangingMap(1), ChangingMap(2)
     for _ in range(5):
         robot.says(MAP_DELTA, old.delta())
-    robot.says(GRAPH_CORRECTION, EXAMPLES["correction"])
+    robot.says(GRAPH_CORRECTION, EXAMPLES["graph_correction"])
     lives(robot, epoch=1)
     wait_until(lambda: shows(source, old) and bool(source.scene.keyframes), 10, "the old map")
     deltas = [new.delta() for _ in range(6)][first - 1 : 4]

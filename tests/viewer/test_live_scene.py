@@ -8,9 +8,9 @@ from ldo_service.conversions.frames import camera_from_message
 from ldo_service.conversions.poses import correction_to_message, pose_to_message
 from ldo_service.geometry import se3
 from ldo_service.schemas import (
-    Correction,
     Detection,
     DetectionBoxes,
+    GraphCorrection,
     Health,
     Keyframe,
     LoopClosure,
@@ -62,12 +62,12 @@ def pose(frame: int, x_m: float, reference: int | None, **fields: object) -> Tra
         "T_map_odom": pose_to_message(np.eye(4)),
         "T_reference_camera": pose_to_message(T_reference_camera),
         "keyframe": None,
-        "segment": 0,
+        "submap": 0,
     }
     return msgspec.structs.replace(EXAMPLES["tracked_pose"], **{**plain, **fields})
 
 
-def correction(version: int, x_m: dict[int, float], **fields: object) -> Correction:
+def correction(version: int, x_m: dict[int, float], **fields: object) -> GraphCorrection:
     message = correction_to_message(0, version, {k: at(x) for k, x in x_m.items()})
     return msgspec.structs.replace(message, **fields)
 
@@ -137,8 +137,8 @@ def test_a_lost_camera_leaves_no_path(live: LiveScene) -> None:
     assert len(live.scene.online) == 0
 
 
-def test_a_segment_that_is_not_joined_has_no_place_in_the_published_path(live: LiveScene) -> None:
-    taken(live, *WALK, pose(9, 50.0, None, segment=1))
+def test_a_submap_that_is_not_joined_has_no_place_in_the_published_path(live: LiveScene) -> None:
+    taken(live, *WALK, pose(9, 50.0, None, submap=1))
     np.testing.assert_array_equal(np.isnan(live.scene.online[:, 0]), [False] * 4 + [True])
 
 
@@ -199,10 +199,15 @@ def seen_in(*keyframes: int) -> MapObjects:
 def test_loops_are_those_that_the_optimizer_believes(live: LiveScene) -> None:
     taken(live, closure(1, 8), closure(2, 9))
     assert live.scene.loops == ((1, 8), (2, 9))
-    agreed = correction(1, {0: 0.0}, closures=((0, 7), (1, 8)), not_believed=((2, 9),))
+    agreed = correction(
+        1, {0: 0.0}, accepted_closures=((0, 7), (1, 8)), rejected_closures=((2, 9),)
+    )
     assert "loops" in taken(live, agreed)
     assert set(live.scene.loops) == {(1, 8), (0, 7)}
-    taken(live, correction(2, {0: 0.0}, closures=((0, 7), (1, 8)), not_believed=((3, 10),)))
+    taken(
+        live,
+        correction(2, {0: 0.0}, accepted_closures=((0, 7), (1, 8)), rejected_closures=((3, 10),)),
+    )
     assert set(live.scene.loops) == {(1, 8), (0, 7)}, "a correction names the newest refused ones"
 
 
@@ -232,7 +237,7 @@ def test_health_and_rates_are_told(live: LiveScene, clock: Clock) -> None:
     for beat in range(11):
         clock.now_s += 0.5
         steps = 100 + 10 * beat
-        live.take(msgspec.structs.replace(health, actor="tracker", steps=steps, held=False))
+        live.take(msgspec.structs.replace(health, actor="tracker", steps=steps, paused=False))
         taken(live, pose(beat, 0.0, None))
     (row,) = [line for line in live.scene.facts.splitlines() if line.startswith("| tracker")]
     assert "| 20.0 |" in row

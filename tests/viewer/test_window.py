@@ -14,7 +14,7 @@ from ldo_service.transport.endpoint import LOOPBACK
 from ldo_service.viewer.scene import splats_of
 from ldo_service.viewer.view_config import ViewerConfig
 from ldo_service.viewer.window import Server, Window, open_window
-from tests.viewer.staged import EVERY_LAYER, GREEN, RED, Staged, chair, scene_of, wall
+from tests.viewer.scenes import EVERY_LAYER, GREEN, RED, Staged, chair, scene_of, wall
 
 NODES = ("gaussians", "online", "final", "keyframes", "sights", "objects", "loops", "names/7")
 CONFIG = ViewerConfig(port=0, gaussians_s=2.0)

@@ -212,14 +212,14 @@ class HttpLabeller:
         return fused_over_views(views)
 
     def metrics(self) -> dict[str, float]:
-        """`answers_refused`: no name, or none of the list. `answers_undecided`: the model said that
+        """`answers_refused`: no name, or none of the list. `answers_none`: the model said that
         it cannot tell. `answers_without_logprobs`: sure to a configured degree only."""
         return {
             "names": len(self._names),
             "questions": self._questions,
             "attempts": self._endpoint.attempts,
             "answers_refused": self._refused,
-            "answers_undecided": self._undecided,
+            "answers_none": self._undecided,
             "answers_without_logprobs": self._untold,
         }
 

@@ -21,7 +21,7 @@ VISIBLE_SHARE = 1e-3  # of the image: 300 pixels of 640x480
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class MotionSpeeds:
     """Between consecutive frames."""
 
     speeds_m_s: np.ndarray  # [N - 1]
@@ -41,13 +41,13 @@ class Contents:
         return sum(name in CLASS_NAMES[:COCO_COUNT] for name in self.objects_per_class)
 
 
-def motion(T_world_camera: np.ndarray) -> Motion:
+def motion(T_world_camera: np.ndarray) -> MotionSpeeds:
     """Speeds and turns of a trajectory [N, 4, 4] at the rate of the walk."""
     steps_m = np.diff(T_world_camera[:, :3, 3], axis=0)
     before, after = T_world_camera[:-1, :3, :3], T_world_camera[1:, :3, :3]
     cosines = (np.einsum("nij,nij->n", before, after) - 1) / 2
     turns = np.rad2deg(np.arccos(np.clip(cosines, -1, 1)))
-    return Motion(np.linalg.norm(steps_m, axis=1) * RATE_HZ, turns * RATE_HZ)
+    return MotionSpeeds(np.linalg.norm(steps_m, axis=1) * RATE_HZ, turns * RATE_HZ)
 
 
 def contents(sequence: FlatSequence, stride: int = 1) -> Contents:

@@ -24,7 +24,7 @@ _DIGEST_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
-class StoredFrame:
+class CachedFrame:
     """What is kept of a frame: color [H, W, 3], depth_m [H, W] float32, labels [H, W]."""
 
     color: np.ndarray
@@ -52,7 +52,7 @@ class FrameCache:
         self.folder = cache_root() / "synthetic-flat" / key
         self._size = (height, width)
 
-    def load(self, index: int) -> StoredFrame | None:
+    def load(self, index: int) -> CachedFrame | None:
         """The frame, or None where it is missing or damaged."""
         try:
             data = self._path(index).read_bytes()
@@ -64,7 +64,7 @@ class FrameCache:
             log.warning("cached frame %s is damaged and rendered again: %s", index, error)
             return None
 
-    def store(self, index: int, frame: StoredFrame) -> None:
+    def store(self, index: int, frame: CachedFrame) -> None:
         """Keep the frame; a reader sees all of it or nothing."""
         try:
             self._make_room()
@@ -89,7 +89,7 @@ class FrameCache:
             shutil.rmtree(other, ignore_errors=True)
             total -= size
 
-    def _unpacked(self, data: bytes) -> StoredFrame:
+    def _unpacked(self, data: bytes) -> CachedFrame:
         digest, *lengths = _HEADER.unpack_from(data)
         body = data[_HEADER.size :]
         if len(body) != sum(lengths) or _digest(body) != digest:
@@ -101,7 +101,7 @@ class FrameCache:
         height, width = self._size
         color = codecs.decode_color("png", width, height, parts[0])
         depth_m = codecs.decode_depth("f32+zstd", width, height, parts[1])
-        return StoredFrame(
+        return CachedFrame(
             color, depth_m, self._plane(parts[2], np.uint8), self._plane(parts[3], np.uint16)
         )
 
@@ -109,7 +109,7 @@ class FrameCache:
         return np.frombuffer(zstandard.decompress(data), dtype).reshape(self._size)
 
 
-def _packed(frame: StoredFrame) -> bytes:
+def _packed(frame: CachedFrame) -> bytes:
     _, png = cv2.imencode(".png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
     planes = (frame.depth_m, frame.class_ids, frame.instance_ids)
     parts = [png.tobytes(), *(zstandard.compress(plane.tobytes(), 3) for plane in planes)]

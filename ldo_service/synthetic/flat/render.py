@@ -80,7 +80,7 @@ def _grid_on_face(panel: Panel) -> tuple[Vector, tuple[int, int]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Rendering:
+class FlatRendering:
     """One frame before any sensor.
 
     light          [H, W, 3] float64 in 0..1
@@ -107,7 +107,7 @@ class FlatRenderer:
             self._with_shadows(panel.room, i) for i, panel in enumerate(flat.panels)
         ]
 
-    def render(self, camera: Camera, T_world_camera: np.ndarray) -> Rendering:
+    def render(self, camera: Camera, T_world_camera: np.ndarray) -> FlatRendering:
         """Pixels on an outline average four rays in light; depth and labels never mix surfaces."""
         v, u = np.divmod(np.arange(camera.width * camera.height), camera.width)
         view = RayCaster(SHELL, self._table.solids, camera, T_world_camera)
@@ -116,7 +116,7 @@ class FlatRenderer:
         light = self._reflected(view, u, v, hits)
         edge = outline(hits.surface.reshape(size)).ravel()
         light[edge] = self._antialiased(view, u[edge], v[edge])
-        return Rendering(
+        return FlatRendering(
             light.reshape(*size, 3),
             hits.depth_m.reshape(size),
             self._class_ids[hits.surface].reshape(size),

@@ -30,7 +30,7 @@ def furnished_flat(seed: int) -> Flat:
 
 
 @dataclass(frozen=True, slots=True)
-class Surfaces:
+class SurfaceTable:
     """Every solid of the flat, those of the panels first; all in one order, S of them.
 
     rooms         [S] which lamp lights it
@@ -44,13 +44,13 @@ class Surfaces:
     instance_ids: np.ndarray
 
 
-def surfaces(flat: Flat) -> Surfaces:
+def surfaces(flat: Flat) -> SurfaceTable:
     """The table of a flat's solids."""
     rows = [(panel.solid, panel.room, panel.class_id, 0) for panel in flat.panels]
     for number, (thing, room) in enumerate(zip(flat.things, flat.rooms, strict=True), 1):
         class_id = CLASS_NAMES.index(thing.label)
         rows += [(solid, room, class_id, number) for solid in thing.solids]
     solids, rooms, class_ids, instance_ids = zip(*rows, strict=True)
-    return Surfaces(
+    return SurfaceTable(
         solids, np.array(rooms), np.array(class_ids, np.uint8), np.array(instance_ids, np.uint16)
     )

@@ -7,7 +7,7 @@ import numpy as np
 from ldo_service.geometry import Camera
 from ldo_service.synthetic.room_sequence import DISPARITY_SIGMA_STEPS, DISPARITY_STEP_PER_M
 
-from .render import Rendering
+from .render import FlatRendering
 from .walk import FRAMES, RATE_HZ, CameraPath, closed_spline
 
 SHUTTER_S = 0.02  # indoors in the evening: 11 pixels of blur at 60 degrees per second
@@ -31,7 +31,7 @@ class Sensor:
     walk: CameraPath
     seed: int
 
-    def color(self, frame: int, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
+    def color(self, frame: int, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
         """Light [H, W, 3] as recorded: moved while the shutter is open, amplified, noisy.
 
         Motion during the exposure is taken as linear: a pixel averages the sharp image along the
@@ -41,7 +41,7 @@ class Sensor:
         blurred = blur(rendering.light, *self.motion_px(frame, rendering.depth_m))
         return gain * blurred + NOISE * normal(rng, blurred.shape)
 
-    def depth_m(self, rendering: Rendering, rng: np.random.Generator) -> np.ndarray:
+    def depth_m(self, rendering: FlatRendering, rng: np.random.Generator) -> np.ndarray:
         """Depth [H, W] as measured; 0 where nothing is."""
         return measured_depth_m(rendering, self.camera.fx, rng)
 
@@ -63,7 +63,9 @@ class Sensor:
         return float(min(max(drift, -1.0), 1.0))
 
 
-def measured_depth_m(rendering: Rendering, focal_px: float, rng: np.random.Generator) -> np.ndarray:
+def measured_depth_m(
+    rendering: FlatRendering, focal_px: float, rng: np.random.Generator
+) -> np.ndarray:
     """Depth [H, W] of a Kinect-like camera; 0 where it measures none.
 
     Steps of 2.85e-3 z^2 (Khoshelham and Elberink, Sensors 2012), noise of half a step that

@@ -13,7 +13,7 @@ from ldo_service.errors import ConfigError, DataError
 from ldo_service.geometry import Camera, RawFrame, Trajectory
 from ldo_service.geometry.sequence import FrameLabels, Sequence, TrueLabels
 
-from .cache import FrameCache, StoredFrame
+from .cache import CachedFrame, FrameCache
 from .render import FlatRenderer
 from .scene import Flat, furnished_flat
 from .scene_object import CLASS_NAMES, SceneObject
@@ -109,14 +109,14 @@ class FlatSequence(Sequence):
     def _renderer(self) -> FlatRenderer:
         return FlatRenderer(self._flat)
 
-    def _frame(self, index: int) -> StoredFrame:
+    def _frame(self, index: int) -> CachedFrame:
         frame = self._cache.load(index)
         if frame is None:
             frame = self._rendered(index)
             self._cache.store(index, frame)
         return frame
 
-    def _rendered(self, index: int) -> StoredFrame:
+    def _rendered(self, index: int) -> CachedFrame:
         exact = self._renderer.render(self.raw_camera, self._T_world_camera[index])
         light, depth_m = exact.light, exact.depth_m
         if self.config.noise:
@@ -124,7 +124,7 @@ class FlatSequence(Sequence):
             light = self._sensor.color(index, exact, rng)
             depth_m = self._sensor.depth_m(exact, rng)
         color = np.floor(np.clip(light, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
-        return StoredFrame(color, depth_m.astype(np.float32), exact.class_ids, exact.instance_ids)
+        return CachedFrame(color, depth_m.astype(np.float32), exact.class_ids, exact.instance_ids)
 
 
 def prerender(

@@ -113,7 +113,7 @@ def test_none_is_an_honest_answer() -> None:
     with serving(says("None.", 0.99)) as server:
         one = labeller(server.url, views=1)
         assert one.label([RED]) == []
-        assert (one.metrics()["answers_refused"], one.metrics()["answers_undecided"]) == (0, 1)
+        assert (one.metrics()["answers_refused"], one.metrics()["answers_none"]) == (0, 1)
 
 
 def test_an_open_question_takes_any_name_and_no_sentence() -> None:

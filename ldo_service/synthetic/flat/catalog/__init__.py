@@ -16,4 +16,4 @@ CATALOG: dict[str, Builder] = {
     **rooms.FIXTURES,
 }
 
-__all__ = ["CATALOGUE"]
+__all__ = ["CATALOG"]

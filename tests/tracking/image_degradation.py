@@ -1,6 +1,6 @@
 """Frames that went bad, and what tracking makes of them.
 
-    python -m tests.tracking.degraded SOURCE [FRAMES]      prints the table of all troubles
+    python -m tests.tracking.image_degradation SOURCE [FRAMES]      prints the table of all troubles
 
 A `Degrader` is a pure function: what the camera shows in place of frame k while there is trouble.
 """

@@ -1,6 +1,6 @@
 """Seeded faults on the real service, and what must hold after each.
 
-    python -m tests.faults.campaign OUT.jsonl [--batches 10] [--faults 20] [--seed 0]
+    python -m tests.faults.fault_injection OUT.jsonl [--batches 10] [--faults 20] [--seed 0]
 
 A batch is a service on a fresh state folder that meets a number of faults, one after the other,
 while a camera goes to and fro. OUT gets a line per fault; batches that are in it whole are skipped,
@@ -28,19 +28,20 @@ import numpy as np
 from ldo_service.conversions.poses import pose_from_message
 from ldo_service.geometry import se3
 from ldo_service.maps.replica import MapReplica
-from ldo_service.schemas import CameraRgbd, Correction, Health, encode
+from ldo_service.schemas import CameraRgbd, GraphCorrection, Health, encode
 from ldo_service.schemas.topics import (
     DETECTION_BOXES,
     KEYFRAME_NEW,
     KEYFRAME_REFINEMENT,
-    LABEL_OPEN,
+    LABEL_RESULT,
     LOOP_CLOSURE,
     MAP_SNAPSHOT,
     OBJECT_OBSERVATION,
 )
 
 from .camera import Streaming, frames, number_of, true_poses
-from .life import (
+from .message_recorder import TAKERS, Witness
+from .service_process import (
     ACTORS,
     ALL_APART,
     Life,
@@ -51,7 +52,6 @@ from .life import (
     objects_difference,
     saved_objects,
 )
-from .witness import TAKERS, Witness
 
 RATE_HZ = 5.0
 # What moves objects or graph on after a restart, sent again by who made it; a correction that says
@@ -59,7 +59,7 @@ RATE_HZ = 5.0
 CHANGING = {
     topic.name for topic in (KEYFRAME_NEW, DETECTION_BOXES, KEYFRAME_REFINEMENT, LOOP_CLOSURE)
 }
-CHANGING |= {LABEL_OPEN.name, OBJECT_OBSERVATION.name}
+CHANGING |= {LABEL_RESULT.name, OBJECT_OBSERVATION.name}
 BEATS = 6  # of a heart that say the same: 1.5 s, longer than one is on its way
 AGAIN_SHARE = 0.3  # of faults: another comes before all have recovered
 UNJUDGED_SHARE = 0.3  # of faults: nothing waits for rest or is saved before the next
@@ -307,12 +307,12 @@ class Batch:
         return time.monotonic() - self._met_s
 
     def _is_tracked(self) -> bool:
-        """In the map, not in a segment that is not joined to it."""
+        """In the map, not in a submap that is not joined to it."""
         pose = self.witness.pose
         return (
             pose is not None
             and pose.stamp_ns >= self._stamp_ns
-            and (pose.status, pose.segment) == ("OK", 0)
+            and (pose.status, pose.submap) == ("OK", 0)
         )
 
     def _all_report(self) -> bool:
@@ -342,7 +342,7 @@ class Batch:
         pose, first_ns = self.witness.pose, self.witness.first_stamp_ns
         if first_ns is None:
             return  # keyframe 0 was not heard: nobody knows what the map's frame is
-        if pose is None or pose.status == "LOST" or pose.segment:
+        if pose is None or pose.status == "LOST" or pose.submap:
             self.witness.violations.append("the last pose is not in the map")
             return
         count = len(self.truth)
@@ -380,7 +380,7 @@ class Batch:
         life.wait("followers are told", lambda: self._refined() > before)
         answer = life.client.control("save")
         if not answer.ok:
-            self.witness.violations.append(answer.text)
+            self.witness.violations.append(answer.message)
         saved = life.saved_map()
         version = saved["told"]["version"]
         life.wait(
@@ -463,13 +463,13 @@ class Batch:
         self.objects = len(on_disk)
 
 
-def _as_version_0(graph: Correction | None) -> bytes:
+def _as_version_0(graph: GraphCorrection | None) -> bytes:
     """All that it says, however often it was said."""
     return b"" if graph is None else encode(msgspec.structs.replace(graph, graph_version=0))
 
 
 def _is_idle(health: Health) -> bool:
-    return health.busy_s == 0 and not any(count.waiting for count in health.inputs)
+    return health.current_step_s == 0 and not any(count.queued for count in health.inputs)
 
 
 # --- the campaign ---------------------------------------------------------------------------------

@@ -8,9 +8,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from .of_data_sets import COLOR as IMAGE
-from .of_data_sets import jpeg, png
-from .of_runs import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, record
+from ldo_service.storage.state_store import STATE_VERSION
+
+from .dataset_targets import COLOR as IMAGE
+from .dataset_targets import jpeg, png
+from .run_folder_targets import RUN, SEMANTICS, bytes_of, gaussians_of_a_chunk, record
 from .targets import TARGETS
 
 DEEP_JSON, DEEP_YAML, DEEP_MSGPACK = b'{"a": ' * 100_000, b"{a: " * 3000, b"\x91" * 100_000
@@ -40,7 +42,10 @@ FOUND = [
     ("places", DEEP_MSGPACK),
     ("state", DEEP_MSGPACK),
     ("state", msgspec.msgpack.encode(msgspec.msgpack.Ext(1, b"\x93\xa3<q9\x91\x01\xc4\x01\0"))),
-    ("contents of a state", msgspec.msgpack.encode({"sum": "\0"})),
+    (
+        "contents of a state",
+        msgspec.msgpack.encode({"files": {"sum": "\0"}, "version": STATE_VERSION}),
+    ),
     ("state", bytes.fromhex("d80193a32c666390c4080000008000009a0440")),  # the type is ",fc"
     ("labels of a map", ENCRYPTED),
     ("loops.json", LOOPS.replace(b'"reference": 1', b'"reference": 1e999')),

@@ -15,7 +15,7 @@ from ldo_service.runtime.stage import Stage
 from ldo_service.schemas import Message
 from ldo_service.storage.state_store import FolderStore, State
 from ldo_service.transport.interface import MemoryTransport
-from tests.runtime.cast import (
+from tests.runtime.fake_actors import (
     DOUBLES,
     NUMBERS,
     PIECES,
@@ -102,7 +102,9 @@ async def live(
         for done, value in enumerate(values, 1):
             meanwhile(recorder, value)
             await send(numbers, number(value))
-            await eventually(lambda n=done: stage.health().steps + stage.health().set_aside == n)
+            await eventually(
+                lambda n=done: stage.health().steps + stage.health().dead_lettered == n
+            )
         if not is_killed:
             stage.drain()
             await task

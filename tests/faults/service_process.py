@@ -26,7 +26,7 @@ from ldo_service.errors import ConfigError
 from ldo_service.gaussians.map_builder import MapBuilder
 from ldo_service.maps.replica import MapReplica
 from ldo_service.runtime.delivery_state import RestoredState, restore_actor
-from ldo_service.schemas import Correction, MapObject, MapObjects, MapSnapshot
+from ldo_service.schemas import GraphCorrection, MapObject, MapObjects, MapSnapshot
 from ldo_service.schemas.topics import GRAPH_CORRECTION, MAP_OBJECTS, MAP_SNAPSHOT
 from ldo_service.semantics.semantic_map import SemanticMap
 from ldo_service.storage.state_store import FolderStore
@@ -34,7 +34,7 @@ from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.zenoh_transport import open_session
 from tests.ports import free_endpoint
 
-from .witness import Witness
+from .message_recorder import Witness
 
 PROGRAM = Path(__file__).with_name("faulty_service.py")
 PATIENCE_S = 120.0  # on a machine with much else to do
@@ -66,7 +66,7 @@ class Shown:
 
     map: MapReplica
     objects: tuple[MapObject, ...] | None  # None before any were told, or where nobody looked
-    graph: Correction | None
+    graph: GraphCorrection | None
 
     @classmethod
     def of(cls, messages: Iterable[Any]) -> "Shown | None":
@@ -76,7 +76,7 @@ class Shown:
             match message:
                 case MapObjects():
                     objects = message.objects
-                case Correction():
+                case GraphCorrection():
                     graph = message
                 case _:
                     follower.apply(message)
@@ -205,7 +205,9 @@ class Life:
             *restore_actor(mapper(), past, mapper).on_restored(),
             *restore_actor(optimizer(), of_graph, optimizer).on_restored(),
         ]
-        return Shown.of(m for m in said if isinstance(m, MapSnapshot | MapObjects | Correction))
+        return Shown.of(
+            m for m in said if isinstance(m, MapSnapshot | MapObjects | GraphCorrection)
+        )
 
 
 def saved_objects(state: Mapping[str, Any]) -> tuple[MapObject, ...]:

@@ -7,11 +7,11 @@ import numpy as np
 from ldo_service.conversions.poses import keyframe_poses_from_correction
 from ldo_service.detection.vocabulary import Vocabulary
 from ldo_service.gaussians.model import GaussianMap
-from ldo_service.schemas import Correction, InputCount, LabelOpen, LabelRequest, TrackedPose
+from ldo_service.schemas import GraphCorrection, InputCount, LabelRequest, LabelResult, TrackedPose
 from ldo_service.schemas.topics import GRAPH_CORRECTION, POSE_TRACKED
 from ldo_service.storage.state_store import FolderStore
 from tests.service.conftest import LiveService
-from tests.service.exhibits import Guide
+from tests.service.failure_artifacts import Guide
 
 
 class Heard:
@@ -22,11 +22,11 @@ class Heard:
         self.poses: list[TrackedPose] = []
         self.frame_of: dict[int, int] = {}  # by keyframe
         self.requests: list[LabelRequest] = []
-        self.answers: list[LabelOpen] = []
+        self.answers: list[LabelResult] = []
         self.late: list[int] = []  # keyframes that were made until each answer came
         listen = service.client.poller
         self._requests = stack.enter_context(listen("label/request", LabelRequest))
-        self._answers = stack.enter_context(listen("label/open", LabelOpen))
+        self._answers = stack.enter_context(listen("label/result", LabelResult))
 
     def listen(self) -> None:
         requests = self._requests()  # of keyframes whose poses were told before
@@ -58,9 +58,9 @@ class Heard:
         labeller = self.service.update_health()["vlm_labeller"]
         asked, taken = (
             self.input("vlm_labeller", "label/request"),
-            self.input("mapper", "label/open"),
+            self.input("mapper", "label/result"),
         )
-        is_idle = labeller.state == "ready" and asked.waiting == 0
+        is_idle = labeller.state == "ready" and asked.queued == 0
         return is_idle and asked.delivered == taken.delivered + taken.dropped + taken.lost
 
     def input(self, actor: str, topic: str) -> InputCount:
@@ -69,18 +69,18 @@ class Heard:
         return next(count for count in inputs if count.topic == topic)
 
     def fact(self, actor: str, name: str) -> float:
-        return self.service.update_health()[actor].facts.get(name, 0.0)
+        return self.service.update_health()[actor].metrics.get(name, 0.0)
 
     def graph(self) -> dict[int, np.ndarray]:
         """T_map_keyframe [4, 4] by keyframe, as the optimizer has them."""
         (correction,) = self.service.client.latest(GRAPH_CORRECTION)
-        assert isinstance(correction, Correction)
+        assert isinstance(correction, GraphCorrection)
         return keyframe_poses_from_correction(correction)
 
     def map(self) -> tuple[GaussianMap, tuple[str, ...]]:
         """As the mapper has it, and the names of its labels."""
         answer = self.service.client.control("save")
-        assert answer.ok, answer.text
+        assert answer.ok, answer.message
         state = FolderStore(self.service.state / "state").load("mapper")
         assert state is not None
         saved = state["map"]

@@ -20,10 +20,10 @@ from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.flow_control import ALIVE
 from ldo_service.transport.keys import TlsKeys
 from ldo_service.transport.zenoh_transport import ZenohTransport, open_session
-from tests.runtime import cast
+from tests.runtime import fake_actors
 
 from .attempt import Attempt, kept_in
-from .lab import (
+from .network_fixture import (
     EXPIRED,
     INSIDE,
     LOST,
@@ -249,27 +249,27 @@ def flood(lab: Lab) -> str:
 
 async def _flooded(lab: Lab) -> str:
     arrived, busy = [], threading.Event()
-    topic = cast.NUMBERS.name
+    topic = fake_actors.NUMBERS.name
     transport = ZenohTransport(lab.session, lab.network)
     transport.subscribe(topic, lambda _header, body: arrived.append(len(body)))
-    stage = cast.collector(transport, [], lambda _value: busy.wait(0.5), policy=Latest(4))
+    stage = fake_actors.collector(transport, [], lambda _value: busy.wait(0.5), policy=Latest(4))
 
     def put_all() -> None:
         with open_session(lab.keys("service")) as session:
             for value in range(FLOOD):
-                session.put(f"ldo/{ROBOT}/{topic}", encode(cast.number(value)))
+                session.put(f"ldo/{ROBOT}/{topic}", encode(fake_actors.number(value)))
 
-    async with cast.running(stage):
+    async with fake_actors.running(stage):
         await asyncio.to_thread(put_all)
-        await cast.eventually(lambda: len(arrived) > 100 and _is_quiet(arrived))
+        await fake_actors.eventually(lambda: len(arrived) > 100 and _is_quiet(arrived))
         busy.set()
-        await cast.eventually(lambda: _accounted(stage) == len(arrived))
-        peak = stage.health().inputs[0].peak
+        await fake_actors.eventually(lambda: _accounted(stage) == len(arrived))
+        peak = stage.health().inputs[0].peak_queued
     transport.close()
     return f"{peak} wait, rest is counted"
 
 
-def _accounted(stage: cast.Stage) -> int:
+def _accounted(stage: fake_actors.Stage) -> int:
     taken = stage.health().inputs[0]
     return taken.delivered + taken.dropped + taken.rejected
 

@@ -24,7 +24,7 @@ from ldo_service.transport.endpoint import Endpoint
 from ldo_service.transport.keys import CA, CERTIFICATE, KEY, TlsKeys
 from tests.detection.networks import SQUARES
 
-from .of_runs import bytes_of
+from .run_folder_targets import bytes_of
 from .target import Read, Target, as_file, in_folder
 
 CONFIG = b"tracker:\n  hold_out: 5\nservice: {process_actors: [optimizer], max_message_mb: 60}\n"

@@ -16,7 +16,7 @@ from ldo_service.regions.foreground import RegionDetections
 from ldo_service.semantics.data_association import MapView
 from ldo_service.semantics.gaussian_labels import new_labels
 from ldo_service.semantics.objects import Objects, ObjectUpdate
-from ldo_service.semantics.semantic_fusion import SemanticFusionConfig, label_keyframe
+from ldo_service.semantics.semantic_fusion import SemanticFusionConfig, fuse_detections
 from ldo_service.synthetic.path import look_at
 from ldo_service.synthetic.ray_casting import RayCaster
 from ldo_service.synthetic.solids import Solid
@@ -147,7 +147,7 @@ class Stage:
         assert shown is not None
         gaussians, depth_m = self.builder.gaussians, shot.frame.depth_m
         labels, at = self.labels(), (CAMERA, shot.T_map_camera)
-        labelled = label_keyframe(
+        labelled = fuse_detections(
             gaussians.rows, labels, shown.indices, *at, depth_m, claims, self.labelling
         )
         return MapView(

@@ -28,7 +28,7 @@ def see(service: LiveService, folder: Path, poses: int) -> None:
     machine some frames are dropped."""
     camera = service.publisher(str(folder), "--rate", "5", "--restamp")
     told = service.wait_for_poses(poses, timeout_s=60)
-    assert {(pose.status, pose.segment) for pose in told} <= {("OK", 0)}
+    assert {(pose.status, pose.submap) for pose in told} <= {("OK", 0)}
     assert camera.wait(60) == 0
 
 
@@ -37,7 +37,7 @@ def test_folder_run_service_query_recording_resume_and_localizing(
 ) -> None:
     frames = len(open_sequence(str(room_folder)))
     # a folder of one's own
-    ldo("run", room_folder, "--out", tmp_path / "run", "--hold-out", "5", *LIGHT, *NETWORKS)
+    ldo("run", room_folder, "--out", tmp_path / "run", "--hold-out-every", "5", *LIGHT, *NETWORKS)
     assert "ATE" in ldo("eval", tmp_path / "run", room_folder)
     assert "couch" in ldo("query", tmp_path / "run", "sofa")
     # a service, a camera, another program, and a question
@@ -46,7 +46,9 @@ def test_folder_run_service_query_recording_resume_and_localizing(
         service.wait_for_actors()
         see(service, room_folder, frames // 2)
         at = "--endpoint", service.endpoint
-        wait_until(lambda: service.update_health()["mapper"].facts["objects"] > 0, 20, "an object")
+        wait_until(
+            lambda: service.update_health()["mapper"].metrics["objects"] > 0, 20, "an object"
+        )
         assert "couch" in ldo("query", "live", "sofa", *at)
         assert "mapper" in ldo("doctor", *at)
         service.process.kill()  # as a power cut would
@@ -62,6 +64,6 @@ def test_folder_run_service_query_recording_resume_and_localizing(
         assert service.stop() == 0
     # tracked in the map of the run, which stays as it is
     before = (tmp_path / "run" / "map.ply").read_bytes()
-    ldo("run", room_folder, "--out", tmp_path / "today", "--localise", tmp_path / "run")
+    ldo("run", room_folder, "--out", tmp_path / "today", "--localize", tmp_path / "run")
     assert "ATE" in ldo("eval", tmp_path / "today", room_folder)
     assert (tmp_path / "run" / "map.ply").read_bytes() == before

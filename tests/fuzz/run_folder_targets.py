@@ -21,15 +21,19 @@ from ldo_service.runs.finished import MapFolder, read_run, vlm_calls
 from ldo_service.runs.records import OBJECTS, read_loops, read_objects, write_objects
 from ldo_service.runs.replayed import open_recording
 from ldo_service.runs.source import RecordingSequence
-from ldo_service.runtime.journal import Started, Step, checksum
+from ldo_service.runtime.journal import Started, StepRecord, checksum
 from ldo_service.schemas import CameraRgbd, MapObjects
 from ldo_service.semantics.semantics_file import read_semantics, write_semantics
 from ldo_service.storage.state_codec import decode_state, encode_state
-from ldo_service.storage.state_store import FolderStore
-from ldo_service.tracking.keyframe_database import DATABASE_FILE, KeyframeRecord, places_of
+from ldo_service.storage.state_store import STATE_VERSION, FolderStore
+from ldo_service.tracking.keyframe_database import (
+    DATABASE_FILE,
+    KeyframeRecord,
+    load_keyframe_database,
+)
 from tests.schemas.examples import EXAMPLES
 
-from .of_data_sets import DEPTH, TRAJECTORY, png
+from .dataset_targets import DEPTH, TRAJECTORY, png
 from .target import Target, as_file, in_folder
 
 ROWS = np.random.default_rng(7).normal(size=(3, 16)).astype(np.float32)
@@ -41,10 +45,12 @@ KEYFRAME = {
     "camera": CAMERA,
     "T_map_camera": np.eye(4).tolist(),
     "exposure": [[1, 1, 1], [0, 0, 0]],
-    "segment": 0,
+    "submap": 0,
 }
 LOOPS = {
-    "candidates": [{"keyframes": [4], "references": [1], "refused": "", "ms": 1.5}],
+    "candidates": [
+        {"keyframes": [4], "reference_keyframes": [1], "rejected_reason": "", "ms": 1.5}
+    ],
     "closures": [{"keyframe": 4, "reference": 1, "T_reference_keyframe": np.eye(4).tolist()}],
 }
 FRAMES = b"frame,stamp_ns,status,held_out\n0,0,OK,0\n1,33333333,LOST,1\n"
@@ -96,7 +102,7 @@ def places_bytes() -> bytes:
     """Of a place with two features."""
     place = KeyframeRecord(
         id=0,
-        segment=0,
+        submap=0,
         T_odom_keyframe=np.eye(4),
         median_depth_m=1.5,
         intensity_sigma=2.0,
@@ -120,7 +126,7 @@ RUN = {
     "trajectory_online.txt": TRAJECTORY,
     "keyframes.json": json.dumps([KEYFRAME]).encode(),
     "loops.json": json.dumps(LOOPS).encode(),
-    "summary.json": b'{"vlm_calls": 3}',
+    "summary.json": b'{"labeller_requests": 3}',
     "semantics.npz": SEMANTICS,
 }
 
@@ -132,7 +138,7 @@ def record(path: Path, stamp_ns: int = 2) -> None:
     file = RecordingFile(path, {"config": "tracker: {hold_out: 5}"}, RecordConfig())
     file.add_entry(Started(step=0, state={"last_stamp_ns": encode_state(1)}))
     file.add("camera/rgbd", CameraRgbd, body, 0, stamp_ns)
-    step = Step(step=0, kind="done", taken=0, topic="camera/rgbd", checksum=checksum(body))
+    step = StepRecord(step=0, kind="done", taken=0, topic="camera/rgbd", checksum=checksum(body))
     file.add_entry(step)
     file.close()
 
@@ -178,7 +184,7 @@ def states() -> Iterator[bytes]:
     yield encode_state(np.float64(2.5))
 
 
-CONTENTS = msgspec.msgpack.encode({"sum": "sum.a"})
+CONTENTS = msgspec.msgpack.encode({"files": {"sum": "sum.a"}, "version": STATE_VERSION})
 STATE = {"actor/contents.msgpack": CONTENTS, "actor/sum.a": next(states())}
 RECORDING = bytes_of(record)
 
@@ -194,7 +200,7 @@ TARGETS = [
     Target("PLY", as_file("map.ply", read_ply), [MAP, as_text(MAP)]),
     Target("labels of a map", as_file("s.npz", read_semantics), [SEMANTICS]),
     Target("objects.json", in_folder(OBJECTS, read_objects, {}), [objects_bytes()]),
-    Target("places", in_folder(DATABASE_FILE, places_of, {}), [places_bytes()]),
+    Target("places", in_folder(DATABASE_FILE, load_keyframe_database, {}), [places_bytes()]),
     Target("summary.json", in_folder("summary.json", vlm_calls, {}), [RUN["summary.json"]]),
     Target("loops.json", in_folder("loops.json", read_loops, {}), [RUN["loops.json"]]),
     Target(

@@ -14,7 +14,13 @@ from ldo_service.conversions.poses import relative_pose_to_message
 from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.geometry.keyframe_poses import RelativePose
 from ldo_service.runtime import Actor
-from ldo_service.schemas import Correction, DetectionBoxes, Keyframe, LoopCandidate, LoopClosure
+from ldo_service.schemas import (
+    DetectionBoxes,
+    GraphCorrection,
+    Keyframe,
+    LoopCandidate,
+    LoopClosure,
+)
 from ldo_service.tracking.map_frame import MapCorrection, MapFrame
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.odometry_prior import OdometryPriorBuffer
@@ -116,7 +122,7 @@ class MistakenLoopCloser(LoopCloser):
         self._beside = dict(beside)
 
     def handle(
-        self, message: Keyframe | DetectionBoxes | Correction
+        self, message: Keyframe | DetectionBoxes | GraphCorrection
     ) -> Iterator[LoopClosure | LoopCandidate]:
         yield from super().handle(message)
         if isinstance(message, Keyframe) and message.keyframe in self._beside:

@@ -10,7 +10,7 @@ import zenoh
 
 from ldo_service.maps.replica import MapReplica
 from ldo_service.schemas import (
-    Correction,
+    GraphCorrection,
     Health,
     Keyframe,
     MapDelta,
@@ -26,7 +26,7 @@ TAKERS = ("detector", "mapper", "loop_closer", "optimizer")  # of keyframes
 KINDS: dict[str, type[Message]] = {
     "keyframe/new": Keyframe,
     "link/again/keyframe/new": Keyframe,
-    "graph/correction": Correction,
+    "graph/correction": GraphCorrection,
     "map/delta": MapDelta,
     "map/snapshot": MapSnapshot,
     "pose/tracked": TrackedPose,
@@ -102,7 +102,7 @@ class Witness:
         match message:
             case Keyframe():
                 self._made(message, decode(header, Header), hashlib.blake2b(body).digest())
-            case Correction():
+            case GraphCorrection():
                 self._corrected(message)
             case MapDelta():
                 of = decode(header, Header)
@@ -135,7 +135,7 @@ class Witness:
                 )
             self.handled[grant.consumer] = grant.epoch, grant.handled
 
-    def _corrected(self, message: Correction) -> None:
+    def _corrected(self, message: GraphCorrection) -> None:
         self._must_grow("graph", self.graph_version, message.graph_version)
         self.graph_version = message.graph_version
         ids = message.keyframes.numpy().tolist()
@@ -177,5 +177,5 @@ class Witness:
     def repeated(self) -> Iterator[str]:
         """Who took a keyframe twice."""
         for actor, (_, health) in self.health.items():
-            if count := health.facts.get("keyframes_repeated", 0):
+            if count := health.metrics.get("keyframes_repeated", 0):
                 yield f"{actor} took {count:g} keyframes twice"

@@ -7,7 +7,7 @@ from ldo_service.geometry import RgbdFrame, se3
 from ldo_service.tracking.odometry import Odometry, OdometryConfig
 from ldo_service.tracking.tracking_result import KeyframeKind
 
-from .mistaken import Drift, DriftingOdometry
+from .false_closures import Drift, DriftingOdometry
 
 DRIFT = Drift(scale=0.1, turn_rad_per_m=0.3)
 

@@ -1,8 +1,8 @@
 """What grows with keyframes, and whose it is: a camera that goes to and fro in a room, without end.
 
-    python -m tests.bench.bench_month [--keyframes 3000] [--laps 1000] [--csv FILE]
+    python -m tests.bench.bench_long_term [--keyframes 3000] [--laps 1000] [--csv FILE]
         [--set actor.field=value ...]
-    python -m tests.bench.bench_month --plot PNG --beside OLD.csv NEW.csv
+    python -m tests.bench.bench_long_term --plot PNG --beside OLD.csv NEW.csv
 
 All actors on the logical clock at 160x120. After each to and fro each actor is walked through,
 attribute by attribute, and its state is encoded as it is saved. Told are bytes per keyframe (per

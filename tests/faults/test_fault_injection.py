@@ -1,4 +1,7 @@
-"""Faults on a real service: minutes of them; `python -m tests.faults.campaign` has hundreds."""
+"""Faults on a real service for minutes.
+
+`python -m tests.faults.fault_injection` injects hundreds.
+"""
 
 from pathlib import Path
 
@@ -11,8 +14,8 @@ from ldo_service.schemas import Message
 from ldo_service.schemas import encode as encode_message
 from ldo_service.transport.flow_control import Credit, Header, encode_link
 from tests.faults.camera import frames
-from tests.faults.campaign import Batch, Outcome, table, whole_batches
-from tests.faults.witness import GRANTS, TAKERS, Witness
+from tests.faults.fault_injection import Batch, Outcome, table, whole_batches
+from tests.faults.message_recorder import GRANTS, TAKERS, Witness
 from tests.schemas.examples import EXAMPLES
 
 

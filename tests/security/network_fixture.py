@@ -26,7 +26,7 @@ STEP_S, PATIENCE_S = 0.01, 60.0
 SETTLED = "settled"
 LOST, STOLEN, EXPIRED = "lost", "stolen", "expired"  # a camera's keys that were made again; others
 ROLES: tuple[Role, ...] = ("service", "camera", "odometry", "viewer", "operator")
-INSIDE = ("link/order", "link/grant/keyframe/new", "link/welcome/keyframe/new")  # between actors
+INSIDE = ("link/command", "link/grant/keyframe/new", "link/welcome/keyframe/new")  # between actors
 NAMES = (*(f"{t.name}/mapper" if t.is_per_actor else t.name for t in TOPICS), *INSIDE, SETTLED)
 
 
