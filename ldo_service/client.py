@@ -15,7 +15,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +22,7 @@ import msgspec
 import numpy as np
 import zenoh
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, did_you_mean
 from ldo_service.schemas import (
     AddLabel,
     CameraColor,
@@ -325,8 +324,7 @@ def _topic(topic: Topic | str) -> Topic:
     if isinstance(topic, Topic):
         return topic
     if topic not in BY_NAME:
-        near = get_close_matches(topic, BY_NAME, 1)
-        hint = f"Did you mean {near[0]}?" if near else "`ldo topics` lists all."
+        hint = did_you_mean(topic, BY_NAME, "`ldo topics` lists all.")
         raise ConfigError(f"there is no topic {topic!r}. {hint}")
     return BY_NAME[topic]
 

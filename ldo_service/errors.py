@@ -16,6 +16,9 @@ Every message is one paragraph: what, where, and what to do next. Outcomes that 
 expects (tracking lost, a loop refused) are values in messages, not errors.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 
 class LdoError(Exception):
     exit_code = 1
@@ -96,3 +99,16 @@ def named(parameters: object, *fields: str) -> str:
     """
     owner = type(parameters).__name__
     return ", ".join(f"{owner}.{field}={getattr(parameters, field)!r}" for field in fields)
+
+
+def did_you_mean(name: str, known: Iterable[str], otherwise: str, prefix: str = "") -> str:
+    """Return the sentence that ends the refusal of an unknown name.
+
+    Args:
+        name: What was written.
+        known: The names that exist.
+        otherwise: The sentence if none of these is near.
+        prefix: What stands before the name that is suggested, such as the path of its section.
+    """
+    near = get_close_matches(name, known, 1)
+    return f"Did you mean {prefix}{near[0]}?" if near else otherwise

@@ -1,7 +1,6 @@
 """Reading and checking of configurations: defaults, YAML files and single settings."""
 
 import dataclasses
-import difflib
 import re
 import typing
 from collections.abc import Sequence
@@ -12,7 +11,7 @@ from typing import Any
 import msgspec
 import yaml
 
-from ldo_service.errors import ConfigError
+from ldo_service.errors import ConfigError, did_you_mean
 from ldo_service.storage.yaml_io import dump_yaml, load_yaml
 
 from .moved_settings import refuse_moved, was_section
@@ -116,10 +115,8 @@ def _check_names(tree: Any, schema: type, prefix: str) -> None:
 def _hint(path: str, prefix: str, names: list[str]) -> str:
     if was_section(path):
         return "Its settings have moved: docs/configuration.md lists those of today."
-    near = difflib.get_close_matches(path.removeprefix(prefix), names, 1)
-    if near:
-        return f"Did you mean {prefix}{near[0]}?"
-    return f"Known: {', '.join(names)}."
+    known = f"Known: {', '.join(names)}."
+    return did_you_mean(path.removeprefix(prefix), names, known, prefix)
 
 
 def _refuse_nan(tree: dict[str, Any], prefix: str) -> None:

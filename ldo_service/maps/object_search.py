@@ -6,7 +6,7 @@ import numpy as np
 
 from ldo_service.errors import DataError
 from ldo_service.schemas import MapObjects, Pose
-from ldo_service.semantics.text_search import Encode, TextComparisonError, nearest_names, search
+from ldo_service.semantics.text_search import Encode, TextComparisonError, search, suggest_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,4 @@ def find_objects(
 def _nothing(text: str, names: list[str]) -> str:
     if not names:
         return "the map has no objects yet: a detector has to find one in three keyframes."
-    near = nearest_names(text, names)
-    more = " and more" if len(set(names)) > len(near) else ""
-    return f"none of {len(names)} objects answers to {text!r}. There is {', '.join(near)}{more}."
+    return f"none of {len(names)} objects answers to {text!r}. {suggest_names(text, names)}"

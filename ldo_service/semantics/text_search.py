@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import numpy as np
 
 from ldo_service.detection.vocabulary import answers_to, normalized
+from ldo_service.errors import did_you_mean
 
 # Vectors [T, D] of length 1 of T texts, as the text half of an open-vocabulary labeller gives them;
 # zeros of those that it cannot place. Raises NotCompared.
@@ -71,9 +71,9 @@ def text_similarity(
     return near
 
 
-def nearest_names(text: str, names: Sequence[str], count: int = 5) -> list[str]:
-    """Names that look like `text`; where none does, the commonest of those given."""
-    alike = get_close_matches(normalized(text), set(names), count, cutoff=0.6)
-    if alike:
-        return alike
-    return sorted(set(names), key=lambda name: (-names.count(name), name))[:count]
+def suggest_names(text: str, names: Sequence[str], max_names: int = 5) -> str:
+    """Return a sentence with the name that looks like `text`, or else with the most common ones."""
+    distinct = sorted(set(names), key=lambda name: (-names.count(name), name))
+    more = " and more" if len(distinct) > max_names else ""
+    common = f"There is {', '.join(distinct[:max_names])}{more}."
+    return did_you_mean(normalized(text), distinct, common)

@@ -110,7 +110,7 @@ def test_another_word_finds_it_in_a_table(capsys, folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
-    [("chiar", "There is chair and more."), ("piano", "There is chair, couch.")],
+    [("chiar", "Did you mean chair?"), ("piano", "There is chair, couch.")],
 )
 def test_what_is_not_there_is_told_with_what_is(
     capsys, folder: Path, text: str, complaint: str

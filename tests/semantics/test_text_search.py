@@ -5,7 +5,7 @@ import pytest
 
 from ldo_service.detection.vocabulary import COCO
 from ldo_service.semantics import text_search as module
-from ldo_service.semantics.text_search import nearest_names, search
+from ldo_service.semantics.text_search import search, suggest_names
 
 THINGS = [{"couch": 0.9, "chair": 0.1}, {"chair": 0.7}, {"whiteboard": 1.0}, {"chair": 0.7}]
 
@@ -59,7 +59,8 @@ def test_scores_ascend_to_what_brute_force_finds_over_many_objects() -> None:
     assert [hit.score for hit in hits] == sorted(expected.values(), reverse=True)
 
 
-def test_names_that_look_alike_are_told_and_else_the_commonest() -> None:
+def test_a_name_that_looks_alike_is_suggested_and_else_the_most_common_ones() -> None:
     names = ["chair", "chair", "couch", "vase"]
-    assert nearest_names("chiar", names) == ["chair"]
-    assert nearest_names("xylophone", names, 2) == ["chair", "couch"]
+    assert suggest_names("Chiar", names) == "Did you mean chair?"
+    assert suggest_names("xylophone", names) == "There is chair, couch, vase."
+    assert suggest_names("xylophone", names, 2) == "There is chair, couch and more."
