@@ -35,6 +35,7 @@ LIBRARIES = {  # name on the package index: name to import
     "scipy": "scipy",
     "mcap": "mcap",
     "safetensors": "safetensors",
+    "tokenizers": "tokenizers",
     "zstandard": "zstandard",
 }
 EXTRAS = {

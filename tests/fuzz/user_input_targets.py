@@ -14,7 +14,7 @@ from safetensors.numpy import save
 
 from ldo_service.config import config_of, config_yaml, load_config
 from ldo_service.detection.detectors import OnnxDetector
-from ldo_service.detection.labellers.text_embeddings import BpeTokenizer, CachedEmbeddings
+from ldo_service.detection.labellers.text_embeddings import CachedEmbeddings, read_tokenizer
 from ldo_service.detection.model_registry import Models
 from ldo_service.detection.vocabulary import class_names, read_names
 from ldo_service.suites import load_suite
@@ -110,9 +110,7 @@ TARGETS = [
         of_names(lambda text: class_names(2, metadata=text)),
         [b"{0: 'chair', 1: 'sofa'}", b"['a', 'b']"],
     ),
-    Target(
-        "byte pairs", as_file("bpe", BpeTokenizer.read), [MERGES, gzip.compress(MERGES, mtime=0)]
-    ),
+    Target("byte pairs", as_file("bpe", read_tokenizer), [MERGES, gzip.compress(MERGES, mtime=0)]),
     Target("embeddings", as_file("e.npz", CachedEmbeddings), [npz()]),
     Target(
         "embeddings in safetensors",

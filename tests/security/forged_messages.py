@@ -19,7 +19,7 @@ from ldo_service.actors.topology import actor_spec
 from ldo_service.datasets import open_sequence
 from ldo_service.detection.detectors import NetworkConfig
 from ldo_service.detection.labellers import text_embeddings
-from ldo_service.detection.labellers.text_embeddings import BpeTokenizer, CachedEmbeddings
+from ldo_service.detection.labellers.text_embeddings import CachedEmbeddings, read_tokenizer
 from ldo_service.detection.model_registry import Models
 from ldo_service.errors import LdoError
 from ldo_service.gaussians.file_formats import read_ply
@@ -137,7 +137,7 @@ def exchanged(folder: Path) -> str:
 @attempt("byte pairs that unpack from 66 kB to 67 MB and more", REFUSED)
 def byte_pairs(folder: Path) -> str:
     (folder / "bpe.txt.gz").write_bytes(gzip.compress(bytes(80_000_000)))
-    return told(lambda: BpeTokenizer.read(folder / "bpe.txt.gz"))
+    return told(lambda: read_tokenizer(folder / "bpe.txt.gz"))
 
 
 @attempt("embeddings with a pickle inside", "refused, not run")

@@ -14,11 +14,11 @@ from ldo_service.detection.vocabulary import COCO, LONGEST, canonical, is_name
 from ldo_service.errors import ConfigError, ModelError
 
 from .text_embeddings import (
-    BpeTokenizer,
     CachedEmbeddings,
     TextEmbeddings,
     TextEncoder,
     only_embedding,
+    read_tokenizer,
     unit,
 )
 
@@ -227,8 +227,8 @@ class ImageEncoder:
 def _text_encoder(pair: EncoderFiles, config: DualEncoderConfig) -> TextEncoder | None:
     if pair.text is None or pair.vocabulary is None:
         return None
-    pairs = BpeTokenizer.read(pair.vocabulary)
-    return TextEncoder(Network(pair.text, config.providers, config.threads), pairs, config.prompts)
+    network = Network(pair.text, config.providers, config.threads)
+    return TextEncoder(network, read_tokenizer(pair.vocabulary), config.prompts)
 
 
 def _square_input(network: Network) -> tuple[str, int]:

@@ -1,108 +1,68 @@
-"""Embeddings of names in the space that images and texts share: computed, or read from a file.
-
-CLIP's text encoder reads byte pairs (Sennrich, ACL 2016): a word begins as its UTF-8 bytes, the
-last one marked as an end; the pair of neighbors that stands first in the list of merges becomes
-one, until none is in the list.
-"""
+"""Embeddings of names in the space that images and texts share: computed, or read from a file."""
 
 import gzip
-import re
 import zlib
-from collections.abc import Iterator, Sequence
-from functools import cache
-from itertools import pairwise
+from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
+from tokenizers import Regex, Tokenizer, models, normalizers, pre_tokenizers, processors
 
 from ldo_service.detection.onnx_network import Network
 from ldo_service.detection.vocabulary import canonical, is_name, normalized
 from ldo_service.errors import ModelError
 from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
-END = "</w>"
+WORD_END = "</w>"
+START, END = "<|startoftext|>", "<|endoftext|>"
 # CLIP's vocabulary of 49,408 less the 512 bytes and the two marks; its file goes on beyond.
 MAX_MERGES = 49_408 - 512 - 2
 MAX_VOCABULARY_BYTES = 1 << 26  # unpacked; CLIP's has 3 MB
-_WORDS = re.compile(r"'(?:s|t|re|ve|m|ll|d)|[^\W\d_]+|\d|(?:[^\s\w]|_)+")
+_WORDS = r"'(?:s|t|re|ve|m|ll|d)|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"  # as CLIP has them
 
 MAX_BYTES = 1 << 30  # of 260,000 names in 1024 dimensions
 CONTEXT = 77  # tokens of a text, where a network takes any number: CLIP's
 
 
-Pair = tuple[str, str]
+def read_tokenizer(path: Path) -> Tokenizer:
+    """Return CLIP's tokenizer with the byte pairs of a file.
 
+    Tokens are numbered as in CLIP: the bytes, those that print first; the same as ends of words;
+    the merges in order of their rank; the marks of start and end of a text.
 
-class BpeTokenizer:
-    """A tokenizer, from the merges in order of their rank.
+    Args:
+        path: A file such as CLIP's bpe_simple_vocab_16e6.txt.gz: a line about itself, then a pair
+            per line.
 
-    The bytes are numbered as GPT-2 has it, first those that print; then the same as ends of words,
-    the merges, and the marks of start and end of a text.
+    Raises:
+        ModelError: The file cannot be read, or is no list of byte pairs.
     """
-
-    def __init__(self, merges: list[Pair]) -> None:
-        letters = list(_letters().values())
-        symbols = [*letters, *(letter + END for letter in letters), *map("".join, merges)]
-        self._ranks = {pair: rank for rank, pair in enumerate(merges)}
-        self._ids = {symbol: number for number, symbol in enumerate(symbols)}
-        self.start, self.end = len(symbols), len(symbols) + 1
-
-    @staticmethod
-    def read(path: Path) -> "BpeTokenizer":
-        """From a file as CLIP's bpe_simple_vocab_16e6.txt.gz: a line about itself, then a pair a
-        line. Raises ModelError."""
-        _, *lines = _text(path).splitlines() or [""]
-        merges = [tuple(line.split()) for line in lines[:MAX_MERGES] if line.strip()]
-        if not merges or any(len(pair) != 2 for pair in merges):
-            raise ModelError(
-                f"{path} is no list of byte pairs: a line about itself is expected, then two "
-                "symbols a line, as in CLIP's bpe_simple_vocab_16e6.txt.gz."
-            )
-        return BpeTokenizer([(pair[0], pair[1]) for pair in merges])
-
-    def __len__(self) -> int:
-        return self.end + 1
-
-    def encode(self, text: str, length: int) -> np.ndarray:
-        """[length] int64: start, the text, end, zeros. What is too long loses its last words."""
-        inner = [number for word in _words(text) for number in self._of_word(word)]
-        marked = [self.start, *inner[: length - 2], self.end]
-        return np.array(marked + [0] * (length - len(marked)), np.int64)
-
-    def _of_word(self, word: str) -> list[int]:
-        letters = _letters()
-        symbols = [letters[byte] for byte in word.encode()]
-        symbols[-1] += END
-        while pair := self._first_pair(symbols):
-            symbols = list(_merged(symbols, pair))
-        return [self._ids[symbol] for symbol in symbols]
-
-    def _first_pair(self, symbols: list[str]) -> Pair | None:
-        known = [pair for pair in pairwise(symbols) if pair in self._ranks]
-        return min(known, key=self._ranks.__getitem__, default=None)
-
-
-def _words(text: str) -> list[str]:
-    return _WORDS.findall(text.lower())
-
-
-def _merged(symbols: list[str], pair: Pair) -> Iterator[str]:
-    place = 0
-    while place < len(symbols):
-        is_pair = tuple(symbols[place : place + 2]) == pair
-        yield "".join(pair) if is_pair else symbols[place]
-        place += 2 if is_pair else 1
-
-
-@cache
-def _letters() -> dict[int, str]:
-    """A printing character for each byte: its own where Latin-1 has one, else from 256 on."""
-    printing = [*range(33, 127), *range(161, 173), *range(174, 256)]
-    others = [byte for byte in range(256) if byte not in printing]
-    return {byte: chr(byte) for byte in printing} | {
-        byte: chr(256 + number) for number, byte in enumerate(others)
-    }
+    _, *lines = _text(path).splitlines() or [""]
+    merges = [tuple(line.split()) for line in lines[:MAX_MERGES] if line.strip()]
+    pairs = [(pair[0], pair[1]) for pair in merges if len(pair) == 2]
+    letters = sorted(pre_tokenizers.ByteLevel.alphabet())
+    ends = [letter + WORD_END for letter in letters]
+    symbols = [*letters, *ends, *map("".join, pairs), START, END]
+    ids = {symbol: number for number, symbol in enumerate(symbols)}
+    if not merges or len(pairs) < len(merges) or not ids.keys() >= {*chain.from_iterable(pairs)}:
+        raise ModelError(
+            f"{path} is no list of byte pairs: a line about itself is expected, then two symbols "
+            "per line, as in CLIP's bpe_simple_vocab_16e6.txt.gz."
+        )
+    tokenizer = Tokenizer(models.BPE(ids, pairs, end_of_word_suffix=WORD_END))
+    tokenizer.normalizer = normalizers.Lowercase()
+    tokenizer.pre_tokenizer = pre_tokenizers.Sequence(
+        [
+            pre_tokenizers.Split(Regex(_WORDS), "removed", invert=True),
+            pre_tokenizers.ByteLevel(add_prefix_space=False, use_regex=False),
+        ]
+    )
+    tokenizer.post_processor = processors.TemplateProcessing(
+        f"{START} $A {END}", special_tokens=[(START, ids[START]), (END, ids[END])]
+    )
+    return tokenizer
 
 
 def _text(path: Path) -> str:
@@ -124,9 +84,11 @@ class TextEncoder:
     Raises ModelError for a file that is no text encoder.
     """
 
-    def __init__(self, network: Network, pairs: BpeTokenizer, prompts: Sequence[str]) -> None:
-        self._network, self._pairs, self._prompts = network, pairs, tuple(prompts)
-        self._inputs, self._context = _text_inputs(network)
+    def __init__(self, network: Network, tokenizer: Tokenizer, prompts: Sequence[str]) -> None:
+        self._network, self._tokenizer, self._prompts = network, tokenizer, tuple(prompts)
+        self._inputs, context = _text_inputs(network)
+        tokenizer.enable_truncation(context)  # A text that is too long loses its last words.
+        tokenizer.enable_padding(length=context)
         self.dimensions = len(self._of_text("a"))
 
     def embed(self, name: str) -> np.ndarray:
@@ -134,10 +96,11 @@ class TextEncoder:
         return unit(np.mean(rows, axis=0))
 
     def _of_text(self, text: str) -> np.ndarray:
-        tokens = self._pairs.encode(text, self._context)
-        mask = np.arange(self._context) <= np.flatnonzero(tokens == self._pairs.end)[0]
-        values = {name: (mask if "mask" in name else tokens) for name in self._inputs}
-        inputs = {name: values[name].astype(kind)[None] for name, kind in self._inputs.items()}
+        tokens = self._tokenizer.encode(text)
+        inputs = {
+            name: np.array([tokens.attention_mask if "mask" in name else tokens.ids], kind)
+            for name, kind in self._inputs.items()
+        }
         return only_embedding(self._network.run(**inputs))
 
 

@@ -190,7 +190,7 @@ def test_garbage_and_other_networks_are_refused(tmp_path: Path, full: EncoderFil
         DualEncoder(replace(full, image=full.text))
     with pytest.raises(ModelError, match="Expected: tokens"):
         DualEncoder(replace(full, text=full.image))
-    vocabulary(tmp_path / "large.gz", tuple(f"x{n} y" for n in range(40)))
+    vocabulary(tmp_path / "large.gz", tuple(f"x {chr(ord('!') + n)}" for n in range(40)))
     with pytest.raises(ModelError, match="inference fails"):
         DualEncoder(replace(full, vocabulary=tmp_path / "large.gz"))
 
