@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         format="%(asctime)s %(levelname).1s %(name)s: %(message)s",
         datefmt="%H:%M:%S",
     )
+    if not debug:
+        logging.getLogger("httpx2").setLevel(logging.WARNING)  # It logs every request.
     _handle_interrupts()
     try:
         if not words or words[0] in ("-h", "--help"):

@@ -1,15 +1,13 @@
 """A server that is asked over HTTP: patiently, not too often, and never for longer than allowed."""
 
+import asyncio
 import os
-import socket
 import ssl
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
 from dataclasses import dataclass
-from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
-from threading import Timer
-from urllib.parse import SplitResult, urlsplit
+
+import httpx2
 
 from ldo_service.errors import ConfigError, EndpointError, named
 
@@ -76,8 +74,13 @@ class HttpClient:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         self.url, self._config = url, config
-        self._address = _address(url)
-        self._headers = {"Content-Type": "application/json", **_key(config.key_variable)}
+        self._address = str(_address(url))
+        self._headers = {
+            "Content-Type": "application/json",
+            "Accept-Encoding": "identity",  # The answer is read as it comes, not unpacked.
+            **_key(config.key_variable),
+        }
+        self._tls = ssl.create_default_context()
         self._clock, self._sleep = clock, sleep
         self._free_at_s = self._rested_at_s = float("-inf")
         self._failures = 0  # in a row
@@ -107,7 +110,7 @@ class HttpClient:
             self._wait(pause_s, until_s, failure)
             within_s = min(self._config.timeout_s, until_s - self._clock())
             try:
-                return self._ask(path, body, within_s)
+                return self._attempt(path, body, within_s)
             except _TransientError as passing:
                 if within_s < self._config.timeout_s and self._clock() >= until_s:
                     raise failure from passing  # nobody knows what it would have said
@@ -127,81 +130,72 @@ class HttpClient:
             self._sleep(start_s - now_s)
         self._free_at_s = start_s + 60 / self._config.per_minute
 
-    def _ask(self, path: str, body: bytes, within_s: float) -> bytes:
-        """One attempt. Raises _Passing for what may pass, EndpointError for what will not."""
+    def _attempt(self, path: str, body: bytes, within_s: float) -> bytes:
+        """Return the answer to one attempt.
+
+        Raises:
+            _TransientError: Another attempt may succeed.
+            EndpointError: The server refuses the question, or answers too much.
+        """
         self.attempts += 1
-        connection = _connection(self._address, within_s)
         try:
-            connection.connect()
-            with _cut_after(within_s, connection.sock):
-                connection.request("POST", self._address.path + path, body, self._headers)
-                return _checked(connection.getresponse(), self.url)
+            return asyncio.run(self._exchange(path, body, within_s))
         except TimeoutError as error:
             raise _TransientError(f"did not answer within {within_s:.1f} s") from error
-        except (OSError, HTTPException, ValueError) as error:
+        except httpx2.TransportError as error:
             raise _TransientError(
                 f"cannot be asked: {type(error).__name__} {error}".strip()
             ) from error
-        finally:
-            connection.close()
+
+    async def _exchange(self, path: str, body: bytes, within_s: float) -> bytes:
+        """Send a question and read its answer, in one connection.
+
+        The timeouts of the library are of each read alone, and a server that sends a byte now and
+        then would never reach them. So one timeout is set around all of it, connecting included.
+        Proxies of the environment are not used, and redirects are not followed: the key would go
+        to another host.
+        """
+        async with (
+            asyncio.timeout(within_s),
+            httpx2.AsyncClient(verify=self._tls, trust_env=False, timeout=None) as client,
+            client.stream(
+                "POST", self._address + path, content=body, headers=self._headers
+            ) as response,
+        ):
+            answer = b""
+            async for piece in response.aiter_raw():
+                answer += piece
+                if len(answer) > MAX_BYTES:
+                    raise EndpointError(f"{self.url} answers more than {MAX_BYTES} bytes.")
+        status = f"answers {response.status_code} {response.reason_phrase[:40]}"
+        if response.status_code in RETRY_STATUS_CODES:
+            raise _TransientError(status)
+        if response.status_code != 200:
+            raise EndpointError(
+                f"{self.url} {status}: check the address (often it ends in /v1), the name of the "
+                "model and the key."
+            )
+        return answer
 
 
 class _TransientError(Exception):
     """A failure that another attempt may not meet."""
 
 
-def _checked(response: HTTPResponse, url: str) -> bytes:
-    body = response.read(MAX_BYTES + 1)
-    if response.status in RETRY_STATUS_CODES:
-        raise _TransientError(f"answers {response.status} {response.reason[:40]}")
-    if response.status != 200:
-        raise EndpointError(
-            f"{url} answers {response.status} {response.reason[:40]}: check the address (often it "
-            "ends in /v1), the name of the model and the key."
-        )
-    if len(body) > MAX_BYTES:
-        raise EndpointError(f"{url} answers more than {MAX_BYTES} bytes.")
-    return body
-
-
-@contextmanager
-def _cut_after(within_s: float, connected: socket.socket) -> Iterator[None]:
-    """Whoever reads from it then finds the end. Its own timeout is of each read alone, and a byte
-    now and then would keep it waiting for ever."""
-
-    def cut() -> None:
-        with suppress(OSError):
-            connected.shutdown(socket.SHUT_RDWR)
-
-    watchdog = Timer(within_s, cut)
-    watchdog.daemon = True
-    watchdog.start()
+def _address(url: str) -> httpx2.URL:
+    """Return where to ask. Raises ConfigError."""
     try:
-        yield
-    finally:
-        watchdog.cancel()
-
-
-def _connection(address: SplitResult, timeout_s: float) -> HTTPConnection:
-    host = address.hostname or ""
-    if address.scheme == "https":
-        context = ssl.create_default_context()
-        return HTTPSConnection(host, address.port, timeout=timeout_s, context=context)
-    return HTTPConnection(host, address.port, timeout=timeout_s)
-
-
-def _address(url: str) -> SplitResult:
-    address = urlsplit(url.rstrip("/"))
-    try:
-        is_usable = address.scheme in ("http", "https") and address.hostname and address.port != 0
-    except ValueError:
-        is_usable = False
-    if not is_usable or address.query or address.fragment:
+        address = httpx2.URL(url.rstrip("/"))
+    except httpx2.InvalidURL:
+        address = httpx2.URL()
+    port = 80 if address.port is None else address.port
+    is_usable = address.scheme in ("http", "https") and address.host and 0 < port < 65536
+    if not is_usable or "?" in url or "#" in url:
         raise ConfigError(
             f"{_without_user(url)!r} is no address of a server: write it as "
             "http://127.0.0.1:8000/v1."
         )
-    if address.username or address.password:
+    if address.userinfo:
         raise ConfigError(
             f"{_without_user(url)!r} has a name or password in it, which every configuration that "
             "is saved would show: put the key into an environment variable and name that in "

@@ -94,5 +94,35 @@ def trickles(handler: BaseHTTPRequestHandler) -> None:
         handler.wfile.flush()
 
 
+def trickles_headers(handler: BaseHTTPRequestHandler) -> None:
+    """A header line now and then, without end."""
+    handler.send_response(200)
+    while not handler.over.wait(0.02):  # type: ignore[attr-defined]
+        handler.send_header("X-More", "to come")
+        handler.flush_headers()
+
+
+def breaks_off(handler: BaseHTTPRequestHandler) -> None:
+    """Sends less than it announced, and a whole completion."""
+    body = b'{"choices": [{"message": {"content": "sofa"}}]}'
+    handler.send_response(200)
+    handler.send_header("Content-Length", str(len(body) + 10))
+    handler.end_headers()
+    handler.wfile.write(body)
+    handler.close_connection = True
+
+
+def redirects(url: str) -> Callable[[BaseHTTPRequestHandler], None]:
+    """To another server, with the question."""
+
+    def answer(handler: BaseHTTPRequestHandler) -> None:
+        handler.send_response(307)
+        handler.send_header("Location", url)
+        handler.send_header("Content-Length", "0")
+        handler.end_headers()
+
+    return answer
+
+
 def hangs_up(handler: BaseHTTPRequestHandler) -> None:
     handler.close_connection = True

@@ -1,8 +1,12 @@
 """A labeller behind a server: good answers, and every kind of bad one."""
 
 import base64
+import contextlib
 import logging
+import os
 import socket
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler
@@ -17,7 +21,17 @@ from ldo_service.detection.labellers.http_endpoint import HttpClientConfig
 from ldo_service.errors import ConfigError, EndpointError
 
 from .encoders import plain
-from .server import hangs, hangs_up, says, sends, serving, trickles
+from .server import (
+    breaks_off,
+    hangs,
+    hangs_up,
+    redirects,
+    says,
+    sends,
+    serving,
+    trickles,
+    trickles_headers,
+)
 
 RED = plain("red")
 NAMES = ("cup", "sofa", "samovar")
@@ -138,7 +152,11 @@ def test_a_name_that_is_added_is_asked_for() -> None:
 
 
 # --- servers that misbehave -----------------------------------------------------------------------
-@pytest.mark.parametrize("trouble", [sends(500), sends(429), hangs_up], ids=["500", "429", "gone"])
+@pytest.mark.parametrize(
+    "trouble",
+    [sends(500), sends(429), hangs_up, breaks_off],
+    ids=["500", "429", "gone", "cut short"],
+)
 def test_what_may_pass_is_tried_again_with_growing_pauses(trouble: Callable) -> None:
     time = Time()
     with serving(trouble, trouble, says("cup", 0.5)) as server:
@@ -172,12 +190,64 @@ def test_what_will_not_pass_is_not_tried_again(status: int) -> None:
     assert len(server.asked) == 1
 
 
-@pytest.mark.parametrize("way", [hangs, trickles], ids=["hangs", "trickles"])
+@pytest.mark.parametrize(
+    "way",
+    [hangs, trickles, trickles_headers],
+    ids=["hangs", "trickles", "trickles headers"],
+)
 def test_a_server_that_never_ends_its_answer_is_not_waited_for(way: Callable) -> None:
     with serving(way) as server:
         one = labeller(server.url, endpoint={"timeout_s": 0.2, "attempts": 1})
-        with pytest.raises(EndpointError):
+        with pytest.raises(EndpointError, match=r"did not answer within 0\.2 s"):
             one.label([RED])
+    assert one.metrics()["attempts"] == 1
+
+
+def test_the_key_is_not_sent_to_where_a_server_redirects(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LABELLER_KEY", "sk-secret")
+    with serving(says("cup", 0.5)) as other, serving(redirects(other.url)) as server:
+        one = labeller(server.url, endpoint={"key_variable": "LABELLER_KEY"})
+        with pytest.raises(EndpointError, match="answers 307"):
+            one.label([RED])
+    assert (len(server.asked), other.asked) == (1, [])
+
+
+def test_an_attempt_leaves_no_thread_and_no_file_open() -> None:
+    def left() -> np.ndarray:
+        return np.array([threading.active_count(), len(os.listdir("/proc/self/fd"))])
+
+    with serving(sends(404)) as server:
+        one = labeller(server.url, endpoint={"rest_s": 0, "per_minute": 1e9})
+        before = left()
+        for _ in range(20):
+            with pytest.raises(EndpointError):
+                one.label([RED])
+        until_s = time.monotonic() + 30  # The server ends its own threads a little later.
+        while (left() > before).any() and time.monotonic() < until_s:
+            time.sleep(0.01)
+        assert (left() <= before).all()
+
+
+def test_an_address_that_hangs_does_not_keep_the_next_one_waiting(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first address takes no more connections: its queue is full."""
+    with serving(says("cup", 0.5)) as server, contextlib.ExitStack() as opened:
+        port = int(server.url.split(":")[2].split("/")[0])
+        full = opened.enter_context(socket.create_server(("127.0.0.2", port), backlog=0))
+        for _ in range(6):
+            queued = opened.enter_context(socket.socket())
+            queued.setblocking(False)
+            queued.connect_ex(full.getsockname())
+        found = [
+            (socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, port))
+            for host in ("127.0.0.2", "127.0.0.1")
+        ]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_args, **_kwargs: found)
+        one = labeller(f"http://two-addresses:{port}/v1", views=1, endpoint={"timeout_s": 30})
+        start_s = time.monotonic()
+        assert one.label([RED]) == [("cup", pytest.approx(0.5))]
+        assert time.monotonic() - start_s < 20
 
 
 def test_no_server_at_all() -> None:
@@ -309,7 +379,8 @@ def test_a_key_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    "url", ["", "127.0.0.1:80", "ftp://a/b", "http://", "http://a:b/", "http://a/?q"]
+    "url",
+    ["", "127.0.0.1:80", "ftp://a/b", "http://", "http://a:b/", "http://a:99999/", "http://a/?q"],
 )
 def test_an_address_that_is_none_is_refused(url: str) -> None:
     with pytest.raises(ConfigError, match="no address"):
