@@ -74,4 +74,4 @@ def test_a_fix_survives_packing(large_room, make_walk, places) -> None:
     fix, again = localizer._fix, MapFix.unpack(localizer.snapshot()["fix"])
     np.testing.assert_array_equal(again.T_map_odom, fix.T_map_odom)
     assert again.pending_match is not None
-    assert again.since_look == fix.since_look
+    assert again.frames_since_search == fix.frames_since_search
