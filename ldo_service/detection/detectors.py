@@ -7,10 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from ldo_service.errors import ConfigError, ModelError, named
+from ldo_service.geometry.boxes import non_maximum_suppression
 
 from .onnx_network import Network, sha256
 from .vocabulary import canonical, class_names, read_names
-from .yolo import EXPECTED, Letterbox, detect_layout, layout_named, non_maximum_suppression
+from .yolo import EXPECTED, Letterbox, detect_layout, layout_named
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +64,9 @@ class Detections:
         return self.chosen(np.argsort(-self.scores, kind="stable")[:most])
 
     def distinct(self, iou_max: float) -> "Detections":
-        kept = non_maximum_suppression(self.boxes_px, self.scores, self.class_ids, iou_max)
-        return self.chosen(kept)
+        return self.chosen(
+            non_maximum_suppression(self.boxes_px, self.scores, self.class_ids, iou_max)
+        )
 
 
 class OnnxDetector:

@@ -14,6 +14,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
+from ldo_service.geometry.boxes import non_maximum_suppression
 
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
 from .geometric_segmentation import GeometricSegmentationConfig, Segment
@@ -216,11 +217,8 @@ def distinct_boxes(
     >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), RegionProposalConfig())
     [0, 2]
     """
-    kept: list[int] = []
-    for i in np.argsort(-np.asarray(scores), kind="stable"):
-        if np.all(_ious(boxes_px[kept], boxes_px[i]) < config.same_iou):
-            kept.append(int(i))
-    return kept
+    of_any_class = np.zeros(len(boxes_px), int)
+    return non_maximum_suppression(boxes_px, scores, of_any_class, config.same_iou).tolist()
 
 
 def _is_worth_a_look(
