@@ -4,6 +4,29 @@ import cv2
 import numpy as np
 
 
+def areas(boxes: np.ndarray) -> np.ndarray:
+    """Return the areas [...] of boxes [..., 4], in square pixels."""
+    return np.prod(boxes[..., 2:] - boxes[..., :2], axis=-1)
+
+
+def intersections(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the areas [K, R] that boxes [K, 4] and [R, 4] have in common, in square pixels."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    return np.prod(np.maximum(high - low, 0), axis=-1)
+
+
+def ious(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the intersection over union [K, R] of boxes [K, 4] and [R, 4]; 0 of empty boxes.
+
+    >>> ious(np.array([[0, 0, 2, 2]]), np.array([[1, 0, 3, 2], [5, 5, 6, 6]])).round(3)
+    array([[0.333, 0.   ]])
+    """
+    common = intersections(boxes, others)
+    union = areas(boxes)[:, None] + areas(others) - common
+    return np.divide(common, union, out=np.zeros(common.shape), where=common > 0)
+
+
 def non_maximum_suppression(
     boxes: np.ndarray, scores: np.ndarray, class_ids: np.ndarray, max_iou: float
 ) -> np.ndarray:

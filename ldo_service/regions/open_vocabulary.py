@@ -14,6 +14,7 @@ import numpy as np
 from ldo_service.detection.vocabulary import Vocabulary, normalized
 from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.training_views import TrainingView
+from ldo_service.geometry.boxes import areas, intersections
 
 from .foreground import Foreground, RegionDetections
 from .geometric_segmentation import segment_geometry
@@ -277,19 +278,13 @@ def add_region_labels(
 
 def _is_part_of_one(opinion: RegionLabel, opinions: Sequence[RegionLabel]) -> bool:
     """Most of its box lies in that of a larger region of the same name: one thing, not two."""
-    box_px = opinion.of.box_px
-    for other in opinions:
-        sides = np.minimum(box_px[2:], other.of.box_px[2:])
-        sides = sides - np.maximum(box_px[:2], other.of.box_px[:2])
-        shared_px = float(np.prod(np.maximum(sides, 0)))
-        is_larger = _area_px(other.of.box_px) > _area_px(box_px)
-        if is_larger and other.label == opinion.label and shared_px > 0.7 * _area_px(box_px):
-            return True
-    return False
-
-
-def _area_px(box_px: np.ndarray) -> float:
-    return float(np.prod(box_px[2:] - box_px[:2]))
+    larger = [
+        other.of.box_px
+        for other in opinions
+        if other.label == opinion.label and areas(other.of.box_px) > areas(opinion.of.box_px)
+    ]
+    shared_px2 = intersections(opinion.of.box_px[None], np.reshape(larger, (-1, 4)))
+    return bool(np.any(shared_px2 > 0.7 * areas(opinion.of.box_px)))
 
 
 def _packed(asked: PendingRequest) -> list[Any]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
-from ldo_service.geometry.boxes import non_maximum_suppression
+from ldo_service.geometry.boxes import ious, non_maximum_suppression
 
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
 from .geometric_segmentation import GeometricSegmentationConfig, Segment
@@ -133,7 +133,7 @@ def _boxed(
     regions_px = _boxes(found)
     for i in distinct_boxes(boxes_px, scores, config):
         label, score = labels[i], float(scores[i])
-        fits = np.where(is_taken, 0, _ious(regions_px, boxes_px[i]))
+        fits = np.where(is_taken, 0, ious(regions_px, boxes_px[[i]])[:, 0])
         best = int(np.argmax(fits)) if len(fits) else -1
         if best >= 0 and fits[best] >= config.fits_iou:
             is_taken[best] = True
@@ -180,7 +180,7 @@ def labeled_regions(
         for one in found
         if one.kind != "standing"
         and _share(is_labelled, one.part) >= config.explained
-        and np.all(_ious(boxes_px, one.box_px) < config.same_iou)
+        and np.all(ious(boxes_px, one.box_px[None]) < config.same_iou)
     ]
 
 
@@ -195,7 +195,7 @@ def regions_of_image(
             one = RegionProposal(segment.part.box_px, segment.part, kind=segment.kind)
             if segment.kind != kind or not _is_worth_a_look(one, shape, config):
                 continue
-            if np.all(_ious(_boxes(out), one.box_px) < config.alike_iou):
+            if np.all(ious(_boxes(out), one.box_px[None]) < config.alike_iou):
                 out.append(one)
     stands = np.any([one.part.image(shape) for one in out if one.kind == "standing"], axis=0)
     return [_without(one, stands) if one.kind == "apart" and stands.any() else one for one in out]
@@ -242,18 +242,6 @@ def _painted(boxes_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     for x0, y0, x1, y1 in np.round(boxes_px).astype(int).clip(0):
         image[y0 : y1 + 1, x0 : x1 + 1] = True
     return image
-
-
-def _ious(boxes_px: np.ndarray, box_px: np.ndarray) -> np.ndarray:
-    """[M] of boxes [M, 4] with one."""
-    low, high = np.maximum(boxes_px[:, :2], box_px[:2]), np.minimum(boxes_px[:, 2:], box_px[2:])
-    sides = np.maximum(high - low, 0)
-    both = sides[:, 0] * sides[:, 1]
-    return both / (_areas(boxes_px) + _areas(box_px[None])[0] - both)
-
-
-def _areas(boxes_px: np.ndarray) -> np.ndarray:
-    return (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
 
 
 def _boxes(found: Sequence[RegionProposal]) -> np.ndarray:

@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
+from ldo_service.geometry.boxes import areas, intersections, ious
 
 from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
@@ -167,7 +168,7 @@ def find_containing_regions(
     ...     AssociationConfig())
     array([1, 1, 1])
     """
-    area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=1)
+    area = areas(boxes)
     common = intersections(boxes, boxes)
     is_part = (common > 0) & (common >= config.part_inside * area[:, None])
     is_part &= area[:, None] < area
@@ -283,27 +284,6 @@ def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarr
     return px, np.where(inside, view.depth_m[v, u], 0)
 
 
-def overlaps(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """IoU [K, R] of boxes [K, 4] and [R, 4]; 0 of empty ones.
-
-    >>> overlaps(np.array([[0, 0, 2, 2]]), np.array([[1, 0, 3, 2], [5, 5, 6, 6]])).round(3)
-    array([[0.333, 0.   ]])
-    """
-    common = intersections(boxes, others)
-    area, other = (
-        np.prod(np.clip(these[:, 2:] - these[:, :2], 0, None), axis=1) for these in (boxes, others)
-    )
-    union = area[:, None] + other[None] - common
-    return np.where(common > 0, common / np.where(union > 0, union, 1), 0)
-
-
-def intersections(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Areas [K, R] that boxes [K, 4] and [R, 4] share."""
-    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
-    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
-    return np.prod(np.clip(high - low, 0, None), axis=2)
-
-
 def depth_gaps_m(
     near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
 ) -> np.ndarray:
@@ -327,7 +307,7 @@ def association_costs(
     config: AssociationConfig,
 ) -> AssociationCosts:
     """Of landmarks with distributions [K, C]."""
-    iou = overlaps(looks.boxes, regions.boxes)
+    iou = ious(looks.boxes, regions.boxes)
     gap_m = depth_gaps_m(looks.near_m, looks.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
     k, r = np.nonzero(allowed)

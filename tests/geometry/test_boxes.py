@@ -1,10 +1,18 @@
 """Boxes in an image, judged by plain loops."""
 
+import doctest
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from ldo_service.geometry.boxes import non_maximum_suppression
+from ldo_service.geometry import boxes as boxes_module
+from ldo_service.geometry.boxes import ious, non_maximum_suppression
+
+
+def test_the_examples_hold() -> None:
+    assert doctest.testmod(boxes_module).failed == 0
 
 
 def plain_iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -34,6 +42,27 @@ def random_boxes(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     centers, sides = rng.uniform(0, 100, (count, 2)), rng.uniform(5, 60, (count, 2))
     boxes = np.hstack((centers - sides / 2, centers + sides / 2)).clip(-0.5)
     return boxes, rng.integers(0, 40, count) / 40, rng.integers(0, 3, count)
+
+
+whole_boxes = arrays(np.int64, (3, 4), elements=st.integers(0, 12)).map(
+    lambda a: np.concatenate([np.minimum(a[:, :2], a[:, 2:]), np.maximum(a[:, :2], a[:, 2:])], 1)
+)
+
+
+@given(whole_boxes, whole_boxes)
+def test_intersection_over_union_is_that_of_counted_pixels(
+    one: np.ndarray, other: np.ndarray
+) -> None:
+    def mask(box: np.ndarray) -> np.ndarray:
+        out = np.zeros((12, 12), bool)
+        out[box[1] : box[3], box[0] : box[2]] = True
+        return out
+
+    got = ious(one, other)
+    for i, j in np.ndindex(3, 3):
+        a, b = mask(one[i]), mask(other[j])
+        union = np.count_nonzero(a | b)
+        assert abs(got[i, j] - (np.count_nonzero(a & b) / union if union else 0)) < 1e-12
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 40), st.floats(0, 1))

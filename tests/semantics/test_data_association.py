@@ -17,7 +17,6 @@ from ldo_service.semantics.data_association import (
     compute_region_statistics,
     find_containing_regions,
     merge_parts,
-    overlaps,
 )
 from ldo_service.semantics.gaussian_labels import distribution
 from ldo_service.semantics.object_landmarks import MEMBERS, shuffled
@@ -63,25 +62,6 @@ def test_of_nothing_nothing_is_paired() -> None:
     for shape in ((0, 3), (3, 0), (0, 0)):
         k, r = associate(np.zeros(shape), np.zeros(shape, bool), 0.4)
         assert len(k) == len(r) == 0
-
-
-boxes = arrays(np.int64, (3, 4), elements=st.integers(0, 12)).map(
-    lambda a: np.concatenate([np.minimum(a[:, :2], a[:, 2:]), np.maximum(a[:, :2], a[:, 2:])], 1)
-)
-
-
-@given(boxes, boxes)
-def test_overlaps_are_those_of_counted_pixels(one: np.ndarray, other: np.ndarray) -> None:
-    def mask(box: np.ndarray) -> np.ndarray:
-        out = np.zeros((12, 12), bool)
-        out[box[1] : box[3], box[0] : box[2]] = True
-        return out
-
-    got = overlaps(one, other)
-    for i, j in np.ndindex(3, 3):
-        a, b = mask(one[i]), mask(other[j])
-        union = np.count_nonzero(a | b)
-        assert abs(got[i, j] - (np.count_nonzero(a & b) / union if union else 0)) < 1e-12
 
 
 def test_regions_are_samples_of_their_gaussians() -> None:
