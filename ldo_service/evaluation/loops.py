@@ -145,10 +145,7 @@ def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
     v, u = np.nonzero(sampled & (new.depth_m > 0))
     if not len(v):
         return 0.0
-    z = new.depth_m[v, u].astype(float)
-    camera = new.camera
-    rays = np.column_stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy])
-    p_new = np.column_stack([rays, np.ones(len(rays))]) * z[:, None]
+    p_new = new.camera.points_at(u, v, new.depth_m[v, u])
     p_old = se3.transform(se3.inverse(old.T_world_camera) @ new.T_world_camera, p_new)
     p_old = p_old[p_old[:, 2] > 0]
     pixels = np.rint(old.camera.project(p_old)).astype(np.int64)

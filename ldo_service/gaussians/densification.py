@@ -42,8 +42,7 @@ def surfels(
 
     color [H, W, 3] uint8; depth_m [H, W] float32, > 0 in every cell; T_map_camera [4, 4]
     """
-    rays = np.stack([(cells.u - camera.cx) / camera.fx, (cells.v - camera.cy) / camera.fy], -1)
-    rays = np.concatenate([rays, np.ones((len(cells), 1))], axis=1)
+    rays = camera.rays_at(cells.u, cells.v)
     z = cells.mean_of(depth_m).astype(float)
     normals = normals_of(cells, rays, z, depth_m, camera)
     axes, cosines = slope_axes(normals, rays)

@@ -83,11 +83,31 @@ class Camera:
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def rays(self) -> np.ndarray:
-        """Viewing rays [H, W, 3] with z = 1, float64; `rays * depth_m` are camera points."""
-        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return np.stack(
-            [(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones_like(u, float)], axis=-1
-        )
+        """Viewing rays [H, W, 3] of all pixels; see `rays_at`."""
+        return self.rays_at(np.arange(self.width), np.arange(self.height)[:, None])
+
+    def rays_at(self, u: np.ndarray | float, v: np.ndarray | float) -> np.ndarray:
+        """Return the viewing rays through pixels, of a camera without lens distortion.
+
+        Args:
+            u, v: Columns and rows in pixels, of shapes that broadcast to [...].
+
+        Returns:
+            Rays with z = 1 in the camera frame, [..., 3] float64: `rays * depth_m` are points.
+        """
+        x, y = np.broadcast_arrays((u - self.cx) / self.fx, (v - self.cy) / self.fy)
+        return np.stack([x, y, np.ones(x.shape)], axis=-1)
+
+    def points_at(
+        self, u: np.ndarray | float, v: np.ndarray | float, depth_m: np.ndarray | float
+    ) -> np.ndarray:
+        """Return the points [..., 3] in meters, camera frame, that pixels show at a depth.
+
+        Args:
+            u, v: Columns and rows in pixels, of shapes that broadcast to [...].
+            depth_m: Depth along the optical axis, [...].
+        """
+        return self.rays_at(u, v) * np.asarray(depth_m)[..., None]
 
     def backproject(self, depth_m: np.ndarray) -> np.ndarray:
         """Camera points [H, W, 3] of a depth image [H, W]; the origin where depth is missing."""

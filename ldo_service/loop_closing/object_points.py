@@ -79,8 +79,7 @@ def locate_detections(
         if mask.any():
             v, u = np.nonzero(mask)
             z = float(np.median(depth_m[mask]))
-            rays = (np.median(u) - camera.cx) / camera.fx, (np.median(v) - camera.cy) / camera.fy
-            p_camera[k] = z * rays[0], z * rays[1], z
+            p_camera[k] = camera.points_at(float(np.median(u)), float(np.median(v)), z)
     return DetectionPoints(labels.astype(np.uint8), scores.astype(np.float32), p_camera)
 
 

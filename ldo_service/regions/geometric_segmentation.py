@@ -127,8 +127,7 @@ def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
 def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
     """Where normals of neighbours turn towards each other: (p_b - p_a) . (n_b - n_a) < 0, for
     normals towards the camera, and by more than noise."""
-    rays = np.stack(np.broadcast_arrays(seen.x, seen.y, np.float32(1)), axis=-1)
-    points = rays / np.maximum(seen.smooth, np.float32(1e-3))[..., None]
+    points = seen.rays / np.maximum(seen.smooth, np.float32(1e-3))[..., None]
     r, concave = config.crease_px, np.zeros(seen.inverse.shape, bool)
     for axis, inner in ((1, np.s_[:, r:-r]), (0, np.s_[r:-r])):
         turn, along = (_across(values, r, axis) for values in (seen.normals, points))

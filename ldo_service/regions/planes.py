@@ -61,7 +61,7 @@ class DepthFeatures:
     inverse  float32, 1 / m, as measured, 0 where nothing is
     smooth   float32, the same, blurred
     normals  [h, w, 3] float32, towards the camera
-    x, y     float32, [1, w] and [h, 1]: rays
+    rays     [h, w, 3] float32, with z = 1
     is_step  bool, depth jumps here or is missing
     surfaces int32, smooth pieces; 0 on edges; `sizes` [S] px of each
     """
@@ -69,8 +69,7 @@ class DepthFeatures:
     inverse: np.ndarray
     smooth: np.ndarray
     normals: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
+    rays: np.ndarray
     is_step: np.ndarray
     surfaces: np.ndarray
     sizes: np.ndarray
@@ -99,17 +98,17 @@ def compute_depth_features(
     height, width = inverse.shape
     fx, fy = camera.fx / k, camera.fy / k
     middle = (k - 1) / 2
-    x = ((np.arange(width) * k + middle - camera.cx) / camera.fx).astype(np.float32)[None]
-    y = ((np.arange(height) * k + middle - camera.cy) / camera.fy).astype(np.float32)[:, None]
+    columns, rows = np.arange(width) * k + middle, np.arange(height) * k + middle
+    rays = camera.rays_at(columns, rows[:, None]).astype(np.float32)
     smooth = _blurred(inverse, config.blur_px)
     n_x = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=fx / 8)
     n_y = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=fy / 8)
-    normals = np.stack([n_x, n_y, smooth - n_x * x - n_y * y], axis=-1)
+    normals = np.stack([n_x, n_y, smooth - n_x * rays[..., 0] - n_y * rays[..., 1]], axis=-1)
     normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), _LEAST)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
     is_step = (low <= 0) | (high >= (1 + config.max_step) * low + config.step_floor)
     surfaces, sizes = _pieces(~is_step, normals, config)
-    return DepthFeatures(inverse, smooth, normals, x, y, is_step, surfaces, sizes)
+    return DepthFeatures(inverse, smooth, normals, rays, is_step, surfaces, sizes)
 
 
 def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
@@ -125,7 +124,7 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
         plane = _fitted(seen, part, config)
         if plane is None:
             continue
-        inverse = plane[0] * seen.x + plane[1] * seen.y + plane[2]
+        inverse = plane[0] * seen.rays[..., 0] + plane[1] * seen.rays[..., 1] + plane[2]
         is_near = np.abs(seen.smooth - inverse) < config.tolerance
         is_along = seen.normals @ (plane / np.linalg.norm(plane)).astype(np.float32) > 0.8
         inverses.append(inverse.astype(np.float32))
@@ -189,7 +188,7 @@ def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.nd
     """a, b, c of 1 / z = a x + b y + c; None where it is no plane. Twice without what is off."""
     v, u = np.nonzero(part)
     v, u = v[::4], u[::4]
-    rays = np.stack([seen.x[0, u], seen.y[v, 0], np.ones(len(u), np.float32)], axis=1)
+    rays = seen.rays[v, u]
     inverse = seen.smooth[v, u]
     plane = np.linalg.lstsq(rays, inverse, rcond=None)[0]
     for _ in range(2):

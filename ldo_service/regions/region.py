@@ -152,7 +152,9 @@ def observe_region(
     if len(rows) == 0:
         return None
     few = _spread(rows, columns)
-    return RegionObservation(keyframe, candidate, _points(rows[few], columns[few], depth_m, camera))
+    rows, columns = rows[few], columns[few]
+    p_camera = camera.points_at(columns, rows, depth_m[rows, columns]).astype(np.float32)
+    return RegionObservation(keyframe, candidate, p_camera)
 
 
 def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -168,14 +170,6 @@ def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     if 2 * np.count_nonzero(on_grid) >= most:
         return np.flatnonzero(on_grid)
     return np.linspace(0, len(rows) - 1, most).astype(int)
-
-
-def _points(
-    rows: np.ndarray, columns: np.ndarray, depth_m: np.ndarray, camera: Camera
-) -> np.ndarray:
-    z = depth_m[rows, columns]
-    x, y = (columns - camera.cx) / camera.fx * z, (rows - camera.cy) / camera.fy * z
-    return np.stack([x, y, z], axis=1).astype(np.float32)
 
 
 def merge_observation(region: Region, seen: RegionObservation, most_boxes: float) -> Region:

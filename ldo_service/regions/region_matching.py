@@ -150,9 +150,7 @@ def _points(
         indexing="ij",
     )
     row, column = (axis.ravel() for axis in grid)
-    z = depth_m[row, column].astype(np.float64)
-    x, y = (column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z
-    return row, column, np.stack([x, y, z], axis=1)
+    return row, column, camera.points_at(column, row, depth_m[row, column])
 
 
 def _spacing_m(seen: RegionObservation, camera: Camera) -> float:

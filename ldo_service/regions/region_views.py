@@ -102,10 +102,7 @@ def facing_factor(
         return config.least
     rows, columns = part.row + np.arange(height), part.column + np.arange(width)
     z = depth_m[rows[:, None], columns].astype(np.float64)
-    rays = np.empty((height, width, 3))
-    rays[..., 0] = (columns - camera.cx) / camera.fx
-    rays[..., 1] = ((rows - camera.cy) / camera.fy)[:, None]
-    rays[..., 2] = 1
+    rays = camera.rays_at(columns, rows[:, None])
     p_camera = rays * z[..., None]
     normals = np.cross(np.gradient(p_camera, axis=1), np.gradient(p_camera, axis=0))
     lengths = np.linalg.norm(normals, axis=-1) * np.linalg.norm(rays, axis=-1)

@@ -76,7 +76,7 @@ class RayCaster:
 
     def _directions(self, u: np.ndarray, v: np.ndarray) -> Vector:
         """World directions with z = 1 in the camera, so that their parameter is depth."""
-        x, y = (u - self.camera.cx) / self.camera.fx, (v - self.camera.cy) / self.camera.fy
+        x, y, _ = np.moveaxis(self.camera.rays_at(u, v), -1, 0)
         R = self._T
         return (
             R[0, 0] * x + R[0, 1] * y + R[0, 2],

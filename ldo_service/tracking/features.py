@@ -90,9 +90,8 @@ def _measured(
     pixels = np.array([k.pt for k in keypoints], np.float64).reshape(-1, 2)
     column, row = np.rint(pixels).astype(int).T
     measured_m = depth_m[row, column].astype(np.float64)
-    rays = (pixels - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-    points = np.column_stack([rays, np.ones(len(rays))]) * measured_m[:, None]
-    return Features(pixels, points, descriptors)
+    u, v = pixels.T
+    return Features(pixels, camera.points_at(u, v, measured_m), descriptors)
 
 
 def match(reference: Features, frame: Features, config: FeatureConfig) -> np.ndarray:

@@ -127,8 +127,7 @@ def color_of(name: str) -> Color:
 def _outlines(camera: Camera, boxes_px: np.ndarray) -> np.ndarray:
     """The sides [M, 4, 2, 3] of boxes [M, 4] in the image, FRUSTUM_M in front of the camera."""
     corners_px = boxes_px[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]  # [M, 4, 2]
-    rays = (corners_px - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-    points = FRUSTUM_M * np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+    points = camera.points_at(corners_px[..., 0], corners_px[..., 1], FRUSTUM_M)
     return np.stack([points, np.roll(points, -1, axis=1)], axis=2)
 
 

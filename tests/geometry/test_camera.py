@@ -20,6 +20,15 @@ def test_projection_is_the_product_with_the_intrinsic_matrix() -> None:
     np.testing.assert_allclose(CAMERA.project(points), homogeneous[:, :2] / homogeneous[:, 2:])
 
 
+def test_points_between_pixels_lie_on_their_rays() -> None:
+    u, v, depth_m = np.array([[0.5, 31.2]]), np.array([[7.25], [22.9]]), np.array([[2.0, 3.0]])
+    points = CAMERA.points_at(u, v, depth_m)
+    assert points.shape == (2, 2, 3)
+    np.testing.assert_allclose(points[..., 2], np.broadcast_to(depth_m, (2, 2)))
+    np.testing.assert_allclose(CAMERA.project(points), np.stack(np.broadcast_arrays(u, v), -1))
+    np.testing.assert_array_equal(points[1, 1], [0, 0, 3])
+
+
 def test_missing_depth_backprojects_to_the_origin() -> None:
     assert not CAMERA.backproject(np.zeros((48, 64), np.float32)).any()
 

@@ -146,15 +146,14 @@ def _projected(
     camera: Camera, T_world_other: np.ndarray, T_world_camera: np.ndarray, depth_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where [H, W] another pose sees the surfaces of this one. Sums in a fixed order."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    ray = ((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0)
+    ray = np.moveaxis(camera.rays(), -1, 0)
     T, S = T_world_camera, T_world_other
     world = [depth_m * _dot(T[i, :3], ray) + (T[i, 3] - S[i, 3]) for i in range(3)]
     x, y, z = (_dot(S[:3, i], world) for i in range(3))
     return x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
 
 
-def _dot(a: np.ndarray, b: tuple | list) -> np.ndarray:
+def _dot(a: np.ndarray, b: np.ndarray | list) -> np.ndarray:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
