@@ -32,6 +32,7 @@ LIBRARIES = {  # name on the package index: name to import
     "small-gicp": "small_gicp",
     "opencv-python-headless": "cv2",
     "onnxruntime": "onnxruntime",
+    "scikit-image": "skimage",
     "scipy": "scipy",
     "mcap": "mcap",
     "safetensors": "safetensors",
