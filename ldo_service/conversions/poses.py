@@ -7,7 +7,6 @@ import numpy as np
 
 from ldo_service.geometry import se3
 from ldo_service.geometry.keyframe_poses import RelativePose
-from ldo_service.geometry.se3 import quaternions
 from ldo_service.schemas import (
     Array,
     GraphCorrection,
@@ -76,7 +75,7 @@ def correction_to_message(
     landmarks: Iterable[GraphLandmark] = (),
 ) -> GraphCorrection:
     T = np.array(list(T_map_keyframe.values())).reshape(-1, 4, 4)
-    rows = np.concatenate([T[:, :3, 3], quaternions(T[:, :3, :3])], axis=1)
+    rows = np.concatenate([T[:, :3, 3], se3.quaternion(T[:, :3, :3])], axis=1)
     return GraphCorrection(
         stamp_ns=stamp_ns,
         graph_version=graph_version,

@@ -8,7 +8,6 @@ from math import inf, log
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame, se3
@@ -53,7 +52,7 @@ def surfels(
     rows = np.zeros((len(cells), ROW), np.float32)
     rows[:, 0:3] = se3.transform(T_map_camera, rays * z[:, None])
     rows[:, 3:6] = np.log(np.stack([sigma * stretch, sigma, sigma * thickness], -1))
-    rows[:, 6:10] = _quaternions(T_map_camera[:3, :3] @ axes)
+    rows[:, 6:10] = se3.quaternion(T_map_camera[:3, :3] @ axes)
     rows[:, 10] = log(opacity / (1 - opacity))
     rows[:, 11:14] = cells.mean_of(color) / 255
     return rows
@@ -103,13 +102,6 @@ def _two_from_edges(index: np.ndarray, length: int) -> np.ndarray:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
-
-
-def _quaternions(R: np.ndarray) -> np.ndarray:
-    """Quaternions [M, 4] wxyz of rotations [M, 3, 3]."""
-    if len(R) == 0:  # SciPy refuses an empty batch in some of the versions we admit
-        return np.zeros((0, 4))
-    return Rotation.from_matrix(R).as_quat()[:, [3, 0, 1, 2]]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ldo_service.errors import DataError
-from ldo_service.geometry.se3 import quaternions
+from ldo_service.geometry import se3
 from ldo_service.kernels._rasterize import Bounds
 
 ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused
@@ -234,7 +234,7 @@ class GaussianMap:
         T = np.stack([np.asarray(T_new_old[int(k)], float) for k in keyframes])
         if T.shape[1:] != (4, 4) or not np.all(np.isfinite(T)):
             raise ValueError("transforms must be [4, 4] and finite.")
-        q = quaternions(T[:, :3, :3])
+        q = se3.quaternion(T[:, :3, :3])
         for start in range(0, self._size, _CHUNK):
             chunk = slice(start, min(start + _CHUNK, self._size))
             _move(self._rows[chunk], self._anchors[chunk], keyframes, T, q)
@@ -304,7 +304,7 @@ def transform_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
     out = aligned_rows(len(rows))
     out[:] = rows
     T = np.asarray(T_new_old, float)[None]
-    q = quaternions(T[:, :3, :3])
+    q = se3.quaternion(T[:, :3, :3])
     _move(out, np.zeros(len(rows), np.int32), np.zeros(1, np.int64), T, q)
     return out
 

@@ -5,6 +5,7 @@ transform between corresponding points (Umeyama, PAMI 1991).
 """
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 Array = np.ndarray
 
@@ -34,11 +35,8 @@ def exp(xi: Array) -> Array:
 
 def log(T: Array) -> Array:
     """Tangent vector [6] of T [4, 4]; the inverse of `exp` for rotations below pi."""
-    q = quaternion(T[:3, :3])
-    q = q if q[0] >= 0 else -q
-    sin_half = float(np.linalg.norm(q[1:]))
-    theta = 2.0 * np.arctan2(sin_half, q[0])
-    omega = q[1:] * (2.0 if sin_half < 1e-9 else theta / sin_half)
+    omega = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+    theta = float(np.linalg.norm(omega))
     W = skew(omega)
     if theta < 1e-4:  # the closed form loses digits here; the series is exact to 1e-17
         d = 1.0 / 12 + theta**2 / 720
@@ -100,29 +98,15 @@ def transform(T: Array, points: Array) -> Array:
 
 
 def quaternion(R: Array) -> Array:
-    """Unit quaternion wxyz [4] of the rotation R [3, 3], w >= 0."""
-    # The largest of the four squared components is divided by, so no case loses digits.
-    squares = np.array(
-        [
-            1 + R[0, 0] + R[1, 1] + R[2, 2],
-            1 + R[0, 0] - R[1, 1] - R[2, 2],
-            1 - R[0, 0] + R[1, 1] - R[2, 2],
-            1 - R[0, 0] - R[1, 1] + R[2, 2],
-        ]
-    )
-    wx, wy, wz = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
-    rows = np.array(
-        [
-            [squares[0], wx, wy, wz],
-            [wx, squares[1], xy, xz],
-            [wy, xy, squares[2], yz],
-            [wz, xz, yz, squares[3]],
-        ]
-    )
-    q = rows[int(np.argmax(squares))]
-    q = q / np.linalg.norm(q)
-    return q if q[0] >= 0 else -q
+    """Return the unit quaternions wxyz [..., 4], w >= 0, of rotations R [..., 3, 3].
+
+    Raises:
+        ValueError: A matrix has a determinant that is not positive, so it is no rotation.
+    """
+    if not R.size:  # Some of the admitted versions of SciPy refuse an empty batch.
+        return np.zeros((*R.shape[:-2], 4))
+    xyzw = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.roll(xyzw, 1, axis=-1).reshape(*R.shape[:-2], 4)
 
 
 def rotation(q: Array) -> Array:
@@ -173,33 +157,12 @@ def interpolate(T_a: np.ndarray, T_b: np.ndarray, share: np.ndarray) -> np.ndarr
     """
     T_a_b = inverse(T_a) @ T_b
     part = np.zeros_like(T_a_b)
-    part[:, :3, :3] = rotation(_powers(quaternions(T_a_b[:, :3, :3]), share))
+    if len(T_a_b):  # Some of the admitted versions of SciPy refuse an empty batch.
+        omega = Rotation.from_matrix(T_a_b[:, :3, :3]).as_rotvec()
+        part[:, :3, :3] = Rotation.from_rotvec(share[:, None] * omega).as_matrix()
     part[:, :3, 3] = share[:, None] * T_a_b[:, :3, 3]
     part[:, 3, 3] = 1
     return T_a @ part
-
-
-def quaternions(R: np.ndarray) -> np.ndarray:
-    """Unit quaternions wxyz [N, 4], w >= 0, of rotations R [N, 3, 3]; `se3.quaternion` of many."""
-    x, y, z = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
-    # rows that are multiples of q: the one with the largest square loses no digits
-    wx, wy, wz = R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]
-    xy, xz, yz = R[:, 0, 1] + R[:, 1, 0], R[:, 0, 2] + R[:, 2, 0], R[:, 1, 2] + R[:, 2, 1]
-    squares = 1 + np.stack([x + y + z, x - y - z, y - x - z, z - x - y])
-    w2, x2, y2, z2 = squares
-    rows = np.array([[w2, wx, wy, wz], [wx, x2, xy, xz], [wy, xy, y2, yz], [wz, xz, yz, z2]])
-    q = rows[squares.argmax(axis=0), :, np.arange(len(R))]
-    q /= np.linalg.norm(q, axis=1, keepdims=True)
-    return np.where(q[:, :1] >= 0, q, -q)
-
-
-def _powers(q: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """q^s [N, 4] of unit quaternions: turned by that share of the angle."""
-    sin_half = np.linalg.norm(q[:, 1:], axis=1)
-    half = share * np.arctan2(sin_half, q[:, 0])
-    # sin(s h) / sin(h) tends to s
-    scale = np.where(sin_half > 1e-9, np.sin(half) / np.maximum(sin_half, 1e-9), share)
-    return np.column_stack([np.cos(half), scale[:, None] * q[:, 1:]])
 
 
 def fit_rigid_transform(points: np.ndarray, target: np.ndarray) -> np.ndarray:

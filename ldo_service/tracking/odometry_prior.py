@@ -159,12 +159,8 @@ class OdometryPriorBuffer:
 def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
     """T [4, 4] at a stamp: rotation on the shortest arc, translation on a line; also beyond b."""
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
-    T_a_b = se3.inverse(a.T_prior_base) @ b.T_prior_base
-    turn = se3.log(T_a_b)
-    turn[3:] = 0.0
-    T = a.T_prior_base @ se3.exp(share * turn)
-    T[:3, 3] = (1 - share) * a.T_prior_base[:3, 3] + share * b.T_prior_base[:3, 3]
-    return T
+    T = se3.interpolate(a.T_prior_base[None], b.T_prior_base[None], np.array([share]))
+    return T[0]
 
 
 @dataclass(frozen=True, slots=True)
