@@ -222,7 +222,7 @@ class LoopCloser(Actor):
         state = self.recognizer.snapshot()
         subgraphs = {f"subgraph_{s['keyframes'][0]}": s for s in state.pop("subgraphs")}
         views = {f"view_{view['place']['id']}": view for view in state.pop("views")}
-        waiting = {f"waiting_{k}": w.place.packed for k, w in self._waiting.items()}
+        waiting = {f"waiting_{k}": w.place.pack() for k, w in self._waiting.items()}
         words = {"words": state.pop("words")}  # the same array until one is learnt
         now = {
             **state,
@@ -230,7 +230,7 @@ class LoopCloser(Actor):
             "boxes": [encode(boxes) for boxes in self._boxes.values()],
             "newest": self._newest,
             "joined": list(self._joined.items()),
-            "vocabulary": self._vocabulary.packed,
+            "vocabulary": self._vocabulary.pack(),
         }
         return {**subgraphs, **views, **waiting, **words, **self._poses_part(), "now": now}
 

@@ -174,7 +174,7 @@ class Mapper(Actor):
         self._objects_teller = ObjectPublisher()
         self._poses = KeyframePoses()
         self._links = RelativeMeasurements(self._poses, self.config.measured_keyframes)
-        self._teller = MapPublisher(self._map, self.config.pace())
+        self._publisher = MapPublisher(self._map, self.config.pace())
         self._newest: tuple[int, int] = (0, -1)  # stamp_ns and id of the newest keyframe
         self._repair = LoopRefit(self._map, self.config.repair())
         self._checkpoint: dict[str, Any] = {}
@@ -217,9 +217,9 @@ class Mapper(Actor):
         self._repair.with_keyframe(is_behind=self._waiting() > 0)
         # tell
         yield from self._refinement()
-        yield from self._teller.on_keyframe(self._message_context())
+        yield from self._publisher.on_keyframe(self._message_context())
         yield self._view(message)
-        yield from self._teller.snapshot_if_due(self._message_context())
+        yield from self._publisher.snapshot_if_due(self._message_context())
         yield from self._publish_semantics(learnt, message.stamp_ns)
 
     def _iterations(self) -> int:
@@ -239,7 +239,7 @@ class Mapper(Actor):
         self._semantics.refresh()
         self._checkpoint = {}  # is due: half a minute of work, and perhaps no keyframe follows
         yield from self._refinement()
-        yield from self._teller.deltas(self._message_context(), with_changed=True)
+        yield from self._publisher.deltas(self._message_context(), with_changed=True)
         yield from self._objects()
 
     def _refinement(self) -> Iterator[KeyframeRefinement]:
@@ -274,7 +274,7 @@ class Mapper(Actor):
         """All of them; nothing where nobody ever looked."""
         semantics = self._semantics
         if semantics.is_used:
-            now = self._teller.version, self._poses.version, self._newest[0]
+            now = self._publisher.version, self._poses.version, self._newest[0]
             yield self._objects_teller.message(semantics.objects, semantics.names, *now)
 
     # --- corrections ------------------------------------------------------------------------------
@@ -290,7 +290,7 @@ class Mapper(Actor):
             T_new_old = {m.keyframe: pose_from_message(m.T_new_old) for m in motions}
             self._map.move(T_new_old)
             self._semantics.objects.move(T_new_old)
-            yield self._teller.delta(self._message_context(), motions=motions)
+            yield self._publisher.delta(self._message_context(), motions=motions)
             yield from self._objects()
 
     def _moved_keyframes(self) -> list[int]:
@@ -319,7 +319,7 @@ class Mapper(Actor):
         return MapRendering(
             stamp_ns=keyframe.stamp_ns,
             keyframe=keyframe.keyframe,
-            version=self._teller.version,
+            version=self._publisher.version,
             graph_version=self._poses.version,
             camera=keyframe.camera,
             T_map_camera=pose_to_message(views.poses[k]),
@@ -331,7 +331,7 @@ class Mapper(Actor):
     def on_restored(self) -> Iterator[Output]:
         """The whole map: followers may have missed deltas, and late joiners find nothing else."""
         if self._map.size():
-            yield from self._teller.snapshot(self._message_context())
+            yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
 
     def on_stop(self) -> Iterator[Output]:
@@ -339,7 +339,7 @@ class Mapper(Actor):
         if self._map.size():
             self._repair.at_end()
             self._semantics.refresh()
-            yield from self._teller.snapshot(self._message_context())
+            yield from self._publisher.publish_snapshot(self._message_context())
             yield from self._objects()
 
     # --- state ------------------------------------------------------------------------------------
@@ -367,7 +367,7 @@ class Mapper(Actor):
             "semantics": self._semantics.snapshot(),
             "poses": self._poses.snapshot(),
             "links": self._links.snapshot(),
-            "told": self._teller.state(),
+            "told": self._publisher.snapshot(),
             **self._repair.snapshot(),
         }
 
@@ -379,7 +379,7 @@ class Mapper(Actor):
         self._semantics.restore(saved["semantics"])
         self._poses.restore(saved["poses"])
         self._links.restore(saved["links"])
-        self._teller.restore(saved["told"])
+        self._publisher.restore(saved["told"])
         self._repair.restore(saved)
 
     def metrics(self) -> dict[str, float]:

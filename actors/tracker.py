@@ -197,7 +197,7 @@ class Tracker(Actor):
         """Return a part for each known keyframe, written once, and few parts that change."""
         if self._parts is None:
             self._parts = self._tracked_parts()
-        return {**self._parts, "prior": self._prior.packed}
+        return {**self._parts, "prior": self._prior.pack()}
 
     def _tracked_parts(self) -> dict[str, Any]:
         """Return all parts as of the last frame, correction or detection."""
@@ -212,7 +212,7 @@ class Tracker(Actor):
             **own,
             "graph_correction": self._correction,
             "now": {"odometry": state, "poses": poses, "localise": localize},
-            "prior": self._prior.packed,
+            "prior": self._prior.pack(),
             **fix,
         }
 

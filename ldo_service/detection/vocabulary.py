@@ -189,8 +189,7 @@ class Vocabulary:
         self._names.append(plain)
         return self._indices[plain]
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Plain values, for a file or a state."""
         return {"cap": self.cap, "names": list(self._names), "refused": self.refused}
 

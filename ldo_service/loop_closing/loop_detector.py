@@ -279,8 +279,8 @@ class LoopDetector:
     def snapshot(self) -> dict[str, Any]:
         """`subgraphs` and `views` are lists of parts that never change; the rest is small."""
         return {
-            "subgraphs": [subgraph.packed for subgraph in self._memory.subgraphs],
-            "views": [view.packed for view in self._open],
+            "subgraphs": [subgraph.pack() for subgraph in self._memory.subgraphs],
+            "views": [view.pack() for view in self._open],
             "words": self._words.words,
             "path": (self._path_m, self._last),
         }

@@ -106,8 +106,7 @@ class SubgraphLandmarks:
         said = np.where(self.labels < HIDDEN_NAMES, -1, self.weights).argmax(axis=1)
         return self.labels[np.arange(len(self)), said].astype(np.int64)
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         return {"p_odom": self.p_odom, "labels": self.labels, "weights": self.weights}
 
 

@@ -58,15 +58,18 @@ class SubgraphKeyframe:
     def keyframe(self) -> int:
         return self.place.id
 
+    def pack(self) -> dict[str, Any]:
+        """Return arrays and plain values, the same object each time."""
+        return self._packed
+
     @cached_property
-    def packed(self) -> dict[str, Any]:
-        """Arrays and plain values, one and the same object each time."""
+    def _packed(self) -> dict[str, Any]:
         kept = {field.name: getattr(self, field.name) for field in fields(self)}
-        return {**kept, "place": self.place.packed, "sightings": asdict(self.sightings)}
+        return {**kept, "place": self.place.pack(), "sightings": asdict(self.sightings)}
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "SubgraphKeyframe":
-        """The inverse of `packed`."""
+        """The inverse of `pack`."""
         place, sightings = (
             KeyframeRecord.unpack(kept["place"]),
             DetectionPoints(**kept["sightings"]),
@@ -97,16 +100,19 @@ class Subgraph:
     def submap(self) -> int:
         return self.views[0].place.submap
 
+    def pack(self) -> dict[str, Any]:
+        """Return arrays and plain values, the same object each time."""
+        return self._packed
+
     @cached_property
-    def packed(self) -> dict[str, Any]:
-        """Arrays and plain values, one and the same object each time."""
+    def _packed(self) -> dict[str, Any]:
         kept = {field.name: getattr(self, field.name) for field in fields(self)}
-        views = [view.packed for view in self.views]
-        return {**kept, "views": views, "landmarks": self.landmarks.packed}
+        views = [view.pack() for view in self.views]
+        return {**kept, "views": views, "landmarks": self.landmarks.pack()}
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "Subgraph":
-        """The inverse of `packed`."""
+        """The inverse of `pack`."""
         changed = {
             "views": tuple(map(SubgraphKeyframe.unpack, kept["views"])),
             "keyframes": tuple(kept["keyframes"]),

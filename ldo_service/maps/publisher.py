@@ -120,9 +120,9 @@ class MapPublisher:
         if self._since_snapshot >= (
             pace.snapshot_keyframes if has_grown else pace.snapshot_keyframes_max
         ):
-            yield from self.snapshot(now)
+            yield from self.publish_snapshot(now)
 
-    def snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
+    def publish_snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
         """First all that is new, so that followers and late joiners hold the same."""
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
@@ -145,7 +145,8 @@ class MapPublisher:
             )
 
     # --- state ------------------------------------------------------------------------------------
-    def state(self) -> dict[str, int]:
+    def snapshot(self) -> dict[str, int]:
+        """Return the counters that `restore` needs."""
         return {
             "version": self.version,
             "since_changed": self._since_changed,

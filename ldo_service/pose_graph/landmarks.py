@@ -93,8 +93,7 @@ class LandmarkObservation:
         right, below = width - 1 - BORDER_PX, height - 1 - BORDER_PX
         return bool(min(x0, y0) > BORDER_PX and x1 < right and y1 < below)
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Of its distribution only what is not zero: a few of 256."""
         values = {name: getattr(self, name) for name in self.__slots__}
         labels = np.flatnonzero(self.distribution)
@@ -294,7 +293,7 @@ class ObjectLandmarks:
     def snapshot(self) -> dict[str, Any]:
         """`known` is the same object until the next `update_graph`."""
         self._saved = self._saved or self._packed()
-        waiting = [seen.packed for seen in self._waiting]
+        waiting = [seen.pack() for seen in self._waiting]
         return {"known": self._saved, "waiting": waiting, "skipped": self.skipped}
 
     def _packed(self) -> dict[str, Any]:

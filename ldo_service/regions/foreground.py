@@ -81,8 +81,7 @@ class Foreground:
         corners = self.column, self.row, self.column + width, self.row + height
         return np.array(corners) - 0.5
 
-    @property
-    def packed(self) -> tuple[tuple[int, ...], np.ndarray]:
+    def pack(self) -> tuple[tuple[int, ...], np.ndarray]:
         """Row, column and shape, and the mask as bits: for a state."""
         return (self.row, self.column, *self.mask.shape), np.packbits(self.mask)
 

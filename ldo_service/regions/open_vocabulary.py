@@ -195,11 +195,10 @@ class OpenVocabularyLabeling:
         return normalized(name) not in self.config.structure
 
     # --- state ------------------------------------------------------------------------------------
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Plain values and arrays, for a state."""
         return {
-            "regions": self._regions.packed,
+            "regions": self._regions.pack(),
             "open": [[*key, *_packed(asked)] for key, asked in self._open.items()],
         }
 
@@ -288,7 +287,7 @@ def _is_part_of_one(opinion: RegionLabel, opinions: Sequence[RegionLabel]) -> bo
 
 
 def _packed(asked: PendingRequest) -> list[Any]:
-    return [asked.box_px, *asked.part.packed, asked.label, asked.score, asked.kind]
+    return [asked.box_px, *asked.part.pack(), asked.label, asked.score, asked.kind]
 
 
 def _unpacked(

@@ -217,7 +217,7 @@ def _packed_sighting(seen: RegionObservation) -> list[Any]:
     """Without the number that its box had in its keyframe: nobody asks for it any more."""
     of = seen.candidate
     said = of.label, of.score, of.kind
-    return [seen.keyframe, seen.p_camera, of.box_px, *said, *of.part.packed]
+    return [seen.keyframe, seen.p_camera, of.box_px, *said, *of.part.pack()]
 
 
 def _unpacked_sighting(

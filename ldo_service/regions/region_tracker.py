@@ -348,8 +348,7 @@ class RegionTracker:
         while len(self._regions) > self.config.most:
             del self._regions[next(iter(self._regions))]
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Plain values, bytes and lists, for a state."""
         regions = [pack(region) for region in self._regions.values()]
         return {"next_id": self._next_id, "allowed": self._allowed, "regions": regions}

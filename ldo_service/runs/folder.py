@@ -127,7 +127,7 @@ class DatabaseWriter:
             for place in self._places.all
             if joined.get(place.submap, place.submap) == 0
         ]
-        path.write_bytes(encode_state({"places": [place.packed for place in places]}))
+        path.write_bytes(encode_state({"places": [place.pack() for place in places]}))
 
 
 def prepare(folder: Path, overwrite: bool) -> None:

@@ -60,14 +60,14 @@ class Stage:
     ) -> None:
         self._make, self._transport = make, transport
         self._config = config = config or SupervisionConfig()
-        self._keeper = Checkpointer(store or MemoryStore())
+        self._checkpointer = Checkpointer(store or MemoryStore())
         self._expected = expected or {}
         self._on_evicted = on_evicted
         self._journal = journal or Journal()
         self._actor = self._restored_actor()
         self.name = self._actor.name
         self._epoch = new_epoch()
-        self._vitals = StageMetrics()
+        self._metrics = StageMetrics()
         self._budget = RestartBudget(
             self.name,
             config.max_restarts,
@@ -86,7 +86,7 @@ class Stage:
         nice = 0 if self._actor.is_prompt else self._config.nice
         self._worker = Worker(self.name, nice=nice)
         self._open_outlets()
-        if self._keeper.past.is_none:
+        if self._checkpointer.past.is_none:
             self._begin()
         self._mailbox = self._open_mailbox()
         self._transport.declare_liveliness(self.name)
@@ -109,7 +109,7 @@ class Stage:
     def drain(self) -> None:
         """Soft stop: handle what has arrived, say the last words, end."""
         self._drain_requested = True
-        self._vitals.state = "draining"
+        self._metrics.state = "draining"
         if self._mailbox:
             self._mailbox.close()
 
@@ -123,7 +123,7 @@ class Stage:
                 self._expected.get(port.topic.name, ()),
                 self._config.evict_after_s,
                 self._on_evicted,
-                self._keeper.past.outputs.get(port.topic.name),
+                self._checkpointer.past.outputs.get(port.topic.name),
             )
             for port in self._actor.outputs
         )
@@ -135,13 +135,13 @@ class Stage:
             self._actor.inputs,
             self._transport,
             max_bytes=round(self._config.max_message_mb * 1e6),
-            past=self._keeper.past.inputs,
+            past=self._checkpointer.past.inputs,
         )
         self._orders = CommandReceiver(self.name, self._transport, mailbox.put_command)
         if self._drain_requested:
             mailbox.close()
         else:
-            self._vitals.state = "ready"
+            self._metrics.state = "ready"
         return mailbox
 
     def _close_ports(self, mailbox: Mailbox) -> None:
@@ -161,14 +161,14 @@ class Stage:
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         try:
-            if self._keeper.is_unsaved:
+            if self._checkpointer.is_unsaved:
                 await self._save()
             await self._outlets.release()  # what a predecessor made
             await self._publish_restored()
             while delivery := await self._next(mailbox):
                 await self._take(delivery, mailbox)
             await self._publish_final()
-            if self._keeper.is_unsaved:
+            if self._checkpointer.is_unsaved:
                 raise UnsavedStateError
             await self._outlets.flush()
         except UnsavedStateError:
@@ -176,7 +176,7 @@ class Stage:
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
         """While something is not saved, it is tried again meanwhile."""
-        while self._keeper.is_unsaved:
+        while self._checkpointer.is_unsaved:
             try:
                 return await asyncio.wait_for(mailbox.take(), self.SAVE_AGAIN_S)
             except TimeoutError:
@@ -197,7 +197,7 @@ class Stage:
         for _attempt in range(2):
             if await self._try(message, delivery):
                 return
-        self._vitals.dead_lettered += 1
+        self._metrics.dead_lettered += 1
         self._journal.record_step("dead_lettered", FlowStatus())
         await self._save(delivery)
         log.error(
@@ -209,7 +209,7 @@ class Stage:
         """Handle, save, send; False when it failed and a successor is in place."""
         self._update_flow_status()
         try:
-            with self._vitals.step():
+            with self._metrics.step():
                 produced = await self._worker.run(self._handle, message)
             self._outlets.hold(produced)
             is_saved = await self._save(delivery, self._taken(delivery))
@@ -222,7 +222,7 @@ class Stage:
             return False
         self._journal.record_step("done", self._actor.situation, produced)
         await self._outlets.release(is_saved=is_saved)
-        self._vitals.record_step(message, is_timed=bool(produced) or not self._actor.outputs)
+        self._metrics.record_step(message, is_timed=bool(produced) or not self._actor.outputs)
         return True
 
     def _taken(self, delivery: Delivery) -> LoggedInput | None:
@@ -242,7 +242,7 @@ class Stage:
         )
 
     async def _publish_restored(self) -> None:
-        if self._keeper.past.of_actor:
+        if self._checkpointer.past.of_actor:
             await self._say("resumed", lambda: self._actor.on_restored())
 
     async def _publish_final(self) -> None:
@@ -253,7 +253,7 @@ class Stage:
         try:
             produced = await self._worker.run(lambda: produce(self._actor, words()))
         except Exception:
-            self._vitals.failures += 1
+            self._metrics.failures += 1
             log.exception("%s: what it says when it has %s failed", self.name, kind)
             return
         if produced or kind == "finished":
@@ -273,7 +273,7 @@ class Stage:
         is to end and the disk takes nothing.
         """
         state = await self._worker.run(
-            self._keeper.build_checkpoint, self._actor, self._links(delivery), taken, whole
+            self._checkpointer.build_checkpoint, self._actor, self._links(delivery), taken, whole
         )
         while not await self._is_written(state):
             if not self._waits_for_disk:
@@ -289,8 +289,8 @@ class Stage:
         except OSError as error:
             self._note_unsaved(error)
         if self._mailbox:
-            self._mailbox.waits_for_disk = self._keeper.is_unsaved
-        return not self._keeper.is_unsaved
+            self._mailbox.waits_for_disk = self._checkpointer.is_unsaved
+        return not self._checkpointer.is_unsaved
 
     @property
     def _waits_for_disk(self) -> bool:
@@ -301,17 +301,19 @@ class Stage:
         """Save what there is before anyone counts on this stage: at once, as it is little. What the
         disk does not take is tried again before the first step."""
         try:
-            self._write(self._keeper.build_checkpoint(self._actor, self._links(), None, False))
+            self._write(
+                self._checkpointer.build_checkpoint(self._actor, self._links(), None, False)
+            )
         except OSError as error:
             self._note_unsaved(error)
 
     def _links(self, delivery: Delivery | None = None) -> State:
-        inputs = self._mailbox.past(delivery) if self._mailbox else self._keeper.past.inputs
-        return self._keeper.links(inputs, self._outlets.past())
+        inputs = self._mailbox.past(delivery) if self._mailbox else self._checkpointer.past.inputs
+        return self._checkpointer.links(inputs, self._outlets.past())
 
     def _note_unsaved(self, error: OSError) -> None:
-        self._vitals.failures += self._keeper.record_failure(self.name, error)
-        self._vitals.facts = {**self._vitals.facts, **self._keeper.metrics()}
+        self._metrics.failures += self._checkpointer.record_failure(self.name, error)
+        self._metrics.facts = {**self._metrics.facts, **self._checkpointer.metrics()}
 
     # --- orders ---------------------------------------------------------------------------------
     async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
@@ -333,10 +335,10 @@ class Stage:
 
     async def _renew(self, mailbox: Mailbox) -> None:
         """Begin anew; to everyone else it looks like a process that was started again."""
-        self._keeper.forget(self.name)
+        self._checkpointer.forget(self.name)
         self._actor = await self._worker.run(self._restored_actor)
         self._epoch = new_epoch()
-        self._vitals.facts = {}
+        self._metrics.facts = {}
         mailbox.reset()
         self._outlets.renew(self._epoch)
         await self._save()
@@ -346,32 +348,32 @@ class Stage:
         return produce(self._actor, self._actor.handle(message))
 
     def _restored_actor(self) -> Actor:
-        actor = self._keeper.restore_actor(self._make)
-        self._journal.record_start(self._keeper.past.of_actor or None)
+        actor = self._checkpointer.restore_actor(self._make)
+        self._journal.record_start(self._checkpointer.past.of_actor or None)
         return actor
 
     def _write(self, state: State) -> None:
-        self._keeper.write(self._actor, state)
-        self._vitals.facts = {
+        self._checkpointer.write(self._actor, state)
+        self._metrics.facts = {
             **self._actor.metrics(),
             **self._journal.metrics(),
-            **self._keeper.metrics(),
+            **self._checkpointer.metrics(),
         }
 
     def _save_whole(self, links: State) -> None:
-        self._write(self._keeper.build_checkpoint(self._actor, links, None, True))
+        self._write(self._checkpointer.build_checkpoint(self._actor, links, None, True))
 
     async def _restart(self) -> None:
         """Wait, longer with each failure, and put a successor in place."""
         while True:
-            self._vitals.failures += 1
+            self._metrics.failures += 1
             await asyncio.sleep(self._budget.record_failure(asyncio.get_running_loop().time()))
             try:
                 self._actor = await self._worker.run(self._restored_actor)
             except Exception:
                 log.exception("%s cannot go on from its last state", self.name)
                 continue
-            self._vitals.restarts += 1
+            self._metrics.restarts += 1
             self._outlets.take_back()
             await self._publish_restored()
             return
@@ -381,15 +383,15 @@ class Stage:
         while True:
             mailbox.send_credits()
             self._outlets.check_windows()
-            header = Header(self.name, self._epoch, 0, self._vitals.last_stamp_ns)
+            header = Header(self.name, self._epoch, 0, self._metrics.last_stamp_ns)
             self._health.post(encode_link(header), encode(self.health()))
-            if self._vitals.busy_s > self._config.stall_after_s:
-                raise StageStalled(self.name, self._vitals.busy_s)
+            if self._metrics.busy_s > self._config.stall_after_s:
+                raise StageStalled(self.name, self._metrics.busy_s)
             await asyncio.sleep(self._config.heartbeat_s)
 
     def health(self) -> Health:
         """How it is now; also sent with every heartbeat."""
-        return self._vitals.health(
+        return self._metrics.health(
             actor=self.name,
             epoch=self._epoch,
             paused=self._mailbox is not None and self._mailbox.is_held,

@@ -356,8 +356,7 @@ class Objects:
         self._table[which] = table
 
     # --- state ------------------------------------------------------------------------------------
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Arrays and plain numbers, for a file or a state."""
         table = self._table.copy().view(np.uint8).reshape(len(self._table), LANDMARK.itemsize)
         counts = [self._next_id, self._merged, self._retired, self._refused]
@@ -365,7 +364,7 @@ class Objects:
 
     @staticmethod
     def unpack(packed: Mapping[str, Any], config: ObjectsConfig | None = None) -> "Objects":
-        """As it was. Raises ValueError when this is not what `packed` gave."""
+        """As it was. Raises ValueError when this is not what `pack` gave."""
         table = np.ascontiguousarray(packed["landmarks"])
         if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
             raise ValueError(f"landmarks {table.dtype}{table.shape} are not of this version.")

@@ -291,12 +291,12 @@ class SemanticMap:
     def snapshot(self) -> dict[str, Any]:
         """All but the labels, which the map has."""
         return {
-            "vocabulary": self.vocabulary.packed,
-            "objects": self.objects.packed,
+            "vocabulary": self.vocabulary.pack(),
+            "objects": self.objects.pack(),
             "done": list(self._done),
             "labelled": self._labelled,
             "waiting": [(keyframe, _packed(claims)) for keyframe, claims in self._waiting.items()],
-            "naming": self.naming and self.naming.packed,
+            "naming": self.naming and self.naming.pack(),
             "given": [sorted(self._by_detector), sorted(self._by_labeller)],
         }
 

@@ -92,15 +92,18 @@ class KeyframeRecord:
             return otherwise
         return ResidualHistory((self.intensity_sigma,), (self.depth_noise_scale,))
 
+    def pack(self) -> dict[str, Any]:
+        """Return arrays and plain values, the same object each time."""
+        return self._packed
+
     @cached_property
-    def packed(self) -> dict[str, Any]:
-        """Arrays and plain values, one and the same object each time."""
+    def _packed(self) -> dict[str, Any]:
         kept = {field.name: getattr(self, field.name) for field in fields(self)}
         return {**kept, "camera": asdict(self.camera)}
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
-        """The inverse of `packed`. A record of version 0.1 says `segment` for `submap`."""
+        """The inverse of `pack`. A record of version 0.1 says `segment` for `submap`."""
         values = {**kept, "camera": Camera.of(kept["camera"])}
         if "segment" in values:
             values["submap"] = values.pop("segment")

@@ -76,9 +76,12 @@ class ReferenceKeyframe:
             self.__dict__["_features"] = detect(self.view, config)
         return self.__dict__["_features"]
 
+    def pack(self) -> dict[str, Any]:
+        """Return arrays and plain values, the same object each time."""
+        return self._packed
+
     @cached_property
-    def packed(self) -> dict[str, Any]:
-        """Arrays and plain values, one and the same object each time."""
+    def _packed(self) -> dict[str, Any]:
         view, features = self.view, self.stored_features
         return {
             "gray": view.gray,
@@ -95,7 +98,7 @@ class ReferenceKeyframe:
 
     @staticmethod
     def unpack(kept: dict[str, Any], config: PyramidConfig) -> "ReferenceKeyframe":
-        """The inverse of `packed`, under the same configuration."""
+        """The inverse of `pack`, under the same configuration."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
         return ReferenceKeyframe(

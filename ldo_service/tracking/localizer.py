@@ -54,8 +54,7 @@ class MapFix:
         since = 0 if is_confirmed else config.look_every - config.confirm_after
         return replace(self, T_map_odom=T_map_odom, pending_match=look, frames_since_search=since)
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """The fix in arrays and plain values."""
         return asdict(self)
 
@@ -129,7 +128,7 @@ class Localizer(Odometry):
 
     def snapshot(self) -> dict[str, Any]:
         """Return all that the next frames depend on; see `Odometry.snapshot`."""
-        return {**super().snapshot(), "fix": self._fix.packed}
+        return {**super().snapshot(), "fix": self._fix.pack()}
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:
         """Continue from a snapshot; see `Odometry.restore`."""

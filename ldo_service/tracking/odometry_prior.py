@@ -141,8 +141,7 @@ class OdometryPriorBuffer:
         base = self.poses[bisect_left(self.poses, earliest_ns, key=attrgetter("stamp_ns"))]
         return None if base is newest else interpolated(base, newest, stamp_ns)
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Arrays and plain values."""
         return {
             "stamps_ns": [pose.stamp_ns for pose in self.poses],
@@ -181,8 +180,7 @@ class DeadReckoningStart:
         moved = se3.inverse(then.T_prior_camera) @ now.T_prior_camera
         return se3.orthonormalize(self.T_odom_camera @ moved)
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Arrays and plain values."""
         return asdict(self)
 

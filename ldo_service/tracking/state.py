@@ -90,9 +90,9 @@ class OdometryState:
 def pack(state: OdometryState) -> dict[str, Any]:
     """Arrays and plain values. The keyframe is grey image, depth and pose: the rest follows."""
     return {
-        "places": [place.packed for place in state.places.all],
-        "keyframe": None if state.keyframe is None else state.keyframe.packed,
-        "supporting": None if state.mapping_keyframe is None else state.mapping_keyframe.packed,
+        "places": [place.pack() for place in state.places.all],
+        "keyframe": None if state.keyframe is None else state.keyframe.pack(),
+        "supporting": None if state.mapping_keyframe is None else state.mapping_keyframe.pack(),
         "motion": asdict(state.motion),
         "history": asdict(state.history),
         "status": state.status.value,
@@ -101,17 +101,17 @@ def pack(state: OdometryState) -> dict[str, Any]:
         "origin": state.origin.value,
         "trusted": state.trusted_thumbnail,
         "searches": state.relocalization_count,
-        "submaps": state.submaps.packed,
+        "submaps": state.submaps.pack(),
         "T_odom_mapped": state.T_odom_last_mapped,
         "dynamic_mask": _bits(state.dynamic_mask),
         "suspicion": state.motion_evidence
         and (_bits(state.motion_evidence.contradicts), state.motion_evidence.gone),
-        "anchor": state.dead_reckoning_start and state.dead_reckoning_start.packed,
+        "anchor": state.dead_reckoning_start and state.dead_reckoning_start.pack(),
     }
 
 
 def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
-    """The inverse of `packed`, under the same configuration."""
+    """The inverse of `pack`, under the same configuration."""
     keyframe, suspicion, dynamic_mask = (
         values["keyframe"],
         values["suspicion"],

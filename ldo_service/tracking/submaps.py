@@ -169,8 +169,7 @@ class Submaps:
         roots = tuple(older if root == younger else root for root in self.roots)
         return replace(self, roots=roots, pending_match=None)
 
-    @property
-    def packed(self) -> dict[str, Any]:
+    def pack(self) -> dict[str, Any]:
         """Arrays and plain values."""
         return asdict(self)
 

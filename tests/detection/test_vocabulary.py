@@ -60,8 +60,8 @@ def test_what_was_saved_goes_on_as_if_it_had_never_been(names: list[str], cap: i
     vocabulary = Vocabulary(cap)
     indices = [vocabulary.index(name) for name in names]
     assert all(0 <= index < cap for index in indices)
-    restored = Vocabulary.unpack(json.loads(json.dumps(vocabulary.packed)))
-    assert restored.packed == vocabulary.packed
+    restored = Vocabulary.unpack(json.loads(json.dumps(vocabulary.pack())))
+    assert restored.pack() == vocabulary.pack()
     assert [restored.find(name) or OTHER for name in names] == indices
     assert restored.index("brand new") == vocabulary.index("brand new")
 
@@ -77,4 +77,4 @@ def test_what_was_saved_goes_on_as_if_it_had_never_been(names: list[str], cap: i
 )
 def test_names_that_no_vocabulary_has_are_refused(change: dict) -> None:
     with pytest.raises(ValueError, match="name"):
-        Vocabulary.unpack({**Vocabulary().packed, **change})
+        Vocabulary.unpack({**Vocabulary().pack(), **change})

@@ -114,7 +114,7 @@ def places_bytes() -> bytes:
         gray=png(DEPTH.astype(np.uint8)),
         depth=codecs.encode_depth(DEPTH)[1],
     )
-    return encode_state({"places": [place.packed]})
+    return encode_state({"places": [place.pack()]})
 
 
 MAP = bytes_of(lambda path: write_ply(path, ROWS))
@@ -231,5 +231,5 @@ TARGETS = [
     Target(
         "contents of a state", in_folder("actor/contents.msgpack", state_of, STATE), [CONTENTS], ()
     ),
-    Target("vocabulary", vocabulary, [msgspec.msgpack.encode(Vocabulary().packed)], of_vocabulary),
+    Target("vocabulary", vocabulary, [msgspec.msgpack.encode(Vocabulary().pack())], of_vocabulary),
 ]

@@ -77,7 +77,7 @@ def test_a_region_whose_boxes_have_no_vote_is_as_sure_as_the_labeller_is() -> No
 @pytest.mark.parametrize("is_heard", [True, False])
 def test_who_is_not_heard_changes_nothing_about_boxes(is_heard: bool) -> None:
     naming = OpenVocabularyLabeling.unpack(
-        asked_about(region(kind="standing")).packed, is_heard=is_heard
+        asked_about(region(kind="standing")).pack(), is_heard=is_heard
     )
     naming.apply_label_result(
         0, 3, RegionLabelResult("cushion", 0.9), vocabulary := Vocabulary(256)
@@ -108,9 +108,9 @@ def asked_about(
     unboxed = replace(region, label="", score=0.0)
     for one in (unboxed, *[region] * boxes)[: None if is_remembered else 0]:
         regions.observe_keyframe(3, [one], color, depth_m, camera, {3: np.eye(4)})
-    asked = [0, 3, region.box_px, *PART.packed, region.label, region.score, region.kind]
-    naming = OpenVocabularyLabeling.unpack({"regions": regions.packed, "open": [asked]})
-    assert naming.packed["open"][0][-3:] == [region.label, region.score, region.kind]
+    asked = [0, 3, region.box_px, *PART.pack(), region.label, region.score, region.kind]
+    naming = OpenVocabularyLabeling.unpack({"regions": regions.pack(), "open": [asked]})
+    assert naming.pack()["open"][0][-3:] == [region.label, region.score, region.kind]
     return naming
 
 
@@ -155,7 +155,7 @@ def test_what_is_no_object_is_no_name_and_what_is_said_unsurely_neither(
     naming = asked_about(RegionProposal(BOX, PART))
     claims = naming.apply_label_result(0, 3, answer, Vocabulary(256))
     assert (claims is not None) == bool(known)
-    (row,) = naming.packed["regions"]["regions"]
+    (row,) = naming.pack()["regions"]["regions"]
     assert tuple(name for name, *_ in row["votes"]) == known
 
 
@@ -167,10 +167,10 @@ def test_an_unsure_answer_takes_no_name_away_and_that_it_is_no_object_does(
     second: RegionLabelResult, is_named: bool
 ) -> None:
     naming = asked_about(RegionProposal(BOX, PART))
-    asked, vocabulary = naming.packed["open"], Vocabulary(256)
+    asked, vocabulary = naming.pack()["open"], Vocabulary(256)
     naming.apply_label_result(0, 3, RegionLabelResult("clock", 0.5), vocabulary)
-    naming = OpenVocabularyLabeling.unpack({**naming.packed, "open": asked})
+    naming = OpenVocabularyLabeling.unpack({**naming.pack(), "open": asked})
     naming.apply_label_result(0, 3, second, vocabulary)
-    (row,) = naming.packed["regions"]["regions"]
+    (row,) = naming.pack()["regions"]["regions"]
     label, _, others = row["answer"]
     assert (label == "clock", len(others)) == (is_named, 0)

@@ -369,7 +369,7 @@ def test_what_has_no_depth_is_left_out() -> None:
 def test_a_state_is_plain_and_goes_on_where_it_was() -> None:
     walk = Walk()
     walk.see(thing(label="cup", score=0.5), thing(left=110))
-    packed = decode_state(encode_state(walk.regions.packed))
+    packed = decode_state(encode_state(walk.regions.pack()))
     successor = Walk()
     successor.regions = RegionTracker.unpack(packed, CONFIG)
     successor.T_map_keyframe = dict(walk.T_map_keyframe)

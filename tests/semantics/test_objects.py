@@ -97,10 +97,10 @@ def test_the_same_keyframes_give_the_same_bits_also_after_a_restart() -> None:
     way = poses(10)
     told = list(whole.walk(THINGS, way))
     also = list(halves.walk(THINGS, way[:5]))
-    halves.objects = Objects.unpack(halves.objects.packed)
+    halves.objects = Objects.unpack(halves.objects.pack())
     also += list(halves.walk(THINGS, way[5:]))
     for name in ("landmarks", "counts"):
-        np.testing.assert_array_equal(whole.objects.packed[name], halves.objects.packed[name])
+        np.testing.assert_array_equal(whole.objects.pack()[name], halves.objects.pack()[name])
     for one, other in zip(told, also, strict=True):
         assert (one.born, one.merged, one.retired) == (other.born, other.merged, other.retired)
         for a, b in zip(one.observations, other.observations, strict=True):
@@ -109,7 +109,7 @@ def test_the_same_keyframes_give_the_same_bits_also_after_a_restart() -> None:
 
 
 def test_state_of_another_version_is_refused() -> None:
-    packed = Objects().packed
+    packed = Objects().pack()
     with pytest.raises(ValueError, match="not of this version"):
         Objects.unpack({**packed, "landmarks": np.zeros((1, 8), np.uint8)})
 

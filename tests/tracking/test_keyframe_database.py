@@ -49,7 +49,7 @@ def test_a_place_is_small_and_survives_packing_bit_for_bit(make_room) -> None:
     place = place_at(room, np.eye(4))
     full = 640 * 480 * 5  # grey level and depth
     assert place.nbytes < full / 5
-    again = KeyframeRecord.unpack(place.packed)
+    again = KeyframeRecord.unpack(place.pack())
     assert again.keyframe(PyramidConfig()).view.gray.tobytes() == (
         place.keyframe(PyramidConfig()).view.gray.tobytes()
     )

@@ -283,13 +283,13 @@ def test_a_fast_camera_is_followed_by_a_prior(room, make_walk) -> None:
 # --- state ----------------------------------------------------------------------------------------
 def test_prior_and_anchor_come_back_bit_for_bit_from_disk() -> None:
     prior = prior_of([0, 100 * MS], [IDENTITY, se3.exp(FORWARD)])
-    again = OdometryPriorBuffer.unpack(decode_state(encode_state(prior.packed)))
-    assert encode_state(again.packed) == encode_state(prior.packed)
+    again = OdometryPriorBuffer.unpack(decode_state(encode_state(prior.pack())))
+    assert encode_state(again.pack()) == encode_state(prior.pack())
     reading = prior.at(50 * MS, IDENTITY, CONFIG)
     assert reading is not None
     anchor = DeadReckoningStart(se3.exp(FORWARD), reading)
-    kept = DeadReckoningStart.unpack(decode_state(encode_state(anchor.packed)))
-    assert encode_state(kept.packed) == encode_state(anchor.packed)
+    kept = DeadReckoningStart.unpack(decode_state(encode_state(anchor.pack())))
+    assert encode_state(kept.pack()) == encode_state(anchor.pack())
 
 
 def test_a_successor_that_begins_while_covered_resumes_bit_for_bit(covered: Covered) -> None:

@@ -115,7 +115,7 @@ def test_joined_submaps_share_the_oldest_as_their_root() -> None:
     "submaps", [Submaps(), begun(3).with_search_result(look(), CONFIG), begun(2).with_merge(0, 1)]
 )
 def test_submaps_survive_packing(submaps: Submaps) -> None:
-    again = Submaps.unpack(submaps.packed)
+    again = Submaps.unpack(submaps.pack())
     assert again.roots == submaps.roots
     assert (again.pending_match is None) == (submaps.pending_match is None)
     if again.pending_match is not None:
