@@ -83,7 +83,7 @@ class DriftingOdometry(Odometry):
             self._told[keyframe.id] = self._T_drifted
             told = TrackedFrame(
                 right.status,
-                right.method,
+                right.pose_source,
                 self._T_drifted,
                 T_reference_camera,
                 None if reference == keyframe.id else reference,
