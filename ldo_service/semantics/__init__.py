@@ -1,14 +1,14 @@
-"""Labels of the Gaussians, and the objects among them.
+"""Labels of the Gaussians and objects of the map.
 
 gaussian_labels    label distributions of the Gaussians over time, smoothed among neighbors
-label_assignment   which Gaussians a region shows
-semantic_fusion    a keyframe's regions, fused into the labels of the map
+label_assignment   assignment of Gaussians to the regions of a keyframe
+semantic_fusion    fusion of a keyframe's regions into the labels of the map
 semantic_map       labels and objects of a map while it grows
 distributions      label distributions: means, divergences, entropies
-object_landmarks   objects: samples of Gaussians, and what follows from them
-data_association   which object a region of a keyframe shows
-observations       what a keyframe adds to an object
-objects            how objects are proposed, confirmed, merged and removed
-semantics_file     labels and objects in a file
-text_search        objects that match a text
+object_landmarks   table of objects: a sample of Gaussians each, and derived values
+data_association   association of the regions of a keyframe with objects
+observations       update of an object from a keyframe
+objects            creation, confirmation, merge and removal of objects
+semantics_file     file of labels and objects
+text_search        search for objects by text
 """

@@ -1,12 +1,13 @@
-"""Which landmark of the map is which region of a keyframe (paper, III.C).
+"""Data association between the regions of a keyframe and object landmarks (paper, III.C).
 
-The box of a landmark is that of its members in the image, where measured depth does not hide them:
-what a detector would draw about what it can see of it. A landmark and a region may be the same if
+The predicted box of a landmark contains its members that the measured depth does not occlude. It is
+the box that a detector would draw around the visible part. A landmark and a region may be the same
+object if
 
     IoU of their boxes >= 0.4,  they share a class,  and their depths meet;
 
-of all ways to pair them the one with the largest sum of IoU is taken. Before, regions that show a
-part of what another shows are made one with it.
+the assignment with the largest sum of IoU is used. Before that, a region that shows a part of
+another region's object is merged into that region.
 """
 
 from dataclasses import dataclass, replace
@@ -21,30 +22,35 @@ from ldo_service.geometry.boxes import areas, intersections, ious
 from .distributions import common_mass, mean_distributions
 from .object_landmarks import MEMBERS, NO_MEMBER, reliable_members, rows_of, shuffled, trimmed
 
-PROBES = 128  # members that are projected: the first when shuffled are a sample of the sample
+PROBES = 128  # Members that are projected. The first in shuffled order are a uniform subsample.
 
 
 @dataclass(frozen=True, slots=True)
 class AssociationConfig:
-    min_iou: float = 0.4  # of the boxes (III.C)
-    min_shared: float = 0.3  # of the classes: a cup on a table is in its box, and no table
-    max_depth_gap_m: float = 0.1  # between their depths, and of members hidden (delta_z, III.A)
-    min_gaussians: int = 8  # of a region: with fewer nothing is known of where it is
-    max_regions: int = 64  # per keyframe, those with the most Gaussians: COCO images have 7
-    # Detectors box a plant, its crown and its pot. The share of a box in a larger one of its class,
-    # at the same depth, to show a part of what that shows; above 1 none does:
+    """Settings of the data association."""
+
+    min_iou: float = 0.4  # Minimum IoU of the boxes (III.C).
+    # Minimum `common_mass`: a cup lies in the box of its table, but is no table.
+    min_shared: float = 0.3
+    # Maximum gap between depth ranges; tolerance of the occlusion test (delta_z, III.A).
+    max_depth_gap_m: float = 0.1
+    min_gaussians: int = 8  # Minimum Gaussians of a region; with fewer, its position is unknown.
+    # Maximum regions per keyframe, those with the most Gaussians; COCO images have 7.
+    max_regions: int = 64
+    # Detectors draw separate boxes around a plant, its crown and its pot. A box is a part of a
+    # larger one of its class and depth if this fraction of it lies inside; above 1, none is.
     part_inside: float = 0.9
 
     def __post_init__(self) -> None:
         if not (0 < self.min_iou <= 1 and 0 <= self.min_shared <= 1):
             raise ConfigError(
                 named(self, "min_iou", "min_shared")
-                + ": min_iou must be in (0, 1], min_shared in 0..1."
+                + ": min_iou must be in (0, 1], min_shared in [0, 1]."
             )
         if self.max_depth_gap_m <= 0 or min(self.min_gaussians, self.max_regions) < 1:
             raise ConfigError(
                 named(self, "max_depth_gap_m", "min_gaussians", "max_regions")
-                + ": max_depth_gap_m positive, counts at least 1."
+                + ": max_depth_gap_m must be positive, the counts at least 1."
             )
         if self.part_inside <= 0:
             raise ConfigError(f"part_inside={self.part_inside:g} must be positive.")
@@ -52,14 +58,21 @@ class AssociationConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MapView:
-    """The map, and what a keyframe shows of it.
+    """The map and the part of it that a keyframe shows.
 
-    rows [N, 16], labels [N, 32], ids [N] int64 ascending, anchors [N] int32: of the map
-    indices      [V] uint32, ascending: rows of those that made the image
-    regions      [V] int32, region of each, see `Assigned`; negative: none
-    boxes        [M, 4] of the regions: x0 y0 x1 y1, px
-    classes      [M, 2] what a detector and a labeller say is in them; -1: it says nothing
-    depth_m      [H, W] float32, as it was measured
+    Attributes:
+        keyframe: Id of the keyframe.
+        camera: Intrinsics of the keyframe.
+        T_map_camera: Pose of the camera, [4, 4].
+        rows: Gaussians of the map, [N, 16].
+        labels: Label rows of the Gaussians, [N, 32].
+        ids: Ids of the Gaussians, [N] int64, ascending.
+        anchors: Anchor keyframes of the Gaussians, [N] int32.
+        indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.
+        regions: Region of each of them, [V] int32, see `Assignment`; negative if it has none.
+        boxes: Boxes of the regions, [M, 4], x0 y0 x1 y1, pixels.
+        classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
+        depth_m: Depth of the keyframe, [H, W] float32, meters.
     """
 
     keyframe: int
@@ -78,27 +91,39 @@ class MapView:
     def __post_init__(self) -> None:
         n, v, size = len(self.rows), len(self.indices), (self.camera.height, self.camera.width)
         if not len(self.labels) == len(self.ids) == len(self.anchors) == n:
-            raise ValueError(f"labels, ids and anchors must be those of the {n} rows.")
+            raise ValueError(f"labels, ids and anchors must have the {n} rows of the map.")
         if len(self.regions) != v or (v and not self.indices[-1] < n):
-            raise ValueError(f"{len(self.regions)} regions of {v} Gaussians among {n} rows.")
+            raise ValueError(
+                f"{len(self.regions)} regions for {v} Gaussians: must be one for each, and the "
+                f"indices below {n}, the rows of the map."
+            )
         if v and self.regions.max() >= len(self.boxes):
-            raise ValueError(f"region {self.regions.max()} has none of {len(self.boxes)} boxes.")
+            raise ValueError(
+                f"region {self.regions.max()} must be below {len(self.boxes)}, the number of boxes."
+            )
         if len(self.classes) != len(self.boxes):
-            raise ValueError(f"{len(self.classes)} classes of {len(self.boxes)} regions.")
+            raise ValueError(
+                f"{len(self.classes)} classes must be one for each of {len(self.boxes)} regions."
+            )
         if self.depth_m.shape != size:
-            raise ValueError(f"depth has shape {self.depth_m.shape}, its camera {size}.")
+            raise ValueError(
+                f"depth has shape {self.depth_m.shape}, must have that of its camera, {size}."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionStatistics:
-    """R regions of a keyframe with enough Gaussians.
+    """Statistics of the R regions of a keyframe that have enough Gaussians.
 
-    numbers       [R] among those of the keyframe, ascending
-    boxes         [R, 4] px
-    members       [R, 256] ids of a sample of their Gaussians, as `landmarks` keeps them
-    p_map         [R, 256, 3] where they are
-    distributions [R, C] means of theirs, by opacity
-    near_m, far_m [R] depths they lie between
+    Attributes:
+        numbers: Numbers of the regions within the keyframe, [R], ascending.
+        boxes: Boxes of the regions, [R, 4], pixels.
+        members: Ids of a sample of their Gaussians, [R, 256], in the order of `shuffled`; NO_MEMBER
+            beyond.
+        p_map: Positions of these Gaussians in the map frame, [R, 256, 3], meters.
+        distributions: Means of their label distributions, [R, C], weighted by opacity.
+        near_m: Near end of the depth range of these Gaussians, [R], meters.
+        far_m: Far end of that range, [R], meters.
     """
 
     numbers: np.ndarray
@@ -113,7 +138,7 @@ class RegionStatistics:
 def compute_region_statistics(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> RegionStatistics:
-    """What the regions of a keyframe are made of."""
+    """Compute the statistics of the regions of a keyframe."""
     hit = np.flatnonzero(view.regions >= 0)
     counts = np.bincount(view.regions[hit], minlength=len(view.boxes))
     numbers = np.sort(np.argsort(-counts, kind="stable")[: config.max_regions])
@@ -136,8 +161,11 @@ def compute_region_statistics(
 
 
 def merge_parts(view: MapView, regions: RegionStatistics, config: AssociationConfig) -> MapView:
-    """A view in which regions that are parts of another belong to it. That one may have lost all
-    of its Gaussians to them: then it is where its largest part is."""
+    """Return a view in which regions that are parts of another region belong to it.
+
+    The containing region may have lost all of its Gaussians to its parts. It then has the depth of
+    its largest part.
+    """
     near_m = np.full(len(view.boxes), np.inf)
     far_m = -near_m
     near_m[regions.numbers], far_m[regions.numbers] = regions.near_m, regions.far_m
@@ -158,9 +186,21 @@ def find_containing_regions(
     far_m: np.ndarray,
     config: AssociationConfig,
 ) -> np.ndarray:
-    """[M] which region shows all of what each of M shows a part of; itself where none does. They
-    share a class, their depths meet, and one box lies in the other, the largest of all that it
-    lies in. Boxes [M, 4], classes [M, 2]; depths [M], infinite where nothing is known.
+    """Return for each of M regions the region that contains all of its object.
+
+    That is the region itself where no other contains it. A region contains another if they share a
+    class, their depths meet, and the other box lies in its box. Of several such regions, the
+    largest is used.
+
+    Args:
+        boxes: Boxes of the regions, [M, 4], pixels.
+        classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
+        near_m: Near ends of their depth ranges, [M], meters; infinite where unknown.
+        far_m: Far ends of their depth ranges, [M], meters; infinite where unknown.
+        config: Settings of the data association.
+
+    Returns:
+        Region numbers, [M].
 
     >>> plant, crown, pot = [0, 0, 9, 20], [0, 0, 9, 12], [2, 12, 7, 20]
     >>> at_m = np.full(3, 2.0)
@@ -181,7 +221,7 @@ def find_containing_regions(
             near_m[k], far_m[k] = near_m[parts[0]], far_m[parts[0]]
     is_part &= depth_gaps_m(near_m, far_m, near_m, far_m) <= config.max_depth_gap_m
     whole = np.arange(len(area))
-    for part in by_size:  # so that a part of a part is one of the whole
+    for part in by_size:  # Large boxes first: a part of a part joins the whole.
         around = np.flatnonzero(is_part[part])
         if len(around):
             whole[part] = whole[around[np.argmax(area[around])]]
@@ -189,8 +229,12 @@ def find_containing_regions(
 
 
 def share_a_class(classes: np.ndarray) -> np.ndarray:
-    """[M, M] bool: which of M things may be of one class, whoever says it of either; [M, 2] what a
-    detector and a labeller say, -1 where they say nothing.
+    """Return which pairs of M regions may be of one class, [M, M] bool.
+
+    Two regions share a class if any label of one equals any label of the other.
+
+    Args:
+        classes: Labels by the detector and by the labeller, [M, 2]; -1 if missing.
 
     >>> share_a_class(np.array([[3, -1], [-1, 3], [-1, -1]])).astype(int)
     array([[1, 1, 0],
@@ -202,9 +246,9 @@ def share_a_class(classes: np.ndarray) -> np.ndarray:
 
 
 def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Rows [R, 256] of the Gaussians of each region that come first when shuffled; -1 beyond.
+    """Return the rows of each region's first 256 Gaussians in shuffled order, [R, 256]; -1 beyond.
 
-    Of regions with more than 512 only that share is sorted that has some 512 of them.
+    In regions with more than 512 Gaussians, only a fraction that contains about 512 is sorted.
     """
     ordinal = np.full(len(counts), -1)
     ordinal[numbers] = np.arange(len(numbers))
@@ -227,14 +271,17 @@ def _sampled(view: MapView, hit: np.ndarray, counts: np.ndarray, numbers: np.nda
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PredictedBoxes:
-    """K landmarks as a keyframe should show them.
+    """Predicted appearance of K landmarks in a keyframe.
 
-    boxes         [K, 4] px, of what nothing hides, or of where that should be; empty ones
-                  (x0 > x1) where all is hidden
-    shown         [K] share of the believed members that are in the image where depth was measured
-    through       [K] share of them that depth was measured far behind of: they are not there
-    near_m, far_m [K] depths they lie between
-    rows          [K, 256] of the members, -1 of those that are not awake
+    Attributes:
+        boxes: Boxes of the visible members, [K, 4], pixels. If no member is visible, the box of the
+            members in front of measured depth; empty (x0 > x1) if all are occluded or out of view.
+        shown: Fraction of the reliable members that are in the image where depth was measured, [K].
+        through: Fraction of the reliable members that the camera sees through, [K]: the measured
+            depth lies far behind them, so they do not exist any more.
+        near_m: Near end of the depth range, [K], meters.
+        far_m: Far end of the depth range, [K], meters.
+        rows: Rows of the members in the map, [K, 256]; -1 where a member is not resident.
     """
 
     boxes: np.ndarray
@@ -248,7 +295,7 @@ class PredictedBoxes:
 def predict_boxes(
     table: np.ndarray, view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> PredictedBoxes:
-    """How landmarks [K] appear; of one none of whose members is awake, how its centroid does."""
+    """Predict the appearance of landmarks [K]; without resident members, that of the centroid."""
     where = rows_of(table["members"], view.ids)
     there = ((where >= 0) & reliable_members(table))[:, :PROBES]
     p_map = view.rows[np.maximum(where[:, :PROBES], 0), :3].astype(float)
@@ -275,7 +322,7 @@ def predict_boxes(
 
 
 def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels [..., 2] of points [..., 3], and the depth [...] there; 0 outside the image."""
+    """Return pixels [..., 2] of points [..., 3] and the depth [...] there; 0 outside the image."""
     z = np.maximum(p_camera[..., 2:], 1e-6)
     px = view.camera.project(np.concatenate([p_camera[..., :2], z], axis=-1))
     size = view.camera.width, view.camera.height
@@ -287,14 +334,19 @@ def _measured(p_camera: np.ndarray, view: MapView) -> tuple[np.ndarray, np.ndarr
 def depth_gaps_m(
     near_m: np.ndarray, far_m: np.ndarray, others_near_m: np.ndarray, others_far_m: np.ndarray
 ) -> np.ndarray:
-    """[K, R] between intervals [K] and [R]; negative where they overlap."""
+    """Return the gaps [K, R] between depth ranges [K] and [R]; negative where they overlap."""
     return np.maximum(near_m[:, None], others_near_m) - np.minimum(far_m[:, None], others_far_m)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AssociationCosts:
-    """K landmarks and R regions: iou [K, R], and which may be the same, [K, R] bool: their boxes
-    overlap, their depths meet, and they share a class."""
+    """Association of K landmarks with R regions.
+
+    Attributes:
+        iou: IoU of predicted box and region box, [K, R].
+        allowed: Pairs that may be the same object, [K, R] bool: their boxes overlap, their depths
+            meet, and they share a class.
+    """
 
     iou: np.ndarray
     allowed: np.ndarray
@@ -306,7 +358,7 @@ def association_costs(
     regions: RegionStatistics,
     config: AssociationConfig,
 ) -> AssociationCosts:
-    """Of landmarks with distributions [K, C]."""
+    """Compute the association costs of landmarks with label distributions [K, C]."""
     iou = ious(looks.boxes, regions.boxes)
     gap_m = depth_gaps_m(looks.near_m, looks.far_m, regions.near_m, regions.far_m)
     allowed = (iou > 0) & (gap_m <= config.max_depth_gap_m)
@@ -318,8 +370,10 @@ def association_costs(
 def associate(
     iou: np.ndarray, allowed: np.ndarray, min_iou: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of rows and columns of iou [K, R], rows ascending: of those that are allowed and at
-    least min_iou the ones with the largest sum. The same arrays give the same pairs."""
+    """Return the pairs of rows and columns of iou [K, R] with the largest sum, rows ascending.
+
+    A pair must be allowed and have an IoU of at least min_iou. The same arrays give the same pairs.
+    """
     gain = np.where(allowed & (iou >= min_iou), iou, 0)
     k, r = linear_sum_assignment(gain, maximize=True)
     paired = gain[k, r] > 0

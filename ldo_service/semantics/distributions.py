@@ -1,25 +1,33 @@
-"""What things are, as distributions over the labels of a vocabulary: dense [..., C], C = 256.
+"""Distributions over the labels of a vocabulary: dense [..., C] with C = 256, or sparse.
 
-Kept and sent they are sparse: the eight heaviest labels; what the others had is on `other`.
+Distributions are stored and published in sparse form: the eight heaviest labels. The mass of all
+other labels counts as `other`.
 """
 
 import numpy as np
 
 from .gaussian_labels import BACKGROUND, MAX_LABELS, OTHER, background, fields
 
-KEPT = 8  # labels of a sparse distribution: the five of a Gaussian, and those of its neighbours
-FLOOR = 1e-6  # of what a distribution holds impossible, so that divergences are finite
+KEPT = 8  # Labels of a sparse distribution: the five of a Gaussian and those of its neighbors.
+FLOOR = 1e-6  # Minimum probability in a divergence, so that divergences are finite.
 
 
 def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """[K, C] float64: means of the distributions of K groups of M Gaussians.
+    """Return the mean label distributions [K, C] float64 of K groups of M Gaussians.
 
         p_k = sum_m w_km p_km / sum_m w_km
 
-    labels [K, M, 32] uint8, rows of `labels`; weights [K, M], 0 where a group has fewer.
-    All on background where all weights are 0. Paper, III.C (landmarks).
+    Paper, III.C (landmarks).
 
-    One that is wholly label 2 and weighs 3, and one that is half of it and weighs 1:
+    Args:
+        labels: Label rows of the Gaussians, [K, M, 32] uint8.
+        weights: Weights of the Gaussians, [K, M]; 0 where a group has fewer than M.
+
+    Returns:
+        The means. A group has all of its mass on background if its weights are all 0.
+
+    Example: the first Gaussian has all its mass on label 2 and weight 3. The second has half of its
+    mass on label 2 and weight 1.
 
     >>> from ldo_service.semantics.gaussian_labels import new_labels
     >>> labels = new_labels(2)
@@ -38,7 +46,7 @@ def mean_distributions(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def normalized(p: np.ndarray) -> np.ndarray:
-    """Rows that sum to one; all on background where there is nothing."""
+    """Return rows that sum to one; an empty row gets all of its mass on background."""
     total = p.sum(axis=-1, keepdims=True)
     nothing = np.zeros(p.shape[-1])
     nothing[BACKGROUND] = 1
@@ -46,14 +54,17 @@ def normalized(p: np.ndarray) -> np.ndarray:
 
 
 def sparse(p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels [..., 8] uint8 and weights [..., 8] float32 of the heaviest, heaviest first; of equals
-    the first. What is missing from one belongs to `other`."""
+    """Return the heaviest labels [..., 8] uint8 and their weights [..., 8] float32.
+
+    The heaviest label comes first; of equal ones, the lower number. Mass missing from a sum of one
+    belongs to `other`.
+    """
     order = np.argsort(-p, axis=-1, kind="stable")[..., :KEPT]
     return order.astype(np.uint8), np.take_along_axis(p, order, axis=-1).astype(np.float32)
 
 
 def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """[..., C] float64 of sparse ones, with what they miss on `other`."""
+    """Return dense distributions [..., C] float64 of sparse ones; missing mass goes to `other`."""
     out = np.zeros((*labels.shape[:-1], MAX_LABELS))
     np.put_along_axis(out, labels.astype(np.int64), weights.astype(float), axis=-1)
     out[..., OTHER] += np.maximum(1 - weights.sum(axis=-1, dtype=float), 0)
@@ -61,7 +72,9 @@ def dense(labels: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[...], KL(p || q) = sum_c p_c log(p_c / q_c) in nats, of dense [..., C]; q_c at least 1e-6.
+    """Return KL(p || q) = sum_c p_c log(p_c / q_c) in nats, [...], of dense [..., C].
+
+    q_c is clamped to at least 1e-6.
 
     >>> couch, both = np.array([0.0, 0.0, 1.0]), np.array([0.1, 0.1, 0.8])
     >>> round(float(divergence(couch, both)), 4)  # log(1 / 0.8)
@@ -74,13 +87,15 @@ def divergence(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def entropy(p: np.ndarray) -> np.ndarray:
-    """[...], H = -sum_c p_c log p_c in nats (III.C), of dense [..., C]."""
+    """Return the entropy H = -sum_c p_c log p_c in nats (III.C), [...], of dense [..., C]."""
     return -np.sum(p * np.log(np.where(p > 0, p, 1)), axis=-1)
 
 
 def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """[...], how much two distributions have in common, 0..1, background apart:
-    sum_c min(p_c, q_c) over the smaller mass that is not background."""
+    """Return the common mass of two distributions without background, [...], 0..1.
+
+    It is sum_c min(p_c, q_c), divided by the smaller of the two masses that are not background.
+    """
     p, q = p.copy(), q.copy()
     p[..., BACKGROUND] = q[..., BACKGROUND] = 0
     least = np.minimum(p.sum(axis=-1), q.sum(axis=-1))
@@ -89,7 +104,7 @@ def common_mass(p: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def names(p: np.ndarray) -> np.ndarray:
-    """[...] uint8, the heaviest label but background."""
+    """Return the heaviest label other than background, [...] uint8."""
     p = p.copy()
     p[..., BACKGROUND] = -1
     return np.argmax(p, axis=-1).astype(np.uint8)

@@ -9,16 +9,17 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.gaussians.model import new_labels as new_labels
 from ldo_service.kernels import _labels
 
-BACKGROUND, OTHER = 0, 1  # what every vocabulary begins with
+BACKGROUND, OTHER = 0, 1  # The first two labels of every vocabulary.
 MAX_LABELS = 256  # C_max (III.B)
 SLOTS = 5  # L (III.B)
-NOT_SEEN, MISS = -2, -1  # in place of a label that was observed
+NOT_SEEN, MISS = -2, -1  # Values in place of an observed label.
 ROW = np.dtype(
     [
         ("weights", "<f4", SLOTS),
-        ("evidence", "<f4"),  # sum of the weights of all observations, those of long ago faded
-        ("extent_mm", "<u2"),  # of the object that the Gaussian was last seen as a part of
-        ("misses", "u1"),  # keyframes since then that expected it to be one
+        ("evidence", "<f4"),  # Sum of the weights of all observations, decayed with age.
+        # Size of the object that the Gaussian was last observed as a part of.
+        ("extent_mm", "<u2"),
+        ("misses", "u1"),  # Keyframes since then that expected it to be part of one.
         ("ids", "u1", SLOTS),
     ]
 )
@@ -26,24 +27,29 @@ ROW = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class ConsistencyConfig:
-    sigma_m: float = 0.05  # sigma_cons (III.A)
-    radius_m: float = 0.15  # three sigma: beyond, a weight is below 2e-4
-    rate: float = 0.1  # of the step, 0..1: 1 - lambda (III.A), as of one observation
+    """Settings of the label smoothing among neighbors."""
+
+    sigma_m: float = 0.05  # sigma_cons (III.A).
+    radius_m: float = 0.15  # Three sigma; beyond it, weights are below 2e-4.
+    rate: float = 0.1  # Step size, 0..1: 1 - lambda (III.A), that of one observation.
 
     def __post_init__(self) -> None:
         if not (self.sigma_m > 0 and self.radius_m > 0 and 0 <= self.rate <= 1):
             raise ConfigError(
                 named(self, "sigma_m", "radius_m", "rate")
-                + ": lengths must be positive, rate in 0..1."
+                + ": lengths must be positive, rate in [0, 1]."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class Disagreement:
-    """Before the step, summed over the Gaussians: with k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2)
+    """Label disagreement before the smoothing step, summed over the Gaussians.
 
-    literal   sum k_ij [s_i != s_j], as printed; it has no gradient
-    expected  sum k_ij (1 - p_i . p_j), which the step makes smaller
+    With k_ij = w_ij exp(-|mu_i - mu_j|^2 / sigma^2):
+
+    Attributes:
+        literal: sum k_ij [s_i != s_j], as the paper prints it; it has no gradient.
+        expected: sum k_ij (1 - p_i . p_j), which the step reduces.
     """
 
     literal: float
@@ -58,19 +64,31 @@ def smooth_labels(
     *,
     threads: int = 1,
 ) -> Disagreement:
-    """A step of the Gaussians `indices` [V] (uint32, ascending) towards their neighbours among
-    them, in place.
+    """Smooth the labels of the Gaussians `indices` towards their neighbors among them, in place.
 
         p_i <- (1 - rate K_i) p_i + rate sum_j k_ij p_j,  K_i = sum_j k_ij,  w_ij = 1 / |N_i|
 
-    which is along the gradient of the expected disagreement, sum_j k_ij p_j, and keeps a
-    distribution. Neighbours: of the first eight Gaussians in the same voxel of two sigma, and the
-    first ones of the voxels around it, sixteen together, those within radius_m.
+    The step follows the gradient of the expected disagreement, sum_j k_ij p_j, and keeps a
+    distribution. Candidate neighbors are the first eight Gaussians in the same voxel (two sigma
+    wide) and the first ones of the surrounding voxels, sixteen in total. Those within radius_m are
+    neighbors. Every Gaussian reads the labels from before the step. The result is bitwise equal for
+    any number of threads.
 
-    rows [N, 16] of the map; labels [N, 32]. All read what was before the step. Raises ValueError
-    for arrays that do not fit. Bitwise equal for any number of threads.
+    Args:
+        rows: Gaussians of the map, [N, 16].
+        labels: Label rows of the Gaussians, [N, 32].
+        indices: Rows to smooth, [V] uint32, ascending.
+        config: Settings of the smoothing.
+        threads: Number of threads.
 
-    Two Gaussians 5 cm apart, a chair (2) and a wall: k = exp(-1), p = 0.1 k = 0.037 apart.
+    Returns:
+        The disagreement before the step.
+
+    Raises:
+        ValueError: If the shapes or types of the arrays do not fit.
+
+    Example: two Gaussians are 5 cm apart, one a chair (2), one background. k = exp(-1), and each
+    moves by p = 0.1 k = 0.037.
 
     >>> from .gaussian_labels import distribution, fields, new_labels
     >>> rows, labels = np.zeros((2, 16), np.float32), new_labels(2)
@@ -88,17 +106,22 @@ def smooth_labels(
 
 @dataclass(frozen=True, slots=True)
 class LabelConfig:
-    """Constants of `corrected` were given by a study with voxels on one floor of a Replica
-    apartment; usual_extent_m and hold_back were chosen on the same frames, with two detectors."""
+    """Settings of the label update with each observation.
+
+    A study with voxels on one floor of a Replica apartment gave the constants of `corrected`.
+    usual_extent_m and hold_back were chosen on the same frames with two detectors.
+    """
 
     ema: Literal["paper", "corrected"] = "corrected"
-    keep: float = 0.9  # lambda (III.A)
-    miss_limit: int = 5  # keyframes, N_miss (III.A), of `paper`
-    # Of `corrected`: a miss is evidence for background, where the detector should have seen it.
-    miss_weight: float = 0.3  # of a detection: its confidence
-    least_px: float = 40.0  # side of an object's box that the detector should see
-    usual_extent_m: float = 0.5  # of an object nobody has seen yet
-    hold_back: float = 1.0  # 0..1, of uncertain observations of settled Gaussians
+    keep: float = 0.9  # Decay of the average per observation: lambda (III.A).
+    # Keyframes of misses in a row that make background: N_miss (III.A), for `paper`.
+    miss_limit: int = 5
+    # A miss with `corrected` is evidence for background if the detector should have seen the
+    # object.
+    miss_weight: float = 0.3  # Weight of a miss; that of a detection is its confidence.
+    least_px: float = 40.0  # Minimum side (pixels) of an object's box for a miss to count.
+    usual_extent_m: float = 0.5  # Assumed size of an object that was not observed yet.
+    hold_back: float = 1.0  # Damping of uncertain observations of settled Gaussians, 0..1.
 
     def __post_init__(self) -> None:
         if self.ema not in ("paper", "corrected"):
@@ -106,24 +129,25 @@ class LabelConfig:
         if not (0 <= self.keep < 1 and 0 <= self.miss_weight <= 1 and 0 <= self.hold_back <= 1):
             raise ConfigError(
                 named(self, "keep", "miss_weight", "hold_back")
-                + ": keep in [0, 1), miss_weight and hold_back in 0..1."
+                + ": keep must be in [0, 1), miss_weight and hold_back in [0, 1]."
             )
         if not (1 <= self.miss_limit <= 255 and self.least_px >= 0 and self.usual_extent_m >= 0):
             raise ConfigError(
                 named(self, "miss_limit", "least_px", "usual_extent_m")
-                + ": miss_limit in 1..255, lengths not negative."
+                + ": miss_limit must be in 1..255, the lengths not negative."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observations:
-    """What a keyframe says of V Gaussians.
+    """Observations of V Gaussians in a keyframe.
 
-    indices     [V] uint32, ascending: their rows
-    labels      [V] int16, or MISS: seen, and in no region; or NOT_SEEN
-    confidences [V] float32, 0..1, of labels
-    extents_m   [V] float32: of a label how large its object is, of a miss how large an object must
-                be to be missed
+    Attributes:
+        indices: Rows of the Gaussians, [V] uint32, ascending.
+        labels: Observed labels, [V] int16; MISS: visible, but in no region; or NOT_SEEN.
+        confidences: Confidences of the labels, [V] float32, 0..1.
+        extents_m: Size of the labelled object, [V] float32, meters. For a miss, the minimum size
+            that an object must have for the miss to count.
     """
 
     indices: np.ndarray
@@ -133,24 +157,33 @@ class Observations:
 
 
 def fields(labels: np.ndarray) -> np.ndarray:
-    """Rows [N, 32] as records [N] of `ROW`, without a copy."""
+    """Return rows [N, 32] as records [N] of `ROW`, without a copy."""
     return labels.view(ROW)[:, 0]
 
 
 def observe(
     labels: np.ndarray, seen: Observations, config: LabelConfig, *, threads: int = 1
 ) -> None:
-    """Fold a keyframe into rows [N, 32], in place.
+    """Fold the observations of a keyframe into label rows [N, 32], in place.
 
-    A label s makes p <- (1 - a) p + a onehot(s). With `paper` a = 1 - keep, so that 0.9 needs seven
-    sightings to flip a label; misses are counted, and miss_limit in a row make background of it.
-    With `corrected` the mean of all observations is weighted as the average fades: with
-    w = confidence, W <- keep W + w, and a = w / W: the first sighting counts whole. A miss is an
-    observation of background with w = miss_weight, if the object it was seen as, or one of
-    usual_extent_m, would appear at least least_px large.
+    An observed label s changes the distribution to p <- (1 - a) p + a onehot(s). With `paper`, a =
+    1 - keep, so that keep = 0.9 needs seven observations to flip a label. Misses are counted, and
+    miss_limit in a row turn a Gaussian into background.
 
-    Uncertain observations of settled Gaussians are held back: the step of `paper`, and w, have the
-    factor 1 - hold_back exp(-2 H) (1 - confidence), with the entropy H of p, once p has a label.
+    With `corrected`, the mean of all observations is weighted, and the weights decay with age. With
+    w = confidence, W <- keep W + w and a = w / W, so that the first observation counts in full. A
+    miss is an observation of background with w = miss_weight. It counts if the last observed
+    object, or one of usual_extent_m, would appear at least least_px large.
+
+    Uncertain observations of settled Gaussians are held back. The step of `paper`, and w, are
+    multiplied by 1 - hold_back exp(-2 H) (1 - confidence), with the entropy H of p, once p has a
+    label.
+
+    The result is bitwise equal for any number of threads. Paper, III.A; ALGORITHMS, Semantics on
+    Gaussians.
+
+    Raises:
+        ValueError: If the shapes or types of the arrays do not fit.
 
     >>> labels, config = new_labels(1), LabelConfig(hold_back=0)
     >>> def see(label, confidence, config):
@@ -166,16 +199,13 @@ def observe(
     >>> see(2, 0.6, LabelConfig(ema="paper", hold_back=0))  # 0.9 p + 0.1
     [0.225, 0.0, 0.464, 0.31]
 
-    Held back, of a Gaussian that is settled, H = 0: 0.5 counts as 0.5 (1 - (1 - 0.5)).
+    A settled Gaussian (H = 0) holds an observation back: 0.5 counts as 0.5 (1 - (1 - 0.5)).
 
     >>> labels = new_labels(1)
-    >>> see(2, 0.6, LabelConfig())  # nothing to hold on to: W = 0.6
+    >>> see(2, 0.6, LabelConfig())  # No label yet, nothing is held back: W = 0.6.
     [0.0, 0.0, 1.0, 0.0]
     >>> see(3, 0.5, LabelConfig())  # w = 0.25, W = 0.54 + 0.25, a = 0.316
     [0.0, 0.0, 0.684, 0.316]
-
-    Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads.
-    Paper, III.A; ALGORITHMS, Semantics on Gaussians.
     """
     _labels.update(
         labels,
@@ -194,8 +224,9 @@ def observe(
 
 
 def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
-    """Take background, and the evidence for it, out of rows `indices` [V] of labels [N, 32], in
-    place: what else they were seen as stays, in proportion.
+    """Remove background and its evidence from rows `indices` [V] of labels [N, 32], in place.
+
+    The other labels keep their proportions.
 
     >>> labels = new_labels(1)
     >>> row = fields(labels)
@@ -212,27 +243,33 @@ def clear_background(labels: np.ndarray, indices: np.ndarray) -> None:
 
 
 def reset_labels(labels: np.ndarray, indices: np.ndarray) -> None:
-    """Make rows `indices` [V] of labels [N, 32] as never seen, in place."""
+    """Reset rows `indices` [V] of labels [N, 32] to never observed, in place."""
     labels[indices] = 0
 
 
 def background(labels: np.ndarray) -> np.ndarray:
-    """[N] float32, the share of background."""
+    """Return the probability of background, [N] float32."""
     return np.maximum(1 - fields(labels)["weights"].sum(axis=1), 0)
 
 
 def top_labels(labels: np.ndarray) -> np.ndarray:
-    """[N] uint8, the likeliest label; background where no other has more."""
+    """Return the likeliest label, [N] uint8; background where no other label is likelier."""
     rows = fields(labels)
     return np.where(rows["weights"][:, 0] > background(labels), rows["ids"][:, 0], BACKGROUND)
 
 
 def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
-    """[N, classes] float32, dense: rows sum to one. Raises ValueError where a label is beyond."""
+    """Return dense distributions, [N, classes] float32; each row sums to one.
+
+    Raises:
+        ValueError: If a label is not below `classes`.
+    """
     rows = fields(labels)
     used = rows["weights"] > 0
     if np.any(rows["ids"][used] >= classes):
-        raise ValueError(f"labels go up to {rows['ids'][used].max()}, beyond {classes} classes.")
+        raise ValueError(
+            f"label {rows['ids'][used].max()} must be below {classes}, the number of classes."
+        )
     out = np.zeros((len(labels), classes), np.float32)
     out[:, BACKGROUND] = background(labels)
     which = np.nonzero(used)
@@ -241,7 +278,7 @@ def distribution(labels: np.ndarray, classes: int = MAX_LABELS) -> np.ndarray:
 
 
 def entropy(labels: np.ndarray) -> np.ndarray:
-    """[N] float32, H = -sum p log p (III.A), in nats.
+    """Return the entropy H = -sum p log p (III.A) in nats, [N] float32.
 
     >>> labels = new_labels(1)
     >>> fields(labels)["weights"][0, 0] = 0.5

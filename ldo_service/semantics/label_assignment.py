@@ -1,4 +1,4 @@
-"""Which region of a keyframe each Gaussian belongs to (paper, III.A).
+"""Assignment of Gaussians to the regions of a keyframe (paper, III.A).
 
 The kernel is `kernels/assignment.hpp`; `tests/reference/assignment.py` implements it in NumPy.
 """
@@ -15,16 +15,18 @@ from ldo_service.geometry import Camera
 from ldo_service.kernels import _labels
 from ldo_service.regions.foreground import Foreground
 
-HIDDEN, UNMATCHED = -2, -1  # in place of a region
+HIDDEN, UNMATCHED = -2, -1  # Values in place of a region.
 
 
 @dataclass(frozen=True, slots=True)
 class AssignmentConfig:
-    # The paper's IoU of box and Gaussian labels next to nothing: a splat is a few pixels, a box
-    # hundreds. Coverage is their intersection over the splat.
+    """Settings of the assignment of Gaussians to regions."""
+
+    # The paper's IoU of box and splat labels almost no Gaussian: a splat is a few pixels, a box
+    # hundreds. Coverage is their intersection divided by the area of the splat.
     rule: Literal["coverage", "iou"] = "coverage"
-    min_overlap: float = 0.3  # theta_IoU (III.A)
-    max_depth_gap_m: float = 0.1  # delta_z (III.A)
+    min_overlap: float = 0.3  # Minimum overlap by the rule: theta_IoU (III.A).
+    max_depth_gap_m: float = 0.1  # Maximum distance from the measured depth: delta_z (III.A).
 
     def __post_init__(self) -> None:
         if self.rule not in ("coverage", "iou"):
@@ -32,7 +34,7 @@ class AssignmentConfig:
         if not (0 <= self.min_overlap <= 1 and self.max_depth_gap_m > 0):
             raise ConfigError(
                 named(self, "min_overlap", "max_depth_gap_m")
-                + ": min_overlap in 0..1, max_depth_gap_m positive."
+                + ": min_overlap must be in [0, 1], max_depth_gap_m positive."
             )
 
 
@@ -40,10 +42,14 @@ class AssignmentConfig:
 class Regions:
     """M regions of an image.
 
-    boxes  [M, 4] float32, x0 y0 x1 y1, px
-    scores [M] float32, 0..1: where regions overlap, the larger overlap times score wins
-    rects  [M, 4] int32, column, row, width, height of what `sums` covers; width 0: all of the box
-    sums   [S] int32, summed-area tables [height + 1, width + 1], one after the other
+    Attributes:
+        boxes: Boxes, [M, 4] float32, x0 y0 x1 y1, pixels.
+        scores: Scores, [M] float32, 0..1. Where regions overlap, the largest overlap times score
+            wins.
+        rects: Column, row, width and height of the area of `sums`, [M, 4] int32; with width 0, the
+            region is all of its box.
+        sums: Summed-area tables [height + 1, width + 1] of the masks, one after the other, [S]
+            int32.
     """
 
     boxes: np.ndarray
@@ -53,13 +59,17 @@ class Regions:
 
     @classmethod
     def of_boxes(cls, boxes: np.ndarray, scores: np.ndarray) -> "Regions":
+        """Return regions that are whole boxes."""
         return cls(*_float32(boxes, scores), np.zeros((len(boxes), 4), np.int32), _NO_SUMS)
 
     @classmethod
     def of_foregrounds(
         cls, boxes: np.ndarray, scores: np.ndarray, foregrounds: Sequence[Foreground]
     ) -> "Regions":
-        """Of each box only that part; one without any pixel keeps no Gaussian."""
+        """Return regions that are only the foregrounds of their boxes.
+
+        A foreground without any pixel gets no Gaussian.
+        """
         shown = [f if f.mask.size else _NOWHERE for f in foregrounds]
         rects = [(f.column, f.row, f.mask.shape[1], f.mask.shape[0]) for f in shown]
         sums = [cv2.integral(f.mask.view(np.uint8)).ravel() for f in shown]
@@ -69,10 +79,13 @@ class Regions:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Assignment:
-    """regions  [V] int32: number of the region; UNMATCHED; or HIDDEN: out of the image, or not at
-                the depth that was measured there
-    overlaps [V] float32, with that region, by the rule; 0 without one
-    depths_m [V] float32
+    """Regions of V Gaussians.
+
+    Attributes:
+        regions: Number of the region, [V] int32; UNMATCHED; or HIDDEN: out of the image, or not at
+            the depth that was measured there.
+        overlaps: Overlap with that region by the rule, [V] float32; 0 without a region.
+        depths_m: Depths of the Gaussians in the camera frame, [V] float32.
     """
 
     regions: np.ndarray
@@ -91,25 +104,34 @@ def assign_gaussians(
     *,
     threads: int = 1,
 ) -> Assignment:
-    """Match Gaussians with regions.
+    """Assign Gaussians to the regions of an image.
 
-    Each is projected, S = J R Sigma R' J' + 0.3 px^2 I as it is rendered, and has the axis-aligned
-    box of two standard deviations about its centre, cut to the image. It is expected if its centre
-    lies in the image and is within max_depth_gap_m of depth_m there. A region gets it if
+    Each Gaussian is projected as it is rendered, S = J R Sigma R' J' + 0.3 px^2 I. Its splat is the
+    axis-aligned box of two standard deviations around its center, cut to the image. A Gaussian is
+    expected if its center lies in the image within max_depth_gap_m of depth_m there. It may belong
+    to a region if
 
         overlap > min_overlap,  overlap = |splat * region| / |splat|, or by `iou` / |splat + region|
 
-    and by `coverage`, if the centre too lies in the region: where depth was tested. Of several the
-    one with the largest overlap times score does, of equals the first.
+    With `coverage`, its center must lie in the region too, because depth was tested there. Of
+    several regions, it gets the one with the largest overlap times score; of equals, the first. The
+    result is bitwise equal for any number of threads.
 
-    rows         [N, 16] float32 of the map
-    indices      [V] uint32, ascending: those to look at, as `Contributions.indices`
-    camera       without distortion, of depth_m [H, W] float32, 0 where not measured
-    T_camera_map [4, 4]
-    Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads.
+    Args:
+        rows: Gaussians of the map, [N, 16] float32.
+        indices: Rows to assign, [V] uint32, ascending, as `Contributions.indices`.
+        camera: Intrinsics of depth_m, without distortion.
+        T_camera_map: Transform from the map to the camera, [4, 4].
+        depth_m: Measured depth, [H, W] float32, meters; 0 where unknown.
+        regions: Regions of the image.
+        config: Settings of the assignment.
+        threads: Number of threads.
 
-    A splat of sigma 1 px at (2, 5), whose box is [0, 4] x [3, 7], is half covered by a region that
-    begins at x = 2. They share 8 px^2 of 16 and 64:
+    Raises:
+        ValueError: If the shapes or types of the arrays do not fit.
+
+    Example: the splat of a Gaussian with a sigma of 1 px at (2, 5) is [0, 4] x [3, 7]. A region
+    that begins at x = 2 covers half of it. They share 8 px^2 of 16 and 64:
 
     >>> camera, depth_m = Camera(20, 10, 10.0, 10.0, 2.0, 5.0), np.ones((10, 20), np.float32)
     >>> row = np.zeros((1, 16), np.float32)

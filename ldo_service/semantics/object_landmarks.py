@@ -1,9 +1,9 @@
-"""Objects of the map: a table of landmarks, each a sample of its Gaussians and what follows of it.
+"""Table of object landmarks: a sample of Gaussians each, and the values derived from it.
 
-What a landmark knows of its Gaussians are the ids of at most 256 members and a vote for each. The
-members are those of all its Gaussians that come first when ids are shuffled by a fixed rule: a
-uniform sample, the same in whatever order they come in. Where they are and what they are called
-follows from the rows and labels of the map, and follows these when they change.
+A landmark stores the ids of at most 256 member Gaussians and a vote for each. The members are those
+of its Gaussians that come first when ids are shuffled by a fixed rule. This makes them a uniform
+sample that does not depend on the order of arrival. Position and label are derived from the rows
+and labels of the map and change with them.
 """
 
 import numpy as np
@@ -13,38 +13,39 @@ from ldo_service.geometry import Camera
 from .distributions import KEPT, dense, entropy, mean_distributions, sparse
 from .gaussian_labels import BACKGROUND
 
-MEMBERS = 256  # of each landmark: centroids of samples are within 1/16 of an object's spread
-VIEWS = 3  # best views that are remembered
+# Members per landmark: the centroid of a sample is within 1/16 of the object's spread.
+MEMBERS = 256
+VIEWS = 3  # Best views that are stored.
 NO_MEMBER = -1
-MAX_VOTES = 8  # so that a member that is one no more is out after as many keyframes
-TRIM = 0.02  # of the members at each end are strays: beyond the box
+MAX_VOTES = 8  # Maximum votes: a member that is wrong is removed after as many keyframes.
+TRIM = 0.02  # Fraction of the members at each end of an axis that counts as outliers of the box.
 
 LANDMARK = np.dtype(
     [
-        ("id", "<i8"),  # what other programs know it by; -1 of a candidate
-        ("seen", "<i4"),  # keyframes
-        ("missed", "<i4"),  # keyframes that should have seen it, and did not
-        ("misses", "<i4"),  # of those, since it was last seen
-        ("first", "<i8"),  # keyframes that saw it
+        ("id", "<i8"),  # Id of the object for other programs; -1 for a candidate.
+        ("seen", "<i4"),  # Keyframes that observed it.
+        ("missed", "<i4"),  # Keyframes that should have observed it and did not.
+        ("misses", "<i4"),  # Misses in a row since the last observation.
+        ("first", "<i8"),  # First and last keyframe that observed it.
         ("last", "<i8"),
-        ("anchor", "<i8"),  # the keyframe that most of its members hang on
-        ("centroid", "<f8", 3),  # m, map frame
+        ("anchor", "<i8"),  # Anchor keyframe of most of its members.
+        ("centroid", "<f8", 3),  # m, map frame.
         ("covariance", "<f8", (3, 3)),  # m^2
-        ("T_map_object", "<f8", (4, 4)),  # its box: centre and axes,
-        ("size", "<f8", 3),  # and extents along them, m
-        ("weights", "<f4", KEPT),  # sparse distribution over labels
+        ("T_map_object", "<f8", (4, 4)),  # Center and axes of its box.
+        ("size", "<f8", 3),  # Extents of the box along its axes, m.
+        ("weights", "<f4", KEPT),  # Sparse distribution over labels.
         ("labels", "u1", KEPT),
-        ("members", "<i8", MEMBERS),  # ids of Gaussians, in shuffled order, then NO_MEMBER
+        ("members", "<i8", MEMBERS),  # Ids of Gaussians in shuffled order, then NO_MEMBER.
         ("votes", "i1", MEMBERS),
-        ("view_keyframes", "<i8", VIEWS),  # best first; -1 of none
+        ("view_keyframes", "<i8", VIEWS),  # Best first; -1 for none.
         ("view_scores", "<f4", VIEWS),
-        ("view_boxes", "<f4", (VIEWS, 4)),  # x0 y0 x1 y1, px
+        ("view_boxes", "<f4", (VIEWS, 4)),  # x0 y0 x1 y1, pixels.
     ]
 )
 
 
 def new_landmarks(n: int, keyframe: int) -> np.ndarray:
-    """Candidates [n] that nothing is known of but when they were first seen."""
+    """Return n candidates without members, first observed in `keyframe`."""
     table = np.zeros(n, LANDMARK)
     table["id"] = table["view_keyframes"] = NO_MEMBER
     table["members"], table["T_map_object"] = NO_MEMBER, np.eye(4)
@@ -53,27 +54,27 @@ def new_landmarks(n: int, keyframe: int) -> np.ndarray:
 
 
 def distributions(table: np.ndarray) -> np.ndarray:
-    """[K, C], dense."""
+    """Return the dense label distributions of landmarks, [K, C]."""
     return dense(table["labels"], table["weights"])
 
 
 def labels_of(table: np.ndarray) -> np.ndarray:
-    """[K] uint8: what each is, the heaviest label but background."""
+    """Return the label of each landmark, [K] uint8: the heaviest one other than background."""
     first = table["labels"][:, 0]
     return np.where(first == BACKGROUND, table["labels"][:, 1], first)
 
 
 def entropies(table: np.ndarray) -> np.ndarray:
-    """[K] nats."""
+    """Return the entropies of the label distributions, [K], nats."""
     return entropy(distributions(table))
 
 
 # --- members --------------------------------------------------------------------------------------
 def shuffled(ids: np.ndarray) -> np.ndarray:
-    """[...] uint64, a place for each id, two of which are never equal; NO_MEMBER comes last.
+    """Return a sort key for each id, [...] uint64, unique per id; that of NO_MEMBER is the last.
 
-    A multiplication by an odd number turns 64 bits about; that by the golden ratio spreads ids that
-    follow each other.
+    Multiplication by an odd number permutes the 64-bit numbers. The golden ratio spreads
+    consecutive ids.
     """
     places = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)
     return np.where(ids == NO_MEMBER, np.uint64(2**64 - 1), places)
@@ -82,8 +83,16 @@ def shuffled(ids: np.ndarray) -> np.ndarray:
 def joined(
     members: np.ndarray, votes: np.ndarray, others: np.ndarray, other_votes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Members [K, 256] and votes of the unions of members [K, M] and others [K, L], by row. Who is
-    in both keeps the votes of the first; who has none left goes."""
+    """Return the members [K, 256] and votes of the unions of two member lists per row.
+
+    A member of both keeps its votes of the first list. A member without votes is removed.
+
+    Args:
+        members: Ids of the first list, [K, M].
+        votes: Votes of the first list, [K, M].
+        others: Ids of the second list, [K, L].
+        other_votes: Votes of the second list, [K, L].
+    """
     both = np.concatenate([np.where(votes > 0, members, NO_MEMBER), others], axis=1)
     counts = np.concatenate([votes, other_votes], axis=1)
     both, counts = _in_order(both, counts)
@@ -98,23 +107,27 @@ def _in_order(ids: np.ndarray, votes: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def reliable_members(table: np.ndarray) -> np.ndarray:
-    """[K, 256] bool: members with a third of the votes of the one that has most, or more. Edges of
-    regions lie beside objects now and then, and never in the same place for long."""
+    """Return which members are reliable, [K, 256] bool.
+
+    Reliable members have at least a third of the highest number of votes. Edges of regions
+    sometimes lie next to an object, but never in the same place for long.
+    """
     return (table["votes"] > 0) & (3 * table["votes"] >= table["votes"].max(axis=1, keepdims=True))
 
 
 def rows_of(members: np.ndarray, ids: np.ndarray) -> np.ndarray:
-    """[...] where members are in the map's ids [N], ascending; -1 of those that are not awake."""
+    """Return the rows of members [...] among the map's ids [N], ascending; -1 if not resident."""
     if len(ids) == 0:
         return np.full(members.shape, -1)
-    order = np.argsort(members, axis=None)  # neighbours are found side by side: four times faster
+    # Sorted queries search neighboring entries: four times faster.
+    order = np.argsort(members, axis=None)
     at = np.empty(members.size, np.int64)
     at[order] = np.searchsorted(ids, members.ravel()[order])
     at = np.minimum(at, len(ids) - 1).reshape(members.shape)
     return np.where(ids[at] == members, at, -1)
 
 
-# --- what follows from them -----------------------------------------------------------------------
+# --- derived values -------------------------------------------------------------------------------
 def derive(
     table: np.ndarray,
     rows: np.ndarray,
@@ -123,8 +136,18 @@ def derive(
     anchors: np.ndarray,
     least: int,
 ) -> None:
-    """Where landmarks [K] are and what they are, from the map [N], in place. Those of which
-    fewer than `least` members are awake, and believed, stay as they were."""
+    """Derive pose, size, label and anchor of landmarks [K] from the map, in place.
+
+    Landmarks with fewer than `least` reliable resident members stay unchanged.
+
+    Args:
+        table: Landmarks, [K] records of `LANDMARK`.
+        rows: Gaussians of the map, [N, 16].
+        labels: Label rows of the Gaussians, [N, 32].
+        ids: Ids of the Gaussians, [N], ascending.
+        anchors: Anchor keyframes of the Gaussians, [N].
+        least: Minimum number of members.
+    """
     where = np.where(reliable_members(table), rows_of(table["members"], ids), -1)
     known = np.flatnonzero(np.count_nonzero(where >= 0, axis=1) >= max(least, 1))
     if len(known) == 0:
@@ -148,18 +171,20 @@ def derive(
 
 
 def _opacities(rows: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """[K, M], 0 of members that are not there."""
+    """Return the opacities of members, [K, M]; 0 where a member is not resident."""
     opacity = 1 / (1 + np.exp(-rows[np.maximum(where, 0), 10].astype(float)))
     return np.where(where >= 0, opacity, 0)
 
 
 def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted means [K, 3] and covariances [K, 3, 3] of points [K, M, 3], without the strays that
-    lie beyond 2 % of the others along an axis. Paper, III.C (landmarks).
+    """Return weighted means [K, 3] and covariances [K, 3, 3] of points [K, M, 3].
 
         mu = sum_m w_m x_m / sum_m w_m,  Sigma = sum_m w_m (x_m - mu) (x_m - mu)' / sum_m w_m
 
-    Two on the x axis, the one at 4 three times as heavy: mu = 12 / 4, Sigma = (9 + 3) / 4.
+    Outliers, the 2 % at each end of an axis, do not count. Paper, III.C (landmarks).
+
+    Example: two points lie on the x axis; the one at 4 has three times the weight. mu = 12 / 4,
+    Sigma = (9 + 3) / 4.
 
     >>> mean, covariance = moments(np.array([[[0.0, 0, 0], [4, 0, 0]]]), np.array([[1.0, 3.0]]))
     >>> mean[0].tolist(), covariance[0].diagonal().tolist()
@@ -176,8 +201,11 @@ def moments(p_map: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest [K, D] of values [K, M, D] where `valid` [K, M], but for 2 % at each end;
-    infinity and minus infinity of none."""
+    """Return the lowest and highest values [K, D] of values [K, M, D] without 2 % at each end.
+
+    Only values where `valid` [K, M] is true count. Without any, the result is infinity and minus
+    infinity.
+    """
     count = np.count_nonzero(valid, axis=1)[:, None]
     ordered = np.where(valid[:, None], np.swapaxes(values, 1, 2), np.inf)
     ordered.sort(axis=2)
@@ -187,16 +215,19 @@ def trimmed(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return low, np.where(count > 0, high, -np.inf)
 
 
-SAVING = 0.8  # an own orientation must make a box smaller by so much
+SAVING = 0.8  # Maximum volume ratio of an oriented box to the axis-aligned one that it replaces.
 
 
 def boxes(
     p_map: np.ndarray, valid: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """T_map_object [K, 4, 4] and sizes [K, 3] of boxes about points [K, M, 3]: along the axes of
-    the map, or along the main axes of the points where that saves a fifth of the volume."""
+    """Return T_map_object [K, 4, 4] and sizes [K, 3] of boxes around points [K, M, 3].
+
+    A box is parallel to the axes of the map, or to the main axes of the points if that saves a
+    fifth of the volume.
+    """
     _, main = np.linalg.eigh(covariance)
-    main = main[..., ::-1] * np.sign(_largest(main[..., ::-1]))[:, None]  # signs are arbitrary
+    main = main[..., ::-1] * np.sign(_largest(main[..., ::-1]))[:, None]  # Fix the arbitrary signs.
     main[..., 2] *= np.linalg.det(main)[:, None]
     upright = np.broadcast_to(np.eye(3), main.shape)
     (low, high), (turned_low, turned_high) = (
@@ -214,13 +245,13 @@ def boxes(
 
 
 def _largest(axes: np.ndarray) -> np.ndarray:
-    """[K, 3]: of each axis, a column of [K, 3, 3], the component of largest size."""
+    """Return of each axis, a column of [K, 3, 3], the component of largest magnitude, [K, 3]."""
     at = np.argmax(np.abs(axes), axis=1)[:, None]
     return np.take_along_axis(axes, at, axis=1)[:, 0]
 
 
 def _commonest(values: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    """[K] of [K, M]; of equals the smallest."""
+    """Return the most frequent valid value of each row, [K] of [K, M]; of equals, the smallest."""
     ordered = np.sort(np.where(valid, values, np.iinfo(np.int32).max).astype(np.int64), axis=1)
     width = ordered.shape[1]
     starts = np.concatenate(
@@ -239,11 +270,12 @@ def moved(table: np.ndarray, T_new_old: np.ndarray) -> None:
     table["T_map_object"] = T_new_old @ table["T_map_object"]
 
 
-# --- as a camera sees them ------------------------------------------------------------------------
+# --- visibility -----------------------------------------------------------------------------------
 def within(table: np.ndarray, camera: Camera, T_camera_map: np.ndarray) -> np.ndarray:
-    """[K] bool: whose spheres reach into the view of a camera."""
+    """Return which landmarks have a bounding sphere in the view of a camera, [K] bool."""
     p = table["centroid"] @ T_camera_map[:3, :3].T + T_camera_map[:3, 3]
-    radius = np.linalg.norm(table["size"], axis=1)  # twice that of the box: members stray
+    # Twice the radius of the box, since members lie outside it too.
+    radius = np.linalg.norm(table["size"], axis=1)
     low = (-0.5 - camera.cx) / camera.fx, (-0.5 - camera.cy) / camera.fy
     out = p[:, 2] > -radius
     for axis, (first, side) in enumerate(

@@ -1,4 +1,4 @@
-"""The objects of the map: how they come, are recognised, become one, and go (paper, III.C)."""
+"""Objects of the map: creation, association, merge and removal (paper, III.C)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -45,24 +45,31 @@ from .observations import (
     update_votes,
 )
 
-CANDIDATE = -1  # in place of an id
-_AT_A_TIME = 128  # landmarks that are derived together, to stay in cache
+CANDIDATE = -1  # Value in place of an id.
+_AT_A_TIME = 128  # Landmarks per batch of `derive`, to stay in cache.
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectsConfig:
+    """Settings of the objects."""
+
     association: AssociationConfig = field(default_factory=AssociationConfig)
-    min_keyframes: int = 3  # that see it, until it is an object (III.C)
-    max_divergence: float = 0.2  # nats, of what they see from what was known (III.C)
-    miss_limit: int = 10  # keyframes in a row, while it is visible (III.C)
-    uncertain_miss_limit: int = 5  # of objects with more than
-    uncertain_entropy: float = 0.5  # nats: these go earlier (III.C)
-    candidate_miss_limit: int = 3  # nothing is lost with a candidate: it may come again
-    min_visible: float = 0.5  # share of its members in view and not hidden, to be missed
-    min_side_px: float = 20.0  # of its box; smaller ones are nobody's fault
-    merge_overlap: float = 0.5  # share of the members of one in the box of the other
-    max_objects: int = 2000  # 6 MB, and some ms per keyframe where all are in view
-    max_candidates: int = 256  # those seen last
+    # Keyframes that must observe a candidate before it becomes an object (III.C).
+    min_keyframes: int = 3
+    # Maximum divergence (nats) of an observation from the candidate (III.C).
+    max_divergence: float = 0.2
+    miss_limit: int = 10  # Misses in a row, while it is visible, that remove an object (III.C).
+    uncertain_miss_limit: int = 5  # The same for objects with a high entropy.
+    # Minimum entropy (nats) of such objects, which are removed earlier (III.C).
+    uncertain_entropy: float = 0.5
+    # The same for candidates; a removed candidate can be created again.
+    candidate_miss_limit: int = 3
+    min_visible: float = 0.5  # Minimum fraction of the members in view and not occluded for a miss.
+    # Minimum side of the predicted box for a miss; smaller objects may be overlooked.
+    min_side_px: float = 20.0
+    merge_overlap: float = 0.5  # Minimum fraction of the members of one in the box of the other.
+    max_objects: int = 2000  # 6 MB, and some ms per keyframe if all are in view.
+    max_candidates: int = 256  # Maximum candidates; those observed last are kept.
 
     def __post_init__(self) -> None:
         counts = (
@@ -84,10 +91,15 @@ class ObjectsConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ObjectSighting:
-    """An object in a keyframe: the box that shows it, or where one was missed.
+    """An object in a keyframe: an observation or a miss.
 
-    box [4] px, x0 y0 x1 y1; distribution [C] and entropy (nats) of the Gaussians in its region, of
-    the object itself where it was missed
+    Attributes:
+        object: Id of the object.
+        box: Observed box or, for a miss, the predicted one, [4], x0 y0 x1 y1, pixels.
+        distribution: Label distribution of the Gaussians in the region or, for a miss, of the
+            object, [C].
+        entropy: Entropy of that distribution, nats.
+        is_miss: True if the object should have been visible and was not observed.
     """
 
     object: int
@@ -99,17 +111,21 @@ class ObjectSighting:
 
 @dataclass(frozen=True, slots=True)
 class ObjectUpdate:
-    """What a keyframe made of the objects: ids that came, that went, and that became another."""
+    """Changes of the objects by a keyframe."""
 
-    observations: tuple[ObjectSighting, ...] = ()
-    born: tuple[int, ...] = ()
-    merged: tuple[tuple[int, int], ...] = ()  # this one is that one now
-    retired: tuple[int, ...] = ()
+    observations: tuple[ObjectSighting, ...] = ()  # Observations and misses.
+    born: tuple[int, ...] = ()  # Ids of new objects.
+    # Pairs of a removed id and the id of the object that it was merged into.
+    merged: tuple[tuple[int, int], ...] = ()
+    retired: tuple[int, ...] = ()  # Ids of objects removed after misses.
 
 
 class Objects:
-    """All landmarks. Not for two threads at once; the same calls give the same bits, also after
-    `unpack`. An id is given once, and is its object's until that is merged or retired."""
+    """Table of all landmarks: objects and candidates.
+
+    The class is not thread-safe. The same calls give bitwise equal results, also after `unpack`. An
+    id is assigned once and belongs to its object until that is merged or removed.
+    """
 
     def __init__(self, config: ObjectsConfig | None = None) -> None:
         self.config = config or ObjectsConfig()
@@ -121,37 +137,45 @@ class Objects:
 
     @property
     def landmarks(self) -> np.ndarray:
-        """A copy of the objects, records [K] of `LANDMARK`, by id."""
+        """Copy of the objects, records [K] of `LANDMARK`, sorted by id."""
         table = self._table[self._table["id"] != CANDIDATE]
         return table[np.argsort(table["id"])]
 
     def observe(self, view: MapView, spared: np.ndarray | None = None) -> ObjectUpdate:
-        """Take in what a keyframe shows. `spared` [256] bool: labels that the detector does not
-        know, and cannot miss unless their place is empty.
+        """Update the objects from a keyframe.
 
-        A region that no landmark is associated with begins a candidate. It becomes an object when
-        it was seen in min_keyframes, and each time KL(p || p_t) < max_divergence: p is what its
-        Gaussians were said to be before, p_t what those in the region are said to be now, both
-        means weighted by opacity. A keyframe that disagrees begins the count anew. Objects are
-        associated first, candidates with the regions that are left.
+        A region without an associated landmark creates a candidate. A candidate becomes an object
+        after min_keyframes observations that agree: KL(p || p_t) < max_divergence. The mean label
+        distribution of its Gaussians was p before; that of the Gaussians in the region is p_t now.
+        Both are weighted by opacity. A keyframe that exceeds the divergence restarts the count.
+        Objects are associated first, candidates with the remaining regions.
 
-        Raises ValueError for arrays that do not fit.
+        Args:
+            view: The map and the regions of the keyframe.
+            spared: Labels that the detector does not know, [256] bool. Their objects count as
+                missed only if depth shows that their place is empty.
+
+        Returns:
+            The changes of the objects.
+
+        Raises:
+            ValueError: If the shapes of the arrays do not fit.
         """
         T_camera_map = se3.inverse(view.T_map_camera)
         limits = self.config.association
-        # what is there, and what should be
+        # Observed and predicted regions.
         view, regions = _seen(view, T_camera_map, limits)
         near = np.flatnonzero(within(self._table, view.camera, T_camera_map))
         looks = predict_boxes(self._table[near], view, T_camera_map, limits)
-        # which is which
+        # Data association.
         pairs = association_costs(distributions(self._table[near]), looks, regions, limits)
         k, r = self._match(near, pairs)
         excused, left = self._pieces(near, k, pairs, regions, r)
-        # what is learnt of those seen, and of those not
+        # Observations and misses.
         observations = self._update(view, near[k], r, looks.rows[k], looks.shown[k], regions)
         missed = self._missed(near, looks, excused, spared)
         observations += self._miss(near[missed], looks.boxes[missed])
-        # who comes, who is another, who goes
+        # New, merged and removed objects.
         born = self._promote(near[k])
         merged, gone = self._merge(view, near, near[k])
         retired = self._retire(gone)
@@ -160,7 +184,7 @@ class Objects:
 
     # --- association ------------------------------------------------------------------------------
     def _match(self, near: np.ndarray, pairs: AssociationCosts) -> tuple[np.ndarray, np.ndarray]:
-        """Landmarks, as numbers in `near`, and the regions that show them."""
+        """Return the matched landmarks, as numbers in `near`, and their regions."""
         is_object = (self._table["id"][near] != CANDIDATE)[:, None]
         allowed, least = pairs.allowed.copy(), self.config.association.min_iou
         k, r = associate(pairs.iou, allowed & is_object, least)
@@ -176,8 +200,11 @@ class Objects:
         regions: RegionStatistics,
         r: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Which landmarks near are not missed, [K] bool, since they were matched or a region shows
-        a piece of them, and the regions that are neither matched nor such pieces."""
+        """Return landmarks that are not missed, [K] bool, and numbers of remaining regions.
+
+        A landmark is not missed if it was matched or a region shows a piece of it. The remaining
+        regions are neither matched nor such pieces.
+        """
         excused, is_left = np.zeros(len(near), bool), np.ones(len(regions.numbers), bool)
         excused[k], is_left[r] = True, False
         for row, region in np.argwhere(pairs.allowed & ~excused[:, None] & is_left):
@@ -187,7 +214,7 @@ class Objects:
                 excused[row], is_left[region] = True, False
         return excused, np.flatnonzero(is_left)
 
-    # --- those seen -------------------------------------------------------------------------------
+    # --- observations -----------------------------------------------------------------------------
     def _update(
         self,
         view: MapView,
@@ -219,7 +246,12 @@ class Objects:
         ]
 
     def _derive(self, table: np.ndarray, *gaussians: np.ndarray) -> None:
-        """As far as enough of their Gaussians are awake; `gaussians`: see `landmarks.derive`."""
+        """Derive landmarks in batches where enough of their Gaussians are resident.
+
+        Args:
+            table: Landmarks, [K] records of `LANDMARK`, updated in place.
+            *gaussians: Rows, labels, ids and anchors of the map, see `object_landmarks.derive`.
+        """
         for start in range(0, len(table), _AT_A_TIME):
             derive(
                 table[start : start + _AT_A_TIME],
@@ -228,7 +260,7 @@ class Objects:
             )
 
     def _promote(self, which: np.ndarray) -> tuple[int, ...]:
-        """Ids of candidates that became objects."""
+        """Turn candidates with enough observations into objects and return their ids."""
         seen = self._table[which]
         ready = (seen["id"] == CANDIDATE) & (seen["seen"] >= self.config.min_keyframes)
         ready = which[ready & (seen["labels"][:, 0] != BACKGROUND)]
@@ -239,7 +271,7 @@ class Objects:
         self._next_id += len(ids)
         return tuple(ids.tolist())
 
-    # --- those not seen ---------------------------------------------------------------------------
+    # --- misses -----------------------------------------------------------------------------------
     def _missed(
         self,
         near: np.ndarray,
@@ -247,7 +279,7 @@ class Objects:
         excused: np.ndarray,
         spared: np.ndarray | None,
     ) -> np.ndarray:
-        """Numbers of those near that a detector should have seen, or whose place is empty."""
+        """Return the numbers of landmarks that the detector missed or whose place is empty."""
         sides = np.clip(looks.boxes[:, 2:] - looks.boxes[:, :2], 0, None)
         is_large = np.sqrt(np.prod(sides, axis=1)) >= self.config.min_side_px
         is_visible = (looks.shown >= self.config.min_visible) & is_large
@@ -266,7 +298,11 @@ class Objects:
         ]
 
     def _retire(self, gone: np.ndarray) -> tuple[int, ...]:
-        """Ids of those missed too often. Drops them, and those that are `gone` [K] bool."""
+        """Remove landmarks with too many misses and those in `gone` [K] bool.
+
+        Returns:
+            Ids of the objects that were removed after misses.
+        """
         table, config = self._table, self.config
         missed = np.flatnonzero((table["misses"] > 0) & ~gone)
         is_unsure = entropies(table[missed]) > config.uncertain_entropy
@@ -281,11 +317,16 @@ class Objects:
             self._table = table[~gone]
         return tuple(retired.tolist())
 
-    # --- those that are one -----------------------------------------------------------------------
+    # --- merges -----------------------------------------------------------------------------------
     def _merge(
         self, view: MapView, near: np.ndarray, matched: np.ndarray
     ) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
-        """Objects that became another, and which landmarks [K] bool did: see `merging`."""
+        """Merge landmarks that overlap; see `observations.boxes_overlap`.
+
+        Returns:
+            Pairs of a removed id and the id it was merged into, and which landmarks were merged
+            into others, [K] bool.
+        """
         merged: list[tuple[int, int]] = []
         gone = np.zeros(len(self._table), bool)
         for a, b in neighbors(self._table, near, matched):
@@ -301,7 +342,7 @@ class Objects:
         return tuple(merged), gone
 
     def _age(self, k: int) -> tuple[bool, int, int]:
-        """By which objects come before candidates, then the first."""
+        """Return a sort key: objects before candidates, then by id."""
         return self._table["id"][k] == CANDIDATE, int(self._table["id"][k]), k
 
     def _join(self, keep: int, goes: int, view: MapView) -> None:
@@ -310,9 +351,9 @@ class Objects:
         self._derive(one, view.rows, view.labels, view.ids, view.anchors)
         self._table[[keep]] = one
 
-    # --- those that come --------------------------------------------------------------------------
+    # --- candidates -------------------------------------------------------------------------------
     def _begin(self, view: MapView, regions: RegionStatistics, left: np.ndarray) -> None:
-        """A candidate of each region that is left; of too many those seen longest ago go."""
+        """Create a candidate for each remaining region; drop the candidates seen longest ago."""
         new = new_landmarks(len(left), view.keyframe)
         new["members"], new["seen"] = regions.members[left], 1
         new["votes"] = one_each(new["members"])
@@ -328,8 +369,14 @@ class Objects:
 
     # --- corrections ------------------------------------------------------------------------------
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Keyframes were corrected: each landmark goes with the one that most of its members hang
-        on, so that those asleep are where their Gaussians will wake. `refresh` has the others."""
+        """Move each landmark with the anchor keyframe of most of its members after a correction.
+
+        Landmarks of offloaded Gaussians get the position that these will have when they are loaded.
+        `refresh` updates the others.
+
+        Args:
+            T_new_old: Correction of each moved keyframe in the map frame, [4, 4], by id.
+        """
         corrected = np.array(sorted(T_new_old), np.int64)
         which = np.flatnonzero(np.isin(self._table["anchor"], corrected))
         if len(which):
@@ -345,8 +392,15 @@ class Objects:
         anchors: np.ndarray,
         seen_from: tuple[Camera, np.ndarray] | None = None,
     ) -> None:
-        """Derive landmarks anew from the map, after corrections, late labels and refinement: all,
-        or those in the view of a camera at T_map_camera."""
+        """Derive landmarks from the map again after corrections, late labels and refinement.
+
+        Args:
+            rows: Gaussians of the map, [N, 16].
+            labels: Label rows of the Gaussians, [N, 32].
+            ids: Ids of the Gaussians, [N], ascending.
+            anchors: Anchor keyframes of the Gaussians, [N].
+            seen_from: Camera and T_map_camera; only landmarks in this view are derived. None: all.
+        """
         which = np.arange(len(self._table))
         if seen_from:
             camera, T_map_camera = seen_from
@@ -357,36 +411,44 @@ class Objects:
 
     # --- state ------------------------------------------------------------------------------------
     def pack(self) -> dict[str, Any]:
-        """Arrays and plain numbers, for a file or a state."""
+        """Return arrays and plain numbers for a file or a checkpoint."""
         table = self._table.copy().view(np.uint8).reshape(len(self._table), LANDMARK.itemsize)
         counts = [self._next_id, self._merged, self._retired, self._refused]
         return {"landmarks": table, "counts": np.array(counts, np.int64)}
 
     @staticmethod
     def unpack(packed: Mapping[str, Any], config: ObjectsConfig | None = None) -> "Objects":
-        """As it was. Raises ValueError when this is not what `pack` gave."""
+        """Restore the objects from `pack`.
+
+        Raises:
+            ValueError: If the landmarks have another format.
+        """
         table = np.ascontiguousarray(packed["landmarks"])
         if table.dtype != np.uint8 or table.ndim != 2 or table.shape[1] != LANDMARK.itemsize:
-            raise ValueError(f"landmarks {table.dtype}{table.shape} are not of this version.")
+            raise ValueError(
+                f"landmarks are {table.dtype}{table.shape} of another version; "
+                f"must be uint8[K, {LANDMARK.itemsize}]."
+            )
         out = Objects(config)
         out._table = table.copy().view(LANDMARK)[:, 0]
         out._next_id, out._merged, out._retired, out._refused = map(int, packed["counts"])
         return out
 
     def metrics(self) -> dict[str, float]:
+        """Return the counters of the objects."""
         return {
             "objects": len(self),
             "object_candidates": len(self._table) - len(self),
             "objects_merged": self._merged,
             "objects_retired": self._retired,
-            "objects_rejected": self._refused,  # there are max_objects
+            "objects_rejected": self._refused,  # Candidates that did not fit into max_objects.
         }
 
 
 def _seen(
     view: MapView, T_camera_map: np.ndarray, config: AssociationConfig
 ) -> tuple[MapView, RegionStatistics]:
-    """What a keyframe shows of things, not of their parts."""
+    """Return a view with parts merged into whole regions, and the statistics of its regions."""
     regions = compute_region_statistics(view, T_camera_map, config)
     whole = merge_parts(view, regions, config)
     return whole, regions if whole is view else compute_region_statistics(

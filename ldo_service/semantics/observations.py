@@ -16,15 +16,26 @@ from .object_landmarks import (
 
 
 def one_each(members: np.ndarray) -> np.ndarray:
+    """Return one vote for each member, [K, 256] int8; 0 beyond."""
     return (members != NO_MEMBER).astype(np.int8)
 
 
 def update_votes(
     votes: np.ndarray, rows: np.ndarray, view: MapView, numbers: np.ndarray
 ) -> np.ndarray:
-    """Votes [K, 256] one higher for members, in `rows` of the map, that lie in the region `numbers`
-    [K] of their landmark, and one lower for those that were seen beside it or are no more."""
-    wanted = np.maximum(rows, 0).astype(view.indices.dtype)  # or all of `indices` is converted
+    """Return the votes [K, 256] of the members of landmarks after a keyframe.
+
+    Members in the region of their landmark gain a vote. Members that are visible outside of it, or
+    not resident, lose one.
+
+    Args:
+        votes: Votes before, [K, 256].
+        rows: Rows of the members in the map, [K, 256]; -1 if not resident.
+        view: The map and the regions of the keyframe.
+        numbers: Region of each landmark, [K].
+    """
+    # Same dtype, else all of `indices` is converted.
+    wanted = np.maximum(rows, 0).astype(view.indices.dtype)
     at = np.minimum(np.searchsorted(view.indices, wanted), len(view.indices) - 1)
     is_shown = view.indices[at] == rows
     region = np.where(is_shown, view.regions[at], HIDDEN)
@@ -35,7 +46,7 @@ def update_votes(
 
 
 def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.ndarray) -> None:
-    """Large boxes with much of the object in them are good views."""
+    """Add the view of a keyframe to landmarks; a large box with most of the object scores high."""
     scores = shown * np.sqrt(np.prod(boxes[:, 2:] - boxes[:, :2], axis=1))
     add_view(table, np.full(len(table), keyframe), scores, boxes)
 
@@ -43,7 +54,7 @@ def add_views(table: np.ndarray, keyframe: int, shown: np.ndarray, boxes: np.nda
 def add_view(
     table: np.ndarray, keyframes: np.ndarray, scores: np.ndarray, boxes: np.ndarray
 ) -> None:
-    """The best of the views that landmarks [K] have and one more of each, in place."""
+    """Keep the best views of landmarks [K] after adding one to each, in place."""
     all_scores = np.concatenate([table["view_scores"], scores[:, None]], axis=1).astype(np.float32)
     order = np.argsort(-all_scores, axis=1, kind="stable")[:, :VIEWS]
     for name, new in (
@@ -57,8 +68,10 @@ def add_view(
 
 
 def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[tuple[int, int]]:
-    """Pairs of one of `near` [K] that was `matched` and one that was not, of the same name, whose
-    boxes are close enough to meet."""
+    """Return pairs of a matched and an unmatched landmark with one label and boxes that may meet.
+
+    Both are numbers of `table`, from those in `near` [K].
+    """
     here, is_matched = table[near], np.isin(near, matched)
     name, place = labels_of(here), here["T_map_object"][:, :3, 3]
     reach = np.linalg.norm(here["size"], axis=1) / 2
@@ -68,14 +81,23 @@ def neighbors(table: np.ndarray, near: np.ndarray, matched: np.ndarray) -> list[
 
 
 def boxes_overlap(one: np.ndarray, other: np.ndarray, view: MapView, least: float) -> bool:
-    """Whether that share of one, of two tables [1], lies in the box of the other."""
+    """Return whether the fraction `least` of one landmark lies in the box of the other.
+
+    Args:
+        one: A table of one landmark.
+        other: A table of one landmark.
+        view: The map with the Gaussians of both.
+        least: Minimum fraction of the reliable members.
+    """
     shares = inside(other[0], awake(one, view)), inside(one[0], awake(other, view))
     return max(shares) >= least
 
 
 def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
-    """Give one landmark what another was, both tables [1], in place; what follows of its members
-    is to be derived anew."""
+    """Add the members, counts and views of one landmark to another, both tables [1], in place.
+
+    The values that depend on the members must be derived again.
+    """
     one["members"], one["votes"] = joined(
         one["members"], one["votes"], gone["members"], gone["votes"]
     )
@@ -89,7 +111,7 @@ def merge_into(one: np.ndarray, gone: np.ndarray) -> None:
 
 
 def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
-    """Share of points [M, 3] within the box of a landmark; 0 of none."""
+    """Return the fraction of points [M, 3] within the box of a landmark; 0 without points."""
     T = landmark["T_map_object"]
     local = (p_map - T[:3, 3]) @ T[:3, :3]
     return (
@@ -98,6 +120,6 @@ def inside(landmark: np.ndarray, p_map: np.ndarray) -> float:
 
 
 def awake(landmark: np.ndarray, view: MapView) -> np.ndarray:
-    """Where the Gaussians [M, 3] of one, in a table [1], are."""
+    """Return the positions [M, 3] of the reliable resident members of a landmark, a table [1]."""
     where = rows_of(landmark["members"][reliable_members(landmark)], view.ids)
     return view.rows[where[where >= 0], :3].astype(float)

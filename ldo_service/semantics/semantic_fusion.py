@@ -1,7 +1,7 @@
-"""Fusion of a keyframe's regions into the labels of the map, one step a line.
+"""Fusion of a keyframe's regions into the labels of the map.
 
-Detections and open-vocabulary labels of a region are fused first (paper, III.B). Label images show
-what the map says of each pixel.
+Detections and open-vocabulary labels of a region are fused first (paper, III.B). Label images
+render the labels of the map.
 """
 
 from dataclasses import dataclass, field
@@ -43,10 +43,12 @@ from .label_assignment import HIDDEN, Assignment, AssignmentConfig, Regions, ass
 
 @dataclass(frozen=True, slots=True)
 class FusionConfig:
+    """Settings of the fusion of detector and labeller."""
+
     rule: Literal["adaptive", "fixed", "detector"] = "adaptive"
-    beta: float = 2.0  # III.B
-    epsilon: float = 1e-6  # III.B
-    fixed_alpha: float = 0.5  # of `fixed`, an ablation (IV.C)
+    beta: float = 2.0  # Exponent of the reliabilities (III.B).
+    epsilon: float = 1e-6  # Term against division by zero (III.B).
+    fixed_alpha: float = 0.5  # Weight of the detector with `fixed`, an ablation (IV.C).
 
     def __post_init__(self) -> None:
         if self.rule not in ("adaptive", "fixed", "detector"):
@@ -54,14 +56,20 @@ class FusionConfig:
         if not (self.beta > 0 and self.epsilon > 0 and 0 <= self.fixed_alpha <= 1):
             raise ConfigError(
                 named(self, "beta", "epsilon", "fixed_alpha")
-                + ": beta and epsilon positive, fixed_alpha in 0..1."
+                + ": beta and epsilon must be positive, fixed_alpha in [0, 1]."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FusedLabels:
-    """labels [V] int16; confidences [V] float32, SemConf; alpha [V] float32, the detector's part;
-    by_detector [V] float32, alpha Conf_YOLO"""
+    """Fused labels of V Gaussians or regions.
+
+    Attributes:
+        labels: Labels, [V] int16.
+        confidences: SemConf, [V] float32, 0..1.
+        alpha: Weight of the detector, [V] float32, 0..1.
+        by_detector: Contribution of the detector, alpha Conf_YOLO, [V] float32.
+    """
 
     labels: np.ndarray
     confidences: np.ndarray
@@ -77,21 +85,28 @@ def fuse_confidences(
     open_confidences: np.ndarray,
     config: FusionConfig,
 ) -> FusedLabels:
-    """Label and confidence of V Gaussians, or regions.
+    """Fuse the labels of detector and labeller for V Gaussians or regions.
 
         r_YOLO = overlap Conf_YOLO,  r_VLM = Conf_VLM
         alpha = r_YOLO^beta / (r_YOLO^beta + r_VLM^beta + epsilon)
         SemConf = alpha Conf_YOLO + (1 - alpha) Conf_VLM
 
-    detector_labels, open_labels            [V] int
-    detector_confidences, open_confidences  [V], 0..1; 0: not invoked, or it found nothing
-    overlaps                                [V], 0..1, IoU or coverage of region and Gaussian
+    The label is the detector's if alpha Conf_YOLO >= (1 - alpha) Conf_VLM. Without a label of the
+    labeller, alpha is 1. `fixed` has one alpha for all that have both labels; `detector` ignores
+    the labeller.
 
-    The label is the detector's if alpha Conf_YOLO >= (1 - alpha) Conf_VLM. Where the labeller was
-    not invoked alpha is 1. `fixed` has the same alpha wherever it was; `detector` ignores it.
+    Args:
+        detector_labels: Labels of the detector, [V] int.
+        detector_confidences: Confidences of the detector, [V], 0..1; 0 without a detection.
+        overlaps: IoU or coverage of region and Gaussian, [V], 0..1.
+        open_labels: Labels of the labeller, [V] int.
+        open_confidences: Confidences of the labeller, [V], 0..1; 0 if not invoked or without a
+            label.
+        config: Settings of the fusion.
 
-    A box of 0.8 over half of a splat, and a labeller that is 0.6 sure: r = 0.4 and 0.6,
-    alpha = 0.16 / (0.16 + 0.36), SemConf = 0.308 * 0.8 + 0.692 * 0.6; 0.246 loses against 0.415:
+    Example: a box with a score of 0.8 covers half of a splat, and the labeller has a confidence of
+    0.6. r = 0.4 and 0.6, alpha = 0.16 / (0.16 + 0.36), SemConf = 0.308 * 0.8 + 0.692 * 0.6. The
+    labeller wins, 0.415 to 0.246:
 
     >>> one = fuse_confidences(*np.array([[7], [0.8], [0.5], [9], [0.6]]), FusionConfig())
     >>> int(one.labels[0]), round(float(one.alpha[0]), 3), round(float(one.confidences[0]), 3)
@@ -115,8 +130,13 @@ def _alpha(r_detector: np.ndarray, r_open: np.ndarray, config: FusionConfig) -> 
 
 
 def reliable_label_mask(labels: np.ndarray, top: np.ndarray, least: float) -> np.ndarray:
-    """[H, W] bool, where the Gaussian that made most of a pixel, `top` [H, W], has a label but
-    background with that probability, or more."""
+    """Return where the map has a reliable label other than background, [H, W] bool.
+
+    Args:
+        labels: Label rows of the Gaussians, [N, 32].
+        top: Row of the Gaussian that contributes most to each pixel, [H, W]; negative without one.
+        least: Minimum probability of the label.
+    """
     rows = labels[np.maximum(top, 0).ravel()]
     is_named = (fields(rows)["weights"][:, 0] >= least) & (top_labels(rows) != BACKGROUND)
     return is_named.reshape(top.shape) & (top >= 0)
@@ -131,11 +151,18 @@ def label_image(
     *,
     threads: int = 1,
 ) -> np.ndarray:
-    """[H, W] uint8, per pixel the label s of the largest sum_i w_i p_i(s) over the Gaussians, of
-    equals the lower number; background where there is none.
+    """Return the label s with the largest sum_i w_i p_i(s) over the Gaussians, [H, W] uint8.
 
-    Three labels a rendering, of the Gaussians that `shown` found to have made the image: for
-    evaluation and pictures.
+    Of equals, the lower number is used; pixels without Gaussians are background. Each rendering
+    computes three labels, so this is for evaluation and pictures.
+
+    Args:
+        rows: Gaussians of the map, [N, 16].
+        labels: Label rows of the Gaussians, [N, 32].
+        shown: Rendering of the image with the Gaussians that contribute to it.
+        camera: Intrinsics of the image.
+        T_camera_map: Transform from the map to the camera, [4, 4].
+        threads: Number of threads.
     """
     assert shown.contributions is not None
     made_by = shown.contributions.indices
@@ -160,6 +187,8 @@ def label_image(
 
 @dataclass(frozen=True, slots=True)
 class SemanticFusionConfig:
+    """Settings of the fusion of regions into the labels of the map."""
+
     region: Literal["foreground", "box"] = "foreground"
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     nesting: NestingConfig = field(default_factory=NestingConfig)
@@ -175,6 +204,8 @@ class SemanticFusionConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FusionResult:
+    """Result of fusing a keyframe: assignment, observations and label disagreement."""
+
     assigned: Assignment
     seen: Observations
     disagreement: Disagreement
@@ -194,24 +225,39 @@ def fuse_detections(
     spared: np.ndarray | None = None,
     threads: int = 1,
 ) -> FusionResult:
-    """Fold what is claimed of a keyframe into the labels [N, 32] of the map, in place.
+    """Fold the labels of a keyframe's regions into the labels [N, 32] of the map, in place.
 
-    rows [N, 16]; indices [V] uint32, the Gaussians that made its image; depth_m [H, W] as it was
-    measured. `is_late`: the claims are some of a keyframe that was folded in before, so that what
-    they leave out is no miss, and where the detector's word is the heavier one it was counted.
-    `spared` [256] bool: labels that the detector does not know, and cannot miss. Raises ValueError
-    for arrays that do not fit.
+    Args:
+        rows: Gaussians of the map, [N, 16].
+        labels: Label rows of the Gaussians, [N, 32].
+        indices: Rows of the Gaussians that contribute to the image, [V] uint32, ascending.
+        camera: Intrinsics of the keyframe.
+        T_map_camera: Pose of the camera, [4, 4].
+        depth_m: Measured depth, [H, W], meters.
+        claims: Labels of the regions by detector and labeller.
+        config: Settings of the fusion.
+        is_late: The keyframe was fused before and `claims` are late labels of some of its regions.
+            Gaussians outside of these are not missed. Where the detector's contribution is the
+            larger one, it is not counted again.
+        spared: Labels that the detector does not know and cannot miss, [256] bool.
+        threads: Number of threads.
+
+    Returns:
+        The assignment of the Gaussians, their observations and the label disagreement.
+
+    Raises:
+        ValueError: If the shapes or types of the arrays do not fit.
     """
-    # which Gaussians are where
+    # Assignment of Gaussians to regions.
     regions = regions_of(claims, depth_m, camera, config)
     T_camera_map = se3.inverse(T_map_camera)
     where = assign_gaussians(
         rows, indices, camera, T_camera_map, depth_m, regions, config.assignment, threads=threads
     )
-    # what they were seen as
+    # Observed labels.
     seen = observations(where, indices, camera, claims, config, is_late=is_late)
     if spared is not None:
-        # what the detector does not know it could not miss, before or now
+        # A label that the detector does not know is neither missed now nor was before.
         is_spared = spared[top_labels(labels[indices])] & (seen.labels == MISS)
         seen.labels[is_spared] = NOT_SEEN
         is_named = spared[np.maximum(seen.labels, 0)] & (seen.labels >= 0)
@@ -219,7 +265,7 @@ def fuse_detections(
     if claims.replaces_labels and config.region == "foreground":
         reset_labels(labels, indices[seen.labels >= 0])
     observe(labels, seen, config.labels, threads=threads)
-    # what their neighbours say
+    # Consistency with the neighbors.
     touched = indices[seen.labels != NOT_SEEN]
     return FusionResult(
         where, seen, smooth_labels(rows, labels, touched, config.consistency, threads=threads)
@@ -229,7 +275,7 @@ def fuse_detections(
 def regions_of(
     claims: RegionDetections, depth_m: np.ndarray, camera: Camera, config: SemanticFusionConfig
 ) -> Regions:
-    """The boxes, or the objects in them, each without those that lie on it."""
+    """Return regions that are boxes or their foregrounds, each without those that lie on it."""
     if config.region == "box" or len(claims.boxes) == 0:
         return Regions.of_boxes(np.reshape(claims.boxes, (-1, 4)), claims.scores())
     known = claims.parts or (None,) * len(claims.boxes)
@@ -253,17 +299,21 @@ def observations(
     *,
     is_late: bool = False,
 ) -> Observations:
-    """Labels and confidences of the Gaussians that a region got; misses of the others in view. The
-    side of an object is that of a square like its box, at the depth of the Gaussian."""
-    # by the outcome: hidden, in no region, in region 0, 1, ...
-    outcome = np.subtract(where.regions, HIDDEN, dtype=np.intp)  # as `take` would have it
+    """Return the labels and confidences of Gaussians in regions, and misses of the others in view.
+
+    The extent of an object is the side of a square with the area of its box, at the depth of the
+    Gaussian.
+    """
+    # Tables indexed by outcome: hidden, in no region, in region 0, 1, ...
+    # intp avoids a conversion in `take`.
+    outcome = np.subtract(where.regions, HIDDEN, dtype=np.intp)
     said = np.where((claims.confidences > 0) & (not is_late), claims.labels, NOT_SEEN)
     miss = NOT_SEEN if is_late else MISS
     labels = np.array([NOT_SEEN, miss, *said], np.int16).take(outcome)
     confidences = np.array([0, 0, *claims.confidences], np.float32).take(outcome)
     corners, least_px = np.reshape(claims.boxes, (-1, 2, 2)), config.labels.least_px
     sides_px = np.sqrt(np.prod(corners[:, 1] - corners[:, 0], axis=1))
-    # where a labeller has spoken too, by the Gaussian
+    # Regions that have a label of the labeller too are fused per Gaussian.
     is_fused = np.array([False, False, *(claims.open_confidences > 0)])
     if is_fused.any():
         both = np.flatnonzero(is_fused.take(outcome))
@@ -279,7 +329,7 @@ def observations(
         is_told = one.confidences > (2 * one.by_detector if is_late else 0)
         labels[both] = np.where(is_told, one.labels, NOT_SEEN)
         confidences[both] = one.confidences
-    extents_m = np.fmax(where.depths_m, 0)  # NaN is hidden, and has none
+    extents_m = np.fmax(where.depths_m, 0)  # NaN: hidden Gaussians have no extent.
     extents_m /= np.float32(np.sqrt(camera.fx * camera.fy))
     extents_m *= np.array([least_px, least_px, *sides_px], np.float32).take(outcome)
     return Observations(indices, labels, confidences, extents_m)

@@ -1,4 +1,4 @@
-"""What is known of a map beside its shape: the labels of its Gaussians, and its objects."""
+"""Labels of the Gaussians of a map, and its objects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -29,33 +29,41 @@ from .semantic_fusion import (
 
 @dataclass(frozen=True, slots=True)
 class SemanticMapConfig:
+    """Settings of the labels and objects of a map."""
+
     labelling: SemanticFusionConfig = field(default_factory=SemanticFusionConfig)
     objects: ObjectsConfig = field(default_factory=ObjectsConfig)
     naming: OpenVocabularyConfig = field(default_factory=OpenVocabularyConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
-    movable_confidence: float = 0.6  # of the detector: below, it is not relied on elsewhere, and a
-    # hole where a picture was taken for a person would be worse than the person
-    most_names: int = MAX_LABELS  # of the vocabulary; a later name is `other`
-    most_waiting: int = 8  # keyframes whose boxes came before they were mapped: as many as may be
-    # on their way to the mapper
-    most_said_again: int = 64  # the newest keyframes whose boxes came: after a restart those of a
-    # window, 8, come once more
+    # Minimum score of a detection that removes dynamic surface. Scores below are not relied on
+    # elsewhere either, and a hole where a picture passed for a person would be worse than the
+    # person.
+    movable_confidence: float = 0.6
+    most_names: int = MAX_LABELS  # Maximum names in the vocabulary; a later name is `other`.
+    # Maximum keyframes with detections that are not mapped yet: as many as may be on their way to
+    # the mapper.
+    most_waiting: int = 8
+    # Newest keyframes with detections that are remembered, to drop repeated messages. After a
+    # restart, a window of 8 is sent again.
+    most_said_again: int = 64
 
     def __post_init__(self) -> None:
         if self.most_waiting < 0 or self.most_said_again < 1 or self.most_names > MAX_LABELS:
             raise ConfigError(
                 named(self, "most_names", "most_waiting", "most_said_again")
-                + (f": most_waiting at least 0, most_said_again 1, most_names up to {MAX_LABELS}.")
+                + ": most_waiting must be at least 0, most_said_again at least 1, "
+                + f"most_names at most {MAX_LABELS}."
             )
 
     @property
     def hears_labeller(self) -> bool:
+        """True if labels of the labeller are fused into the map."""
         return self.labelling.fusion.rule != "detector"
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeSemantics:
-    """What a keyframe told, and which of its regions a labeller is to be asked about."""
+    """Result of fusing a keyframe: changes of the objects, and regions to send to the labeller."""
 
     keyframe: int
     observed: ObjectUpdate
@@ -63,12 +71,12 @@ class KeyframeSemantics:
 
 
 class SemanticMap:
-    """Labels the Gaussians of a MapBuilder, which keeps what each keyframe measured and where it
-    is now, and finds objects among them. What is claimed of a keyframe is folded in once; what a
-    labeller says of a part of it, later, when it is said.
+    """Labels of the Gaussians of a MapBuilder, and the objects among them.
 
-    Deterministic as the builder is. Where nothing is ever claimed, the map stays bit for bit as it
-    is without this class.
+    The MapBuilder stores the images and the current pose of each keyframe. The detections of a
+    keyframe are fused once, label results of its regions when they arrive. Results are as
+    deterministic as the builder. Without any detections and labels, the map is bitwise equal to one
+    without this class.
     """
 
     def __init__(
@@ -79,7 +87,14 @@ class SemanticMap:
         has_labeller: bool = False,
         threads: int = 1,
     ) -> None:
-        """`has_labeller`: there is somebody to be asked for names."""
+        """Create the semantics of a map.
+
+        Args:
+            map_: The map with the Gaussians to label.
+            config: Settings.
+            has_labeller: True if a labeller receives label requests.
+            threads: Number of threads.
+        """
         self.config = config or SemanticMapConfig()
         self.vocabulary = Vocabulary(self.config.most_names)
         self.objects = Objects(self.config.objects)
@@ -88,32 +103,40 @@ class SemanticMap:
             OpenVocabularyLabeling(self.config.naming, is_heard=is_heard) if has_labeller else None
         )
         self._map, self._threads = map_, threads
-        self._by_detector, self._by_labeller = set[int](), set[int]()  # labels they gave
-        self._done: dict[int, None] = {}  # the newest keyframes, in order
-        self._waiting: dict[
-            int, RegionDetections | None
-        ] = {}  # by keyframe, the first to come first
+        self._by_detector, self._by_labeller = set[int](), set[int]()  # Labels by source.
+        self._done: dict[int, None] = {}  # The newest keyframes, in order.
+        # Detections by keyframe, the oldest first.
+        self._waiting: dict[int, RegionDetections | None] = {}
         self._disagreement = Disagreement(0.0, 0.0)
-        self._labelled = 0  # keyframes
+        self._labelled = 0  # Keyframes.
         self._boxes = self._repeated = self._too_early = self._without_images = 0
         self._answers_without_images = self._movable = 0
 
     @property
     def is_used(self) -> bool:
-        """Something was claimed."""
+        """True if detections of any keyframe were received."""
         return bool(self._done or self._waiting)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the labels; none before anything was claimed."""
+        """Names of the labels; empty before any detections were received."""
         return self.vocabulary.names if self.is_used else ()
 
     # --- keyframes --------------------------------------------------------------------------------
     def add_detections(
         self, keyframe: int, claims: RegionDetections | None
     ) -> KeyframeSemantics | None:
-        """What a detector found in a keyframe; None: nobody looked. It waits until the keyframe is
-        mapped; said again, it is left out."""
+        """Fuse the detections of a keyframe, or store them until the keyframe is mapped.
+
+        Repeated messages are dropped and counted.
+
+        Args:
+            keyframe: Id of the keyframe.
+            claims: Detections; None if no detector ran on the keyframe.
+
+        Returns:
+            The result of the fusion; None if nothing was fused.
+        """
         if claims is None and self.naming is None:
             return None
         if keyframe in self._done or keyframe in self._waiting:
@@ -128,7 +151,7 @@ class SemanticMap:
         return None
 
     def on_keyframe_mapped(self, keyframe: int) -> KeyframeSemantics | None:
-        """A keyframe is in the map: learn what waits for it."""
+        """Fuse the stored detections of a keyframe that is mapped now; None without any."""
         if keyframe not in self._waiting:
             return None
         return self._fuse_keyframe(keyframe, self._waiting.pop(keyframe))
@@ -136,7 +159,11 @@ class SemanticMap:
     def _fuse_keyframe(
         self, keyframe: int, found: RegionDetections | None
     ) -> KeyframeSemantics | None:
-        """Its images may be forgotten by now, then nobody can tell what is in the boxes."""
+        """Fuse the detections of a mapped keyframe.
+
+        If its images are not stored any more, the Gaussians in the boxes are unknown. The
+        detections are then counted and dropped.
+        """
         self._done[keyframe] = None
         self._labelled += 1
         while len(self._done) > self.config.most_said_again:
@@ -144,25 +171,28 @@ class SemanticMap:
         if not self._map.views.is_readable(keyframe):
             self._without_images += 1
             return None
-        # who may walk away
+        # Remove dynamic classes.
         found = found and self._remove_dynamic(keyframe, found)
-        # who makes its image
+        # Find the Gaussians that contribute to the image.
         view, made_by = self._seen(keyframe)
-        # what is said of it, and what is to be asked
+        # Add labels of the labeller and choose label requests.
         claims, asked = self._with_names(view, made_by.top, found or RegionDetections.none())
-        # what they are
+        # Label the Gaussians.
         labelled = self._label(view, made_by.indices, claims, is_late=found is None)
         self._boxes += len(found.boxes) if found else 0
         self._disagreement = labelled.disagreement
-        # which objects they are
+        # Update the objects.
         seen = self._map_view(view, made_by.indices, labelled.assigned.regions, claims)
         return KeyframeSemantics(
             keyframe, self.objects.observe(seen, self._undetectable_labels()), asked
         )
 
     def _seen(self, keyframe: int) -> tuple[TrainingView, Contributions]:
-        """A keyframe, and who makes its image. Where depth is missing, as on what is dark, it is
-        the map's, which other keyframes measured; what was left out of the map has none."""
+        """Return a keyframe with completed depth, and the Gaussians that contribute to its image.
+
+        Missing depth, as on dark surfaces, comes from the map, where other keyframes measured it.
+        Pixels of the ignore mask have no depth.
+        """
         made_by, view = self._map.visible_contributions(keyframe), self._map.views[keyframe]
         in_map_m = self._map.render_keyframe(keyframe).median_depth_m
         depth_m = np.where(view.depth_m > 0, view.depth_m, in_map_m)
@@ -171,7 +201,7 @@ class SemanticMap:
         return replace(view, depth_m=depth_m), made_by
 
     def _remove_dynamic(self, keyframe: int, found: RegionDetections) -> RegionDetections:
-        """What may walk away belongs to no map: neither its surface nor its name."""
+        """Remove detections of dynamic classes, and their surface from the map."""
         names, sure = self.config.movable.classes, self.config.movable_confidence
         said = [self.vocabulary.name(int(label)) for label in found.labels]
         is_movable = np.isin(said, names) & (found.confidences >= sure)
@@ -185,7 +215,7 @@ class SemanticMap:
     def _with_names(
         self, view: TrainingView, top: np.ndarray, claims: RegionDetections
     ) -> tuple[RegionDetections, tuple[Region, ...]]:
-        """With what a labeller said before of what is there; what it is asked now."""
+        """Add known labels to the detections of a keyframe, and choose regions to request."""
         self._by_detector.update(claims.labels.astype(int).tolist())
         if self.naming is None:
             return claims, ()
@@ -199,11 +229,11 @@ class SemanticMap:
         return claims, tuple(question.region for question in questions)
 
     def _is_labellers(self, label: int) -> bool:
-        """Only the labeller gave it: of such things the detector says nothing."""
+        """Return whether only the labeller gave a label; the detector does not know it."""
         return label in self._by_labeller and label not in self._by_detector
 
     def _undetectable_labels(self) -> np.ndarray | None:
-        """[256] bool, labels that only the labeller gave: a detector cannot miss them."""
+        """Return labels that only the labeller gave, [256] bool; a detector cannot miss them."""
         if not self._by_labeller:
             return None
         return np.array([self._is_labellers(label) for label in range(MAX_LABELS)])
@@ -216,6 +246,7 @@ class SemanticMap:
         *,
         is_late: bool = False,
     ) -> FusionResult:
+        """Fuse the labels of regions into the Gaussians, and mark those that changed."""
         is_told = claims.open_confidences > 0
         self._by_labeller.update(claims.open_labels[is_told].astype(int).tolist())
         gaussians = self._map.gaussians
@@ -246,11 +277,14 @@ class SemanticMap:
         seen = indices, regions, claims.boxes, claims.classes(), view.depth_m
         return MapView(*at, *known, *seen)
 
-    # --- answers ----------------------------------------------------------------------------------
+    # --- label results ----------------------------------------------------------------------------
     def apply_label(self, region: int, keyframe: int, answer: RegionLabelResult) -> bool:
-        """What a labeller takes a region for, as that keyframe showed it; whether it was folded in.
+        """Fuse a label result of the labeller for a region of a keyframe.
 
-        Without the images of the keyframe nobody can tell which Gaussians are meant.
+        Without the images of the keyframe, the Gaussians of the region are unknown.
+
+        Returns:
+            True if the label was fused.
         """
         claims = self.naming and self.naming.apply_label_result(
             region, keyframe, answer, self.vocabulary
@@ -268,8 +302,11 @@ class SemanticMap:
         return True
 
     def _tell_where_shown(self, region: int, told: int) -> None:
-        """What a region is, in the other keyframes that the labeller was shown of it. Where it has
-        a name of the detector's, this has spoken of it there."""
+        """Fuse the label of a region in the other keyframes of its label request.
+
+        This is for labels that only the labeller gives. A label of the detector is fused there
+        already.
+        """
         assert self.naming is not None
         for keyframe in self.naming.shown_in(region):
             if keyframe == told or not self._map.views.is_readable(keyframe):
@@ -281,7 +318,7 @@ class SemanticMap:
                 self.refresh(view)
 
     def refresh(self, view: TrainingView | None = None) -> None:
-        """Make objects what has become of their Gaussians, or those that a keyframe may show."""
+        """Derive the objects from their Gaussians again: all, or those in view of a keyframe."""
         gaussians = self._map.gaussians
         known = gaussians.rows, gaussians.labels, gaussians.ids, gaussians.anchors
         seen_from = view and (view.camera, view.T_map_camera)
@@ -289,7 +326,7 @@ class SemanticMap:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """All but the labels, which the map has."""
+        """Return the state without the labels, which are stored in the map."""
         return {
             "vocabulary": self.vocabulary.pack(),
             "objects": self.objects.pack(),
@@ -301,6 +338,7 @@ class SemanticMap:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
+        """Restore a state that `snapshot` returned."""
         self.vocabulary = Vocabulary.unpack(state["vocabulary"])
         self.objects = Objects.unpack(state["objects"], self.config.objects)
         self._done, self._labelled = dict.fromkeys(state["done"]), state["labelled"]
@@ -316,30 +354,36 @@ class SemanticMap:
             )
 
     def metrics(self) -> dict[str, float]:
-        """`label_disagreement` is that of the newest keyframe labelled, summed over its Gaussians:
-        `_literal` as the paper prints it, `_expected` as it is made smaller."""
+        """Return the counters of the semantics.
+
+        `label_disagreement` is that of the newest labelled keyframe, summed over its Gaussians:
+        `_literal` as the paper prints it, `_expected` as the smoothing reduces it.
+        """
         labelled = 0
         if self._boxes:
             labelled = int(np.count_nonzero(top_labels(self._map.gaussians.labels) != BACKGROUND))
         return {
-            "gaussians_labelled": labelled,  # of those awake
+            "gaussians_labelled": labelled,  # Resident Gaussians only.
             "keyframes_labelled": self._labelled,
             "boxes": self._boxes,
-            "boxes_repeated": self._repeated,  # messages, said again after a restart
-            "detections_too_early": self._too_early,  # Their keyframe came too late.
-            "boxes_without_images": self._without_images,  # messages, of keyframes forgotten
-            "gaussians_dynamic_removed": self._movable,  # left out again: of what may walk away
+            "boxes_repeated": self._repeated,  # Messages repeated after a restart.
+            "detections_too_early": self._too_early,  # Dropped before their keyframe was mapped.
+            # Messages for keyframes without stored images.
+            "boxes_without_images": self._without_images,
+            # Gaussians of dynamic classes, removed again.
+            "gaussians_dynamic_removed": self._movable,
             "label_disagreement_literal": self._disagreement.literal,
             "label_disagreement_expected": self._disagreement.expected,
             "label_names": len(self.names),
             "label_names_rejected": self.vocabulary.refused,
             **self.objects.metrics(),
             **(self.naming.metrics() if self.naming else {}),
-            "answers_without_images": self._answers_without_images,  # of keyframes forgotten
+            # Keyframes without stored images.
+            "answers_without_images": self._answers_without_images,
         }
 
 
 def _packed(claims: RegionDetections | None) -> list[np.ndarray]:
-    """Arrays of a detector's claims; none where nobody looked."""
+    """Return the arrays of a keyframe's detections; none if no detector ran."""
     names = [f.name for f in fields(RegionDetections) if f.name not in ("parts", "replaces_labels")]
     return [getattr(claims, name) for name in names] if claims else []

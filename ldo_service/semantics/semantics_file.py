@@ -1,11 +1,11 @@
-"""semantics.npz: what each Gaussian of a map.ply is, row by row.
+"""File semantics.npz: the label distribution of each Gaussian of a map.ply, row by row.
 
-names     [C] text           of the labels, by index: background, other, ...
-weights   [N, 5] float32     of the five likeliest labels, heaviest first; background has the rest
-ids       [N, 5] uint8       the labels that the weights belong to; of a weight of 0 none
-evidence  [N] float32        how much was seen: the sum of the weights of observations, faded
-extent_mm [N] uint16         side of the object that it was last seen as a part of
-misses    [N] uint8          keyframes since then that expected it to be one
+names     [C] text           names of the labels, by index: background, other, ...
+weights   [N, 5] float32     five highest probabilities, heaviest first; the rest is background
+ids       [N, 5] uint8       labels that the weights belong to; unused where the weight is 0
+evidence  [N] float32        sum of the weights of all observations, decayed with age
+extent_mm [N] uint16         size of the object that the Gaussian was last observed as a part of
+misses    [N] uint8          keyframes since then that expected it to be part of one
 """
 
 from dataclasses import dataclass
@@ -21,19 +21,19 @@ from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 from .gaussian_labels import MAX_LABELS, ROW, fields
 
 COLUMNS = ROW.names or ()
-MAX_BYTES = 1 << 32  # of 128 million Gaussians
+MAX_BYTES = 1 << 32  # Enough for 128 million Gaussians.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SavedSemantics:
-    """labels [N, 32], see `labels`; names by index."""
+    """Label rows [N, 32], see `gaussian_labels.ROW`, and names by index."""
 
     labels: np.ndarray
     names: tuple[str, ...]
 
 
 def write_semantics(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> None:
-    """Labels [N, 32] in the order of the Gaussians in the map beside it."""
+    """Write labels [N, 32] in the order of the Gaussians in the map.ply of the same run."""
     rows = fields(labels)
     columns: dict[str, Any] = {name: rows[name] for name in COLUMNS}
     with path.open("wb") as file:
@@ -41,16 +41,20 @@ def write_semantics(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> N
 
 
 def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
-    """What `write_semantics` wrote, bit for bit.
+    """Read a file of `write_semantics`, bit for bit.
 
-    gaussians  how many the map beside it has
-    Raises DataError for a file that cannot be read, is something else, or fits another map.
+    Args:
+        path: The file.
+        gaussians: Number of Gaussians in the map.ply of the same run; None: not compared.
+
+    Raises:
+        DataError: If the file cannot be read, has another format, or belongs to another map.
     """
     try:
         saved = read_arrays(path, MAX_BYTES)
         arrays = {name: saved[name] for name in ("names", *COLUMNS)}
     except UNREADABLE as error:
-        raise DataError(f"{path} cannot be read as labels: {error}") from error
+        raise DataError(f"{path} cannot be read as labels of a map: {error}") from error
     labels = new_labels(len(arrays["weights"]))
     for name in COLUMNS:
         _require(path, name, arrays[name], len(labels))
@@ -59,8 +63,8 @@ def read_semantics(path: Path, gaussians: int | None = None) -> SavedSemantics:
     _require_names(path, labels, names)
     if gaussians is not None and len(labels) != gaussians:
         raise DataError(
-            f"{path} labels {len(labels)} Gaussians, the map beside it has {gaussians}: they are "
-            "not of one run."
+            f"{path} labels {len(labels)} Gaussians, but the map next to it has {gaussians}. "
+            "Use the map.ply and semantics.npz of one run."
         )
     return SavedSemantics(labels, names)
 
@@ -70,11 +74,14 @@ def _require(path: Path, name: str, values: np.ndarray, count: int) -> None:
     if values.dtype != base or values.shape != shape:
         raise DataError(f"{path}: {name} is {values.dtype}{values.shape}, must be {base}{shape}.")
     if values.dtype.kind == "f" and not (np.isfinite(values).all() and (values >= 0).all()):
-        raise DataError(f"{path}: {name} holds NaN, infinity or negative numbers.")
+        raise DataError(f"{path}: {name} must be finite and not negative.")
 
 
 def _require_names(path: Path, labels: np.ndarray, names: tuple[str, ...]) -> None:
     rows = fields(labels)
     last = int(rows["ids"][rows["weights"] > 0].max(initial=0))
     if not last < len(names) <= MAX_LABELS:
-        raise DataError(f"{path} names {len(names)} labels, and uses number {last}.")
+        raise DataError(
+            f"{path} uses label {last} and has {len(names)} names; it must have {last + 1} to "
+            f"{MAX_LABELS}."
+        )

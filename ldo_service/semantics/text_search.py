@@ -1,4 +1,4 @@
-"""Which objects somebody means who names a thing."""
+"""Search for objects by text."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,38 +8,44 @@ import numpy as np
 from ldo_service.detection.vocabulary import answers_to, normalized
 from ldo_service.errors import did_you_mean
 
-# Vectors [T, D] of length 1 of T texts, as the text half of an open-vocabulary labeller gives them;
-# zeros of those that it cannot place. Raises NotCompared.
+# Function from T texts to their unit vectors [T, D], the text encoder of an open-vocabulary
+# labeller; zeros where it has no vector. Raises TextComparisonError.
 Encode = Callable[[Sequence[str]], np.ndarray]
 
-# of a word for a kind of the thing, or for what it is a kind of; the thing itself is 1
+# Score of a hyponym or hypernym of the text; the text itself and its synonyms score 1.
 SYNONYM_SCORE = 0.9
-MIN_COSINE = 0.85  # of vectors of texts; CLIP has 0.7 for things that have nothing in common
+MIN_COSINE = 0.85  # Minimum cosine of text vectors; CLIP gives 0.7 to unrelated names.
 MIN_SCORE = 0.1
 
 
 class TextComparisonError(Exception):
-    """Texts could not be compared by what they mean; the text says why, as a sentence."""
+    """Failed comparison of texts by meaning; the message is a sentence with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class SearchHit:
-    index: int  # of the object among those searched
-    score: float  # 0..1
+    """Object that matches a text."""
+
+    index: int  # Index of the object in the sequence searched.
+    score: float  # Score, 0..1.
 
 
 def search(
     text: str, objects: Sequence[Mapping[str, float]], encode: Encode | None = None
 ) -> list[SearchHit]:
-    """Objects that answer to `text`, the best first, of equals the first.
+    """Return the objects that match `text`, best first; of equals, the first.
 
-    The score of an object with the probabilities p, by name, is
+    The score of an object with the probabilities p by name is
 
         max over its names of  p(name) nearness(name)
 
-    nearness is 1 of what was asked for and of words that mean the same, 0.9 of its kinds and of
-    what it is a kind of; of other names the cosine of their vectors, from 0.85 on, where `encode`
-    is given.
+    nearness is 1 for `text` and its synonyms, 0.9 for its hyponyms and hypernyms. For other names
+    it is the cosine of the text vectors, from 0.85 on, if `encode` is given.
+
+    Args:
+        text: Name to search for.
+        objects: Probabilities of each object by name.
+        encode: Text encoder; None: names are compared by the vocabulary only.
 
     >>> things = [{"chair": 0.8, "couch": 0.2}, {"couch": 1.0}, {"armchair": 0.5}]
     >>> [(hit.index, hit.score) for hit in search("Sofa", things)]
@@ -56,14 +62,14 @@ def search(
 def text_similarity(
     text: str, names: Sequence[str], encode: Encode | None = None
 ) -> dict[str, float]:
-    """How near each name is to what is asked for; those that are not are left out."""
+    """Return the nearness of each name to `text`, see `search`; names without any are omitted."""
     itself, *akin = answers_to(text)
     near = dict.fromkeys(akin, SYNONYM_SCORE) | {itself: 1.0}
     others = [name for name in names if name not in near]
     if encode is not None and others:
         vectors = encode([normalized(text), *others])
         if not vectors[0].any():
-            raise TextComparisonError(f"The pair of encoders has no text {text!r}.")
+            raise TextComparisonError(f"The text encoder has no vector for {text!r}.")
         cosines = np.clip(vectors[1:] @ vectors[0], 0, 1)
         for name, cosine in zip(others, cosines.tolist(), strict=True):
             if cosine >= MIN_COSINE:

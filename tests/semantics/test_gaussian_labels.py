@@ -238,6 +238,6 @@ def test_settings_beyond_their_range_are_refused(wrong) -> None:
 def test_a_label_beyond_the_classes_is_told() -> None:
     labels = new_labels(1)
     observe(labels, one(200), LabelConfig())
-    with pytest.raises(ValueError, match="beyond 82"):
+    with pytest.raises(ValueError, match="must be below 82"):
         distribution(labels, 82)
     assert background(labels)[0] == 0

@@ -110,7 +110,7 @@ def test_the_same_keyframes_give_the_same_bits_also_after_a_restart() -> None:
 
 def test_state_of_another_version_is_refused() -> None:
     packed = Objects().pack()
-    with pytest.raises(ValueError, match="not of this version"):
+    with pytest.raises(ValueError, match="of another version"):
         Objects.unpack({**packed, "landmarks": np.zeros((1, 8), np.uint8)})
 
 

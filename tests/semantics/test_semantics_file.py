@@ -63,7 +63,7 @@ def test_the_same_labels_make_the_same_file(written: Path, tmp_path: Path) -> No
 
 
 def test_labels_of_another_map_are_refused(written: Path) -> None:
-    with pytest.raises(DataError, match="labels 50 Gaussians, the map beside it has 51"):
+    with pytest.raises(DataError, match="labels 50 Gaussians, but the map next to it has 51"):
         read_semantics(written, N + 1)
 
 
@@ -87,9 +87,9 @@ def test_a_damaged_file_is_refused(written: Path) -> None:
     [
         ({"misses": np.zeros(N - 1, np.uint8)}, "misses is uint8"),
         ({"weights": np.zeros((N, 5))}, "weights is float64"),
-        ({"weights": np.full((N, 5), np.nan, np.float32)}, "NaN"),
-        ({"names": np.array(FIRST_NAMES[:2])}, "names 2 labels"),
-        ({"names": np.array(["a"] * 300)}, "names 300 labels"),
+        ({"weights": np.full((N, 5), np.nan, np.float32)}, "must be finite and not negative"),
+        ({"names": np.array(FIRST_NAMES[:2])}, "has 2 names"),
+        ({"names": np.array(["a"] * 300)}, "has 300 names"),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(written: Path, changed: dict, complaint: str) -> None:
