@@ -9,46 +9,52 @@ from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import Camera
 from ldo_service.kernels import _foreground
 
-MOST = 1e6  # of a share
+MOST = 1e6  # Maximum of a ratio.
 
 
 @dataclass(frozen=True, slots=True)
 class ForegroundConfig:
-    """Chosen on 275 frames of a Replica apartment, where figures from half to twice of each change
-    the mIoU of what two detectors found by less than one point."""
+    """Settings of the foreground masks.
 
-    max_step: float = 0.05  # of depth within 3x3 pixels of one surface, share
-    min_cosine: float = 0.9  # of normals 4 px apart on one surface
-    min_inside: float = 0.5  # of a surface, to belong to the box: floors and walls go on outside
-    max_gap: float = 0.15  # of depth within 3x3 pixels of one object, share
-    depth_bin: float = 0.05  # of the mode of depths, share
-    near_mode: float = 0.1  # share: where the object begins to grow
-    grow_px: int = 2  # over its noisy edges
+    They were chosen on 275 frames of a Replica apartment. Half or twice of each value changes the
+    mIoU of the objects of two detectors by less than one point.
+    """
+
+    max_step: float = 0.05  # Maximum relative depth step within 3x3 pixels of one surface.
+    min_cosine: float = 0.9  # Minimum cosine of normals 4 px apart on one surface.
+    # Minimum fraction of a surface inside the box; floors and walls extend outside.
+    min_inside: float = 0.5
+    max_gap: float = 0.15  # Maximum relative depth step within 3x3 pixels of one object.
+    depth_bin: float = 0.05  # Relative bin width of the depth histogram that gives the mode.
+    near_mode: float = 0.1  # Relative distance to the mode within which the object starts to grow.
+    grow_px: int = 2  # Growth over the noisy edges of the object.
 
     def __post_init__(self) -> None:
         shares = (self.max_step, self.min_cosine, self.min_inside, self.max_gap, self.near_mode)
         if not (min(shares) >= 0 and max(self.min_cosine, self.min_inside) <= 1):
             raise ConfigError(
                 named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
-                + ": shares must not be negative, cosine and inside at most 1."
+                + ": each must be at least 0, min_cosine and min_inside at most 1."
             )
         if max(shares) > MOST:
             raise ConfigError(
                 named(self, "max_step", "min_cosine", "min_inside", "max_gap", "near_mode")
-                + f": shares may be {MOST:g} at most, which leaves nothing out."
+                + f": each must be at most {MOST:g}, which includes all depths."
             )
         if not (1e-4 <= self.depth_bin <= 1 and 0 <= self.grow_px <= 64):
             raise ConfigError(
                 named(self, "depth_bin", "grow_px")
-                + ": depth_bin must be within 1e-4..1, grow_px within 0..64."
+                + ": depth_bin must be in 1e-4..1, grow_px in 0..64."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SmoothSurfaces:
-    """Smooth pieces of a depth image, as `surfaces` finds them.
+    """Smooth surfaces of a depth image, as `surfaces` finds them.
 
-    labels [H, W] int32, 0 on edges and where depth is missing; sizes [S] int64, px, of each label
+    Attributes:
+        labels: Surface of each pixel, [H, W] int32; 0 on edges and where depth is unknown.
+        sizes: Size of each surface, [S] int64, pixels.
     """
 
     labels: np.ndarray
@@ -57,14 +63,20 @@ class SmoothSurfaces:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Foreground:
-    """Part of a box: `mask` [h, w] bool, whose first pixel lies at (row, column) of the image."""
+    """Part of a box.
+
+    Attributes:
+        row: Row of the mask's first pixel in the image.
+        column: Column of that pixel.
+        mask: Pixels of the part, [h, w] bool.
+    """
 
     row: int
     column: int
     mask: np.ndarray
 
     def image(self, shape: tuple[int, ...]) -> np.ndarray:
-        """[H, W] bool."""
+        """Return the mask in an image of this shape, [H, W] bool."""
         out = np.zeros(shape, bool)
         height, width = self.mask.shape
         out[self.row : self.row + height, self.column : self.column + width] = self.mask
@@ -72,7 +84,7 @@ class Foreground:
 
     @property
     def box_px(self) -> np.ndarray:
-        """[4], x0 y0 x1 y1 around the whole mask, pixel centres at integers.
+        """Box around the whole mask, [4], x0 y0 x1 y1, with pixel centers at integers.
 
         >>> Foreground(2, 1, np.ones((3, 4), bool)).box_px.tolist()
         [0.5, 1.5, 4.5, 4.5]
@@ -82,31 +94,37 @@ class Foreground:
         return np.array(corners) - 0.5
 
     def pack(self) -> tuple[tuple[int, ...], np.ndarray]:
-        """Row, column and shape, and the mask as bits: for a state."""
+        """Return row, column and shape, and the mask as bits, for a checkpoint."""
         return (self.row, self.column, *self.mask.shape), np.packbits(self.mask)
 
     @staticmethod
     def unpack(place: Sequence[int], bits: np.ndarray) -> "Foreground":
+        """Restore a foreground from `pack`."""
         row, column, height, width = place
         mask = np.unpackbits(bits, count=height * width).reshape(height, width).astype(bool)
         return Foreground(row, column, mask)
 
 
 def surfaces(depth_m: np.ndarray, camera: Camera, config: ForegroundConfig) -> SmoothSurfaces:
-    """Pieces of depth without steps and creases, connected by their sides. Once per keyframe, for
-    all boxes: 0.8 ms for 640x480.
+    """Find the smooth surfaces of a depth image, without steps and creases.
 
-    A pixel belongs to one where within 3x3 pixels no depth is missing and none is max_step times
-    more than another, and where the normals of blurred depth two pixels left and right of it, and
-    those above and below, have cosines above min_cosine.
+    They are computed once per keyframe for all boxes, in 0.8 ms for 640x480. A pixel belongs to a
+    surface if all depths within 3x3 pixels are known and no two differ by more than max_step. Also,
+    the normals of the blurred depth two pixels left and right of it must have a cosine above
+    min_cosine, and so those above and below. Surfaces are connected by the sides of their pixels,
+    and numbered from 1 in the order of their first pixels, row by row. If a cosine is at its
+    threshold, the result may differ between instruction sets.
 
-    depth_m [H, W], m, NaN or not above 0 where it is missing, of `camera` without distortion.
-    Pieces are numbered from 1 on, in the order of their first pixels, row by row. Where a cosine
-    is at its threshold the outcome may differ between instruction sets. Raises ValueError for an
-    image that is not of the camera's size.
+    Args:
+        depth_m: Depth, [H, W], meters; NaN or not above 0 where unknown.
+        camera: Intrinsics of the depth, without distortion.
+        config: Settings.
+
+    Raises:
+        ValueError: If depth_m does not have the size of the camera's images.
     """
     if depth_m.shape != (camera.height, camera.width):
-        raise ValueError(f"depth_m has shape {depth_m.shape}, which is not that of {camera}.")
+        raise ValueError(f"depth_m has shape {depth_m.shape}, must have that of {camera}.")
     labels = np.empty(depth_m.shape, np.int32)
     sizes = _foreground.surfaces(
         np.ascontiguousarray(depth_m, np.float32),
@@ -128,13 +146,24 @@ def foreground(
     camera: Camera,
     config: ForegroundConfig,
 ) -> Foreground:
-    """The object that fills the middle of a box x0 y0 x1 y1 (px) of a depth image [H, W] (m), of
-    which `found` are the surfaces.
+    """Return the object that fills the middle of a box of a depth image.
 
-    Its surfaces lie mostly inside the box, and no further from the mode of the depths about its
-    centre than it is wide; it is what of them hangs together, edges included, with what is at that
-    depth in the middle half. Empty where depth is missing, or where only a wall is there. Raises
-    ValueError for surfaces of another image.
+    The surfaces of the object lie mostly inside the box, and no further from the mode of the depths
+    around its center than the box is wide. The object is the part of these surfaces and their edges
+    that is connected to pixels of that depth in the middle half of the box.
+
+    Args:
+        box: The box, x0 y0 x1 y1, pixels.
+        depth_m: Depth, [H, W], meters.
+        found: Surfaces of the depth image.
+        camera: Intrinsics of the depth.
+        config: Settings.
+
+    Returns:
+        The object; an empty mask where depth is unknown or the box shows only a wall.
+
+    Raises:
+        ValueError: If the surfaces belong to another image.
     """
     rows, columns = pixels_of(box, depth_m.shape)
     mask = np.zeros((rows.stop - rows.start, columns.stop - columns.start), bool)
@@ -157,7 +186,7 @@ def foreground(
 
 
 def pixels_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of the pixels whose centres lie in a box, within the image."""
+    """Return rows and columns of the pixels with centers in a box, within the image."""
 
     def within(low: float, high: float, size: int) -> slice:
         start = min(max(0, int(np.ceil(low))), size)
@@ -169,25 +198,28 @@ def pixels_of(box: np.ndarray, shape: tuple[int, ...]) -> tuple[slice, slice]:
 
 @dataclass(frozen=True, slots=True)
 class NestingConfig:
-    """Two regions of which one lies in the other are no rivals: both may be there. As rivals, by
-    score, a table of 0.9 would win the pixels of a cup of 0.5."""
+    """Settings of regions that lie in others.
 
-    inside: float = 0.8  # share of the smaller one, to lie in the larger
-    times: float = 2.0  # as large: less, and they are of one thing
-    least_score: float = 0.5  # of the smaller: many boxes below are wrong
+    A region and another one that it contains may both be correct. If they competed by score, a
+    table with a score of 0.9 would get the pixels of a cup with 0.5.
+    """
+
+    inside: float = 0.8  # Minimum fraction of the smaller region that must lie in the larger one.
+    times: float = 2.0  # Minimum ratio of their sizes; below it, both show one object.
+    least_score: float = 0.5  # Minimum score of the smaller region; many boxes below are wrong.
 
     def __post_init__(self) -> None:
         if not (0 < self.inside <= 1 and self.times > 1 and self.least_score >= 0):
             raise ConfigError(
                 named(self, "inside", "times", "least_score")
-                + ": inside within 0..1, times over 1, least_score not negative."
+                + ": inside must be in (0, 1], times above 1, least_score not negative."
             )
 
 
 def without_nested(
     parts: Sequence[Foreground], scores: np.ndarray, config: NestingConfig
 ) -> list[Foreground]:
-    """Each of M parts but for the pixels of those that lie in it; scores [M].
+    """Return each of M parts without the pixels of the parts that lie in it; scores [M].
 
     >>> table = Foreground(0, 0, np.ones((4, 8), bool))
     >>> cup = Foreground(1, 2, np.ones((2, 2), bool))
@@ -212,7 +244,7 @@ Window = tuple[slice, slice]
 
 
 def _shared(a: Foreground, b: Foreground) -> tuple[Window, Window] | None:
-    """The window that the masks of both have, in each; None where they have none."""
+    """Return the window common to both masks, in the coordinates of each; None without one."""
     top, left = max(a.row, b.row), max(a.column, b.column)
     bottom = min(a.row + a.mask.shape[0], b.row + b.mask.shape[0])
     right = min(a.column + a.mask.shape[1], b.column + b.mask.shape[1])
@@ -227,13 +259,18 @@ def _shared(a: Foreground, b: Foreground) -> tuple[Window, Window] | None:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionDetections:
-    """What is said to be in M boxes of a keyframe.
+    """Labels of M boxes of a keyframe.
 
-    boxes                  [M, 4], x0 y0 x1 y1, px, pixel centres at integers
-    labels, confidences    [M] of the detector; confidence 0: it says nothing
-    open_labels, open_confidences [M] of the open-vocabulary labeller; 0: it was not invoked
-    parts                  what of each box it is; None, or none at all: what is found in it
-    anew                   what their Gaussians were taken for before was said of another thing
+    Attributes:
+        boxes: Boxes, [M, 4], x0 y0 x1 y1, pixels, with pixel centers at integers.
+        labels: Labels of the detector, [M].
+        confidences: Confidences of the detector, [M]; 0 without a detection.
+        open_labels: Labels of the open-vocabulary labeller, [M].
+        open_confidences: Confidences of the labeller, [M]; 0 if it was not invoked.
+        parts: Part of each box that shows the object. None or an empty tuple: the foreground of the
+            box is computed.
+        replaces_labels: True if the Gaussians of the boxes lose their earlier labels, which were
+            those of another object.
     """
 
     boxes: np.ndarray
@@ -248,14 +285,16 @@ class RegionDetections:
     def of_detector(
         cls, boxes: np.ndarray, labels: np.ndarray, confidences: np.ndarray
     ) -> "RegionDetections":
+        """Return labels of the detector alone."""
         return cls(boxes, labels, confidences, labels, np.zeros(len(boxes), np.float32))
 
     @classmethod
     def none(cls) -> "RegionDetections":
+        """Return labels of no boxes."""
         return cls.of_detector(np.zeros((0, 4), np.float32), *np.zeros((2, 0), np.float32))
 
     def where(self, mask: np.ndarray) -> "RegionDetections":
-        """Those of a mask [M]."""
+        """Return the labels where a mask [M] is true."""
         parts = tuple(part for part, is_in in zip(self.parts, mask, strict=False) if is_in)
         return RegionDetections(
             self.boxes[mask],
@@ -268,10 +307,10 @@ class RegionDetections:
         )
 
     def scores(self) -> np.ndarray:
-        """[M], by which regions compete where they overlap."""
+        """Return the scores by which overlapping regions compete, [M]."""
         return np.maximum(self.confidences, self.open_confidences)
 
     def classes(self) -> np.ndarray:
-        """[M, 2] labels of detector and labeller, -1 where they say nothing."""
+        """Return the labels of detector and labeller, [M, 2]; -1 if missing."""
         said = (self.labels, self.confidences), (self.open_labels, self.open_confidences)
         return np.stack([np.where(sure > 0, one.astype(int), -1) for one, sure in said], axis=1)

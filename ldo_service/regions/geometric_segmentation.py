@@ -1,13 +1,13 @@
-"""What geometry and colour set apart in a keyframe: regions worth a name, and the room around them.
+"""Segments of a keyframe by geometry and color: possible objects and structural planes.
 
-    apart      hangs together in depth, and is no structure (see `planes`)
-    standing   what of that stands on a flat piece: a cup on a table, a cushion on a couch
-    convex     what of that no concave crease divides: a cabinet beside an oven (Stein et al., CVPR
-               2014: things are convex, and creases between them concave)
-    flat       lies on structure, and is of another colour: a picture, a window, a rug
-    room       a plane of structure itself: no thing, but what the box of one may show beside it
+    apart      connected in depth, and no structure (see `planes`)
+    standing   the part of that which stands on a flat surface: a cup on a table
+    convex     the part of that which no concave crease divides: a cabinet next to an oven
+    flat       lies on structure, with another color: a picture, a window, a rug
+    room       a plane of structure: no object, but it may appear in an object's box
 
-They overlap: a couch with its cushions is apart, the cushions stand on it.
+Convex segments follow Stein et al., CVPR 2014: objects are convex, and creases between them are
+concave. Segments overlap: a couch with its cushions is apart, and the cushions are standing.
 """
 
 from collections.abc import Iterator
@@ -38,15 +38,16 @@ _3X3 = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True, slots=True)
 class GeometricSegmentationConfig:
-    """Chosen as those of `PlaneConfig`; pixels are those of its small image."""
+    """Settings of the segmentation, in pixels of the small image; chosen like `PlaneConfig`."""
 
     planes: PlaneConfig = field(default_factory=PlaneConfig)
-    min_px: int = 60  # of a segment
-    max_gap: float = 0.06  # of depth within 3x3 pixels of one thing, share
-    crease_px: int = 3  # to either side of a crease, where normals are compared
-    crease: float = 0.35  # rad: a sharper concave one divides
-    color_step: float = 1.5  # Lab, per pixel: more is an edge of colour
-    color_gap: float = 4.5  # Lab, lightness counted half: what is nearer to a wall's colour is wall
+    min_px: int = 60  # Minimum size of a segment.
+    max_gap: float = 0.06  # Maximum relative depth step within 3x3 pixels of one object.
+    crease_px: int = 3  # Distance to either side of a crease at which normals are compared.
+    crease: float = 0.35  # Minimum angle (rad) of a concave crease that divides.
+    color_step: float = 1.5  # Minimum gradient (Lab per pixel) of a color edge.
+    # Minimum color difference (Lab, lightness weighted by half) from a wall to be a flat segment.
+    color_gap: float = 4.5
 
     def __post_init__(self) -> None:
         if min(self.min_px, self.crease_px) < 1:
@@ -56,12 +57,14 @@ class GeometricSegmentationConfig:
         if min(self.max_gap, self.crease, self.color_step, self.color_gap) <= 0:
             raise ConfigError(
                 named(self, "max_gap", "crease", "color_step", "color_gap")
-                + ": gaps and steps must be positive."
+                + ": each must be positive."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Segment:
+    """Segment of a keyframe: its kind and its mask."""
+
     kind: Kind
     part: Foreground
 
@@ -69,15 +72,22 @@ class Segment:
 def segment_geometry(
     color: np.ndarray, depth_m: np.ndarray, camera: Camera, config: GeometricSegmentationConfig
 ) -> list[Segment]:
-    """Of a keyframe: color [H, W, 3] uint8 RGB, depth [H, W] m, 0 where it is missing.
+    """Segment a keyframe; the same images give the same segments.
 
-    The same images give the same segments.
+    Args:
+        color: Color image, [H, W, 3] uint8 RGB.
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of both.
+        config: Settings.
+
+    Returns:
+        The segments at the size of the image.
     """
-    # what is measured, made small
+    # Features of the small depth image.
     seen = compute_depth_features(depth_m, camera, config.planes)
     found = planes(seen, config.planes)
     of_room = structural_planes(seen, found, config.planes)
-    # what is no part of the room
+    # Pixels outside of the structural planes.
     joined = _joined(seen, config)
     apart = (seen.inverse > 0) & (of_room == 0)
     apart = cv2.morphologyEx(apart.astype(np.uint8), cv2.MORPH_OPEN, _3X3) > 0
@@ -90,7 +100,7 @@ def segment_geometry(
         shown.append(("convex", mask))
     for mask in _colored(color, of_room, config, camera):
         shown.append(("flat", mask))
-    # at the size of the image
+    # Enlarge the segments to the size of the image.
     k = shrink_factor(camera.width, config.planes)
     things = [
         Segment(kind, _enlarged(_filled(part) if kind == "flat" else part, k))
@@ -104,7 +114,7 @@ def segment_geometry(
 
 
 def components(mask: np.ndarray, least_px: int = 1) -> Iterator[Foreground]:
-    """What hangs together by its sides in mask [H, W] bool."""
+    """Yield the parts of a mask [H, W] bool that are connected by the sides of their pixels."""
     count, parts, boxes, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=4)
     for part in range(1, count):
         column, row, width, height, area = (int(value) for value in boxes[part])
@@ -114,19 +124,22 @@ def components(mask: np.ndarray, least_px: int = 1) -> Iterator[Foreground]:
 
 
 def _joined(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
-    """Measured, and without a step of depth to a neighbour."""
+    """Return where depth is known and has no step to a neighbor, [h, w] bool."""
     low = cv2.erode(seen.inverse, _3X3)
     return (low > 0) & (cv2.dilate(seen.inverse, _3X3) < (1 + config.max_gap) * low)
 
 
 def _on_planes(found: Planes, apart: np.ndarray) -> np.ndarray:
-    """Flat pieces of things, with their edges."""
+    """Return the flat surfaces of objects with their edges, [h, w] bool."""
     return cv2.dilate(((found.number > 0) & apart).astype(np.uint8), _3X3) > 0
 
 
 def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.ndarray:
-    """Where normals of neighbours turn towards each other: (p_b - p_a) . (n_b - n_a) < 0, for
-    normals towards the camera, and by more than noise."""
+    """Return where the normals of neighbors turn towards each other, [h, w] bool.
+
+    A crease is concave if (p_b - p_a) . (n_b - n_a) < 0 for normals towards the camera. The normals
+    must differ by more than noise.
+    """
     points = seen.rays / np.maximum(seen.smooth, np.float32(1e-3))[..., None]
     r, concave = config.crease_px, np.zeros(seen.inverse.shape, bool)
     for axis, inner in ((1, np.s_[:, r:-r]), (0, np.s_[r:-r])):
@@ -139,8 +152,10 @@ def _concave(seen: DepthFeatures, config: GeometricSegmentationConfig) -> np.nda
 def _divided(
     apart: np.ndarray, concave: np.ndarray, config: GeometricSegmentationConfig
 ) -> Iterator[np.ndarray]:
-    """[h, w] bool: the pieces of each thing between its creases, with what of these is theirs. What
-    has most of a thing is the thing, and no piece."""
+    """Yield the convex pieces of each object, [h, w] bool, grown over the creases around them.
+
+    A piece with most of an object is the object itself, and is not yielded.
+    """
     of_thing = np.asarray(cv2.connectedComponents(apart.astype(np.uint8), connectivity=4)[1])
     sizes = np.bincount(of_thing.ravel())
     for part in components(apart & ~concave, config.min_px):
@@ -152,7 +167,7 @@ def _divided(
 
 
 def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
-    """Differences of what is r pixels to either side."""
+    """Return the differences of values r pixels to either side."""
     swapped = np.swapaxes(values, 0, axis)
     return np.swapaxes(swapped[2 * r :] - swapped[: -2 * r], 0, axis)
 
@@ -160,7 +175,7 @@ def _across(values: np.ndarray, r: int, axis: int) -> np.ndarray:
 def _colored(
     color: np.ndarray, of_room: np.ndarray, config: GeometricSegmentationConfig, camera: Camera
 ) -> Iterator[np.ndarray]:
-    """[h, w] bool for each plane of the room: what on it is of another colour than most of it."""
+    """Yield for each structural plane where its color differs from its main color, [h, w] bool."""
     k, (height, width) = shrink_factor(camera.width, config.planes), of_room.shape
     small = cv2.resize(
         color[: height * k, : width * k], (width, height), interpolation=cv2.INTER_AREA
@@ -174,7 +189,7 @@ def _colored(
 
 
 def _steps(lab: np.ndarray) -> np.ndarray:
-    """[h, w] Lab per pixel."""
+    """Return the color gradient in Lab per pixel, [h, w]."""
     smooth = cv2.GaussianBlur(lab, (0, 0), 1.0)
     across = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     down = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
@@ -182,8 +197,10 @@ def _steps(lab: np.ndarray) -> np.ndarray:
 
 
 def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationConfig) -> np.ndarray:
-    """Of the even pieces of a plane [h, w] bool: the largest, and those of its colour; grown over
-    their edges."""
+    """Return the pixels of a plane with its main color, [h, w] bool, grown over their edges.
+
+    The main color is that of the largest even component.
+    """
     count, parts = cv2.connectedComponents(even.astype(np.uint8), connectivity=4)
     parts = np.asarray(parts, np.int32)
     sizes = np.bincount(parts.ravel(), minlength=count)
@@ -200,7 +217,7 @@ def _of_plane(even: np.ndarray, lab: np.ndarray, config: GeometricSegmentationCo
 
 
 def _filled(part: Foreground) -> Foreground:
-    """With what it goes around, and a pixel more: what its colour begins in is an edge."""
+    """Return a part with holes filled and grown by a pixel, as its color begins at an edge."""
     outline, _ = cv2.findContours(
         part.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
@@ -209,5 +226,6 @@ def _filled(part: Foreground) -> Foreground:
 
 
 def _enlarged(part: Foreground, k: int) -> Foreground:
+    """Return a part at the size of the image, k times as large."""
     mask = np.repeat(np.repeat(part.mask, k, axis=0), k, axis=1)
     return Foreground(k * part.row, k * part.column, mask)

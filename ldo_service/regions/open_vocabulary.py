@@ -1,8 +1,8 @@
-"""What an open-vocabulary labeller is asked, and what its answers are about (paper, III.B).
+"""Label requests to an open-vocabulary labeller and the use of its results (paper, III.B).
 
-An answer comes late. It speaks of the pixels that a keyframe showed of a region, so these are kept
-until then; and it stays with the region, as a vote for its name beside those of the detector's
-boxes: where a later keyframe shows that again, it still has the name.
+A label result arrives late. It describes the pixels of a region in one keyframe, so these are
+stored until then. The label stays with the region as a vote next to the votes of the detector's
+boxes. When a later keyframe observes the region, the label is applied again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,28 +31,39 @@ from .region_tracker import RegionLabel, RegionRequest, RegionTracker, RegionTra
 
 @dataclass(frozen=True, slots=True)
 class OpenVocabularyConfig:
+    """Settings of open-vocabulary labels."""
+
     trigger: RegionProposalConfig = field(default_factory=RegionProposalConfig)
     regions: RegionTrackerConfig = field(default_factory=RegionTrackerConfig)
-    reliable: float = 0.6  # probability of a label, for which nobody needs to be asked (III.B)
-    least_sure: float = 0.3  # of an answer: with 0.5 the flat's recall is 7 points less, and of
-    # labellers that tell what is no thing little else is below
-    structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")  # no objects, whoever
-    # says so: they stay background
-    most_open: int = 96  # questions without an answer, some 10 kB each: the labeller has 32 regions
-    # waiting, and may be asked three times about each
+    reliable: float = 0.6  # Minimum probability of a label that needs no label request (III.B).
+    # Minimum confidence of a label result: with 0.5, the flat's recall is 7 points less.
+    # Labellers that recognize regions without an object return few results below.
+    least_sure: float = 0.3
+    # Labels that are no objects, whatever their source; such regions stay background.
+    structure: tuple[str, ...] = ("background", "wall", "floor", "ceiling")
+    # Maximum pending label requests, some 10 kB each: the labeller queues 32 regions, and each may
+    # be requested three times.
+    most_open: int = 96
 
     def __post_init__(self) -> None:
         if not (0 <= self.reliable <= 1 and 0 <= self.least_sure <= 1) or self.most_open < 1:
             raise ConfigError(
                 named(self, "reliable", "least_sure", "most_open")
-                + ": reliable must be within 0..1, most_open at least 1."
+                + ": reliable and least_sure must be in [0, 1], most_open at least 1."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PendingRequest:
-    """What a question was about: a part of a box in a keyframe, the detector's word on it, and the
-    kind of the region."""
+    """Pending label request.
+
+    Attributes:
+        box_px: Box of the region in the keyframe, [4], x0 y0 x1 y1, pixels.
+        part: Mask of the region.
+        label: Label of the detector; empty without one.
+        score: Score of the detector.
+        kind: Kind of the region, see `geometric_segmentation`.
+    """
 
     box_px: np.ndarray
     part: Foreground
@@ -62,22 +73,29 @@ class PendingRequest:
 
 
 class OpenVocabularyLabeling:
-    """Chooses what to ask, and knows what was asked. Bounded; the same calls give the same bits,
-    also after `unpack`."""
+    """Choice of label requests, and the use of label results.
+
+    Memory is bounded. The same calls give bitwise equal results, also after `unpack`.
+    """
 
     def __init__(
         self, config: OpenVocabularyConfig | None = None, *, is_heard: bool = True
     ) -> None:
-        """`is_heard`: names are claimed; else they are learnt, and boxes stay as they are."""
+        """Create the open-vocabulary labels of a map.
+
+        Args:
+            config: Settings.
+            is_heard: True if labels are added to the detections; else they are only collected as
+                votes.
+        """
         self.config, self._is_heard = config or OpenVocabularyConfig(), is_heard
         self._regions = RegionTracker(self.config.regions)
-        self._open: dict[
-            tuple[int, int], PendingRequest
-        ] = {}  # by region and keyframe, the oldest first
+        # Requests by region and keyframe, the oldest first.
+        self._open: dict[tuple[int, int], PendingRequest] = {}
         self._questions = self._named = self._unnamed = self._unknown = self._overdue = 0
         self._outvoted = 0
 
-    # --- questions --------------------------------------------------------------------------------
+    # --- label requests ---------------------------------------------------------------------------
     def observe_keyframe(
         self,
         view: TrainingView,
@@ -86,11 +104,17 @@ class OpenVocabularyLabeling:
         is_labelled: np.ndarray,
         T_map_keyframe: Mapping[int, np.ndarray],
     ) -> tuple[RegionDetections, list[RegionRequest]]:
-        """The detector's claims of a keyframe with what is known of its regions, and what is to be
-        asked about them now.
+        """Add known labels of regions to the detections of a keyframe, and choose label requests.
 
-        is_labelled [H, W] bool: the map has a reliable name for this pixel
-        T_map_keyframe: where all keyframes are now
+        Args:
+            view: Images and pose of the keyframe.
+            claims: Detections of the keyframe.
+            vocabulary: Vocabulary of the map.
+            is_labelled: Pixels for which the map has a reliable label, [H, W] bool.
+            T_map_keyframe: Current poses of all keyframes, [4, 4], by id.
+
+        Returns:
+            The detections with labels of regions, and the new label requests.
         """
         config, depth_m, camera = self.config.trigger, view.depth_m, view.camera
         labels = [vocabulary.name(int(label)) for label in claims.labels]
@@ -122,12 +146,22 @@ class OpenVocabularyLabeling:
             del self._open[next(iter(self._open))]
             self._overdue += 1
 
-    # --- answers ----------------------------------------------------------------------------------
+    # --- label results ----------------------------------------------------------------------------
     def apply_label_result(
         self, region: int, keyframe: int, answer: RegionLabelResult, vocabulary: Vocabulary
     ) -> RegionDetections | None:
-        """What the labeller claims of that keyframe, with what the detector said of the same part.
-        None where it names nothing, or nobody asked."""
+        """Return the labels of a region by the labeller and the detector in the requested keyframe.
+
+        Args:
+            region: Id of the region.
+            keyframe: Keyframe of the request.
+            answer: Label result.
+            vocabulary: Vocabulary of the map.
+
+        Returns:
+            The labels; None if the result has no label, is overruled by the region's votes, or has
+            no pending request.
+        """
         asked = self._open.pop((region, keyframe), None)
         if asked is None:
             self._unknown += 1
@@ -152,7 +186,7 @@ class OpenVocabularyLabeling:
             np.array([said]),
             np.array([confidence], np.float32),
             (asked.part,),
-            # until now it was a part of what it stands on, for all that was said
+            # Earlier labels of its Gaussians are those of the surface below it.
             replaces_labels=asked.kind == "standing"
             and confidence >= self.config.regions.settled
             and before is not None
@@ -161,7 +195,7 @@ class OpenVocabularyLabeling:
         )
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """The keyframes whose views of a region the labeller was shown; see `RegionTracker`."""
+        """Return the keyframes with views in the label request of a region; see `RegionTracker`."""
         return self._regions.shown_in(region)
 
     def carried(
@@ -171,8 +205,7 @@ class OpenVocabularyLabeling:
         vocabulary: Vocabulary,
         T_map_keyframe: Mapping[int, np.ndarray],
     ) -> RegionDetections | None:
-        """What a region is, as an earlier keyframe shows it; None where it has no name, or is not
-        seen."""
+        """Return the label of a region in an earlier keyframe; None if unknown or not visible."""
         place = view.keyframe, view.depth_m, view.camera, T_map_keyframe
         opinion = self._regions.carried(region, *place)
         return opinion and add_region_labels(
@@ -180,7 +213,10 @@ class OpenVocabularyLabeling:
         )
 
     def _filter_answer(self, answer: RegionLabelResult, asked: PendingRequest) -> RegionLabelResult:
-        """Without a label that is no object's, or is told too unsurely of what no box is about."""
+        """Return a label result without labels that are no objects.
+
+        A label below least_sure is removed, unless the region is a box of the detector.
+        """
         others = tuple((name, sure) for name, sure in answer.others if self._is_object(name))
         if not self._is_object(answer.label):
             return RegionLabelResult("", answer.confidence)
@@ -196,7 +232,7 @@ class OpenVocabularyLabeling:
 
     # --- state ------------------------------------------------------------------------------------
     def pack(self) -> dict[str, Any]:
-        """Plain values and arrays, for a state."""
+        """Return plain values and arrays for a checkpoint."""
         return {
             "regions": self._regions.pack(),
             "open": [[*key, *_packed(asked)] for key, asked in self._open.items()],
@@ -209,7 +245,7 @@ class OpenVocabularyLabeling:
         *,
         is_heard: bool = True,
     ) -> "OpenVocabularyLabeling":
-        """As it was."""
+        """Restore the labels from `pack`."""
         out = OpenVocabularyLabeling(config, is_heard=is_heard)
         out._regions = RegionTracker.unpack(packed["regions"], out.config.regions)
         out._open = {
@@ -218,24 +254,30 @@ class OpenVocabularyLabeling:
         return out
 
     def metrics(self) -> dict[str, float]:
+        """Return the counters of regions, label requests and label results."""
         return {
             "regions_tracked": len(self._regions),
             "questions": self._questions,
             "label_requests_pending": len(self._open),
-            "label_requests_expired": self._overdue,  # given up for newer ones
+            "label_requests_expired": self._overdue,  # Dropped for newer requests.
             "answers_named": self._named,
-            "answers_unnamed": self._unnamed,  # no opinion, or nobody could look
-            "label_results_overruled": self._outvoted,  # boxes of the region say otherwise
-            "answers_unknown": self._unknown,  # to questions given up, or said again
+            # Results without a label: no object, or no labeller available.
+            "answers_unnamed": self._unnamed,
+            # The votes of the region give another label.
+            "label_results_overruled": self._outvoted,
+            # Results without a pending request: it was dropped, or the result repeated.
+            "answers_unknown": self._unknown,
         }
 
 
 def match_boxes_to_regions(
     boxes: int, found: Sequence[RegionProposal]
 ) -> tuple[Foreground | None, ...]:
-    """Of each box of the detector the thing that depth and creases set apart there, or what of it
-    is no room, or None where nobody looked. What colour sets apart has the rim of what it lies
-    on."""
+    """Return for each of the detector's boxes the mask of its object, or None if it has no region.
+
+    It is the segment by depth and creases, or the foreground without structure. Segments by color
+    ("flat") are not used: they include the edge of the surface behind.
+    """
     parts: list[Foreground | None] = [None] * boxes
     for one in found:
         if one.number is not None and one.kind != "flat":
@@ -249,15 +291,24 @@ def add_region_labels(
     vocabulary: Vocabulary,
     boxes_vote: bool,
 ) -> RegionDetections:
-    """Claims of a detector with the names of the same regions: of other regions alone, of a box of
-    the detector beside its label, or in place of it where it has a vote in the name."""
+    """Add the labels of regions to the detections of a keyframe.
+
+    A region without a box is added. The label of a region with a box is added next to the label of
+    the detector. It replaces the detector's label if boxes vote for region labels.
+
+    Args:
+        claims: Detections of the keyframe.
+        opinions: Labels of regions.
+        vocabulary: Vocabulary of the map.
+        boxes_vote: True if boxes of the detector vote for region labels.
+    """
     labels, confidences = claims.open_labels.copy(), claims.open_confidences.copy()
     by_detector, parts = claims.confidences.copy(), claims.parts or (None,) * len(claims.boxes)
     for opinion in opinions:
         if (number := opinion.of.number) is not None:
             labels[number], confidences[number] = vocabulary.index(opinion.label), opinion.sure
             if boxes_vote:
-                by_detector[number] = 0  # its word is a part of the opinion
+                by_detector[number] = 0  # The label of the region contains its vote.
     alone = [
         opinion
         for opinion in opinions
@@ -276,7 +327,7 @@ def add_region_labels(
 
 
 def _is_part_of_one(opinion: RegionLabel, opinions: Sequence[RegionLabel]) -> bool:
-    """Most of its box lies in that of a larger region of the same name: one thing, not two."""
+    """Return whether most of its box lies in that of a larger region with the same label."""
     larger = [
         other.of.box_px
         for other in opinions

@@ -1,12 +1,12 @@
-"""Flat pieces of a keyframe, and which of them are the room rather than things in it.
+"""Planes of a keyframe, and the structural ones among them: walls, floors and ceilings.
 
 Inverse depth is linear in the image on a plane: n . (ray z) = d gives 1 / z = n . ray / d. So
-planes are fitted to it by least squares, and its noise is the same near and far (a Kinect's:
-0.0014 / m).
+planes are fitted to it by least squares. Its noise is the same near and far, for a Kinect
+0.0014 / m.
 
-A plane is structure (a wall, a floor, a ceiling) when next to nothing is seen behind it along its
-outline: floors meet walls, and things stand before both. A table's top, a cabinet's front or a
-seat ends where one looks past it at what is farther away.
+A plane is structure if almost no surface behind it is visible along its outline. Floors meet walls,
+and objects stand in front of both. A table top, a cabinet front or a seat ends where the camera
+sees past it to a farther surface.
 """
 
 from dataclasses import dataclass
@@ -23,47 +23,56 @@ _LEAST = np.float32(1e-6)
 
 @dataclass(frozen=True, slots=True)
 class PlaneConfig:
-    """Set on `synthetic:flat` by how well regions cover its things, and not varied since. Lengths
-    in pixels are those of the small image that all of this is done in."""
+    """Settings of the planes.
 
-    width_px: int = 320  # of that image: normals over a few pixels are steady enough there
-    blur_px: float = 2.0  # of inverse depth, before normals are taken
-    min_cosine: float = 0.94  # of normals 4 px apart on one surface
-    max_step: float = 0.04  # of depth within 3x3 pixels of one surface, share
-    step_floor: float = 0.004  # 1 / m, added to it: far away noise is a step
-    min_share: float = 0.01  # of the image: smaller pieces are no planes worth fitting
-    most: int = 24  # planes, the largest
-    tolerance: float = 0.006  # 1 / m, of a plane's pixels
-    behind: float = 0.3  # of a plane's outline, with something farther beyond: more, and it is no
-    # structure. Where the image ends nobody knows, so this counts as nothing behind
-    gap_px: tuple[int, int] = (3, 8)  # from the outline to where that is looked at
+    They were set on `synthetic:flat` by how well regions cover its objects, and not varied since.
+    Lengths in pixels are those of the small image that all of this is computed in.
+    """
+
+    width_px: int = 320  # Width of that image; normals over a few of its pixels are stable enough.
+    blur_px: float = 2.0  # Blur of the inverse depth for normals.
+    min_cosine: float = 0.94  # Minimum cosine of normals 4 px apart on one surface.
+    max_step: float = 0.04  # Maximum relative depth step within 3x3 pixels of one surface.
+    step_floor: float = 0.004  # 1 / m, added to that step, since far away noise alone is a step.
+    min_share: float = 0.01  # Minimum plane size as a fraction of the image.
+    most: int = 24  # Maximum number of planes, the largest.
+    tolerance: float = 0.006  # 1 / m, maximum distance of a plane's pixels from it.
+    # Maximum fraction of a structural plane's outline with a farther surface behind it. Where the
+    # image cuts the outline, the surface is unknown and counts as none behind.
+    behind: float = 0.3
+    # Range of distances outside the outline where surfaces behind are counted.
+    gap_px: tuple[int, int] = (3, 8)
 
     def __post_init__(self) -> None:
         shares = self.min_cosine, self.max_step, self.min_share, self.behind
         if not (min(shares) >= 0 and max(shares) <= 1):
             raise ConfigError(
                 named(self, "min_cosine", "max_step", "min_share", "behind")
-                + ": shares and the cosine must be within 0..1."
+                + ": each must be in [0, 1]."
             )
         if min(self.blur_px, self.tolerance, self.step_floor) <= 0 or self.width_px < 16:
             raise ConfigError(
                 named(self, "width_px", "blur_px", "step_floor", "tolerance")
-                + ": lengths must be positive, width_px at least 16."
+                + ": each must be positive, width_px at least 16."
             )
         if not 0 <= self.gap_px[0] < self.gap_px[1]:
-            raise ConfigError(named(self, "gap_px") + ": gap_px must be two ascending distances.")
+            raise ConfigError(
+                named(self, "gap_px") + ": must be two ascending distances, not negative."
+            )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class DepthFeatures:
-    """A depth image made small: [h, w] each.
+    """Features of a depth image that was scaled down, [h, w] each.
 
-    inverse  float32, 1 / m, as measured, 0 where nothing is
-    smooth   float32, the same, blurred
-    normals  [h, w, 3] float32, towards the camera
-    rays     [h, w, 3] float32, with z = 1
-    is_step  bool, depth jumps here or is missing
-    surfaces int32, smooth pieces; 0 on edges; `sizes` [S] px of each
+    Attributes:
+        inverse: Measured inverse depth, float32, 1 / m; 0 where unknown.
+        smooth: Blurred inverse depth, float32, 1 / m.
+        normals: Normals towards the camera, [h, w, 3] float32.
+        rays: Viewing rays with z = 1, [h, w, 3] float32.
+        is_step: True where depth has a step or is unknown, bool.
+        surfaces: Smooth surfaces, int32; 0 on edges.
+        sizes: Size of each surface, [S], pixels.
     """
 
     inverse: np.ndarray
@@ -77,8 +86,12 @@ class DepthFeatures:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Planes:
-    """number    [h, w] int32, which plane a pixel belongs to, 0 for none
-    inverses  [P] of [h, w] float32, 1 / m: each plane across the image; plane 1 comes first
+    """Planes of a keyframe.
+
+    Attributes:
+        number: Plane of each pixel, [h, w] int32; 0 without one.
+        inverses: Inverse depth of each plane across the image, P of [h, w] float32, 1 / m; that of
+            plane 1 comes first.
     """
 
     number: np.ndarray
@@ -86,13 +99,14 @@ class Planes:
 
 
 def shrink_factor(width: int, config: PlaneConfig) -> int:
+    """Return the factor by which images of this width are scaled down."""
     return max(1, round(width / config.width_px))
 
 
 def compute_depth_features(
     depth_m: np.ndarray, camera: Camera, config: PlaneConfig
 ) -> DepthFeatures:
-    """Of depth [H, W], 0 where it is missing."""
+    """Compute the features of depth [H, W] in meters, 0 where unknown."""
     k = shrink_factor(camera.width, config)
     inverse = _shrunk_inverse(depth_m, k)
     height, width = inverse.shape
@@ -112,7 +126,7 @@ def compute_depth_features(
 
 
 def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
-    """Fitted to the largest surfaces. A wall that a thing cuts in two is one plane."""
+    """Fit planes to the largest surfaces; a wall that an object divides is one plane."""
     number, inverses = np.zeros(seen.inverse.shape, np.int32), []
     for piece in np.argsort(-seen.sizes, kind="stable")[: config.most]:
         size = seen.sizes[piece]
@@ -120,7 +134,7 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
             break
         part = (seen.surfaces == piece) & (number == 0)
         if np.count_nonzero(part) < 0.5 * size:
-            continue  # most of it is of a plane by now
+            continue  # Most of it belongs to a plane already.
         plane = _fitted(seen, part, config)
         if plane is None:
             continue
@@ -133,8 +147,10 @@ def planes(seen: DepthFeatures, config: PlaneConfig) -> Planes:
 
 
 def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -> np.ndarray:
-    """[h, w] int32, the number of the plane where a pixel lies on one that is structure, or next to
-    such a plane and no farther from it than noise; 0 elsewhere."""
+    """Return the number of the structural plane of each pixel, [h, w] int32; 0 without one.
+
+    A pixel belongs to the plane if it lies on it, or next to it and no farther from it than noise.
+    """
     out = np.zeros(found.number.shape, np.int32)
     for number, inverse in enumerate(found.inverses, 1):
         part = cv2.morphologyEx((found.number == number).astype(np.uint8), cv2.MORPH_OPEN, _3X3)
@@ -142,7 +158,7 @@ def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -
             continue
         part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, disc(3))
         if _share_behind(seen, part, inverse, config) < config.behind:
-            # as measured: what is blurred over a step would be a ring about each thing
+            # Unblurred depth: blurred over a step, it would add a ring around each object.
             is_near = np.abs(seen.inverse - inverse) < np.maximum(config.tolerance, 0.02 * inverse)
             reached = (cv2.dilate(part, disc(15)) > 0) & (seen.inverse > 0)
             out[reached & is_near & (out == 0)] = number
@@ -150,11 +166,12 @@ def structural_planes(seen: DepthFeatures, found: Planes, config: PlaneConfig) -
 
 
 def disc(radius_px: int) -> np.ndarray:
+    """Return a disc as a kernel for morphology, [2 r + 1, 2 r + 1] uint8."""
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1, 2 * radius_px + 1))
 
 
 def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
-    """The mean of what is measured in k x k pixels."""
+    """Return the mean inverse depth of the measured ones among k x k pixels."""
     height, width = (side // k * k for side in depth_m.shape)
     depth_m = depth_m[:height, :width]
     measured = (depth_m > 0).astype(np.float32)
@@ -165,7 +182,7 @@ def _shrunk_inverse(depth_m: np.ndarray, k: int) -> np.ndarray:
 
 
 def _blurred(inverse: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Of what is measured alone."""
+    """Return the inverse depth blurred over measured pixels only."""
     measured = (inverse > 0).astype(np.float32)
     total, count = (cv2.GaussianBlur(a, (0, 0), sigma_px) for a in (inverse, measured))
     return measured * total / np.maximum(count, np.float32(1e-3))
@@ -174,7 +191,7 @@ def _blurred(inverse: np.ndarray, sigma_px: float) -> np.ndarray:
 def _pieces(
     smooth: np.ndarray, normals: np.ndarray, config: PlaneConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Connected pixels whose normals agree, and their sizes; the edges between count as none."""
+    """Return connected surfaces with similar normals, [h, w], and their sizes; 0 for edges."""
     smooth = smooth.copy()
     smooth[:, 2:-2] &= (normals[:, 4:] * normals[:, :-4]).sum(axis=-1) > config.min_cosine
     smooth[2:-2] &= (normals[4:] * normals[:-4]).sum(axis=-1) > config.min_cosine
@@ -185,7 +202,10 @@ def _pieces(
 
 
 def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.ndarray | None:
-    """a, b, c of 1 / z = a x + b y + c; None where it is no plane. Twice without what is off."""
+    """Return a, b, c of 1 / z = a x + b y + c, or None if the surface is not plane.
+
+    Two more fits exclude outliers.
+    """
     v, u = np.nonzero(part)
     v, u = v[::4], u[::4]
     rays = seen.rays[v, u]
@@ -202,8 +222,11 @@ def _fitted(seen: DepthFeatures, part: np.ndarray, config: PlaneConfig) -> np.nd
 def _share_behind(
     seen: DepthFeatures, part: np.ndarray, inverse: np.ndarray, config: PlaneConfig
 ) -> float:
-    """Of the outline of a plane's part: where what is seen beyond is farther than the plane would
-    be there. What lies about on the plane does not count."""
+    """Return the fraction of a plane's outline with a surface behind it.
+
+    A surface is behind if it is farther than the plane would be there. Objects that lie on the
+    plane do not count.
+    """
     near, far = config.gap_px
     ring = (cv2.dilate(part, disc(far)) > 0) & (cv2.dilate(part, disc(near)) == 0) & ~seen.is_step
     is_behind = ring & (seen.inverse < (1 - 0.03) * inverse - 0.003)

@@ -1,4 +1,4 @@
-"""One image region, followed over keyframes: its masks, views and votes for names."""
+"""Region track: an image region over keyframes, with its masks, views and label votes."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,15 +12,16 @@ from .foreground import Foreground
 from .region_proposals import RegionProposal
 from .region_views import RegionView
 
-MAX_POINTS = 96  # of a sighting, 12 bytes each
+MAX_POINTS = 96  # Points per observation, 12 bytes each.
 
 
-Votes = tuple[tuple[str, float, float], ...]  # name, sum of its votes, the surest of them
+Votes = tuple[tuple[str, float, float], ...]  # Label, sum of its votes, highest confidence.
 
 
 def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Votes:
-    """What is twice as sure counts four times. Of the demo's boxes that are 0.3 sure a third are
-    right, of those that are 0.6 sure all but few.
+    """Return votes with one for a label; twice the confidence counts four times.
+
+    In the demo, a third of the boxes with a score of 0.3 are right, and nearly all with 0.6.
 
     >>> votes = with_vote((("tv", 0.25, 0.5),), "tv", 0.6)
     >>> with_vote(votes, "oven", 0.5, weight=4)
@@ -30,7 +31,9 @@ def with_vote(votes: Votes, name: str, sure: float, weight: float = 1.0) -> Vote
 
 
 def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
-    """As above, up to `most` in all: a box comes with every keyframe, and says the same again.
+    """Return votes with that of a box, up to a sum of `most` for its label.
+
+    The sum is limited because each keyframe repeats the same box.
 
     >>> with_box(with_box((), "tv", 0.6, 0.4), "tv", 0.5, 0.4)
     (('tv', 0.4, 0.6),)
@@ -42,7 +45,7 @@ def with_box(votes: Votes, name: str, sure: float, most: float) -> Votes:
 
 
 def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
-    """With those of another region, of which 0..1 this is a `share`.
+    """Return votes with those of another region, weighted by `share`, 0..1.
 
     >>> with_votes_of((("clock", 1.0, 0.5),), (("radiator", 2.0, 0.8), ("clock", 0.5, 0.4)), 0.5)
     (('clock', 1.25, 0.5), ('radiator', 1.0, 0.4))
@@ -51,8 +54,9 @@ def with_votes_of(votes: Votes, others: Votes, share: float) -> Votes:
 
 
 def winning_label(votes: Votes, least: float) -> tuple[str, float]:
-    """What most speaks for, and how sure: as the surest was, by the share of all votes that are for
-    it; nothing where the sum is less than `least`.
+    """Return the label with the most votes and its confidence; ("", 0) below `least`.
+
+    The confidence is the highest one for this label, times its fraction of all votes.
 
     >>> winning_label((("tv", 0.6, 0.5), ("oven", 0.4, 0.6)), 0.35)
     ('tv', 0.3)
@@ -64,6 +68,7 @@ def winning_label(votes: Votes, least: float) -> tuple[str, float]:
 
 
 def _added(votes: Votes, more: Votes) -> Votes:
+    """Return votes with others added."""
     sums = {name: (total, most) for name, total, most in votes}
     for name, total, most in more:
         before, surest = sums.get(name, (0.0, 0.0))
@@ -76,8 +81,13 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionLabelResult:
-    """What a labeller takes a region for, 0..1 `sure`; no label: it is no object, or who knows.
-    `others`: what else it may be, and how sure."""
+    """Label result of a labeller for a region.
+
+    Attributes:
+        label: Label; empty if the region is no object or the labeller does not know it.
+        confidence: Confidence of the label, 0..1.
+        others: Alternative labels and their confidences.
+    """
 
     label: str
     confidence: float
@@ -86,8 +96,13 @@ class RegionLabelResult:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionObservation:
-    """What a keyframe showed of a region, and points [P, 3] float32 of its surface in the camera's
-    frame."""
+    """Observation of a region in a keyframe.
+
+    Attributes:
+        keyframe: Id of the keyframe.
+        candidate: Box, mask and label of the region.
+        p_camera: Points of its surface in the camera frame, [P, 3] float32, meters.
+    """
 
     keyframe: int
     candidate: RegionProposal
@@ -95,29 +110,37 @@ class RegionObservation:
 
     @property
     def box_px(self) -> Box:
+        """Box of the observation as x0, y0, x1, y1, pixels."""
         x0, y0, x1, y1 = (float(value) for value in self.candidate.box_px)
         return x0, y0, x1, y1
 
     @property
     def size_px(self) -> int:
+        """Number of pixels of the mask."""
         return int(np.count_nonzero(self.candidate.part.mask))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Region:
-    """What is known of a region.
+    """Region track over keyframes.
 
-    keyframe, box_px the newest sighting
-    seen            keyframes that showed it
-    shape           the sighting that others are compared with: the one that was asked about, until
-                    then the largest
-    best            the sighting that shows most of it
-    views           the best, the best first
-    label, score    of the surest detector so far
-    votes           what speaks for each name
-    questions       asked so far; `quality` of the views, summed, when it was asked last
-    answer          the surest, without what else it may be
-    is_standing     on a thing, as a keyframe showed: it is no part of that
+    Attributes:
+        id: Id of the region.
+        keyframe: Keyframe of the newest observation.
+        box_px: Box of the newest observation, x0 y0 x1 y1, pixels.
+        shape: Observation that others are compared with: the requested one or, before any request,
+            the largest.
+        seen: Number of keyframes that observed the region.
+        best: Observation with the best view.
+        views: Best views, the best first.
+        label: Label of the detection with the highest score.
+        score: Score of that detection, 0..1.
+        votes: Votes for each label.
+        questions: Number of label requests so far.
+        quality: Summed quality of the views at the last label request.
+        answer: Label result with the highest confidence, without alternatives.
+        is_supported: True if a keyframe showed the region standing on an object; it is no part
+            of that object.
     """
 
     id: int
@@ -136,14 +159,21 @@ class Region:
     is_supported: bool = False
 
     def view_quality_gain(self) -> float:
-        """How much better its views are than when it was asked about."""
+        """Return the gain in summed view quality since the last label request."""
         return sum(view.quality for view in self.views) - self.quality
 
 
 def observe_region(
     keyframe: int, candidate: RegionProposal, depth_m: np.ndarray, camera: Camera
 ) -> RegionObservation | None:
-    """None where depth is missing."""
+    """Return an observation with points of the surface; None where depth is unknown.
+
+    Args:
+        keyframe: Id of the keyframe.
+        candidate: Region in the keyframe.
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the depth.
+    """
     part = candidate.part
     rows, columns = np.nonzero(part.mask)
     rows, columns = rows + part.row, columns + part.column
@@ -158,8 +188,11 @@ def observe_region(
 
 
 def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Which of these pixels [N] to keep, MOST_POINTS at most: those on a grid, or every so many of
-    what is too thin for it. Every so many of a rectangle would lie on a few lines."""
+    """Return which of N pixels to keep, at most MAX_POINTS.
+
+    These are pixels on a grid, or every n-th pixel of a region that is too thin for a grid. Every
+    n-th pixel of a rectangle would lie on a few lines.
+    """
     step = max(1, int(np.sqrt(len(rows) / MAX_POINTS)))
     while True:
         on_grid = (rows % step == step // 2) & (columns % step == step // 2)
@@ -173,8 +206,13 @@ def _spread(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def merge_observation(region: Region, seen: RegionObservation, most_boxes: float) -> Region:
-    """With what is new of it, and the surer of two opinions; `most_boxes` is what all boxes of a
-    name may speak for it."""
+    """Return a region with one more observation.
+
+    Args:
+        region: The region.
+        seen: The observation.
+        most_boxes: Maximum sum of the votes of boxes for a label.
+    """
     said = seen.candidate
     surer = max(region, said, key=lambda one: one.score)
     is_larger = region.questions == 0 and seen.size_px > region.shape.size_px
@@ -192,6 +230,7 @@ def merge_observation(region: Region, seen: RegionObservation, most_boxes: float
 
 
 def pack(region: Region) -> dict[str, Any]:
+    """Return a region as plain values and arrays for a checkpoint."""
     views = [{name: getattr(view, name) for name in RegionView.__slots__} for view in region.views]
     plain = {name: getattr(region, name) for name in Region.__slots__}
     answer = region.answer and [
@@ -202,6 +241,7 @@ def pack(region: Region) -> dict[str, Any]:
 
 
 def unpack(row: Mapping[str, Any]) -> Region:
+    """Restore a region from `pack`."""
     views = tuple(RegionView(**{**view, "box_px": tuple(view["box_px"])}) for view in row["views"])
     changed = {
         "box_px": tuple(row["box_px"]),
@@ -214,7 +254,7 @@ def unpack(row: Mapping[str, Any]) -> Region:
 
 
 def _packed_sighting(seen: RegionObservation) -> list[Any]:
-    """Without the number that its box had in its keyframe: nobody asks for it any more."""
+    """Return an observation as a list, without the number of its box, which is not needed."""
     of = seen.candidate
     said = of.label, of.score, of.kind
     return [seen.keyframe, seen.p_camera, of.box_px, *said, *of.part.pack()]

@@ -1,4 +1,4 @@
-"""Matching of a keyframe's regions to known ones, by masks propagated between keyframes."""
+"""Matching of a keyframe's regions with known ones, and mask propagation between keyframes."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,15 +11,23 @@ from ldo_service.geometry import Camera, se3
 from .foreground import Foreground
 from .region import Region, RegionObservation
 
-STRIDE_PX = 4  # of the pixels that are looked at, and the edge of what each stands for
-MARGIN_PX = 24  # around the points seen: they are few, and end within their region
-LEAST = 12  # pixels looked at that are its own
-SPACING = 1.5  # of its points, as they would lie on a square: what is farther from all is behind
+STRIDE_PX = 4  # Distance of the sampled pixels and side of the square that each represents.
+MARGIN_PX = 24  # Margin around the visible points, which are few and end within their region.
+LEAST = 12  # Minimum sampled pixels of a propagated mask.
+# Maximum distance to the nearest point as a multiple of the points' spacing; farther is behind.
+SPACING = 1.5
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ProjectedPoints:
-    """Those points of R regions that a keyframe sees: rows, columns and of [P] which region."""
+    """Points of R regions that are visible in a keyframe.
+
+    Attributes:
+        rows: Rows of the points in the image, [P].
+        columns: Columns of the points in the image, [P].
+        of: Region of each point, [P], 0..R-1.
+        counts: Number of visible points of each region, [R].
+    """
 
     rows: np.ndarray
     columns: np.ndarray
@@ -27,7 +35,7 @@ class ProjectedPoints:
     counts: np.ndarray
 
     def only(self, regions: Sequence[int]) -> "ProjectedPoints":
-        """Those of some of the R regions, each once, numbered as they come."""
+        """Return the points of some regions, each once, numbered in this order."""
         places = np.full(len(self.counts), -1)
         places[regions] = np.arange(len(regions))
         of = places[self.of]
@@ -36,7 +44,7 @@ class ProjectedPoints:
         return ProjectedPoints(*points, self.counts[regions])
 
     def shares_in(self, part: Foreground) -> np.ndarray:
-        """[R] of the points of each region that it sees."""
+        """Return the fraction of each region's visible points that lie in a mask, [R]."""
         inside = is_in(part, self.rows, self.columns)
         hits = np.bincount(self.of[inside], minlength=len(self.counts))
         return hits / np.maximum(self.counts, 1)
@@ -50,7 +58,16 @@ def projected(
     T_map_keyframe: Mapping[int, np.ndarray],
     max_gap_m: float,
 ) -> ProjectedPoints:
-    """What a keyframe, depth [H, W], sees of the regions' points."""
+    """Return the points of regions that are visible in a keyframe.
+
+    Args:
+        regions: Regions with points.
+        depth_m: Depth of the keyframe, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of all keyframes.
+        T_camera_map: Transform from the map to the keyframe, [4, 4].
+        T_map_keyframe: Current poses of the regions' keyframes, [4, 4], by id.
+        max_gap_m: Maximum distance from the measured depth of a visible point.
+    """
     points, of = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
     for i, region in enumerate(regions):
         T = T_camera_map @ T_map_keyframe[region.shape.keyframe]
@@ -72,10 +89,20 @@ def reverse_overlap(
     T_map_keyframe: Mapping[int, np.ndarray],
     least: int,
 ) -> float:
-    """Of the points of a sighting that lie in the image of the region's: the share in its part.
+    """Return the fraction of an observation's points that lie in the mask of a region.
 
-    What something hid there counts against it: a thing that is seen whole now, and was mostly
-    hidden at its best so far, is a new region."""
+    Only points inside the image of the region's observation count. Points that were occluded there
+    lower the fraction. So an object that is fully visible now, and was mostly occluded at its best
+    before, is a new region.
+
+    Args:
+        seen: The observation.
+        region: The region.
+        shape: Height and width of the images.
+        camera: Intrinsics of all keyframes.
+        T_map_keyframe: Current poses of both keyframes, [4, 4], by id.
+        least: Minimum points inside the image; with fewer, the result is 0.
+    """
     known = region.shape
     T = se3.inverse(T_map_keyframe[known.keyframe]) @ T_map_keyframe[seen.keyframe]
     rows, columns, is_inside = pixels(seen.p_camera @ T[:3, :3].T + T[:3, 3], camera, shape)
@@ -87,7 +114,7 @@ def reverse_overlap(
 def pixels(
     p_camera: np.ndarray, camera: Camera, shape: tuple[int, ...]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows and columns [P] of points [P, 3], and which lie in the image."""
+    """Return rows and columns [P] of points [P, 3] and which lie in the image, [P] bool."""
     z = p_camera[:, 2]
     far = np.maximum(z, 1e-6)
     u = np.rint(camera.fx * p_camera[:, 0] / far + camera.cx)
@@ -98,7 +125,7 @@ def pixels(
 
 
 def is_in(part: Foreground, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """[P] bool"""
+    """Return which pixels lie in a mask, [P] bool."""
     height, width = part.mask.shape
     r, c = rows - part.row, columns - part.column
     inside = (r >= 0) & (c >= 0) & (r < height) & (c < width)
@@ -115,12 +142,24 @@ def propagate_mask(
     T_seen_now: np.ndarray,
     max_gap_m: float,
 ) -> Foreground | None:
-    """The pixels of depth [H, W] whose points lie in the mask of a sighting, and on its surface.
+    """Project a region's mask from an earlier keyframe into the current one.
 
-    rows, columns [P]  where points of that surface are seen now
-    T_seen_now [4, 4]  from the camera of now to that of the sighting
-    max_gap_m          from its surface, or more where its points are farther apart
-    Every fourth pixel of a row and of a column is looked at. None where next to nothing is seen.
+    Every fourth pixel of a row and of a column is sampled. It belongs to the region if its point
+    lies in the mask and on the surface of the observation.
+
+    Args:
+        seen: The earlier observation of the region.
+        rows: Rows of the region's points in the current keyframe, [P].
+        columns: Columns of these points, [P].
+        depth_m: Depth of the current keyframe, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of both keyframes.
+        T_seen_now: Transform from the current camera to the earlier one, [4, 4].
+        max_gap_m: Largest distance to the observed surface that still belongs to the region; larger
+            where its points are farther apart.
+
+    Returns:
+        The mask in the current keyframe, or None if fewer than 12 sampled pixels belong to the
+        region.
     """
     row, column, p_now = _points(rows, columns, depth_m, camera)
     p_seen = p_now @ T_seen_now[:3, :3].T + T_seen_now[:3, 3]
@@ -136,8 +175,12 @@ def propagate_mask(
 def _points(
     rows: np.ndarray, columns: np.ndarray, depth_m: np.ndarray, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rows, columns [N] and points [N, 3] of the grid about what is seen; z 0 where depth is
-    missing."""
+    """Return a grid of pixels around the visible points, and their 3D points.
+
+    Returns:
+        Rows [N], columns [N] and points [N, 3] in the camera frame, meters; z is 0 where depth is
+        unknown.
+    """
     grid = np.meshgrid(
         *(
             np.arange(
@@ -154,13 +197,13 @@ def _points(
 
 
 def _spacing_m(seen: RegionObservation, camera: Camera) -> float:
-    """Of a sighting's points, were its area a square full of them."""
+    """Return the spacing of an observation's points as if they filled a square."""
     m_per_px = float(np.median(seen.p_camera[:, 2])) / camera.fx
     return float(np.sqrt(seen.size_px / len(seen.p_camera))) * m_per_px
 
 
 def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> Foreground:
-    """Squares of STRIDE_PX at those pixels."""
+    """Return a mask of squares of STRIDE_PX at these pixels."""
     top, left = int(rows.min()), int(columns.min())
     small = np.zeros(
         ((int(rows.max()) - top) // STRIDE_PX + 1, (int(columns.max()) - left) // STRIDE_PX + 1),
@@ -172,9 +215,7 @@ def _enlarged(rows: np.ndarray, columns: np.ndarray, shape: tuple[int, ...]) -> 
 
 
 class RegionMatcher:
-    """Those whose keyframe is known, as they were before this one: depth [H, W], T_map_keyframe
-    [4, 4] by keyframe, this one's too. Points of a region are seen within max_gap_m of their depth,
-    and fewer than `least_points` tell nothing."""
+    """Matching of known regions with the regions of a keyframe."""
 
     def __init__(
         self,
@@ -186,6 +227,18 @@ class RegionMatcher:
         max_gap_m: float,
         least_points: int,
     ) -> None:
+        """Project the points of known regions into a keyframe.
+
+        Args:
+            regions: Regions as they were before this keyframe; those of unknown keyframes are
+                ignored.
+            keyframe: Id of the keyframe.
+            depth_m: Depth of the keyframe, [H, W], meters; 0 where unknown.
+            camera: Intrinsics of all keyframes.
+            T_map_keyframe: Current poses of all keyframes and this one, [4, 4], by id.
+            max_gap_m: Maximum distance from the measured depth of a visible point.
+            least_points: Minimum visible points of a region for any conclusion.
+        """
         self._regions = [r for r in regions if r.shape.keyframe in T_map_keyframe]
         self._depth_m, self._camera, self._T_map_keyframe = depth_m, camera, T_map_keyframe
         self._keyframe, self._max_gap_m, self._least = keyframe, max_gap_m, least_points
@@ -196,7 +249,13 @@ class RegionMatcher:
     def same(
         self, sighting: RegionObservation, overlap: float, taken: Collection[int]
     ) -> int | None:
-        """The id of the region that it is most of, and that is most of it; but for those taken."""
+        """Return the id of the region that an observation shows; None without one.
+
+        Args:
+            sighting: The observation.
+            overlap: Minimum fraction of the points of each that lies in the mask of the other.
+            taken: Ids of regions that are matched already.
+        """
         shares = self._seen.shares_in(sighting.candidate.part)
         shares[self._seen.counts < self._least] = 0
         place = self._depth_m.shape, self._camera, self._T_map_keyframe
@@ -211,16 +270,19 @@ class RegionMatcher:
         return best
 
     def seen(self) -> Iterator[int]:
-        """The ids of those that it sees."""
+        """Yield the ids of the regions that are visible in the keyframe."""
         for i, region in enumerate(self._regions):
             if self._is_seen(i):
                 yield region.id
 
     def overlaps(self, shown: Sequence[tuple[int, Foreground]]) -> np.ndarray:
-        """[M, M], intersection over union of what it shows of regions: of the points of each, the
-        share in the other's pixels. 1 of each with itself; 0 of what it sees too little of.
+        """Return the intersection over union of the regions' masks in the keyframe, [M, M].
 
-        shown  [M] their ids, each once, and their pixels in it
+        The intersection of two regions is the fraction of the points of each in the mask of the
+        other. The diagonal is 1. Regions with too few visible points have 0.
+
+        Args:
+            shown: Ids of M regions, each once, and their masks in the keyframe.
         """
         places = {region.id: i for i, region in enumerate(self._regions)}
         inside = np.zeros((len(shown), len(shown)))
@@ -234,7 +296,7 @@ class RegionMatcher:
         return iou
 
     def carried(self, region: int) -> Foreground | None:
-        """The pixels of a region that it sees; see `carried`."""
+        """Return the mask of a region in the keyframe; see `propagate_mask`."""
         i = next(i for i, one in enumerate(self._regions) if one.id == region)
         shape, is_its = self._regions[i].shape, self._seen.of == i
         T_map_now, T_map_seen = (self._T_map_keyframe[k] for k in (self._keyframe, shape.keyframe))

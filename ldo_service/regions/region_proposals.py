@@ -1,10 +1,13 @@
-"""Which regions of a keyframe are to be named by an open-vocabulary labeller (paper, III.B).
+"""Region proposals of a keyframe for an open-vocabulary labeller (paper, III.B).
 
-The paper asks when the best detector is less than 0.6 sure of a region, or gives it no reliable
-label. So a candidate is a box of a hesitant detector that no sure box explains; or a region that
-depth, creases or colour set apart, see `segments`, which neither a sure box nor the map's labels
-explain. What stands on a thing is not explained by the name of that thing. A candidate is followed
-from keyframe to keyframe by where it is, see `regions_tracked`.
+The paper requests a label if the best detection of a region has a score below 0.6, or gives it no
+reliable label. So a proposal is one of two:
+
+- A box with a low score that no box with a high score explains.
+- A segment by depth, creases or color that neither such a box nor the map's labels explain (see
+  `geometric_segmentation`). The label of an object does not explain a region that stands on it.
+
+`region_tracker` follows proposals over keyframes by their positions.
 """
 
 from collections.abc import Sequence
@@ -19,20 +22,26 @@ from ldo_service.geometry.boxes import ious, non_maximum_suppression
 from .foreground import Foreground, ForegroundConfig, foreground, pixels_of, surfaces
 from .geometric_segmentation import GeometricSegmentationConfig, Segment
 
-_ORDER = ("flat", "apart", "standing", "convex")  # of regions alike, the first is kept
+_ORDER = ("flat", "apart", "standing", "convex")  # Preference among similar regions.
 
 
 @dataclass(frozen=True, slots=True)
 class RegionProposalConfig:
-    sure: float = 0.6  # of a detector that nobody needs to help (III.B)
-    same_iou: float = 0.5  # with a sure box: the hesitant one is of the same thing
-    fits_iou: float = 0.6  # of a hesitant box and a region: the box's thing is the region
-    alike_iou: float = 0.7  # of two regions' boxes: one of them is enough
-    explained: float = 0.5  # share of an object's pixels that have a name already
-    min_side_px: int = 24  # smaller ones show a labeller nothing
-    max_share: float = 0.5  # of the image: larger ones are rooms, not objects
-    min_fill: float = 0.25  # of its box: what fills less is a frame around something
-    most: int = 32  # candidates of a keyframe, the largest first
+    """Settings of the region proposals."""
+
+    sure: float = 0.6  # Minimum score of a detection that needs no label request (III.B).
+    # Minimum IoU of two boxes of one object; that with the lower score is dropped.
+    same_iou: float = 0.5
+    # Minimum IoU of a box and the box of a region that shows the same object.
+    fits_iou: float = 0.6
+    alike_iou: float = 0.7  # Minimum IoU of the boxes of two similar regions; one is enough.
+    explained: float = 0.5  # Minimum fraction of labelled pixels for a region to be explained.
+    min_side_px: int = 24  # Minimum side of a region; smaller ones show a labeller nothing.
+    # Maximum size as a fraction of the image; larger ones are rooms, not objects.
+    max_share: float = 0.5
+    # Minimum fraction of its box; a region that fills less is a frame around something.
+    min_fill: float = 0.25
+    most: int = 32  # Maximum proposals of a keyframe, the largest.
     foreground: ForegroundConfig = field(default_factory=ForegroundConfig)
     segments: GeometricSegmentationConfig = field(default_factory=GeometricSegmentationConfig)
 
@@ -51,20 +60,23 @@ class RegionProposalConfig:
                     "max_share",
                     "min_fill",
                 )
-                + ": shares and scores must be within 0..1."
+                + ": each must be in [0, 1]."
             )
         if min(self.min_side_px, self.most) < 1:
-            raise ConfigError(
-                named(self, "min_side_px", "most") + ": sides and counts must be at least 1."
-            )
+            raise ConfigError(named(self, "min_side_px", "most") + ": each must be at least 1.")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionProposal:
-    """A region that nobody has a reliable name for, or that the detector is sure of.
+    """Region proposal: a region without a reliable label, or one with a certain detection.
 
-    box_px [4], x0 y0 x1 y1; part, what of the box it is; number, label and score of the detector's
-    box, if it is one; kind of the segment, if it is one
+    Attributes:
+        box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
+        part: Mask of the region.
+        label: Label of the detector's box; empty without one.
+        score: Score of the detector's box.
+        number: Number of the detector's box; None without one.
+        kind: Kind of the segment, see `geometric_segmentation`; empty without one.
     """
 
     box_px: np.ndarray
@@ -86,16 +98,20 @@ def propose_regions(
     room: Sequence[Foreground],
     config: RegionProposalConfig,
 ) -> list[RegionProposal]:
-    """Regions of a keyframe that a labeller should see, and those that the detector is sure of, to
-    be followed; the largest first.
+    """Return the regions of a keyframe for label requests and those with certain detections.
 
-    boxes_px, labels, scores  [M, 4], M, [M] of the detector
-    depth_m                   [H, W], 0 where it is missing
-    is_labelled               [H, W] bool: the map has a reliable name for what this pixel shows
-    found                     its regions, as `regions_of_image` finds them
-    room                      planes of the room, see `segments`
+    Both are tracked. The largest region comes first. The same arguments give the same proposals.
 
-    The same arguments give the same candidates.
+    Args:
+        boxes_px: Boxes of the detector, [M, 4], pixels.
+        labels: Labels of the detector, M.
+        scores: Scores of the detector, [M].
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the depth.
+        is_labelled: Pixels for which the map has a reliable label, [H, W] bool.
+        found: Regions of the keyframe from `regions_of_image`.
+        room: Structural planes, see `geometric_segmentation`.
+        config: Settings.
     """
     asked, is_taken = _boxed(boxes_px, labels, scores, depth_m, camera, found, room, config)
     is_sure = np.asarray(scores) >= config.sure
@@ -112,7 +128,7 @@ def propose_regions(
         if one.score >= config.sure or _is_worth_a_look(one, depth_m.shape, config)
     ]
     size = {id(one): np.count_nonzero(one.part.mask) for one in worth}
-    # a sure box is no question: it gives way where there is no room for both
+    # Boxes with a high score need no label request, and are dropped first.
     kept = sorted(worth, key=lambda c: (c.score >= config.sure, -size[id(c)]))[: config.most]
     return sorted(kept, key=lambda c: -size[id(c)])
 
@@ -127,8 +143,11 @@ def _boxed(
     room: Sequence[Foreground],
     config: RegionProposalConfig,
 ) -> tuple[list[RegionProposal], list[bool]]:
-    """Boxes of a detector: each is the region that fits it best, else its foreground without the
-    room, if that leaves enough to show. And which regions these are."""
+    """Return proposals of the detector's boxes, and which of the regions `found` they use.
+
+    A box becomes the region that fits it best. Without one, it becomes its foreground, without
+    structural planes if enough of it is left.
+    """
     asked, is_taken, pieces = [], [False] * len(found), None
     regions_px = _boxes(found)
     for i in distinct_boxes(boxes_px, scores, config):
@@ -148,9 +167,15 @@ def _boxed(
 
 
 def remove_structure(part: Foreground, room: Sequence[Foreground], inside: float) -> Foreground:
-    """Without those planes of the room that mostly go on outside of it: a wall between the leaves
-    of a plant, a floor between the legs of a table. Where that is most of it, as of a clock on its
-    wall, it stays whole. `inside`: share of a plane within the box, to be a part of the thing.
+    """Return a part without structural planes that mostly extend outside of its box.
+
+    Examples are a wall between the leaves of a plant and a floor between the legs of a table. If
+    this would remove most of the part, as of a clock on its wall, it stays whole.
+
+    Args:
+        part: The part.
+        room: Structural planes.
+        inside: Minimum fraction of a plane within the box to belong to the object.
 
     >>> plant, wall = np.ones((2, 4), bool), np.zeros((6, 8), bool)
     >>> wall[:, 3:] = True
@@ -173,8 +198,16 @@ def labeled_regions(
     found: Sequence[RegionProposal],
     config: RegionProposalConfig,
 ) -> list[RegionProposal]:
-    """Those of the regions `found` that the map has a reliable name for, is_labelled [H, W] bool,
-    and no box [M, 4] is drawn about; but for what stands on a thing, which is a candidate."""
+    """Return the regions `found` that have a reliable label in the map and match no box.
+
+    Regions that stand on an object are excluded, since they are proposals.
+
+    Args:
+        boxes_px: Boxes of the detector, [M, 4], pixels.
+        is_labelled: Pixels for which the map has a reliable label, [H, W] bool.
+        found: Regions of the keyframe from `regions_of_image`.
+        config: Settings.
+    """
     return [
         one
         for one in found
@@ -187,8 +220,10 @@ def labeled_regions(
 def regions_of_image(
     found: Sequence[Segment], shape: tuple[int, ...], config: RegionProposalConfig
 ) -> list[RegionProposal]:
-    """The segments that a labeller could tell from an image [H, W], each once. What stands on a
-    thing is no part of it."""
+    """Return the segments of an image [H, W] that a labeller could recognize, each once.
+
+    A region does not contain the regions that stand on it.
+    """
     out: list[RegionProposal] = []
     for kind in _ORDER:
         for segment in found:
@@ -202,7 +237,7 @@ def regions_of_image(
 
 
 def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
-    """Its part but for the pixels of others [H, W] bool."""
+    """Return a region without the pixels of others, [H, W] bool."""
     part, (height, width) = one.part, one.part.mask.shape
     here = others[part.row : part.row + height, part.column : part.column + width]
     return replace(one, part=Foreground(part.row, part.column, part.mask & ~here))
@@ -211,7 +246,7 @@ def _without(one: RegionProposal, others: np.ndarray) -> RegionProposal:
 def distinct_boxes(
     boxes_px: np.ndarray, scores: np.ndarray, config: RegionProposalConfig
 ) -> list[int]:
-    """Of the same thing the best of them.
+    """Return the numbers of the boxes with the highest score of each object.
 
     >>> boxes = np.array([[0, 0, 10, 10], [1, 0, 10, 10], [20, 0, 30, 10.0]])
     >>> distinct_boxes(boxes, np.array([0.9, 0.4, 0.5]), RegionProposalConfig())
@@ -224,6 +259,7 @@ def distinct_boxes(
 def _is_worth_a_look(
     candidate: RegionProposal, shape: tuple[int, ...], config: RegionProposalConfig
 ) -> bool:
+    """Return whether a region is large enough, full enough and no room."""
     width, height = candidate.box_px[2:] - candidate.box_px[:2]
     size_px = np.count_nonzero(candidate.part.mask)
     is_object = size_px <= config.max_share * shape[0] * shape[1]
@@ -232,12 +268,14 @@ def _is_worth_a_look(
 
 
 def _share(explained: np.ndarray, part: Foreground) -> float:
+    """Return the fraction of a part's pixels that are explained; 1 for an empty part."""
     height, width = part.mask.shape
     here = explained[part.row : part.row + height, part.column : part.column + width]
     return float(here[part.mask].mean()) if part.mask.any() else 1.0
 
 
 def _painted(boxes_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an image with filled boxes, [H, W] bool."""
     image = np.zeros(shape, bool)
     for x0, y0, x1, y1 in np.round(boxes_px).astype(int).clip(0):
         image[y0 : y1 + 1, x0 : x1 + 1] = True
@@ -245,5 +283,5 @@ def _painted(boxes_px: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _boxes(found: Sequence[RegionProposal]) -> np.ndarray:
-    """[M, 4]"""
+    """Return the boxes of regions, [M, 4]."""
     return np.array([one.box_px for one in found], float).reshape(-1, 4)

@@ -1,15 +1,16 @@
-"""Regions that nobody has a name for, followed over keyframes until a labeller can be asked.
+"""Region tracks: regions over keyframes, with label requests and votes for their labels.
 
-Two sightings are of the same region when most of what each shows of the other lies in it (see
-`region_matching`). Each keeps its best views, and what was said of it: it has the name that most
-speaks for, be it the detector's boxes or the labeller's answers. A thing is set apart now in one
-way, now in another; so of regions that have an answer, what speaks for the name of one counts for
-those that overlap it, by how much they do. What stands on a thing, and the thing, tell nothing of
-each other.
+Two observations belong to one region if most of the visible points of each lie in the other (see
+`region_matching`). A region stores its best views and its votes, from the detector's boxes and from
+label results. Its label is the one with the most votes.
 
-A region is asked about once, when no better view of it has come for a while, and as it was at its
-best. Most regions are no things but parts and shadows of them; so there is a budget, and what has
-most to show goes first.
+An object may be segmented differently in each keyframe. So the votes of labelled regions that
+overlap are shared, weighted by their overlap. A region that stands on an object does not share
+votes with the object.
+
+The tracker requests a label for a region once no better view has come for a while. The request
+shows the region at its best. Most regions are only parts or shadows of objects. So the number of
+requests is limited, and regions with the best views go first.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -38,33 +39,42 @@ from .region_matching import RegionMatcher
 from .region_proposals import RegionProposal
 from .region_views import RegionView, ViewConfig, region_view
 
-MAX_VIEWS = 8  # of a region, that a request has room for
+MAX_VIEWS = 8  # Maximum views in a label request.
 
 
 @dataclass(frozen=True, slots=True)
 class RegionTrackerConfig:
-    views: int = 5  # the best, shown to the labeller
-    views_first: int = 2  # before it is asked at all: a single glimpse may be a flaw of depth
-    patience: int = 3  # keyframes without a better view, before it is asked: one may yet come
-    most_questions: int = 3  # about a region
-    per_keyframe: float = 2.5  # questions, of all that are due those with most to show: half are
-    # about no things. The paper asks on 10-25 % of the frames (IV.B.8); the flat, 1.0
-    at_once: int = 4  # questions saved up while there was nothing to ask
-    gain: float = 1.3  # of the views' summed quality, before it is asked again
-    settled: float = 0.6  # of an answer that needs no second one
-    answer_weight: float = 4.0  # of an answer, which saw several views, beside a box's; all boxes
-    # of a name together count as one that is certain
-    boxes_vote: bool = True  # or what boxes say is weighed Gaussian by Gaussian (III.B), and a
-    # region is what the labeller says alone; regions of a state keep the votes they had
-    least_votes: float = 0.35  # to have a name: a sure box, or four that are 0.3 sure
-    least_carried: float = 0.5  # sure of its name, to be told where nothing sets a region apart
-    most_carried: int = 32  # names of a keyframe told so: as many as it has candidates
-    overlap: float = 0.6  # of what two sightings show of each other, to be of the same region
-    max_gap_m: float = 0.1  # of depth, from a point to what is seen there (delta_z, III.A)
-    least_points: int = 12  # that one sees of the other
-    least_quality: float = 0.02  # of a view: worse ones show a labeller nothing
-    most: int = 1024  # regions, some 50 kB each: five pictures of 5 kB, two masks of 12; the
-    # one not seen for longest is forgotten
+    """Settings of the region tracks."""
+
+    views: int = 5  # Number of best views in a label request.
+    views_first: int = 2  # Minimum views before a request; a single one may show a flaw of depth.
+    patience: int = 3  # Keyframes without a better view before a request; one may yet come.
+    most_questions: int = 3  # Maximum label requests for a region.
+    # Label requests per keyframe; pending regions with the best views go first. Half of them show
+    # no object. The paper requests on 10-25 % of the frames (IV.B.8); the flat, 1.0 per keyframe.
+    per_keyframe: float = 2.5
+    at_once: int = 4  # Maximum requests saved up over keyframes without any.
+    gain: float = 1.3  # Minimum ratio of the views' summed quality for another request.
+    settled: float = 0.6  # Minimum confidence of a label result that needs no second one.
+    # Weight of a label result, which is based on several views, relative to a box. All boxes of
+    # one label together have the votes of one result with confidence 1.
+    answer_weight: float = 4.0
+    # True: boxes vote for the label of a region. False: they are fused per Gaussian (III.B), and
+    # a region has the labeller's label only. Regions of a checkpoint keep their votes.
+    boxes_vote: bool = True
+    # Minimum votes for a label: one box with a score of 0.6, or four with 0.3.
+    least_votes: float = 0.35
+    least_carried: float = 0.5  # Minimum confidence of a label that is applied by mask propagation.
+    # Maximum labels of a keyframe by mask propagation: as many as it has proposals.
+    most_carried: int = 32
+    overlap: float = 0.6  # Minimum mutual overlap of two observations of one region.
+    # Maximum depth difference between a point and the surface measured there (delta_z, III.A).
+    max_gap_m: float = 0.1
+    least_points: int = 12  # Minimum points of one observation that are visible in the other.
+    least_quality: float = 0.02  # Minimum quality of a view; worse ones show a labeller nothing.
+    # Maximum regions, some 50 kB each: five views of 5 kB, two masks of 12. The region not seen for
+    # longest is dropped.
+    most: int = 1024
     view: ViewConfig = field(default_factory=ViewConfig)
 
     def __post_init__(self) -> None:
@@ -80,45 +90,46 @@ class RegionTrackerConfig:
                     "most_carried",
                     "most",
                 )
-                + ": counts must be at least 1."
+                + ": each must be at least 1."
             )
         if self.patience < 0 or self.per_keyframe <= 0:
             raise ConfigError(
                 named(self, "patience", "per_keyframe")
-                + ": patience at least 0, per_keyframe positive."
+                + ": patience must be at least 0, per_keyframe positive."
             )
         if not (0 <= self.least_quality <= 1 and 0 <= self.least_carried <= 1):
             raise ConfigError(
-                named(self, "least_carried", "least_quality")
-                + ": least_quality and least_carried must be within 0..1."
+                named(self, "least_carried", "least_quality") + ": both must be in [0, 1]."
             )
         if self.views_first > self.views or not self.gain > 1:
             raise ConfigError(
                 named(self, "views", "views_first", "gain")
-                + ": views_first at most views, gain over 1."
+                + ": views_first must be at most views, gain above 1."
             )
         if self.views > MAX_VIEWS:
-            raise ConfigError(f"views={self.views}: a labeller is shown up to {MAX_VIEWS}.")
+            raise ConfigError(
+                f"views={self.views} must be at most {MAX_VIEWS}, the views in a label request."
+            )
         if not (0 < self.overlap <= 1 and self.max_gap_m > 0 and self.least_points >= 1):
             raise ConfigError(
                 named(self, "overlap", "max_gap_m", "least_points")
-                + ": overlap within 0..1, max_gap_m positive, least_points at least 1."
+                + ": overlap must be in (0, 1], max_gap_m positive, least_points at least 1."
             )
         if not (self.answer_weight > 0 and self.least_votes >= 0):
             raise ConfigError(
                 named(self, "answer_weight", "least_votes")
-                + ": answer_weight positive, least_votes not negative."
+                + ": answer_weight must be positive, least_votes not negative."
             )
 
     @property
     def most_boxes(self) -> float:
-        """What all boxes of a name may speak for it, at most."""
+        """Maximum sum of the votes of all boxes for one label."""
         return self.answer_weight if self.boxes_vote else 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionRequest:
-    """A region to be asked about now, as it was at its best."""
+    """Label request for a region, with its best observation."""
 
     region: Region
     candidate: RegionProposal
@@ -126,7 +137,7 @@ class RegionRequest:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionLabel:
-    """What is known of a region that is seen again, after a labeller has spoken, 0..1 `sure`."""
+    """Label of a region in a keyframe, with its confidence `sure`, 0..1."""
 
     of: RegionProposal
     label: str
@@ -135,24 +146,29 @@ class RegionLabel:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionUpdate:
+    """Result of a keyframe: new label requests, and labels of its regions."""
+
     questions: list[RegionRequest]
     opinions: list[RegionLabel]
 
 
 class RegionTracker:
-    """Bounded; the same keyframes give the same questions."""
+    """Region tracks over keyframes.
+
+    Memory is bounded. The same keyframes give the same label requests.
+    """
 
     def __init__(self, config: RegionTrackerConfig | None = None) -> None:
         self.config = config or RegionTrackerConfig()
-        self._regions: dict[int, Region] = {}  # the one seen last comes last
+        self._regions: dict[int, Region] = {}  # The last observed comes last.
         self._next_id = 0
-        self._allowed = 0.0  # questions
+        self._allowed = 0.0  # Label requests allowed now.
 
     def __len__(self) -> int:
         return len(self._regions)
 
     def get(self, region: int) -> Region | None:
-        """None when it was forgotten."""
+        """Return a region, or None if it was dropped."""
         return self._regions.get(region)
 
     def observe_keyframe(
@@ -165,12 +181,17 @@ class RegionTracker:
         T_map_keyframe: Mapping[int, np.ndarray],
         named: Sequence[RegionProposal] = (),
     ) -> RegionUpdate:
-        """Take note of a keyframe's candidates: those regions that are to be asked about now, and
-        what was said before of those that have an answer.
+        """Track the proposals of a keyframe; return new label requests and labels of its regions.
 
-        color [H, W, 3] uint8 RGB, depth_m [H, W]; T_map_keyframe [4, 4] by keyframe, this one and
-        those of earlier sightings, as they are now; `named`: objects that the map has a name for,
-        of which nobody is asked.
+        Args:
+            keyframe: Id of the keyframe.
+            found: Region proposals of the keyframe.
+            color: Color image, [H, W, 3] uint8 RGB.
+            depth_m: Depth, [H, W], meters; 0 where unknown.
+            camera: Intrinsics of both.
+            T_map_keyframe: Current poses of this keyframe and those of earlier observations,
+                [4, 4], by id.
+            named: Regions that the map has a label for; they get no label request.
         """
         config, told, taken = self.config, list[tuple[int, RegionProposal]](), set[int]()
         regions, place = [*self._regions.values()], (keyframe, depth_m, camera, T_map_keyframe)
@@ -203,13 +224,14 @@ class RegionTracker:
     def _same(
         self, sighting: RegionObservation, known: RegionMatcher, taken: Collection[int]
     ) -> Region | None:
+        """Return the known region that an observation shows, or None."""
         same = known.same(sighting, self.config.overlap, taken)
         return None if same is None else self._regions[same]
 
     def _propagated(
         self, known: RegionMatcher, taken: Collection[int]
     ) -> list[tuple[int, RegionProposal]]:
-        """Regions that have a name and are seen, and were not set apart."""
+        """Propagate the masks of labelled regions that are visible without a matching segment."""
         found: list[tuple[int, RegionProposal]] = []
         for number in known.seen():
             region = self._regions[number]
@@ -227,8 +249,10 @@ class RegionTracker:
     def _opinions(
         self, shown: Sequence[tuple[int, RegionProposal]], known: RegionMatcher
     ) -> list[RegionLabel]:
-        """What is to be said of those that a labeller has given a name: boxes alone are told
-        anyway, where they are."""
+        """Return the labels of regions with a label result, by the votes of overlapping regions.
+
+        Boxes of regions without a result keep the detector's labels.
+        """
         regions = [(self._regions[number], of) for number, of in shown]
         named = [(region, of) for region, of in regions if self._label_of(region)[0]]
         overlaps = known.overlaps([(region.id, of.part) for region, of in named])
@@ -243,7 +267,7 @@ class RegionTracker:
         return opinions
 
     def shown_in(self, region: int) -> tuple[int, ...]:
-        """The keyframes of the best views of a region, which a labeller is shown."""
+        """Return the keyframes of the best views of a region, which are in its label request."""
         known = self._regions.get(region)
         return tuple(view.keyframe for view in known.views) if known else ()
 
@@ -255,8 +279,10 @@ class RegionTracker:
         camera: Camera,
         T_map_keyframe: Mapping[int, np.ndarray],
     ) -> RegionLabel | None:
-        """The name of a region, and what an earlier keyframe shows of it; None where it has none,
-        or is not seen. Arguments as for `observe_keyframe`."""
+        """Return the label of a region in an earlier keyframe; None if unlabelled or not visible.
+
+        The arguments are those of `observe_keyframe`.
+        """
         known, config = self._regions.get(region), self.config
         label, sure = self._label_of(known) if known else ("", 0.0)
         if known is None or not label:
@@ -267,7 +293,7 @@ class RegionTracker:
         return part and RegionLabel(RegionProposal(part.box_px, part), label, sure)
 
     def _questions(self, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> list[RegionRequest]:
-        """About the regions that are due, those with most to show first, as many as are allowed."""
+        """Return label requests for pending regions, best views first, up to the allowed number."""
         config = self.config
         self._allowed = min(self._allowed + config.per_keyframe, float(config.at_once))
         due = [r for r in self._regions.values() if self._is_due(r, now, T_map_keyframe)]
@@ -277,6 +303,7 @@ class RegionTracker:
         return asked
 
     def _asked(self, region: Region) -> RegionRequest:
+        """Return a label request with the best observation of a region, and count it."""
         quality = sum(view.quality for view in region.views)
         shape = region.best if region.best and region.questions == 0 else region.shape
         region = replace(region, questions=region.questions + 1, quality=quality, shape=shape)
@@ -288,20 +315,23 @@ class RegionTracker:
         )
 
     def _keep(self, region: Region) -> None:
-        """As the one seen last."""
+        """Store a region as the last observed."""
         self._regions.pop(region.id, None)
         self._regions[region.id] = region
 
     def _label_of(self, region: Region) -> tuple[str, float]:
-        """Its name, where a labeller has given it one."""
+        """Return the label and confidence of a region with a label result, or ("", 0)."""
         return self.name(region) if region.answer and region.answer.label else ("", 0.0)
 
     def name(self, region: Region) -> tuple[str, float]:
-        """By its own votes, and how sure; nothing where little speaks for it."""
+        """Return the label of a region by its own votes, and its confidence; ("", 0) if unknown."""
         return winning_label(region.votes, self.config.least_votes)
 
     def answered(self, region: int, answer: RegionLabelResult) -> str:
-        """The labeller has spoken of it; its name now. A confident answer needs no second one."""
+        """Add a label result to the votes of a region and return its label now.
+
+        A result with a high confidence prevents further label requests.
+        """
         known = self._regions.get(region)
         if known is None:
             return answer.label
@@ -315,10 +345,12 @@ class RegionTracker:
         return self.name(known)[0]
 
     def _new(self, seen: RegionObservation) -> Region:
+        """Create a region from its first observation."""
         self._next_id += 1
         return Region(self._next_id - 1, seen.keyframe, seen.box_px, seen)
 
     def _with_view(self, region: Region, sighting: RegionObservation, view: RegionView) -> Region:
+        """Return a region with a view added, if the view is good enough."""
         if view.quality < self.config.least_quality:
             return region
         views = sorted((*region.views, view), key=lambda view: -view.quality)
@@ -326,6 +358,7 @@ class RegionTracker:
         return replace(region, best=best, views=tuple(views[: self.config.views]))
 
     def _is_due(self, region: Region, now: int, T_map_keyframe: Mapping[int, np.ndarray]) -> bool:
+        """Return whether a label request for a region is pending."""
         if self._is_settled(region) or region.questions >= self.config.most_questions:
             return False
         best = region.best
@@ -338,24 +371,25 @@ class RegionTracker:
         return is_still and (region.questions == 0 or is_better)
 
     def _is_settled(self, region: Region) -> bool:
-        """Somebody was sure of it."""
+        """Return whether a detection or label result of a region has a high confidence."""
         return (
             max(region.score, region.answer.confidence if region.answer else 0)
             >= self.config.settled
         )
 
     def _forget(self) -> None:
+        """Drop the regions observed longest ago beyond the maximum."""
         while len(self._regions) > self.config.most:
             del self._regions[next(iter(self._regions))]
 
     def pack(self) -> dict[str, Any]:
-        """Plain values, bytes and lists, for a state."""
+        """Return plain values, bytes and lists for a checkpoint."""
         regions = [pack(region) for region in self._regions.values()]
         return {"next_id": self._next_id, "allowed": self._allowed, "regions": regions}
 
     @staticmethod
     def unpack(packed: dict[str, Any], config: RegionTrackerConfig) -> "RegionTracker":
-        """As it was."""
+        """Restore the tracks from `pack`."""
         out = RegionTracker(config)
         out._next_id, out._allowed = packed["next_id"], packed["allowed"]
         out._regions = {row["id"]: unpack(row) for row in packed["regions"]}
@@ -363,7 +397,7 @@ class RegionTracker:
 
 
 def _worth(region: Region) -> float:
-    """What is large is rarely a shadow or a part."""
+    """Return a weight by size and kind: large regions are rarely shadows or parts."""
     assert region.best is not None
     of = region.best.candidate
     factor = 0.3 if of.kind == "convex" else 1.0

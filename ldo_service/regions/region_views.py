@@ -1,4 +1,4 @@
-"""How good a view of a region is, and the picture of it that a labeller gets to see."""
+"""Views of a region: their quality, and the crop for the labeller."""
 
 from dataclasses import dataclass
 
@@ -14,25 +14,37 @@ from .foreground import Foreground, pixels_of
 
 @dataclass(frozen=True, slots=True)
 class ViewConfig:
-    context: float = 0.15  # of the box's sides, shown around it
-    side_px: int = 336  # a larger crop is shrunk to it
-    good_side_px: float = 128.0  # of a region that more pixels would not show better
-    sharp: float = 100.0  # variance of the Laplacian (grey levels squared) that is half good
-    least: float = 0.25  # factor of a view that is cut off, or seen edge on
+    """Settings of the views."""
+
+    context: float = 0.15  # Margin around the box as a fraction of its sides.
+    side_px: int = 336  # Maximum side of the crop; a larger one is scaled down.
+    good_side_px: float = 128.0  # Side of a region that more pixels would not show better.
+    # Variance of the Laplacian (gray levels squared) with a sharpness factor of 0.5.
+    sharp: float = 100.0
+    least: float = 0.25  # Factor of a view that is cut off or seen edge on.
 
     def __post_init__(self) -> None:
         if not (self.context >= 0 and min(self.good_side_px, self.sharp) > 0 and self.side_px > 0):
             raise ConfigError(
                 named(self, "context", "side_px", "good_side_px", "sharp")
-                + ": sizes must be positive."
+                + ": context must not be negative, the others must be positive."
             )
         if not 0 <= self.least <= 1:
-            raise ConfigError(named(self, "least") + ": least must be within 0..1.")
+            raise ConfigError(named(self, "least") + ": must be in [0, 1].")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegionView:
-    """quality 0..1; jpeg of the crop, width x height; keyframe and box_px where it was seen"""
+    """View of a region.
+
+    Attributes:
+        keyframe: Keyframe of the view.
+        box_px: Box of the region in that keyframe, x0 y0 x1 y1, pixels.
+        quality: Quality of the view, 0..1.
+        width: Width of the crop, pixels.
+        height: Height of the crop, pixels.
+        jpeg: Crop as JPEG.
+    """
 
     keyframe: int
     box_px: tuple[float, float, float, float]
@@ -51,7 +63,17 @@ def region_view(
     part: Foreground,
     config: ViewConfig,
 ) -> RegionView:
-    """The crop of a region from a keyframe: color [H, W, 3] uint8 RGB, depth_m [H, W]."""
+    """Return the view of a region in a keyframe.
+
+    Args:
+        keyframe: Id of the keyframe.
+        color: Color image, [H, W, 3] uint8 RGB.
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of both.
+        box_px: Box of the region, [4], x0 y0 x1 y1, pixels.
+        part: Mask of the region.
+        config: Settings.
+    """
     x0, y0, x1, y1 = (float(v) for v in box_px)
     margin = config.context * np.array([x1 - x0, y1 - y0])
     grown = np.array([*(box_px[:2] - margin), *(box_px[2:] + margin)])
@@ -68,7 +90,7 @@ def region_view(
 
 
 def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
-    """Side of a square like the box, up to `good_side_px`.
+    """Return the side of a square with the area of the box, relative to `good_side_px`, at most 1.
 
     >>> size_factor(np.array([0, 0, 64, 64]), ViewConfig())
     0.5
@@ -78,7 +100,10 @@ def size_factor(box_px: np.ndarray, config: ViewConfig) -> float:
 
 
 def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig) -> float:
-    """1 when the border of the image is a tenth of the box's longer side away, `least` at it."""
+    """Return a factor for the distance of the box from the border of the image.
+
+    It is 1 from a tenth of the box's longer side on, and `least` at the border.
+    """
     height, width = shape[:2]
     gaps = *(box_px[:2] + 0.5), width - 0.5 - box_px[2], height - 0.5 - box_px[3]
     wanted = 0.1 * float((box_px[2:] - box_px[:2]).max())
@@ -87,7 +112,10 @@ def border_factor(box_px: np.ndarray, shape: tuple[int, ...], config: ViewConfig
 
 
 def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
-    """v / (v + sharp), v the variance of the Laplacian (Pech-Pacheco et al., ICPR 2000)."""
+    """Return v / (v + sharp) with the variance v of the Laplacian.
+
+    Pech-Pacheco et al., ICPR 2000.
+    """
     gray = cv2.cvtColor(crop, cv2.COLOR_RGB2GRAY)
     variance = float(cv2.Laplacian(gray, cv2.CV_64F).var())
     return variance / (variance + config.sharp)
@@ -96,7 +124,7 @@ def sharpness_factor(crop: np.ndarray, config: ViewConfig) -> float:
 def facing_factor(
     depth_m: np.ndarray, camera: Camera, part: Foreground, config: ViewConfig
 ) -> float:
-    """Mean cosine between its surface and the rays to it; `least` when edge on or unknown."""
+    """Return the mean cosine of surface normals and viewing rays; `least` if unknown."""
     height, width = part.mask.shape
     if min(height, width) < 3 or not part.mask.any():
         return config.least
