@@ -1,1 +1,1 @@
-"""Networks that find and name objects in images, their vocabulary, and the model registry."""
+"""Detection of objects in images: networks, their vocabulary, labellers, and the model registry."""

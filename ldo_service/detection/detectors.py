@@ -1,4 +1,4 @@
-"""Objects of known classes in an image, by a network of the YOLO family in ONNX."""
+"""Detection of objects of known classes by a network of the YOLO family in ONNX."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,24 +16,28 @@ from .yolo import EXPECTED, Letterbox, detect_layout, layout_named
 
 @dataclass(frozen=True, slots=True)
 class NetworkConfig:
-    """How a detector is read and run."""
+    """Settings of a detector."""
 
-    layout: str = ""  # yolov5, yolox, yolov8; empty: recognised by the shape of its output
-    names: str = ""  # file with a class a line; empty: those it was registered with or carries, or
-    # the 80 of COCO
-    input_px: tuple[int, int] = (640, 480)  # width, height for a network that takes any
-    score_min: float = 0.25  # of a box to be told; YOLOv5's and YOLOX's own default
-    nms_iou: float = 0.45  # boxes of a class that overlap more are one object; YOLOv5
-    max_boxes: int = 100  # in an image, the most certain; what COCO's own evaluation counts
-    max_candidates: int = 1000  # before overlapping boxes are dropped: bounds the time
-    providers: tuple[str, ...] = ("cpu",)  # of onnxruntime, by preference: cuda, tensorrt, ...
-    threads: int = 1  # of one inference; with 1 a replay gives the same bits
+    layout: str = ""  # yolov5, yolox, yolov8; empty: determined by the shape of its output.
+    # File with one class name per line; empty: those it was registered with or contains, or the 80
+    # of COCO.
+    names: str = ""
+    # Width and height of the input, if the network takes any.
+    input_px: tuple[int, int] = (640, 480)
+    score_min: float = 0.25  # Minimum score of a box; the default of YOLOv5 and YOLOX.
+    nms_iou: float = 0.45  # Maximum IoU of two objects of one class; the default of YOLOv5.
+    max_boxes: int = 100  # Maximum boxes of an image, by score; as in COCO's own evaluation.
+    # Maximum boxes before non-maximum suppression, which bounds its time.
+    max_candidates: int = 1000
+    # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
+    providers: tuple[str, ...] = ("cpu",)
+    threads: int = 1  # Threads of one inference; with 1, a replay is bitwise equal.
 
     def __post_init__(self) -> None:
         if self.layout:
             layout_named(self.layout)
         if not (0 <= self.score_min <= 1 and 0 <= self.nms_iou <= 1):
-            raise ConfigError(named(self, "score_min", "nms_iou") + ": both must be within 0..1.")
+            raise ConfigError(named(self, "score_min", "nms_iou") + ": both must be in [0, 1].")
         if min(self.max_boxes, self.max_candidates, self.threads, *self.input_px) < 1:
             raise ConfigError(
                 named(self, "max_boxes", "max_candidates", "threads", "input_px")
@@ -43,43 +47,37 @@ class NetworkConfig:
 
 @dataclass(frozen=True, slots=True)
 class Detections:
-    """Boxes in an image; what is found is told with the most certain first."""
+    """Detections in an image, highest score first in the results of `OnnxDetector`."""
 
-    boxes_px: np.ndarray  # [M, 4] float64: x0, y0, x1, y1; the whole image is -0.5 .. W - 0.5
-    scores: np.ndarray  # [M] 0..1
-    class_ids: np.ndarray  # [M] index into the class names of the network
+    boxes_px: np.ndarray  # [M, 4] float64, x0, y0, x1, y1; the whole image is -0.5 .. W - 0.5.
+    scores: np.ndarray  # [M] 0..1.
+    class_ids: np.ndarray  # [M], index into the class names of the network.
 
     def __len__(self) -> int:
         return len(self.scores)
 
     def chosen(self, which: np.ndarray | slice) -> "Detections":
+        """Return the chosen detections."""
         return Detections(self.boxes_px[which], self.scores[which], self.class_ids[which])
 
     def inside(self) -> "Detections":
-        """Those with anything of them in the image; boxes are clipped to it."""
+        """Return the detections that are partly inside the image, to which boxes were clipped."""
         sides_px = self.boxes_px[:, 2:] - self.boxes_px[:, :2]
         return self.chosen(np.flatnonzero(sides_px.min(axis=1) > 0))
 
     def best(self, most: int) -> "Detections":
+        """Return the detections with the highest scores, at most `most`."""
         return self.chosen(np.argsort(-self.scores, kind="stable")[:most])
 
     def distinct(self, iou_max: float) -> "Detections":
+        """Return the detections after non-maximum suppression."""
         return self.chosen(
             non_maximum_suppression(self.boxes_px, self.scores, self.class_ids, iou_max)
         )
 
 
 class OnnxDetector:
-    """A network that is known to be a detector: opening it runs it once, on noise.
-
-    path    the ONNX file
-    config  see there
-    names   of its classes, unless `config.names` has others; empty: those it carries, or the 80 of
-            COCO
-    name    what errors and `identity` call it; empty: the file
-
-    Raises ConfigError for settings that cannot be, ModelError for a file that is no such network.
-    """
+    """Network of the YOLO family as a detector."""
 
     def __init__(
         self,
@@ -88,6 +86,19 @@ class OnnxDetector:
         names: Sequence[str] = (),
         name: str = "",
     ) -> None:
+        """Open a network and run it once on noise.
+
+        Args:
+            path: The ONNX file.
+            config: Settings.
+            names: Class names, unless `config.names` gives others; empty: those it contains, or the
+                80 of COCO.
+            name: Name in errors and `identity`; empty: that of the file.
+
+        Raises:
+            ConfigError: If a setting is invalid.
+            ModelError: If the file cannot be used as a detector.
+        """
         self.config = config or NetworkConfig()
         if self.config.names:
             names = read_names(Path(self.config.names).expanduser())
@@ -100,37 +111,41 @@ class OnnxDetector:
             self.names = class_names(self._head.class_count, names, metadata)
         except ModelError as error:
             raise ModelError(f"{name or path} cannot be used as a detector: {error}") from error
-        self.labels = tuple(map(canonical, self.names))  # what a vocabulary calls them
-        self.identity = f"{name or path.stem} {sha256(path)[:12]}"  # which network it was
+        self.labels = tuple(map(canonical, self.names))  # Names in a vocabulary.
+        # Identifies the network in records.
+        self.identity = f"{name or path.stem} {sha256(path)[:12]}"
 
     @property
     def layout(self) -> str:
+        """Name of the layout."""
         return self._head.layout.name
 
     @property
     def providers(self) -> list[str]:
-        """What it runs on, as onnxruntime names it."""
+        """Execution providers it runs on, by onnxruntime's names."""
         return self._network.providers
 
     def detect(self, image: np.ndarray) -> Detections:
-        """The objects in an image [H, W, 3] uint8 RGB.
+        """Return the objects in an image [H, W, 3] uint8 RGB.
 
-        The same image gives the same bits on the CPU with one thread. Raises ModelError when the
-        network fails.
+        The same image gives bitwise equal results on the CPU with one thread.
+
+        Raises:
+            ModelError: If the network fails.
         """
         config, layout = self.config, self._head.layout
-        # fit it into the input
+        # Fit the image into the input.
         height, width = image.shape[:2]
         letterbox = Letterbox.fit((width, height), self.input_px, layout.is_centered)
         canvas = letterbox.canvas(image)
-        # run the network
+        # Run the network.
         pixels = canvas if layout.is_rgb else canvas[..., ::-1]
         output = self._output(_planes(pixels, layout.value_scale))
-        # read the boxes
+        # Read the boxes.
         found = self._head.candidates(output, config.score_min)
         boxes_px = letterbox.to_image(found.boxes)
         candidates = Detections(boxes_px, np.clip(found.scores, 0, 1), found.class_ids)
-        # keep one for each object
+        # Keep one box for each object.
         likely = candidates.inside().best(config.max_candidates)
         return likely.distinct(config.nms_iou).best(config.max_boxes)
 
@@ -142,7 +157,7 @@ class OnnxDetector:
 
 
 def _image_input(network: Network, free_px: tuple[int, int]) -> tuple[str, tuple[int, int]]:
-    """Name, width and height of the input; `free_px` where the network takes any size."""
+    """Return name, width and height of the input; `free_px` if the network takes any size."""
     inputs = network.inputs
     shapes = ", ".join(f"{name} {kind} {shape}" for name, kind, shape in inputs)
     name, kind, shape = inputs[0] if len(inputs) == 1 else ("", "", [])
@@ -169,6 +184,6 @@ def _noise(size_px: tuple[int, int]) -> np.ndarray:
 
 
 def _planes(image: np.ndarray, scale: float) -> np.ndarray:
-    """[1, 3, H, W] float32"""
+    """Return an image as float32 planes, [1, 3, H, W]."""
     planes = np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
     return planes if scale == 1 else planes * np.float32(scale)

@@ -1,4 +1,7 @@
-"""What a detector knows to move by itself, as pixels. Conventions: `ldo_service.geometry`."""
+"""Dynamic mask of detections of classes that move by themselves.
+
+Conventions: `ldo_service.geometry`.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,16 +11,19 @@ import numpy as np
 
 from ldo_service.errors import ConfigError
 
-CORE = 0.5  # of a box's width and height, in its middle: mostly the thing itself
+CORE = 0.5  # Middle part of a box by width and height; it mostly shows the object itself.
 
 
 @dataclass(frozen=True, slots=True)
 class DynamicClassConfig:
-    classes: tuple[str, ...] = (  # of COCO's: alive, or driven; what is carried moves with a person
+    """Settings of the dynamic classes."""
+
+    # Classes of COCO that are alive or driven; objects that are carried move with a person.
+    classes: tuple[str, ...] = (
         *("person", "bird", "cat", "dog", "horse", "sheep", "cow", "elephant", "bear", "zebra"),
         *("giraffe", "bicycle", "car", "motorcycle", "bus", "train", "truck", "boat", "airplane"),
     )
-    reach_m: float = 0.4  # in depth from a thing's middle, the median of the core: a stride, an arm
+    reach_m: float = 0.4  # Maximum depth from the median of the core: a stride, an arm.
 
     def __post_init__(self) -> None:
         if not self.reach_m > 0:
@@ -26,7 +32,7 @@ class DynamicClassConfig:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A detection: pixels left <= u < right, top <= v < bottom."""
+    """Detection of a class, with the pixels left <= u < right, top <= v < bottom."""
 
     label: str
     left: float
@@ -35,7 +41,7 @@ class Box:
     bottom: float
 
     def in_smaller(self, times: float) -> "Box":
-        """In an image that is so many times smaller."""
+        """Return the box in an image that is `times` smaller."""
         edges = (self.left, self.top, self.right, self.bottom)
         return Box(self.label, *(edge / times for edge in edges))
 
@@ -43,11 +49,16 @@ class Box:
 def dynamic_class_mask(
     boxes: Sequence[Box], depth_m: np.ndarray, config: DynamicClassConfig
 ) -> np.ndarray:
-    """Pixels [H, W] bool of the things in `boxes` that may move by themselves.
+    """Return the pixels of objects that may move by themselves, [H, W] bool.
 
-    Of a box the pixels count that lie within `reach_m` of its foreground in depth [H, W], in m, and
-    hang together with its core; pixels without depth count where they are enclosed. A box that
-    holds no depth counts as a whole. Labels that are not among `classes` have no say.
+    Pixels of a box count if their depth is within `reach_m` of the median of its core, and if they
+    are connected to the core. Enclosed pixels without depth count too. A box without any depth
+    counts as a whole.
+
+    Args:
+        boxes: Detections; labels that are not in `classes` are ignored.
+        depth_m: Depth, [H, W], meters; 0 where unknown.
+        config: Settings.
     """
     out = np.zeros(depth_m.shape, bool)
     for box in boxes:
@@ -60,6 +71,7 @@ def dynamic_class_mask(
 
 
 def _foreground(depth_m: np.ndarray, core: np.ndarray, config: DynamicClassConfig) -> np.ndarray:
+    """Return the pixels of the object in the window of a box, [h, w] bool."""
     measured = depth_m[core & (depth_m > 0)]
     if not measured.size:
         return np.ones(depth_m.shape, bool)
@@ -73,7 +85,7 @@ def _foreground(depth_m: np.ndarray, core: np.ndarray, config: DynamicClassConfi
 
 
 def _window(box: Box, shape: tuple[int, ...], share: float) -> tuple[slice, slice]:
-    """Rows and columns of the middle `share` of a box, within an image."""
+    """Return rows and columns of the middle `share` of a box, within an image."""
     u, v = (box.left + box.right) / 2, (box.top + box.bottom) / 2
     half_u, half_v = share * (box.right - box.left) / 2, share * (box.bottom - box.top) / 2
     rows = np.clip([v - half_v, v + half_v], 0, shape[0]).round().astype(int)

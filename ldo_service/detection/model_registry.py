@@ -1,14 +1,15 @@
-"""Networks that the user has registered: `ldo models`. Only `demo` comes with the package.
+"""Registry of the user's networks (`ldo models`). Only `demo` comes with the package.
 
     <folder>/<name>/model.onnx    a copy of the file: a detector, or the image encoder of a pair
     <folder>/<name>/about.json    checksum, layout, classes, license
 
-and of a pair that names regions (CLIP's layout) a text encoder with its byte pairs, or embeddings:
+A pair of encoders for a labeller (CLIP's layout) also has a text encoder with its byte pairs, or
+embeddings:
 
     text.onnx, bpe.txt.gz
     embeddings.npz or embeddings.safetensors
 
-The folder is LDO_MODELS, or ldo/models where XDG_DATA_HOME says that data of programs live.
+The folder is LDO_MODELS, or else ldo/models in XDG_DATA_HOME.
 """
 
 import os
@@ -37,33 +38,41 @@ NAME_PATTERN = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 FILE, ABOUT = "model.onnx", "about.json"
 TEXT, VOCABULARY = "text.onnx", "bpe.txt.gz"
 EMBEDDINGS = ("embeddings.npz", "embeddings.safetensors", "text_embeddings.npz")
-IMAGES = (FILE, "image_encoder.onnx")  # as a folder that is not registered may name them
-CLIP = "clip"  # layout of a pair
+# Names of the image encoder in a folder that is not registered.
+IMAGES = (FILE, "image_encoder.onnx")
+CLIP = "clip"  # Layout of a pair of encoders.
 
 
 class ModelInfo(msgspec.Struct, frozen=True, kw_only=True):
-    """What is known of a registered network."""
+    """Description of a registered network, as stored in about.json."""
 
     sha256: str
     layout: str
     classes: tuple[str, ...]
-    license: str = ""  # its text; empty: not stated
-    source: str = ""  # name of the file it was copied from
-    parts: dict[str, str] = {}  # checksums of the other files of a pair, by name
+    license: str = ""  # Text of the license; empty if not stated.
+    source: str = ""  # Name of the file it was copied from.
+    parts: dict[str, str] = {}  # Checksums of the other files of a pair, by name.
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
+    """Registered network: name, folder and description."""
+
     name: str
     folder: Path
     about: ModelInfo
 
     @property
     def file(self) -> Path:
+        """Path of the network, or of the image encoder of a pair."""
         return self.folder / FILE
 
     def verify(self) -> None:
-        """Raises ModelError when the file is not the one that was registered."""
+        """Compare the files with their checksums.
+
+        Raises:
+            ModelError: If a file is not the one that was registered.
+        """
         for part, registered in {FILE: self.about.sha256, **self.about.parts}.items():
             try:
                 is_whole = sha256(self.folder / part) == registered
@@ -71,22 +80,30 @@ class Model:
                 is_whole = False
             if not is_whole:
                 raise ModelError(
-                    f"{self.folder / part} is not what was registered as {self.name}: it is "
-                    f"damaged or was replaced. `ldo models remove {self.name}` and add it again."
+                    f"{self.folder / part} is not the file registered as {self.name}: it is "
+                    f"damaged or was replaced. Run `ldo models remove {self.name}` and add it "
+                    "again."
                 )
 
 
 class Models:
-    """The registered networks in a folder, by default the user's."""
+    """Registered networks in a folder, by default the user's."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = folder or default_folder()
 
     def add(self, name: str, file: Path, config: NetworkConfig, license: str = "") -> Model:
-        """Copy and register a network that is a detector, all of it or nothing.
+        """Copy and register a detector; nothing is left behind if that fails.
 
-        Raises ConfigError for a name that is taken or none, ModelError for a file that cannot be
-        used.
+        Args:
+            name: Name of the model.
+            file: ONNX file of the detector.
+            config: Settings to run it once.
+            license: Text of its license.
+
+        Raises:
+            ConfigError: If the name is invalid or taken, or the folder cannot be written.
+            ModelError: If the file cannot be used as a detector.
         """
         return self._add(name, [file], lambda folder: _fill(folder, file, config, license))
 
@@ -98,7 +115,20 @@ class Models:
         names: Sequence[str] = (),
         license: str = "",
     ) -> Model:
-        """The same for a pair of encoders, see `DualEncoder`; `names` are kept with it."""
+        """Copy and register a pair of encoders for a labeller; see `add` and `DualEncoder`.
+
+        Args:
+            name: Name of the model.
+            pair: Files of the pair.
+            config: Settings to run it once.
+            names: Names to choose from, stored with the pair; empty: those of its embeddings, or
+                COCO's.
+            license: Text of its license.
+
+        Raises:
+            ConfigError: If the name is invalid or taken, or the folder cannot be written.
+            ModelError: If the files cannot be used as a pair.
+        """
         files = [file for file in (pair.image, pair.text, pair.vocabulary, pair.embeddings) if file]
         return self._add(
             name, files, lambda folder: _fill_pair(folder, pair, config, names, license)
@@ -108,32 +138,43 @@ class Models:
         _require_name(name)
         if (self.folder / name).exists():
             raise ConfigError(
-                f"there is a model {name!r} already: `ldo models remove {name}`, or choose another "
-                "name."
+                f"there is a model {name!r} already: run `ldo models remove {name}`, or choose "
+                "another name."
             )
         for file in files:
             if not file.is_file():
-                raise ModelError(f"{file} is no file: name an ONNX file.")
+                raise ModelError(f"{file} is not a file: give the path of an ONNX file.")
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             with folder_made_atomically(self.folder / name) as folder:
                 about = fill(folder)
         except OSError as error:
             raise ConfigError(
-                f"{self.folder} cannot be written: {error}. LDO_MODELS names another folder."
+                f"{self.folder} cannot be written: {error}. Set LDO_MODELS to another folder."
             ) from error
         return Model(name, self.folder / name, about)
 
     def remove(self, name: str) -> None:
-        """Raises ConfigError when there is none of this name."""
+        """Remove a registered network.
+
+        Raises:
+            ConfigError: If the name is not registered, or its folder cannot be removed.
+        """
         self._require_known(name)
         try:
             shutil.rmtree(self.folder / name)
         except OSError as error:
-            raise ConfigError(f"{self.folder / name} cannot be removed: {error}.") from error
+            raise ConfigError(
+                f"{self.folder / name} cannot be removed: {error}. Delete it yourself."
+            ) from error
 
     def get(self, name: str) -> Model:
-        """Raises ConfigError when there is none of this name, ModelError when it is damaged."""
+        """Return a registered network.
+
+        Raises:
+            ConfigError: If the name is not registered.
+            ModelError: If its description cannot be read.
+        """
         self._require_known(name)
         folder = self.folder / name
         try:
@@ -143,13 +184,14 @@ class Models:
             about = msgspec.convert(values, ModelInfo)
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             raise ModelError(
-                f"{folder / ABOUT} cannot be read ({error}): `ldo models remove {name}` and add it "
-                "again."
+                f"{folder / ABOUT} cannot be read ({error}): run `ldo models remove {name}` and "
+                "add it again."
             ) from error
         return Model(name, folder, about)
 
     @property
     def names(self) -> list[str]:
+        """Names of the registered networks, sorted."""
         try:
             entries = sorted(self.folder.iterdir())
         except OSError:
@@ -168,7 +210,7 @@ class Models:
 
 
 def default_folder() -> Path:
-    """As the XDG base directory specification has it, unless LDO_MODELS is set."""
+    """Return the folder of the user's networks: LDO_MODELS, or the XDG base directory."""
     if folder := os.environ.get("LDO_MODELS"):
         return Path(folder).expanduser()
     data = os.environ.get("XDG_DATA_HOME") or os.path.expanduser("~/.local/share")
@@ -176,10 +218,17 @@ def default_folder() -> Path:
 
 
 def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
-    """A detector by the name it is registered as, or by its file.
+    """Open a detector by its registered name or its file.
 
-    What the configuration says of layout and names comes before what was registered.
-    Raises ConfigError when there is neither, ModelError when it cannot be used.
+    Layout and class names of the configuration override the registered ones.
+
+    Args:
+        model: `demo`, a registered name, or the path of an ONNX file.
+        config: Settings.
+
+    Raises:
+        ConfigError: If there is no such model.
+        ModelError: If it cannot be used as a detector.
     """
     if model == demo_networks.NAME:
         return _open_demo_detector(config)
@@ -196,16 +245,24 @@ def open_detector(model: str, config: NetworkConfig) -> OnnxDetector:
     found = models.get(model)
     found.verify()
     if found.about.layout == CLIP:
-        raise ModelError(f"{model} is a pair that names regions: vlm_labeller.model takes it.")
+        raise ModelError(
+            f"{model} is a pair of encoders: set it as vlm_labeller.model, not detector.model."
+        )
     settings = replace(config, layout=config.layout or found.about.layout)
     return OnnxDetector(found.file, settings, found.about.classes, name=model)
 
 
 def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
-    """A pair by the name it is registered as, or by a folder with its files named as here.
+    """Open a pair of encoders by its registered name or a folder with its files.
 
-    names  to choose from; empty: those it was registered with
-    Raises ConfigError when there is neither, ModelError when it cannot be used.
+    Args:
+        model: `demo`, a registered name, or a folder with files named as in this module.
+        config: Settings.
+        names: Names to choose from; empty: those it was registered with.
+
+    Raises:
+        ConfigError: If there is no such model.
+        ModelError: If it cannot be used as a labeller.
     """
     if model == demo_networks.NAME:
         return _open_demo_labeller(config, names)
@@ -223,11 +280,16 @@ def open_labeller(model: str, config: DualEncoderConfig, names: Sequence[str] = 
     found = models.get(model)
     found.verify()
     if found.about.layout != CLIP:
-        raise ModelError(f"{model} is a detector, {found.about.layout}: detector.model takes it.")
+        raise ModelError(
+            f"{model} is a detector ({found.about.layout}): set it as detector.model, not "
+            "vlm_labeller.model."
+        )
     return DualEncoder(_pair_in(found.folder), config, names or found.about.classes, name=model)
 
 
 def _pair_in(folder: Path) -> EncoderFiles:
+    """Return the files of a pair in a folder."""
+
     def here(*parts: str) -> Path | None:
         return next((folder / part for part in parts if (folder / part).is_file()), None)
 
@@ -239,6 +301,7 @@ def _pair_in(folder: Path) -> EncoderFiles:
 def _fill_pair(
     folder: Path, pair: EncoderFiles, config: DualEncoderConfig, names: Sequence[str], license: str
 ) -> ModelInfo:
+    """Check a pair, copy it into a folder and write its description."""
     labeller = DualEncoder(pair, config, names)
     suffix = pair.embeddings.suffix if pair.embeddings else ""
     embeddings = next((part for part in EMBEDDINGS if part.endswith(suffix)), EMBEDDINGS[0])
@@ -262,7 +325,7 @@ def _fill_pair(
 
 
 def _fill(folder: Path, file: Path, config: NetworkConfig, license: str) -> ModelInfo:
-    """A folder for the model; what is described is the copy."""
+    """Copy a detector into a folder and write its description."""
     folder.mkdir()
     shutil.copyfile(file, folder / FILE)
     detector = OnnxDetector(folder / FILE, config, name=str(file))
@@ -280,11 +343,13 @@ def _fill(folder: Path, file: Path, config: NetworkConfig, license: str) -> Mode
 def _require_name(name: str) -> None:
     if not NAME_PATTERN.fullmatch(name):
         raise ConfigError(
-            f"{name!r} is no name for a model: use letters, digits, '.', '-' and '_', at most 64, "
-            "beginning with a letter or digit."
+            f"{name!r} is not a valid model name: use letters, digits, '.', '-' and '_', at most "
+            "64, beginning with a letter or digit."
         )
     if name == demo_networks.NAME:
-        raise ConfigError(f"{name!r} are the networks of the package: choose another name.")
+        raise ConfigError(
+            f"{name!r} is reserved for the networks of the package: choose another name."
+        )
 
 
 def _open_demo_detector(config: NetworkConfig) -> OnnxDetector:
@@ -292,9 +357,14 @@ def _open_demo_detector(config: NetworkConfig) -> OnnxDetector:
 
 
 def _open_demo_labeller(config: DualEncoderConfig, names: Sequence[str] = ()) -> DualEncoder:
-    """To choose from `names`, or from all of the table, but for those of demo_networks.NOTHING.
+    """Return the labeller of the package, which has no text encoder.
 
-    Raises ConfigError for a name that is not in the table: there is no text encoder.
+    Args:
+        config: Settings; without `nothing`, that of the package is used.
+        names: Names to choose from; empty: all of its table.
+
+    Raises:
+        ConfigError: If a name is not in its table.
     """
     pair = EncoderFiles(demo_networks.IMAGE_ENCODER, embeddings=demo_networks.TEXT_EMBEDDINGS)
     settings = replace(config, nothing=config.nothing or demo_networks.NOTHING)

@@ -1,4 +1,4 @@
-"""An ONNX file, opened: which hardware runs it, and what it says of itself."""
+"""Session of an ONNX file: execution providers, inputs, outputs and metadata."""
 
 import hashlib
 import logging
@@ -19,48 +19,66 @@ _SUGAR = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (Load model from .*? f
 
 
 class Network:
-    """A session of onnxruntime.
-
-    path       the file
-    providers  execution providers by preference, as onnxruntime names them or short: cpu, cuda,
-               tensorrt, openvino. One that this machine lacks is warned about and left out; the
-               CPU is always the last resort.
-    threads    of one inference; with 1 the CPU gives the same bits in every run
-
-    Raises ConfigError for a provider that does not exist, ModelError for a file that is no network.
-    """
+    """Session of onnxruntime."""
 
     def __init__(self, path: Path, providers: Sequence[str] = ("cpu",), threads: int = 1) -> None:
+        """Open a network.
+
+        Args:
+            path: The ONNX file.
+            providers: Execution providers by preference, by onnxruntime's names or short: cpu,
+                cuda, tensorrt, openvino. One that this machine lacks is ignored with a warning; the
+                CPU is always the last.
+            threads: Threads of one inference; with 1, the CPU gives bitwise equal results in every
+                run.
+
+        Raises:
+            ConfigError: If a provider does not exist.
+            ModelError: If the file is no network.
+        """
         wanted = available(providers)
         if not path.is_file():
             raise ModelError("there is no such file.")
         try:
             self._session = _session(path, wanted, threads)
-        except Exception as error:  # onnxruntime has a class per cause, without a common base
+        except Exception as error:  # Errors of onnxruntime have no common base class.
             raise ModelError(f"it is no network in ONNX: {_first_line(error)}.") from error
         if self.providers[0] != wanted[0]:
-            log.warning("%s runs on %s: %s refuses it", path, self.providers[0], wanted[0])
+            log.warning(
+                "%s: execution provider %s is unavailable for this network; running on %s.",
+                path,
+                wanted[0],
+                self.providers[0],
+            )
 
     @property
     def providers(self) -> list[str]:
-        """Those that it runs on, preferred ones first."""
+        """Execution providers it runs on, by onnxruntime's names, preferred ones first."""
         return list(self._session.get_providers())
 
     @property
     def inputs(self) -> list[tuple[str, str, list[int | str | None]]]:
-        """Name, type and shape of each; a side without a fixed length is a name or None."""
+        """Name, type and shape of each input; a side without a fixed length is a name or None."""
         return [(node.name, node.type, list(node.shape)) for node in self._session.get_inputs()]
 
     @property
     def metadata(self) -> dict[str, str]:
-        """What its exporter wrote beside it. Raises ModelError for what is no text."""
+        """Metadata that its exporter wrote into the file.
+
+        Raises:
+            ModelError: If it is not text.
+        """
         try:
             return dict(self._session.get_modelmeta().custom_metadata_map)
         except UnicodeDecodeError as error:
-            raise ModelError(f"its metadata is no text: {error}.") from error
+            raise ModelError(f"its metadata is not text: {error}.") from error
 
     def run(self, **inputs: np.ndarray) -> list[np.ndarray]:
-        """All outputs. Raises ModelError when the inference fails or yields NaN or infinity."""
+        """Return all outputs of an inference.
+
+        Raises:
+            ModelError: If the inference fails or an output has NaN or infinity.
+        """
         try:
             outputs = [np.asarray(output) for output in self._session.run(None, inputs)]
         except Exception as error:
@@ -71,22 +89,23 @@ class Network:
 
 
 def sha256(path: Path) -> str:
-    """Checksum of a file, in hexadecimal."""
+    """Return the checksum of a file in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def available(names: Sequence[str]) -> list[str]:
-    """onnxruntime's names of the providers that this machine has, the CPU last."""
-    import onnxruntime  # here and below, because every start of `ldo` would pay for it
+    """Return onnxruntime's names of the providers that this machine has, the CPU last."""
+    import onnxruntime  # A local import, here and below: it would slow every start of `ldo`.
 
     wanted = [_full_name(name) for name in names]
     here = onnxruntime.get_available_providers()
     for name in wanted:
         if name not in here:
             log.warning(
-                "this onnxruntime has no %s, only %s: it is left out. `pip install` the variant "
-                "of onnxruntime that has it, such as onnxruntime-gpu",
+                "execution provider %s is not in this onnxruntime, which has %s; continuing "
+                "without it. `pip install` the onnxruntime package with it, such as "
+                "onnxruntime-gpu.",
                 name,
                 ", ".join(here),
             )
@@ -95,13 +114,14 @@ def available(names: Sequence[str]) -> list[str]:
 
 
 def _full_name(name: str) -> str:
+    """Return onnxruntime's name of a provider."""
     import onnxruntime
 
     known = {full.removesuffix(SUFFIX).casefold(): full for full in onnxruntime.get_all_providers()}
     short = name.casefold().removesuffix(SUFFIX.casefold())
     if short not in known:
         raise ConfigError(
-            f"onnxruntime knows no execution provider {name!r}. It knows {', '.join(known)}."
+            f"onnxruntime knows no execution provider {name!r}. Choose from {', '.join(known)}."
         )
     return known[short]
 
@@ -113,10 +133,11 @@ def _session(path: Path, providers: Sequence[str], threads: int) -> Any:
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1
     options.use_deterministic_compute = True
-    options.log_severity_level = 4  # what is wrong is said in the error
+    options.log_severity_level = 4  # Fatal only: errors are raised.
     return onnxruntime.InferenceSession(str(path), options, providers=providers)
 
 
 def _first_line(error: Exception) -> str:
+    """Return the first line of an error without onnxruntime's prefix."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
     return _SUGAR.sub("", line)

@@ -1,4 +1,4 @@
-"""Class names: those of networks and of COCO, their synonyms, and their indices in a map.
+"""Class names of networks and of COCO, their synonyms, and their indices in a map.
 
 The table of synonyms and its rule are in `synonyms.yaml`.
 """
@@ -14,7 +14,7 @@ import yaml
 
 from ldo_service.errors import ConfigError, ModelError
 
-# Lin et al., ECCV 2014; the 80 in use, in the order of every detector trained on them.
+# Lin et al., ECCV 2014; the 80 classes in use, in the order of all detectors trained on them.
 COCO = (
     "person", "bicycle", "car", "motorcycle", "airplane", "bus", "train", "truck", "boat",
     "traffic light", "fire hydrant", "stop sign", "parking meter", "bench", "bird", "cat", "dog",
@@ -27,34 +27,40 @@ COCO = (
     "microwave", "oven", "toaster", "sink", "refrigerator", "book", "clock", "vase", "scissors",
     "teddy bear", "hair drier", "toothbrush",
 )  # fmt: skip
-LONGEST = 100  # characters of a name
+LONGEST = 100  # Maximum characters of a name.
 
 TABLE = "synonyms.yaml"
 
 BACKGROUND, OTHER = 0, 1
 FIRST_NAMES = ("background", "other", *COCO)
-CAP = 256  # C_max: what one byte can number
+CAP = 256  # C_max: the numbers of one byte.
 
 
 def normalized(name: str) -> str:
-    """In lower case, with single spaces for spaces, hyphens and underscores: "TV-screen" is
-    "tv screen"."""
+    """Return a name in lower case with single spaces for spaces, hyphens and underscores.
+
+    "TV-screen" becomes "tv screen".
+    """
     return " ".join(name.casefold().replace("_", " ").replace("-", " ").split())
 
 
 def is_name(text: object) -> bool:
+    """Return whether a value is a valid name: text of 1 to 100 characters."""
     return isinstance(text, str) and 0 < len(normalized(text)) <= LONGEST
 
 
 def class_names(
     count: int, given: Sequence[str] = (), metadata: str | None = None
 ) -> tuple[str, ...]:
-    """Names of the classes of a network that has `count`.
+    """Return the class names of a network with `count` classes.
 
-    given     those of the user; they come first
-    metadata  the entry `names` that exporters write, a dictionary or list of Python
+    Args:
+        count: Number of classes.
+        given: Names from the user, which are preferred.
+        metadata: The entry `names` that exporters write, a dictionary or list of Python.
 
-    Raises ModelError when there are others than it has classes, or none.
+    Raises:
+        ModelError: If the number of names is not `count`, or there are no names.
     """
     if given:
         return _fitting(tuple(given), count, "the file of names has")
@@ -62,13 +68,15 @@ def class_names(
         return _fitting(_of_metadata(metadata), count, "its metadata names")
     if count == len(COCO):
         return COCO
-    raise ModelError(
-        f"it has {count} classes and does not name them: give a file of names, one a line."
-    )
+    raise ModelError(f"it has {count} classes without names: give a file with one name per line.")
 
 
 def read_names(path: Path) -> tuple[str, ...]:
-    """One a line; empty lines at the end are left out. Raises ConfigError."""
+    """Read one name per line; empty lines at the end are ignored.
+
+    Raises:
+        ConfigError: If the file cannot be read or a line is not a valid name.
+    """
     try:
         lines = path.read_text("utf-8").rstrip().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -77,8 +85,8 @@ def read_names(path: Path) -> tuple[str, ...]:
     for number, name in enumerate(names, 1):
         if not is_name(name):
             raise ConfigError(
-                f"line {number} of {path} is no name: write one of 1 to {LONGEST} characters a "
-                "line, in the order of the network's classes."
+                f"line {number} of {path} is not a valid name: write one name of 1 to {LONGEST} "
+                "characters per line, in the order of the network's classes."
             )
     return names
 
@@ -87,7 +95,7 @@ def _fitting(names: tuple[str, ...], count: int, who: str) -> tuple[str, ...]:
     if len(names) != count:
         raise ModelError(
             f"it has {count} classes and {who} {len(names)}: give the names that it was trained "
-            "with, one a line."
+            "with, one per line."
         )
     return names
 
@@ -102,20 +110,22 @@ def _of_metadata(text: str) -> tuple[str, ...]:
     if not isinstance(entry, list | tuple):
         raise ModelError(f"its metadata names no classes: {text[:60]!r}.")
     if not all(map(is_name, entry)):
-        raise ModelError(f"its metadata has names that are none: {text[:60]!r}.")
+        raise ModelError(
+            f"its metadata has names that are not of 1 to {LONGEST} characters: {text[:60]!r}."
+        )
     return tuple(entry)
 
 
 def canonical(name: str) -> str:
-    """The one name of those that mean the same: "Sofa" is "couch"."""
+    """Return the one name for all its synonyms: "couch" for "Sofa"."""
     plain = normalized(name)
     return _table("same").get(plain, plain)
 
 
 def coco_class(name: str) -> str | None:
-    """The class of COCO that its annotators would have used: "desk" is "dining table".
+    """Return the class of COCO that its annotators would have used: "dining table" for "desk".
 
-    None for what COCO has no class for.
+    None if COCO has no class for it.
     """
     plain = canonical(name)
     found = _table("kinds").get(plain, plain)
@@ -123,8 +133,11 @@ def coco_class(name: str) -> str | None:
 
 
 def answers_to(query: str) -> tuple[str, ...]:
-    """Names of what somebody means who asks for `query`, nearest first: the thing itself, the class
-    of COCO whose kind it is, for detectors know no finer word, and its own kinds."""
+    """Return the names that answer a query, nearest first.
+
+    These are the name itself, the class of COCO above it, since detectors know no finer word, and
+    its own kinds.
+    """
     plain = canonical(query)
     kinds = _table("kinds")
     above = [kinds[plain]] if plain in kinds else []
@@ -133,31 +146,36 @@ def answers_to(query: str) -> tuple[str, ...]:
 
 @cache
 def _table(column: str) -> Mapping[str, str]:
-    """Class by word, of the column `same` or `kinds`."""
+    """Return the class by word of the column `same` or `kinds` of the table."""
     text = resources.files("ldo_service.detection").joinpath(TABLE).read_text("utf-8")
     rows: dict[str, dict[str, list[str]]] = yaml.safe_load(text)
     return {word: name for name, row in rows.items() for word in row.get(column, ())}
 
 
 class Vocabulary:
-    """`background`, `other`, the 80 names of COCO, then every new name in the order it comes.
+    """Vocabulary of a map: `background`, `other`, the 80 names of COCO, then new names in order.
 
-    Names that mean the same share an index, see `synonyms`. Beyond `cap` names, a new one is
-    `other`.
-
-    Raises ConfigError for a cap below the names it starts with.
+    Synonyms share an index, see `synonyms.yaml`. Once there are `cap` names, a new one is `other`.
     """
 
     def __init__(self, cap: int = CAP) -> None:
+        """Create a vocabulary with the names that all start with.
+
+        Args:
+            cap: Maximum number of names.
+
+        Raises:
+            ConfigError: If the cap is below the number of names at the start.
+        """
         if cap < len(FIRST_NAMES):
             raise ConfigError(
                 f"a vocabulary of {cap} has no room for the {len(FIRST_NAMES)} names it starts "
-                "with: raise the cap."
+                f"with: the cap must be at least {len(FIRST_NAMES)}."
             )
         self.cap = cap
         self._names: list[str] = [*FIRST_NAMES]
         self._indices = {name: index for index, name in enumerate(FIRST_NAMES)}
-        self.refused = 0  # times that a new name became `other`
+        self.refused = 0  # New names that became `other`.
 
     def __len__(self) -> int:
         return len(self._names)
@@ -167,18 +185,22 @@ class Vocabulary:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names by index."""
         return tuple(self._names)
 
     def name(self, index: int) -> str:
+        """Return the name of an index."""
         return self._names[index]
 
     def find(self, name: str) -> int | None:
-        """The index of a known name; None for one that is not known."""
+        """Return the index of a name, or None if it is not known."""
         return self._indices.get(canonical(name))
 
     def index(self, name: str) -> int:
-        """The index of a name, which is new from now on if it was not known; `other` when there is
-        no room, or no name."""
+        """Return the index of a name, which is added if it is not known.
+
+        Without space for it, or for an empty name, that of `other`.
+        """
         plain = canonical(name)
         if plain in self._indices:
             return self._indices[plain]
@@ -190,20 +212,26 @@ class Vocabulary:
         return self._indices[plain]
 
     def pack(self) -> dict[str, Any]:
-        """Plain values, for a file or a state."""
+        """Return plain values for a file or a checkpoint."""
         return {"cap": self.cap, "names": list(self._names), "refused": self.refused}
 
     @staticmethod
     def unpack(packed: dict[str, Any]) -> "Vocabulary":
-        """As it was, whatever has become a synonym since. Raises ValueError when these are not the
-        names of a vocabulary."""
+        """Restore a vocabulary from `pack`, even if some of its names are synonyms now.
+
+        Raises:
+            ValueError: If these are not the names of a vocabulary.
+        """
         names, vocabulary = packed["names"], Vocabulary(packed["cap"])
         start = len(FIRST_NAMES)
         if tuple(names[:start]) != FIRST_NAMES or not start <= len(names) <= vocabulary.cap:
-            raise ValueError(f"{len(names)} names, not those that every vocabulary starts with")
+            raise ValueError(
+                f"{len(names)} names must start with those of every vocabulary and be at most "
+                f"{vocabulary.cap}"
+            )
         vocabulary._names = list(names)
         vocabulary._indices = {name: index for index, name in enumerate(names)}
         if len(vocabulary._indices) != len(names):
-            raise ValueError("the vocabulary has a name twice")
+            raise ValueError("each name of a vocabulary must be there once")
         vocabulary.refused = packed["refused"]
         return vocabulary

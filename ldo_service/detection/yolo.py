@@ -1,18 +1,18 @@
-"""How the YOLO family writes boxes: what goes in, and what the numbers that come out mean.
+"""Input and output of networks of the YOLO family.
 
 Every box belongs to a cell of a grid over the input, one grid for each stride. So the number of
-boxes tells the layout, and boxes that lie near their cells tell that it was understood.
+boxes determines the layout. It is verified by the distance of the boxes from their cells.
 
             in                             out
-    yolov5  RGB 0..1, centred              [1, 3 cells, 5 + C] cx, cy, w, h, objectness, classes
+    yolov5  RGB 0..1, centered             [1, 3 cells, 5 + C] cx, cy, w, h, objectness, classes
     yolox   BGR 0..255, upper left corner  [1, cells, 5 + C] the same, as offsets and log sizes
-    yolov8  RGB 0..1, centred              [1, 4 + C, cells] cx, cy, w, h, classes
+    yolov8  RGB 0..1, centered             [1, 4 + C, cells] cx, cy, w, h, classes
 
-YOLOX may also come with its boxes decoded (`--decode_in_inference`); YOLOv7 writes as YOLOv5,
-YOLOv9 and YOLO11 as YOLOv8.
+YOLOX may also come with decoded boxes (`--decode_in_inference`). YOLOv7 has the layout of YOLOv5;
+YOLOv9 and YOLO11 have that of YOLOv8.
 
 Images are scaled into the input of a network (letterbox), and boxes are scaled back. Of overlapping
-boxes of one class, non-maximum suppression keeps the most certain.
+boxes of one class, non-maximum suppression keeps the one with the highest score.
 """
 
 from dataclasses import dataclass
@@ -23,27 +23,31 @@ import numpy as np
 
 from ldo_service.errors import ConfigError, ModelError
 
-STRIDES_PX = (4, 8, 16, 32, 64)  # of one grid, of the exports there are
-CELLS_APART = 8  # a box's centre from its cell, in the median; distances to sides go up to 16
-SCORE_TOLERANCE = 1e-3  # of rounding, beyond 0..1
+# Strides of known exports; a network uses some that follow each other.
+STRIDES_PX = (4, 8, 16, 32, 64)
+# Maximum median distance of a box center from its cell, in cells; distances to sides reach 16.
+CELLS_APART = 8
+SCORE_TOLERANCE = 1e-3  # Tolerance of scores beyond 0..1 for rounding.
 EXPECTED = (
     "[1, N, 5 + C] with three boxes a cell (yolov5) or one (yolox), or [1, 4 + C, N] (yolov8), "
     "over grids of strides 8, 16 and 32 pixels or the like, exported without suppression of "
     "overlapping boxes"
 )
 
-PADDING = 114  # the grey that the YOLO family is trained with
+PADDING = 114  # Gray value that the YOLO family is trained with.
 
 
 @dataclass(frozen=True, slots=True)
 class Layout:
+    """Input and output of one kind of network."""
+
     name: str
     boxes_per_cell: int
     has_objectness: bool
-    is_channels_first: bool  # [1, channels, N]
-    is_centered: bool  # the image in the input
-    is_rgb: bool  # else BGR
-    value_scale: float  # of pixels 0..255
+    is_channels_first: bool  # The output is [1, channels, N].
+    is_centered: bool  # The image is centered in the input.
+    is_rgb: bool  # The colors are RGB; false: BGR.
+    value_scale: float  # Factor of pixels in 0..255.
 
 
 LAYOUTS = {
@@ -58,44 +62,49 @@ LAYOUTS = {
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The cell of each box: its upper left corner [N, 2] and its side [N, 1] in pixels of the
-    input."""
+    """Cells of the boxes.
+
+    Attributes:
+        corners_px: Upper left corners, [N, 2], pixels of the input.
+        strides_px: Sides, [N, 1], pixels of the input.
+        boxes_per_cell: Number of boxes per cell.
+    """
 
     corners_px: np.ndarray
     strides_px: np.ndarray
     boxes_per_cell: int
 
     def cells_apart(self, centers_px: np.ndarray) -> float:
-        """Distance of boxes [N, 2] from the middles of their cells, in cells, in the median."""
+        """Return the median distance of box centers [N, 2] from their cells' centers, in cells."""
         middles_px = self.corners_px + self.strides_px / 2
         return float(np.median(np.abs(centers_px - middles_px) / self.strides_px))
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Boxes before suppression."""
+    """Boxes before non-maximum suppression."""
 
-    boxes: np.ndarray  # [M, 4] x0, y0, x1, y1 in pixels of the input, from its corner
-    scores: np.ndarray  # [M] 0..1
-    class_ids: np.ndarray  # [M]
+    boxes: np.ndarray  # [M, 4] x0, y0, x1, y1, pixels of the input from its corner.
+    scores: np.ndarray  # [M] 0..1.
+    class_ids: np.ndarray  # [M], index into the classes.
 
 
 @dataclass(frozen=True, slots=True)
 class Head:
-    """The output of one network, understood."""
+    """Layout of the output of one network."""
 
     layout: Layout
     class_count: int
-    grid: Grid | None  # None: of no known form, and nothing can be said of where boxes lie
-    is_decoded: bool  # else boxes are offsets to their cells, and log sizes
+    grid: Grid | None  # Grid of the boxes; if unknown, they are not checked.
+    is_decoded: bool  # False: boxes are offsets to their cells and log sizes.
 
     def candidates(self, output: np.ndarray, score_min: float) -> Candidates:
-        """The boxes of an output whose best class has at least this score.
+        """Return the boxes of an output with a best class of at least this score.
 
-        score = objectness * class, or the class alone where there is no objectness.
+        The score is objectness * class, or that of the class alone without objectness.
         """
         rows = _rows(output, self.layout)
-        scores = self._scores(rows)  # of a single column first: most boxes end here
+        scores = self._scores(rows)  # One column excludes most boxes.
         chosen = np.flatnonzero(scores >= score_min)
         classes = rows[chosen, self._first_class :]
         class_ids = classes.argmax(axis=1)
@@ -107,7 +116,11 @@ class Head:
         return Candidates(_corners(boxes), best[passed], class_ids[passed])
 
     def check(self, output: np.ndarray) -> None:
-        """Raises ModelError when scores are no probabilities or boxes lie far from their cells."""
+        """Check that scores are probabilities and boxes lie near their cells.
+
+        Raises:
+            ModelError: If not.
+        """
         scores = _rows(output, self.layout)[:, 4:]
         low, high = float(scores.min()), float(scores.max())
         if low < -SCORE_TOLERANCE or high > 1 + SCORE_TOLERANCE:
@@ -122,7 +135,7 @@ class Head:
             )
 
     def cells_apart(self, output: np.ndarray) -> float:
-        """How far boxes are from where they belong; 0 where that is not known."""
+        """Return the median distance of boxes from their cells, in cells; 0 if unknown."""
         if self.grid is None:
             return 0.0
         rows = _rows(output, self.layout)
@@ -133,27 +146,29 @@ class Head:
         return 5 if self.layout.has_objectness else 4
 
     def _scores(self, rows: np.ndarray) -> np.ndarray:
-        """[N] at least the score of each box."""
+        """Return an upper bound of the score of each box, [N]."""
         return rows[:, 4] if self.layout.has_objectness else rows[:, 4:].max(axis=1)
 
     def _decoded(self, rows: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-        """cx, cy, w, h [M, 4] in pixels of the chosen ones."""
+        """Return cx, cy, w, h of the chosen boxes, [M, 4], pixels."""
         boxes = rows[chosen, :4].astype(np.float64)
         if self.is_decoded or self.grid is None:
             return boxes
         corners, strides = self.grid.corners_px[chosen], self.grid.strides_px[chosen]
-        with np.errstate(over="ignore"):  # an absurd size is clipped to the image
+        with np.errstate(over="ignore"):  # An absurd size is clipped to the image later.
             return np.hstack((corners + boxes[:, :2] * strides, np.exp(boxes[:, 2:]) * strides))
 
 
 def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "") -> Head:
-    """What an output of the network means.
+    """Determine the layout of a network's output.
 
-    output    what it makes of an image, all outputs but this one being absent
-    input_px  width and height of its input
-    wanted    name of the layout; empty: the one that the shape tells
+    Args:
+        output: Its only output for an image.
+        input_px: Width and height of its input.
+        wanted: Name of the layout; empty: determined by the shape.
 
-    Raises ModelError when it is none of the layouts, or not the wanted one.
+    Raises:
+        ModelError: If the output has no known layout, or not the wanted one.
     """
     if output.ndim != 3 or output.shape[0] != 1 or output.dtype != np.float32:
         raise ModelError(
@@ -179,16 +194,22 @@ def detect_layout(output: np.ndarray, input_px: tuple[int, int], wanted: str = "
 
 
 def layout_named(name: str) -> Layout:
+    """Return a layout by its name.
+
+    Raises:
+        ConfigError: If there is no such layout.
+    """
     if name not in LAYOUTS:
         raise ConfigError(f"there is no layout {name!r}. The layouts are {', '.join(LAYOUTS)}.")
     return LAYOUTS[name]
 
 
 def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
-    """The grid that has so many boxes: strides that follow each other, one or three boxes a cell.
+    """Return the grid with `count` boxes, or None.
 
-    Boxes come stride by stride from the finest; with three a cell, each of the three as a whole
-    grid. No two grids of an input have the same count.
+    Grids have consecutive strides and one or three boxes per cell. Boxes are sorted by stride, the
+    finest first. With three per cell, the grid is repeated three times. No two grids of an input
+    have the same count.
     """
     for first, end in combinations(range(len(STRIDES_PX) + 1), 2):
         strides = STRIDES_PX[first:end]
@@ -201,6 +222,7 @@ def find_grid(count: int, input_px: tuple[int, int]) -> Grid | None:
 
 
 def _grid(input_px: tuple[int, int], strides: tuple[int, ...], boxes_per_cell: int) -> Grid:
+    """Return the grid of these strides."""
     corners: list[np.ndarray] = []
     for stride in strides:
         columns, rows = input_px[0] // stride, input_px[1] // stride
@@ -211,7 +233,7 @@ def _grid(input_px: tuple[int, int], strides: tuple[int, ...], boxes_per_cell: i
 
 
 def _layout_of(output: np.ndarray, input_px: tuple[int, int]) -> Layout:
-    """By which side has as many boxes as a grid."""
+    """Return the layout with an axis that has as many boxes as a grid."""
     for layout in LAYOUTS.values():
         grid = find_grid(len(_rows(output, layout)), input_px)
         if grid is not None and grid.boxes_per_cell == layout.boxes_per_cell:
@@ -223,24 +245,25 @@ def _layout_of(output: np.ndarray, input_px: tuple[int, int]) -> Layout:
 
 
 def _rows(output: np.ndarray, layout: Layout) -> np.ndarray:
-    """[N, channels]"""
+    """Return the boxes as rows, [N, channels]."""
     return output[0].T if layout.is_channels_first else output[0]
 
 
 def _corners(boxes: np.ndarray) -> np.ndarray:
-    """x0, y0, x1, y1 of cx, cy, w, h [M, 4]."""
+    """Return x0, y0, x1, y1 of cx, cy, w, h, [M, 4]."""
     halves = boxes[:, 2:] / 2
     return np.hstack((boxes[:, :2] - halves, boxes[:, :2] + halves))
 
 
 @dataclass(frozen=True, slots=True)
 class Letterbox:
-    """Where in the input of a network the image lies: all of it, in proportion, on grey.
+    """Placement of an image in the input of a network: scaled in proportion, on gray.
 
-    image_px   width, height of the image
-    input_px   width, height of the network's input
-    inner_px   width, height of the scaled image
-    offset_px  of the scaled image's upper left corner in the input
+    Attributes:
+        image_px: Width and height of the image.
+        input_px: Width and height of the network's input.
+        inner_px: Width and height of the scaled image.
+        offset_px: Upper left corner of the scaled image in the input.
     """
 
     image_px: tuple[int, int]
@@ -250,7 +273,7 @@ class Letterbox:
 
     @staticmethod
     def fit(image_px: tuple[int, int], input_px: tuple[int, int], is_centered: bool) -> "Letterbox":
-        """Centred as YOLOv5 has it, or in the upper left corner as YOLOX does."""
+        """Return the placement in the center (YOLOv5) or in the upper left corner (YOLOX)."""
         scale = min(input_px[0] / image_px[0], input_px[1] / image_px[1])
         inner = max(1, round(image_px[0] * scale)), max(1, round(image_px[1] * scale))
         room = input_px[0] - inner[0], input_px[1] - inner[1]
@@ -258,7 +281,7 @@ class Letterbox:
         return Letterbox(image_px, input_px, inner, offset)
 
     def canvas(self, image: np.ndarray) -> np.ndarray:
-        """The input [h, w, 3] uint8 for an image [H, W, 3] uint8."""
+        """Return the input [h, w, 3] uint8 for an image [H, W, 3] uint8."""
         width, height = self.input_px
         canvas = np.full((height, width, 3), PADDING, np.uint8)
         (left, top), (inner_width, inner_height) = self.offset_px, self.inner_px
@@ -267,10 +290,11 @@ class Letterbox:
         return canvas
 
     def to_image(self, boxes: np.ndarray) -> np.ndarray:
-        """Boxes [M, 4] (x0, y0, x1, y1) of the input in pixels of the image, clipped to it.
+        """Return boxes [M, 4] of the input in pixels of the image, clipped to it.
 
-        Networks count from the corner of the first pixel, this project from its centre:
-        x_image = (x_input - offset) * W / w - 0.5, so that the image covers -0.5 .. W - 0.5.
+        Boxes are x0, y0, x1, y1. Networks measure from the corner of the first pixel, this project
+        from its center: x_image = (x_input - offset) * W / w - 0.5. So the image covers -0.5 .. W -
+        0.5.
         """
         scale = np.divide(self.image_px, self.inner_px)
         corners = (boxes.reshape(-1, 2, 2) - self.offset_px) * scale

@@ -110,7 +110,7 @@ def test_a_model_of_other_classes_is_not_taken_for_one_of_coco(
 ) -> None:
     actor = detector(changed("yolox", metadata=None).write(tmp_path / "net.onnx"))
     assert only(actor.handle(red)).detections == ()
-    assert "3 classes and does not name them" in caplog.text
+    assert "3 classes without names" in caplog.text
 
 
 def test_a_network_that_fails_is_counted_and_warned_about_once(

@@ -108,12 +108,12 @@ def test_the_names_of_the_user_come_before_those_it_carries(tmp_path, layout) ->
 @pytest.mark.parametrize(
     ("metadata", "says"),
     [
-        (None, "3 classes and does not name them"),
+        (None, "3 classes without names"),
         ("{0: 'a', 1: 'b'}", "3 classes and its metadata names 2"),
         ("{0: 'a', 1: 'b', 3: 'c'}", "metadata names no classes"),
-        ("['a', 'b', 3]", "names that are none"),
-        ("['a', 'b', '']", "names that are none"),
-        ("['a', 'b', '_ -']", "names that are none"),
+        ("['a', 'b', 3]", "names that are not of 1 to 100 characters"),
+        ("['a', 'b', '']", "names that are not of 1 to 100 characters"),
+        ("['a', 'b', '_ -']", "names that are not of 1 to 100 characters"),
         ("__import__('os').getcwd()", "metadata names no classes"),
     ],
 )
@@ -229,7 +229,7 @@ def test_a_provider_that_this_machine_lacks_is_warned_about_and_left_out(tmp_pat
     )
     assert detector.providers == ["CPUExecutionProvider"]
     (record,) = caplog.records
-    assert "no RknpuExecutionProvider" in record.getMessage()
+    assert "RknpuExecutionProvider is not in this onnxruntime" in record.getMessage()
 
 
 # --- real networks --------------------------------------------------------------------------------

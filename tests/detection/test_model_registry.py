@@ -63,7 +63,7 @@ def test_a_file_may_be_used_without_registering_it(models: Models, file: Path) -
 
 @pytest.mark.parametrize("name", ["", ".hidden", "../up", "a/b", "a b", "x" * 65])
 def test_a_name_that_is_no_name_is_refused(models: Models, file: Path, name: str) -> None:
-    with pytest.raises(ConfigError, match="no name for a model"):
+    with pytest.raises(ConfigError, match="not a valid model name"):
         models.add(name, file, CONFIG)
 
 
@@ -115,7 +115,7 @@ def test_a_folder_that_cannot_be_written_is_said(
 ) -> None:
     (tmp_path / "no_folder").write_text("")
     monkeypatch.setenv("LDO_MODELS", str(tmp_path / "no_folder"))
-    with pytest.raises(ConfigError, match="LDO_MODELS names another folder"):
+    with pytest.raises(ConfigError, match="Set LDO_MODELS to another folder"):
         Models().add("one", file, CONFIG)
     assert Models().names == []
 
@@ -178,7 +178,7 @@ def test_a_pair_with_a_damaged_file_is_refused(
 ) -> None:
     model = models.add_pair("colours", pair, ENCODERS)
     (model.folder / part).write_bytes(b"garbage")
-    with pytest.raises(ModelError, match=f"{part} is not what was registered"):
+    with pytest.raises(ModelError, match=f"{part} is not the file registered"):
         open_labeller("colours", ENCODERS)
 
 
@@ -197,9 +197,9 @@ def test_detectors_and_pairs_are_not_taken_for_each_other(
 ) -> None:
     models.add("squares", file, CONFIG)
     models.add_pair("colours", pair, ENCODERS)
-    with pytest.raises(ModelError, match=r"vlm_labeller\.model takes it"):
+    with pytest.raises(ModelError, match=r"set it as vlm_labeller\.model"):
         open_detector("colours", CONFIG)
-    with pytest.raises(ModelError, match=r"detector\.model takes it"):
+    with pytest.raises(ModelError, match=r"set it as detector\.model"):
         open_labeller("squares", ENCODERS)
     with pytest.raises(ConfigError, match="there are: colours, squares"):
         open_labeller("other", ENCODERS)

@@ -1,8 +1,8 @@
-"""Names for image regions from an open vocabulary (paper, III.B).
+"""Open-vocabulary labellers of image regions (paper, III.B).
 
-Labeller      what the actor needs of one
-DualEncoder   dual_encoder.py: image and text meet in one space, as in CLIP; ONNX
-HttpLabeller  http_labeller.py: a vision-language model behind an OpenAI-compatible server
+Labeller      the interface that the actor uses
+DualEncoder   dual_encoder.py: an image and a text encoder with one space, as in CLIP; ONNX
+HttpLabeller  chat_completion.py: a vision-language model behind an OpenAI-compatible server
 """
 
 from collections import defaultdict
@@ -11,42 +11,55 @@ from typing import Protocol
 
 import numpy as np
 
-Opinion = tuple[str, float]  # name as a vocabulary has it, and its probability 0..1
+Opinion = tuple[str, float]  # Label as in a vocabulary, and its probability, 0..1.
 
 
 class Labeller(Protocol):
+    """Labeller of image regions."""
+
     @property
     def identity(self) -> str:
-        """Which one it is, for the record."""
+        """Name and version of the labeller for records."""
         ...
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Those that it chooses from; empty: any."""
+        """Names that it chooses from; empty: any name."""
         ...
 
     def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
-        """What one region is, the most probable first.
+        """Return the labels of a region, the most probable first.
 
-        crops  views of it, each [h, w, 3] uint8 RGB
-        Empty when it has no opinion. Raises ModelError or EndpointError when it cannot look.
+        Args:
+            crops: Views of the region, each [h, w, 3] uint8 RGB.
+
+        Returns:
+            The labels; empty if no name fits.
+
+        Raises:
+            ModelError: If the network fails.
+            EndpointError: If the server fails.
         """
         ...
 
     def add(self, name: str) -> None:
-        """Choose from this name too, from now on. Raises ConfigError when it cannot."""
+        """Add a name to choose from.
+
+        Raises:
+            ConfigError: If that is not possible.
+        """
         ...
 
     def metrics(self) -> dict[str, float]:
-        """What it counts."""
+        """Return the counters of the labeller."""
         ...
 
 
 def fused_over_views(views: Iterable[Iterable[Opinion]]) -> list[Opinion]:
-    """Mean over the views of each name's probability, the most probable first.
+    """Return the mean probability of each label over the views, the most probable first.
 
-    A view that does not speak of a name gives it nothing, so two views that agree outdo one that is
-    sure. Equal ones stay in the order in which they were named.
+    A view without a label counts as probability 0. So two views that agree prevail over one with a
+    high probability. Equal labels keep their order.
 
     >>> fused_over_views([[("cup", 0.75), ("vase", 0.25)], [("vase", 1.0)]])
     [('vase', 0.625), ('cup', 0.375)]

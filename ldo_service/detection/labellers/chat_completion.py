@@ -1,6 +1,6 @@
 """Labels by a vision-language model behind an OpenAI-compatible server: vLLM, llama.cpp, Ollama.
 
-The model's answer is read as one name and a confidence; anything else is refused.
+An answer must be one name; its confidence comes from the log-probabilities. All else is rejected.
 """
 
 import base64
@@ -25,10 +25,10 @@ from .http_endpoint import HttpClient, HttpClientConfig
 
 log = logging.getLogger(__name__)
 
-NONE = "none"  # what a model is told to say when no name fits
+NONE = "none"  # Answer of the model if no name fits.
 _NO_NAME = {NONE, "unknown", "unclear", "nothing", "object", "thing", "item", "n/a", "unsure"}
-_NAME = re.compile(r"[^\W\d_][\w' -]*")  # of words, beginning with a letter
-_MARK = re.compile(r"<[|/]?\w+[|]?>")  # of a model's own, such as an end of turn
+_NAME = re.compile(r"[^\W\d_][\w' -]*")  # Words, beginning with a letter.
+_MARK = re.compile(r"<[|/]?\w+[|]?>")  # Mark of a model's own, such as an end of turn.
 
 OPEN_PROMPT = (
     "What is the object in the middle of this picture? Answer with its common name alone, in one "
@@ -67,29 +67,38 @@ class _Completion(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """`logprobs` of the tokens that spell `text`; empty where the server tells none."""
+    """Answer of the model.
+
+    Attributes:
+        text: Text of the answer.
+        logprobs: Log-probabilities of the tokens of `text`; empty if the server returns none.
+    """
 
     text: str
     logprobs: tuple[float, ...] = ()
 
 
 def read_answer(body: bytes) -> Answer:
-    """The first choice of a chat completion, as OpenAI's API has it. Raises EndpointError."""
+    """Return the first choice of a chat completion of OpenAI's API.
+
+    Raises:
+        EndpointError: If it is not a chat completion.
+    """
     try:
         choice = msgspec.json.decode(body, type=_Completion).choices[0]
     except (msgspec.DecodeError, IndexError, RecursionError, UnicodeDecodeError) as error:
         raise EndpointError(
-            f"it answers {body[:60]!r}, which is no chat completion: is this the address of an "
+            f"the response {body[:60]!r} is not a chat completion: is this the address of an "
             "OpenAI-compatible server, with its path (often /v1)?"
         ) from error
     return Answer((choice.message.content or "").strip(), _logprobs(choice.logprobs))
 
 
 def confidence(logprobs: tuple[float, ...], how: Sureness) -> float:
-    """How probable the answer was: the product over its tokens, or their geometric mean.
+    """Return the probability of an answer: the product over its tokens or their geometric mean.
 
-    `product` is the probability of just this answer, so a name of many tokens is less sure; `mean`
-    takes length out and overstates names whose first token says it all.
+    `product` is the probability of exactly this answer, which is lower for names of many tokens.
+    `mean` is independent of length, and too high for names that the first token determines.
 
     >>> round(confidence((-0.1, -0.3), "product"), 3), round(confidence((-0.1, -0.3), "mean"), 3)
     (0.67, 0.819)
@@ -99,9 +108,12 @@ def confidence(logprobs: tuple[float, ...], how: Sureness) -> float:
 
 
 def name_of(text: str, allowed: Collection[str], most_words: int) -> str | None:
-    """The name in an answer as a vocabulary has it; None for what is none, or not `allowed`.
+    """Return the name in an answer as in a vocabulary; None if missing or not allowed.
 
-    allowed  names as a vocabulary has them; empty: any of at most `most_words` words
+    Args:
+        text: Answer of the model.
+        allowed: Allowed names as in a vocabulary; empty: any.
+        most_words: Maximum words of a name.
 
     >>> name_of("A Sofa.", (), 4), name_of("sofa", ("chair",), 4), name_of("I am not sure", (), 3)
     ('couch', None, None)
@@ -117,7 +129,10 @@ def name_of(text: str, allowed: Collection[str], most_words: int) -> str | None:
 
 
 def _logprobs(raw: msgspec.Raw) -> tuple[float, ...]:
-    """Those of tokens that are not white or a mark; empty unless all of them are numbers."""
+    """Return the log-probabilities of tokens other than white space and marks.
+
+    Empty unless all of them are numbers.
+    """
     try:
         told = msgspec.json.decode(raw, type=_Logprobs | None)
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError):
@@ -130,15 +145,18 @@ def _logprobs(raw: msgspec.Raw) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True)
 class HttpConfig:
-    """How a vision-language model is asked."""
+    """Settings of the requests to a vision-language model."""
 
-    model: str = ""  # its name on the server; empty: the server's only one
-    views: int = 2  # of a region at most, each a question of its own
-    side_px: int = 336  # a larger crop is shrunk to it: what CLIP-L at 336 px, LLaVA's eye, sees
-    confidence: Sureness = "product"  # of an answer's tokens: the probability of all, or their mean
-    confidence_untold: float = 0.3  # where the server tells no log-probabilities
-    most_words: int = 4  # of an answer to the open question; more is a sentence
-    most_tokens: int = 16  # asked for
+    model: str = ""  # Name of the model on the server; empty: its only one.
+    views: int = 2  # Maximum views of a region, one request each.
+    # Maximum side of a crop; a larger one is scaled down. 336 px is the input of CLIP-L, the image
+    # encoder of LLaVA.
+    side_px: int = 336
+    # Product of the probabilities of an answer's tokens, or their mean.
+    confidence: Sureness = "product"
+    confidence_untold: float = 0.3  # Confidence if the server returns no log-probabilities.
+    most_words: int = 4  # Maximum words of an answer without a list of names; more is a sentence.
+    most_tokens: int = 16  # Maximum tokens of an answer.
     endpoint: HttpClientConfig = field(default_factory=HttpClientConfig)
 
     def __post_init__(self) -> None:
@@ -149,17 +167,15 @@ class HttpConfig:
                 "http: views, side_px, most_words and most_tokens must be at least 1."
             )
         if not 0 <= self.confidence_untold <= 1:
-            raise ConfigError("http.confidence_untold must be within 0..1.")
+            raise ConfigError(
+                f"http.confidence_untold={self.confidence_untold:g} must be in [0, 1]."
+            )
 
 
 class HttpLabeller:
-    """Asks for one view at a time; the answers are fused. Keeps to itself what it does not trust.
+    """Labeller by a vision-language model on a server, with one request per view.
 
-    url    of the API, such as http://127.0.0.1:8000/v1
-    names  to choose from; empty: the question is open
-    clock, sleep  see `HttpClient`
-
-    Raises ConfigError for an address or a key that cannot be.
+    The labels of the views are fused; invalid answers are dropped.
     """
 
     def __init__(
@@ -170,6 +186,18 @@ class HttpLabeller:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        """Create a labeller; no request is sent.
+
+        Args:
+            url: Address of the API, such as http://127.0.0.1:8000/v1.
+            config: Settings.
+            names: Names to choose from; empty: any name.
+            clock: See `HttpClient`.
+            sleep: See `HttpClient`.
+
+        Raises:
+            ConfigError: If the address or the key is invalid.
+        """
         self.config = config or HttpConfig()
         self._endpoint, self._clock = HttpClient(url, self.config.endpoint, clock, sleep), clock
         self._names = list(dict.fromkeys(map(canonical, names)))
@@ -178,24 +206,32 @@ class HttpLabeller:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names to choose from; empty: any name."""
         return tuple(self._names)
 
     def add(self, name: str) -> None:
-        """Raises ConfigError when it may say any name, or for what is none."""
+        """Add a name to choose from.
+
+        Raises:
+            ConfigError: If it is not a valid name, or the labeller has no list of names.
+        """
         if not is_name(name):
-            raise ConfigError(f"{name[:40]!r} is no name: write one of 1 to {LONGEST} characters.")
+            raise ConfigError(f"{name[:40]!r} is not a name: write 1 to {LONGEST} characters.")
         if not self._names:
             raise ConfigError(
-                f"{self.identity} may answer any name, {name!r} too: a list that one could add to "
-                "is given with vlm_labeller.class_names."
+                f"{self.identity} may answer any name, {name!r} too: set "
+                "vlm_labeller.class_names to choose from a list."
             )
         if canonical(name) not in self._names:
             self._names.append(canonical(name))
 
     def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
-        """See `Labeller`. A view whose answer is refused has no opinion; when the server fails
-        after a view was answered, that view's answer stands alone. All of them have `patience_s`
-        together: one that would take longer than is left, going by those before, is left out."""
+        """Return the labels of a region; see `Labeller`.
+
+        A view with a rejected answer has no label. If the server fails after some views, those are
+        used. All views together have `patience_s`. A view that would exceed this, by the time of
+        those before, is omitted.
+        """
         views: list[list[Opinion]] = []
         until_s, slowest_s = self._clock() + self.config.endpoint.patience_s, 0.0
         for crop in crops[: self.config.views]:
@@ -212,8 +248,11 @@ class HttpLabeller:
         return fused_over_views(views)
 
     def metrics(self) -> dict[str, float]:
-        """`answers_refused`: no name, or none of the list. `answers_none`: the model said that
-        it cannot tell. `answers_without_logprobs`: sure to a configured degree only."""
+        """Return the counters of the labeller.
+
+        `answers_refused`: no name, or none of the list. `answers_none`: the model cannot recognize
+        the object. `answers_without_logprobs`: answers with the configured confidence.
+        """
         return {
             "names": len(self._names),
             "questions": self._questions,
@@ -224,6 +263,7 @@ class HttpLabeller:
         }
 
     def _look(self, crop: np.ndarray, until_s: float) -> list[Opinion]:
+        """Request the label of one view."""
         self._questions += 1
         body = self._endpoint.post("/chat/completions", self._question(crop), until_s)
         answer = read_answer(body)
@@ -239,7 +279,8 @@ class HttpLabeller:
             return confidence(answer.logprobs, self.config.confidence)
         if not self._untold:
             log.warning(
-                "%s tells no log-probabilities: its answers count as %g sure",
+                "labeller: %s returns no log-probabilities; its answers have confidence %g "
+                "(http.confidence_untold).",
                 self.identity,
                 self.config.confidence_untold,
             )
@@ -247,7 +288,7 @@ class HttpLabeller:
         return self.config.confidence_untold
 
     def _question(self, crop: np.ndarray) -> bytes:
-        """As OpenAI's API has it: text, then the picture in the address of a data URL."""
+        """Return a request of OpenAI's API: text, then the picture as a data URL."""
         picture = base64.b64encode(codecs.encode_jpeg(shrunk(crop, self.config.side_px))).decode()
         text = CLOSED_PROMPT.format(names=", ".join(self._names)) if self._names else OPEN_PROMPT
         content = [

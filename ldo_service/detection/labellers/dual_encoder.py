@@ -1,4 +1,4 @@
-"""Names by an image encoder and a text encoder that share a space (Radford et al., ICML 2021)."""
+"""Labels by an image encoder and a text encoder with one space (Radford et al., ICML 2021)."""
 
 import json
 from collections.abc import Sequence
@@ -22,47 +22,57 @@ from .text_embeddings import (
     unit,
 )
 
-CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)  # of RGB in 0..1; Radford et al., their code
+# Normalization of RGB in 0..1; Radford et al., their code.
+CLIP_MEAN = (0.48145466, 0.4578275, 0.40821073)
 CLIP_STD = (0.26862954, 0.26130258, 0.27577711)
-CLIP_SCALE = 100.0  # what CLIP's logit scale is clipped to, and ends at
-CLIP_PX = 224  # for an encoder that takes any size
-MAX_LABELS = 5  # opinions; the others are noise
+CLIP_SCALE = 100.0  # The maximum of CLIP's logit scale in training, and its final value.
+CLIP_PX = 224  # Side of the input if an encoder takes any size.
+MAX_LABELS = 5  # Maximum labels of a region; the others are noise.
 
 
 @dataclass(frozen=True, slots=True)
 class DualEncoderConfig:
-    """How a pair of encoders is read and run."""
+    """Settings of a pair of encoders."""
 
-    prompts: tuple[str, ...] = (  # their embeddings are averaged
+    # Texts for a name; the mean of their embeddings is used.
+    prompts: tuple[str, ...] = (
         "a photo of a {}.",
         "a cropped photo of a {}.",
         "a {} in a room.",
     )
-    mean: tuple[float, ...] = ()  # of RGB in 0..1; empty: what the image encoder carries, or CLIP's
+    # Normalization of RGB in 0..1; empty: from the metadata of the image encoder, or CLIP's.
+    mean: tuple[float, ...] = ()
     std: tuple[float, ...] = ()
-    logit_scale: float = 0.0  # sharpness of the softmax; 0: what comes with the pair, or CLIP's 100
-    nothing: tuple[str, ...] = ()  # names that compete and are never told, such as wall and floor
-    providers: tuple[str, ...] = ("cpu",)  # of onnxruntime, by preference: cuda, tensorrt, ...
-    threads: int = 1  # of one inference; with 1 a replay gives the same bits
+    # Sharpness of the softmax; 0: from the files of the pair, or CLIP's 100.
+    logit_scale: float = 0.0
+    # Names that compete but are never returned, such as wall and floor.
+    nothing: tuple[str, ...] = ()
+    # Execution providers of onnxruntime, by preference: cuda, tensorrt, ...
+    providers: tuple[str, ...] = ("cpu",)
+    threads: int = 1  # Threads of one inference; with 1, a replay is bitwise equal.
 
     def __post_init__(self) -> None:
         if not self.prompts or any(not _is_prompt(prompt) for prompt in self.prompts):
             raise ConfigError(
-                f"dual_encoder.prompts {list(self.prompts)}: each needs one {{}} for the name."
+                f"dual_encoder.prompts={list(self.prompts)}: each must contain {{}} for the name "
+                "once, and no other braces."
             )
         are_three = len(self.mean) in (0, 3) and len(self.std) in (0, 3)
         if not are_three or min(self.std, default=1) <= 0:
-            raise ConfigError("dual_encoder: mean and std are three numbers, std positive.")
+            raise ConfigError(
+                f"dual_encoder: mean={self.mean} and std={self.std} must be three numbers each, "
+                "std positive."
+            )
         if not 0 <= self.logit_scale < float("inf") or self.threads < 1:
             raise ConfigError(
-                "dual_encoder: logit_scale must be positive or 0, threads at least 1."
+                f"dual_encoder: logit_scale={self.logit_scale:g} must be 0 or positive and finite, "
+                f"threads={self.threads} at least 1."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class EncoderFiles:
-    """Files of a pair: an image encoder, and where texts lie: a text encoder with its byte pairs,
-    or embeddings."""
+    """Files of a pair: an image encoder, and a text encoder with its byte pairs or embeddings."""
 
     image: Path
     text: Path | None = None
@@ -72,26 +82,18 @@ class EncoderFiles:
     def __post_init__(self) -> None:
         if (self.text is None) != (self.vocabulary is None):
             raise ConfigError(
-                "a text encoder needs its byte pairs and they need it: name both, --text and "
-                "--vocabulary (CLIP's is bpe_simple_vocab_16e6.txt.gz)."
+                "a text encoder needs its byte pairs, and byte pairs a text encoder: give both, "
+                "--text and --vocabulary (CLIP's is bpe_simple_vocab_16e6.txt.gz)."
             )
         if self.text is None and self.embeddings is None:
             raise ConfigError(
-                f"{self.image} knows no text: name a text encoder (--text and --vocabulary) or "
+                f"{self.image} needs texts: give a text encoder (--text and --vocabulary) or "
                 "embeddings of names (--embeddings)."
             )
 
 
 class DualEncoder:
-    """A pair that is known to fit: opening it runs both once, on noise and on a word.
-
-    pair    its files
-    config  see there
-    names   to choose from; empty: those that come with embeddings, or the 80 of COCO
-    name    what errors and `identity` call it; empty: the image encoder's file
-
-    Raises ConfigError for settings that cannot be, ModelError for files that are no such networks.
-    """
+    """Labeller by a pair of encoders that fit each other."""
 
     def __init__(
         self,
@@ -100,6 +102,18 @@ class DualEncoder:
         names: Sequence[str] = (),
         name: str = "",
     ) -> None:
+        """Open a pair and run both encoders once, on noise and on a word.
+
+        Args:
+            pair: Files of the pair.
+            config: Settings.
+            names: Names to choose from; empty: those of the embeddings, or the 80 of COCO.
+            name: Name in errors and `identity`; empty: that of the image encoder's file.
+
+        Raises:
+            ConfigError: If a setting is invalid.
+            ModelError: If the files are no such networks.
+        """
         self.config = config or DualEncoderConfig()
         what = name or str(pair.image)
         try:
@@ -112,13 +126,13 @@ class DualEncoder:
             if space and space.dimensions != self._image.dimensions:
                 raise ModelError(
                     f"{what} cannot be used as a labeller: its images have "
-                    f"{self._image.dimensions} dimensions and its texts {space.dimensions}: they "
-                    "are not of one pair."
+                    f"{self._image.dimensions} dimensions and its texts {space.dimensions}. Use "
+                    "the encoders of one pair."
                 )
         self.logit_scale = self._logit_scale()
         self.identity = f"{name or pair.image.stem} {sha256(pair.image)[:12]}"
-        self._rows: dict[str, np.ndarray] = {}  # by name as a vocabulary has it
-        self._listed: dict[str, str] = {}  # the same, and the word that it was first given in
+        self._rows: dict[str, np.ndarray] = {}  # Embeddings by name as in a vocabulary.
+        self._listed: dict[str, str] = {}  # The word that each such name was first given as.
         for entry in (*(names or self._own_names()), *self.config.nothing):
             self._listed.setdefault(canonical(entry), entry)
         if self.texts.encoder is None:
@@ -126,19 +140,21 @@ class DualEncoder:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names to choose from, without those of `nothing`."""
         nothing = set(map(canonical, self.config.nothing))
         return tuple(name for name in self._listed if name not in nothing)
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The names as they were given, which is how a text encoder is asked for them."""
+        """Names as they were given, which is the form that the text encoder gets."""
         return tuple(self._listed.values())
 
     def label(self, crops: Sequence[np.ndarray]) -> list[Opinion]:
-        """P(name) = softmax(logit_scale cos(image, name)) over the names, averaged over the crops.
+        """Return P(name) = softmax(logit_scale cos(image, name)), averaged over the crops.
 
-        Two names, cosines 0.3 and 0.28, scale 100: exp(30) / (exp(30) + exp(28)) = 0.881.
-        Empty when one of `nothing` is the most probable.
+        With two names, cosines of 0.3 and 0.28 and a scale of 100, it is
+        exp(30) / (exp(30) + exp(28)) = 0.881. The result is empty if a name of `nothing` is the
+        most probable.
         """
         self._place_listed()
         rows, told = np.stack([self._rows[name] for name in self._listed]), set(self.names)
@@ -148,9 +164,13 @@ class DualEncoder:
         return [opinion for opinion in best if opinion[0] in told][:MAX_LABELS]
 
     def add(self, name: str) -> None:
-        """Raises ConfigError for what is no name, or when there is nothing to place it with."""
+        """Add a name to choose from.
+
+        Raises:
+            ConfigError: If it is not a valid name, or has no embedding without a text encoder.
+        """
         if not is_name(name):
-            raise ConfigError(f"{name[:40]!r} is no name: write one of 1 to {LONGEST} characters.")
+            raise ConfigError(f"{name[:40]!r} is not a name: write 1 to {LONGEST} characters.")
         if canonical(name) not in self._listed:
             self._rows[canonical(name)] = self._place(name)
             self._listed[canonical(name)] = name
@@ -159,36 +179,38 @@ class DualEncoder:
         return {"names": len(self.names)}
 
     def _view(self, crop: np.ndarray, rows: np.ndarray) -> list[Opinion]:
+        """Return the probability of each name for one crop."""
         probabilities = softmax(self.logit_scale * (rows @ self._image.embed(crop)))
         return list(zip(self._listed, probabilities.tolist(), strict=True))
 
     def _place_listed(self) -> None:
-        """Before they are first needed: a text encoder takes seconds for eighty names."""
+        """Compute embeddings when they are first needed: it takes seconds for eighty names."""
         for name, word in self._listed.items():
             if name not in self._rows:
                 self._rows[name] = self._place(word)
 
     def _place(self, name: str) -> np.ndarray:
-        """[D] float32 of length 1, from the file where it is there."""
+        """Return the embedding of a name, [D] float32 of length 1, from the file if it is there."""
         row = self.texts.find(name)
         if row is not None:
             return row
         raise ConfigError(
-            f"{name!r} is not among the names whose embeddings {self.identity} has, and there is "
-            "no text encoder to place it: register the pair with --text and --vocabulary."
+            f"{name!r} is not among the names with embeddings in {self.identity}, and there is "
+            "no text encoder to compute one: register the pair with --text and --vocabulary."
         )
 
     def _own_names(self) -> tuple[str, ...]:
         return self.texts.cached.names if self.texts.cached else COCO
 
     def _logit_scale(self) -> float:
+        """Return the logit scale of the settings, the embeddings, the image encoder, or CLIP."""
         carried = self._image.metadata_numbers("logit_scale", 1)
         cached = self.texts.cached.logit_scale if self.texts.cached else None
         return self.config.logit_scale or cached or (carried[0] if carried else CLIP_SCALE)
 
 
 class ImageEncoder:
-    """A network that makes [1, D] of an image [1, 3, S, S]. Raises ModelError for another."""
+    """Network that computes an embedding [1, D] of an image [1, 3, S, S]."""
 
     def __init__(self, path: Path, config: DualEncoderConfig) -> None:
         self._network = Network(path, config.providers, config.threads)
@@ -201,7 +223,10 @@ class ImageEncoder:
         self.dimensions = len(self.embed(noise.astype(np.uint8)))
 
     def embed(self, crop: np.ndarray) -> np.ndarray:
-        """[D] float32 of length 1, of a crop [h, w, 3] uint8 RGB, in a square of the mean."""
+        """Return the embedding of a crop [h, w, 3] uint8 RGB, [D] float32 of length 1.
+
+        The crop is padded to a square with the mean color.
+        """
         pixels = _square(crop, self.side_px, self._around).astype(np.float32) / np.float32(255)
         planes = ((pixels - self._mean) / self._std).transpose(2, 0, 1)[None]
         return unit(
@@ -209,7 +234,13 @@ class ImageEncoder:
         )
 
     def metadata_numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """What its exporter wrote, as in "0.5, 0.5, 0.5" or "[0.5, 0.5, 0.5]"; empty: nothing."""
+        """Return numbers from the metadata; empty if missing.
+
+        The exporter wrote them as "0.5, 0.5, 0.5" or "[0.5, 0.5, 0.5]".
+
+        Raises:
+            ModelError: If it has another number of them, or invalid ones.
+        """
         text = self._network.metadata.get(key)
         if text is None:
             return ()
@@ -232,6 +263,11 @@ def _text_encoder(pair: EncoderFiles, config: DualEncoderConfig) -> TextEncoder 
 
 
 def _square_input(network: Network) -> tuple[str, int]:
+    """Return name and side of the image input.
+
+    Raises:
+        ModelError: If the network has other inputs.
+    """
     inputs = network.inputs
     name, kind, shape = inputs[0] if len(inputs) == 1 else ("", "", [])
     fits = len(shape) == 4 and _allows(shape[0], 1) and _allows(shape[1], 3)
@@ -247,7 +283,7 @@ def _allows(side: int | str | None, length: int) -> bool:
 
 
 def _square(crop: np.ndarray, side_px: int, around: np.ndarray) -> np.ndarray:
-    """All of it, in proportion, in the middle: a region's edge must not be cut off."""
+    """Return a crop centered in a square, uncut, so that it contains the region's edges."""
     height, width = crop.shape[:2]
     longest = max(height, width)
     canvas = np.empty((longest, longest, 3), np.uint8)
@@ -259,7 +295,8 @@ def _square(crop: np.ndarray, side_px: int, around: np.ndarray) -> np.ndarray:
 
 
 def softmax(logits: np.ndarray) -> np.ndarray:
-    """
+    """Return the softmax of logits.
+
     >>> softmax(100 * np.array([0.3, 0.28])).round(3).tolist()
     [0.881, 0.119]
     """

@@ -1,4 +1,4 @@
-"""A server that is asked over HTTP: patiently, not too often, and never for longer than allowed."""
+"""HTTP client of a labelling server, with retries, a rate limit and a deadline."""
 
 import asyncio
 import os
@@ -11,23 +11,25 @@ import httpx2
 
 from ldo_service.errors import ConfigError, EndpointError, named
 
-MAX_BYTES = 1 << 20  # of an answer
-RETRY_STATUS_CODES = (408, 425, 429, 500, 502, 503, 504)  # what a later attempt may find otherwise
+MAX_BYTES = 1 << 20  # Maximum size of a response.
+# Status codes that may differ on a later attempt.
+RETRY_STATUS_CODES = (408, 425, 429, 500, 502, 503, 504)
 
 
 @dataclass(frozen=True, slots=True)
 class HttpClientConfig:
-    """How long, how often."""
+    """Timeouts, retries and rate limit of the client."""
 
-    timeout_s: float = 10.0  # of one attempt
+    timeout_s: float = 10.0  # Maximum time of one attempt.
     attempts: int = 3
-    backoff_s: float = 0.5  # before the second attempt; doubled before each further one
-    patience_s: float = 40.0  # of a region, with all its views, attempts and waits; below
-    # supervision.step_timeout_s, at which an actor is given up
-    per_minute: float = 60.0  # attempts, evenly spaced
-    rest_s: float = 10.0  # after a question that failed, nothing is asked; doubled with each more
-    rest_most_s: float = 300.0
-    key_variable: str = ""  # name of the environment variable with the API key; empty: none
+    backoff_s: float = 0.5  # Pause before the second attempt; doubled before each further one.
+    # Maximum time for a region with all its views, attempts and pauses. It must be below
+    # supervision.step_timeout_s, after which an actor is stopped.
+    patience_s: float = 40.0
+    per_minute: float = 60.0  # Maximum attempts per minute, evenly spaced.
+    rest_s: float = 10.0  # Pause after a failed request; doubled with each further one.
+    rest_most_s: float = 300.0  # Maximum pause after failed requests.
+    key_variable: str = ""  # Environment variable with the API key; empty: none.
 
     def __post_init__(self) -> None:
         times = (self.timeout_s, self.patience_s, self.per_minute)
@@ -42,7 +44,8 @@ class HttpClientConfig:
                     "rest_s",
                     "rest_most_s",
                 )
-                + ": times must be positive."
+                + ": timeout_s, patience_s and per_minute must be positive, the others not "
+                "negative."
             )
         if self.patience_s < self.timeout_s:
             raise ConfigError(
@@ -50,21 +53,15 @@ class HttpClientConfig:
                 "which one attempt may take."
             )
         if self.attempts < 1:
-            raise ConfigError("attempts must be at least 1.")
+            raise ConfigError(f"attempts={self.attempts} must be at least 1.")
 
 
 class DeadlineExceeded(EndpointError):
-    """No time is left, and the server did nothing wrong."""
+    """Deadline that passed without a failure of the server."""
 
 
 class HttpClient:
-    """Asked by one thread.
-
-    url    http or https
-    clock  seconds, never backwards; `sleep` waits by it
-
-    Raises ConfigError for an address or a key that cannot be.
-    """
+    """HTTP client for one thread."""
 
     def __init__(
         self,
@@ -73,24 +70,49 @@ class HttpClient:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
+        """Create a client; no connection is made.
+
+        Args:
+            url: Address of the server, http or https.
+            config: Settings.
+            clock: Monotonic clock, seconds.
+            sleep: Function that waits by this clock.
+
+        Raises:
+            ConfigError: If the address or the key is invalid.
+        """
         self.url, self._config = url, config
         self._address = str(_address(url))
         self._headers = {
             "Content-Type": "application/json",
-            "Accept-Encoding": "identity",  # The answer is read as it comes, not unpacked.
+            "Accept-Encoding": "identity",  # The response is read as received, not decompressed.
             **_key(config.key_variable),
         }
         self._tls = ssl.create_default_context()
         self._clock, self._sleep = clock, sleep
         self._free_at_s = self._rested_at_s = float("-inf")
-        self._failures = 0  # in a row
+        self._failures = 0  # Failures in a row.
         self.attempts = 0
 
     def post(self, path: str, body: bytes, until_s: float) -> bytes:
-        """The answer to a question. Raises EndpointError when there is none by `until_s` of the
-        clock; a server that could not have its `timeout_s` until then is not left alone for it."""
+        """Return the response to a request.
+
+        A request with less than `timeout_s` left until the deadline does not count as a failure of
+        the server.
+
+        Args:
+            path: Path of the request below the address.
+            body: Content of the request, JSON.
+            until_s: Deadline by the clock.
+
+        Raises:
+            EndpointError: If there is no response before the deadline.
+        """
         if self._clock() < self._rested_at_s:
-            raise EndpointError(f"{self.url} failed before and is left alone for a while.")
+            raise EndpointError(
+                f"{self.url}: circuit breaker open after a failed request; it closes within "
+                f"{self._config.rest_most_s:g} s."
+            )
         try:
             answer = self._post_with_retries(path, body, until_s)
         except DeadlineExceeded:
@@ -104,6 +126,7 @@ class HttpClient:
         return answer
 
     def _post_with_retries(self, path: str, body: bytes, until_s: float) -> bytes:
+        """Send a request until it succeeds, fails for good, or no attempt is left."""
         failure = DeadlineExceeded(f"{self.url} may not be asked again within patience_s.")
         for attempt in range(self._config.attempts):
             pause_s = self._config.backoff_s * 2 ** (attempt - 1) if attempt else 0.0
@@ -113,7 +136,7 @@ class HttpClient:
                 return self._attempt(path, body, within_s)
             except _TransientError as passing:
                 if within_s < self._config.timeout_s and self._clock() >= until_s:
-                    raise failure from passing  # nobody knows what it would have said
+                    raise failure from passing  # The response is unknown.
                 failure = EndpointError(
                     f"{self.url} {passing} ({attempt + 1} attempts): is the server up, and the "
                     "address right?"
@@ -121,7 +144,7 @@ class HttpClient:
         raise failure
 
     def _wait(self, pause_s: float, until_s: float, failure: EndpointError) -> None:
-        """Until the next attempt may be made. Raises `failure` when that is too late."""
+        """Wait until the next attempt is allowed; raise `failure` if that is past the deadline."""
         now_s = self._clock()
         start_s = max(now_s + pause_s, self._free_at_s)
         if start_s >= until_s:
@@ -131,11 +154,11 @@ class HttpClient:
         self._free_at_s = start_s + 60 / self._config.per_minute
 
     def _attempt(self, path: str, body: bytes, within_s: float) -> bytes:
-        """Return the answer to one attempt.
+        """Return the response to one attempt.
 
         Raises:
-            _TransientError: Another attempt may succeed.
-            EndpointError: The server refuses the question, or answers too much.
+            _TransientError: If another attempt may succeed.
+            EndpointError: If the server rejects the request or its response is too large.
         """
         self.attempts += 1
         try:
@@ -144,16 +167,16 @@ class HttpClient:
             raise _TransientError(f"did not answer within {within_s:.1f} s") from error
         except httpx2.TransportError as error:
             raise _TransientError(
-                f"cannot be asked: {type(error).__name__} {error}".strip()
+                f"cannot be reached: {type(error).__name__} {error}".strip()
             ) from error
 
     async def _exchange(self, path: str, body: bytes, within_s: float) -> bytes:
-        """Send a question and read its answer, in one connection.
+        """Send a request and read its response in one connection.
 
-        The timeouts of the library are of each read alone, and a server that sends a byte now and
-        then would never reach them. So one timeout is set around all of it, connecting included.
-        Proxies of the environment are not used, and redirects are not followed: the key would go
-        to another host.
+        The timeouts of the library apply to each read alone, and a server that sends single bytes
+        would never exceed them. So one timeout covers everything, connecting included. Proxies of
+        the environment are not used, and redirects are not followed: the key would go to another
+        host.
         """
         async with (
             asyncio.timeout(within_s),
@@ -166,7 +189,9 @@ class HttpClient:
             async for piece in response.aiter_raw():
                 answer += piece
                 if len(answer) > MAX_BYTES:
-                    raise EndpointError(f"{self.url} answers more than {MAX_BYTES} bytes.")
+                    raise EndpointError(
+                        f"{self.url} sends more than {MAX_BYTES} bytes: check the address."
+                    )
         status = f"answers {response.status_code} {response.reason_phrase[:40]}"
         if response.status_code in RETRY_STATUS_CODES:
             raise _TransientError(status)
@@ -179,11 +204,15 @@ class HttpClient:
 
 
 class _TransientError(Exception):
-    """A failure that another attempt may not meet."""
+    """Failure that another attempt may not meet."""
 
 
 def _address(url: str) -> httpx2.URL:
-    """Return where to ask. Raises ConfigError."""
+    """Return the address of a server.
+
+    Raises:
+        ConfigError: If it is not a usable address, or contains a password.
+    """
     try:
         address = httpx2.URL(url.rstrip("/"))
     except httpx2.InvalidURL:
@@ -192,25 +221,26 @@ def _address(url: str) -> httpx2.URL:
     is_usable = address.scheme in ("http", "https") and address.host and 0 < port < 65536
     if not is_usable or "?" in url or "#" in url:
         raise ConfigError(
-            f"{_without_user(url)!r} is no address of a server: write it as "
+            f"{_without_user(url)!r} is not the address of a server: write it as "
             "http://127.0.0.1:8000/v1."
         )
     if address.userinfo:
         raise ConfigError(
-            f"{_without_user(url)!r} has a name or password in it, which every configuration that "
-            "is saved would show: put the key into an environment variable and name that in "
-            "key_variable."
+            f"{_without_user(url)!r} contains a name or password, which every saved configuration "
+            "would show: put the key into an environment variable and set key_variable to its "
+            "name."
         )
     return address
 
 
 def _without_user(url: str) -> str:
+    """Return an address without user and password."""
     before, at, after = url.partition("@")
     return f"{before.partition('://')[0]}://...@{after}" if at else url
 
 
 def _key(variable: str) -> dict[str, str]:
-    """The header with the key, which is told to nobody else."""
+    """Return the header with the API key, which is sent to the server only."""
     if not variable:
         return {}
     key = os.environ.get(variable, "").strip()

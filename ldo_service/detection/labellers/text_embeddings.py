@@ -1,4 +1,4 @@
-"""Embeddings of names in the space that images and texts share: computed, or read from a file."""
+"""Text embeddings of names, computed by a text encoder or read from a file."""
 
 import gzip
 import zlib
@@ -17,27 +17,27 @@ from ldo_service.storage.arrays_file import UNREADABLE, read_arrays
 
 WORD_END = "</w>"
 START, END = "<|startoftext|>", "<|endoftext|>"
-# CLIP's vocabulary of 49,408 less the 512 bytes and the two marks; its file goes on beyond.
+# CLIP's vocabulary of 49,408 without the 512 bytes and the two marks; its file has more.
 MAX_MERGES = 49_408 - 512 - 2
-MAX_VOCABULARY_BYTES = 1 << 26  # unpacked; CLIP's has 3 MB
-_WORDS = r"'(?:s|t|re|ve|m|ll|d)|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"  # as CLIP has them
+MAX_VOCABULARY_BYTES = 1 << 26  # Maximum size unpacked; CLIP's has 3 MB.
+_WORDS = r"'(?:s|t|re|ve|m|ll|d)|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"  # Words as in CLIP.
 
-MAX_BYTES = 1 << 30  # of 260,000 names in 1024 dimensions
-CONTEXT = 77  # tokens of a text, where a network takes any number: CLIP's
+MAX_BYTES = 1 << 30  # Enough for 260,000 names in 1024 dimensions.
+CONTEXT = 77  # CLIP's number of tokens, if a network takes any.
 
 
 def read_tokenizer(path: Path) -> Tokenizer:
     """Return CLIP's tokenizer with the byte pairs of a file.
 
-    Tokens are numbered as in CLIP: the bytes, those that print first; the same as ends of words;
-    the merges in order of their rank; the marks of start and end of a text.
+    Tokens are numbered as in CLIP: the bytes, printable ones first; the same as ends of words; the
+    merges in order of their rank; the marks of start and end of a text.
 
     Args:
-        path: A file such as CLIP's bpe_simple_vocab_16e6.txt.gz: a line about itself, then a pair
-            per line.
+        path: A file such as CLIP's bpe_simple_vocab_16e6.txt.gz: a comment line, then one pair per
+            line.
 
     Raises:
-        ModelError: The file cannot be read, or is no list of byte pairs.
+        ModelError: If the file cannot be read or is not a list of byte pairs.
     """
     _, *lines = _text(path).splitlines() or [""]
     merges = [tuple(line.split()) for line in lines[:MAX_MERGES] if line.strip()]
@@ -48,7 +48,7 @@ def read_tokenizer(path: Path) -> Tokenizer:
     ids = {symbol: number for number, symbol in enumerate(symbols)}
     if not merges or len(pairs) < len(merges) or not ids.keys() >= {*chain.from_iterable(pairs)}:
         raise ModelError(
-            f"{path} is no list of byte pairs: a line about itself is expected, then two symbols "
+            f"{path} is not a list of byte pairs: a comment line is expected, then two symbols "
             "per line, as in CLIP's bpe_simple_vocab_16e6.txt.gz."
         )
     tokenizer = Tokenizer(models.BPE(ids, pairs, end_of_word_suffix=WORD_END))
@@ -66,32 +66,45 @@ def read_tokenizer(path: Path) -> Tokenizer:
 
 
 def _text(path: Path) -> str:
+    """Return the text of a file, which may be compressed by gzip.
+
+    Raises:
+        ModelError: If it cannot be read or is too large.
+    """
     try:
         body = path.read_bytes()
         if body.startswith(b"\x1f\x8b"):
             with gzip.open(path) as file:
                 body = file.read(MAX_VOCABULARY_BYTES + 1)
         if len(body) > MAX_VOCABULARY_BYTES:
-            raise ModelError(f"{path} unpacks to more than {MAX_VOCABULARY_BYTES} bytes.")
+            raise ModelError(f"{path} must have at most {MAX_VOCABULARY_BYTES} bytes unpacked.")
         return body.decode("utf-8")
     except (OSError, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise ModelError(f"the byte pairs in {path} cannot be read: {error}.") from error
 
 
 class TextEncoder:
-    """Places any name: the mean of what a network makes of each prompt, brought to length 1.
-
-    Raises ModelError for a file that is no text encoder.
-    """
+    """Text encoder of names: the mean of the embeddings of its prompts, of length 1."""
 
     def __init__(self, network: Network, tokenizer: Tokenizer, prompts: Sequence[str]) -> None:
+        """Run a network once.
+
+        Args:
+            network: The text encoder.
+            tokenizer: Tokenizer of the network.
+            prompts: Texts with {} for the name.
+
+        Raises:
+            ModelError: If the network is not a text encoder.
+        """
         self._network, self._tokenizer, self._prompts = network, tokenizer, tuple(prompts)
         self._inputs, context = _text_inputs(network)
-        tokenizer.enable_truncation(context)  # A text that is too long loses its last words.
+        tokenizer.enable_truncation(context)  # The end of a text that is too long is cut.
         tokenizer.enable_padding(length=context)
         self.dimensions = len(self._of_text("a"))
 
     def embed(self, name: str) -> np.ndarray:
+        """Return the embedding of a name, [D] float32 of length 1."""
         rows = [unit(self._of_text(prompt.format(name))) for prompt in self._prompts]
         return unit(np.mean(rows, axis=0))
 
@@ -105,13 +118,18 @@ class TextEncoder:
 
 
 class CachedEmbeddings:
-    """Places the names in a file, .npz or .safetensors: `embeddings` [C, D], `names` [C], and
-    perhaps `logit_scale`.
+    """Embeddings of names from a file.
 
-    Names in .safetensors are its metadata entry `names`, a name a line. Raises ModelError.
+    The file is .npz or .safetensors, with `embeddings` [C, D], `names` [C], and optionally
+    `logit_scale`. In .safetensors, the names are the metadata entry `names`, one per line.
     """
 
     def __init__(self, path: Path) -> None:
+        """Read a file.
+
+        Raises:
+            ModelError: If it cannot be read or its embeddings are invalid.
+        """
         try:
             names, arrays = _safetensors(path) if path.suffix == ".safetensors" else _npz(path)
             embeddings = np.asarray(arrays["embeddings"], np.float32)
@@ -126,7 +144,10 @@ class CachedEmbeddings:
                 "each name is expected."
             )
         if not (np.isfinite(embeddings).all() and np.linalg.norm(embeddings, axis=1).all()):
-            raise ModelError(f"{path} has embeddings that are zero, NaN or infinite.")
+            raise ModelError(
+                f"{path} has embeddings that are zero, NaN or infinite: all must be finite and "
+                "not zero."
+            )
         self.names = names
         self.dimensions = embeddings.shape[1]
         self.logit_scale = _scale(arrays.get("logit_scale"), path)
@@ -135,27 +156,29 @@ class CachedEmbeddings:
         self._rows |= {normalized(name): row for name, row in rows}
 
     def find(self, name: str) -> np.ndarray | None:
-        """[D] float32 of length 1, of this word or one that means the same; None when there is
-        none in the file."""
+        """Return the embedding of a name or a synonym, [D] float32 of length 1, or None."""
         row = self._rows.get(normalized(name), self._rows.get(canonical(name)))
         return None if row is None else unit(row)
 
 
 class TextEmbeddings:
-    """The text half of a pair: what is in the file is read, anything else is computed."""
+    """Text embeddings of a pair: from the file where possible, else computed."""
 
     def __init__(self, cached: CachedEmbeddings | None, encoder: TextEncoder | None) -> None:
         self.cached, self.encoder = cached, encoder
 
     def find(self, text: str) -> np.ndarray | None:
-        """[D] float32 of length 1; None where it is not in the file and there is no encoder."""
+        """Return an embedding, [D] float32 of length 1.
+
+        None if it is not in the file and there is no encoder.
+        """
         row = self.cached.find(text) if self.cached else None
         if row is None and self.encoder is not None:
             row = self.encoder.embed(normalized(text))
         return row
 
     def encode(self, texts: Sequence[str]) -> np.ndarray:
-        """[T, D]; zeros, which are like nothing, where `find` finds nothing."""
+        """Return embeddings [T, D]; zeros, which resemble nothing, for texts without one."""
         rows = [self.find(text) for text in texts]
         (dimensions,) = {space.dimensions for space in (self.cached, self.encoder) if space}
         nowhere = np.zeros(dimensions, np.float32)
@@ -163,7 +186,11 @@ class TextEmbeddings:
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """Raises ModelError for one of no length."""
+    """Return a vector scaled to length 1.
+
+    Raises:
+        ModelError: If its length is 0.
+    """
     length = np.linalg.norm(vector)
     if not length > 0:
         raise ModelError("it yields an embedding of zeros: its weights are damaged.")
@@ -171,7 +198,11 @@ def unit(vector: np.ndarray) -> np.ndarray:
 
 
 def only_embedding(outputs: Sequence[np.ndarray]) -> np.ndarray:
-    """[D] of the one output that is [1, D]; exporters add hidden states. Raises ModelError."""
+    """Return the one output that is [1, D], as [D]; exporters add hidden states.
+
+    Raises:
+        ModelError: If there is not exactly one.
+    """
     found = [output for output in outputs if output.ndim == 2 and len(output) == 1]
     if len(found) != 1 or found[0].shape[1] < 2:
         shapes = ", ".join(str(list(output.shape)) for output in outputs)
@@ -180,7 +211,7 @@ def only_embedding(outputs: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _text_inputs(network: Network) -> tuple[dict[str, type[np.integer]], int]:
-    """Type of each input by name, and how many tokens they take."""
+    """Return the type of each input by name, and their number of tokens."""
     kinds: dict[str, type[np.integer]] = {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
     inputs, shapes = network.inputs, [shape for _, _, shape in network.inputs]
     tokens = [name for name, _, _ in inputs if "mask" not in name]

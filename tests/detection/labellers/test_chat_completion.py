@@ -99,7 +99,7 @@ def test_without_log_probabilities_confidence_is_low_and_said_so(caplog) -> None
         for _ in range(3):
             assert one.label([RED]) == [("cup", 0.3)]
     (record,) = caplog.records
-    assert "tells no log-probabilities" in record.getMessage()
+    assert "returns no log-probabilities" in record.getMessage()
     assert one.metrics()["answers_without_logprobs"] == 3
 
 
@@ -175,7 +175,7 @@ def test_a_server_that_keeps_failing_is_left_alone_for_longer_and_longer() -> No
                 one.label([RED])
             attempts.append(one.metrics()["attempts"])
             time.now_s += 1
-        with pytest.raises(EndpointError, match="left alone"):
+        with pytest.raises(EndpointError, match="circuit breaker open"):
             one.label([RED])
     assert attempts[:10] == [2] * 10
     assert attempts[-1] == 2 * 4  # at 0, 10, 30 and 70 s, and the waits between attempts
@@ -254,7 +254,7 @@ def test_no_server_at_all() -> None:
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         url = f"http://127.0.0.1:{closed.getsockname()[1]}/v1"
-        with pytest.raises(EndpointError, match=r"cannot be asked.*3 attempts.*is the server up"):
+        with pytest.raises(EndpointError, match=r"cannot be reached.*3 attempts.*is the server up"):
             labeller(url).label([RED])
 
 
@@ -327,7 +327,7 @@ def test_a_view_cut_off_by_patience_is_no_failure_of_the_server(
         if second is not None:
             assert one.label([RED]) == second
         else:
-            with pytest.raises(EndpointError, match="left alone"):
+            with pytest.raises(EndpointError, match="circuit breaker open"):
                 one.label([RED])
 
 
@@ -383,7 +383,7 @@ def test_a_key_that_is_not_there_is_an_error(monkeypatch: pytest.MonkeyPatch) ->
     ["", "127.0.0.1:80", "ftp://a/b", "http://", "http://a:b/", "http://a:99999/", "http://a/?q"],
 )
 def test_an_address_that_is_none_is_refused(url: str) -> None:
-    with pytest.raises(ConfigError, match="no address"):
+    with pytest.raises(ConfigError, match="not the address of a server"):
         labeller(url)
 
 

@@ -128,7 +128,7 @@ def test_without_a_text_encoder_a_new_name_is_refused_with_what_is_missing(
 
 @pytest.mark.parametrize("name", ["", "  ", "x" * 101])
 def test_what_is_no_name_is_not_added(full: EncoderFiles, name: str) -> None:
-    with pytest.raises(ConfigError, match="is no name"):
+    with pytest.raises(ConfigError, match="is not a name"):
         DualEncoder(full).add(name)
 
 
@@ -225,7 +225,7 @@ def test_embeddings_that_cannot_be_are_refused(tmp_path: Path, arrays: dict) -> 
 def test_half_a_pair_is_refused(full: EncoderFiles) -> None:
     with pytest.raises(ConfigError, match="needs its byte pairs"):
         EncoderFiles(full.image, text=full.text)
-    with pytest.raises(ConfigError, match="knows no text"):
+    with pytest.raises(ConfigError, match="needs texts"):
         EncoderFiles(full.image)
 
 
