@@ -1,8 +1,8 @@
-"""C++17 kernels bound with nanobind: small, checked, stateless, the GIL released.
+"""C++17 kernels, bound with nanobind: small and stateless, with checked arguments.
 
-Each kernel is compiled once per instruction set. The widest that the machine has is used;
-`LDO_ISA=avx512|avx2|baseline` forces one. Results are bitwise equal for any number of threads,
-and differ in the last bits between instruction sets.
+The kernels release the GIL. Each is compiled once per instruction set. The process uses the widest
+set that the machine has; `LDO_ISA=avx512|avx2|baseline` forces one. Results are bitwise equal for
+any number of threads, and differ in the last bits between instruction sets.
 """
 
 from ldo_service.errors import ConfigError

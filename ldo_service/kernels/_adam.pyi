@@ -1,3 +1,5 @@
+"""Binding of the Adam step, `kernels/adam.hpp`."""
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,25 @@ def adam_step(
     epsilon: float,
     threads: int = 1,
 ) -> None:
-    """One step of Adam, in place, on rows[indices] [M, 16], whose gradients [M, 16] are given.
+    """Apply one step of Adam to the rows `indices`, in place.
 
     Rows with a gradient of zero in every field stay untouched, moments and step count included.
-    Releases the GIL. Raises ValueError for arrays that do not fit and indices that do not ascend.
-    Bitwise equal for any number of threads.
+    The function releases the GIL. The result is bitwise equal for any number of threads.
+
+    Args:
+        rows: Parameters, [N, 16], changed in place.
+        mean: First moments of the gradients, [N, 16], changed in place.
+        square: Second moments of the gradients, [N, 16], changed in place.
+        steps: Number of steps of each row, [N], changed in place.
+        indices: Rows to change, [M], ascending.
+        gradients: Gradients of these rows, [M, 16].
+        rates: Learning rate per field, [16]; 0 leaves the field unchanged.
+        beta1: Decay rate of `mean`, in [0, 1).
+        beta2: Decay rate of `square`, in [0, 1).
+        epsilon: Positive term that keeps the denominator from zero.
+        threads: Number of threads.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, indices do not ascend, or a
+            number is out of range.
     """

@@ -1,15 +1,32 @@
+"""Binding of the alignment kernels, `kernels/align.hpp`."""
+
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.float32]
-Intrinsics = tuple[float, float, float, float]
+Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy, pixels.
 
 isa: str
 
+# Average the 2x2 blocks of an image [H, W] to [H // 2, W // 2]. Zeros are missing values. Values
+# within the relative `tolerance` of the lowest count; a block with fewer than `least` gives 0.
 def halve(values: Image, tolerance: float, least: int = 1) -> Image: ...
+
+# Combine gray levels [H, W] (0 where clipped) and depth [H, W] in meters (0 where missing) into
+# texels [H, W, 4]: intensity, two gradients, depth. Depth beyond `max_depth_m` becomes 0.
 def pack(image: Image, depth_m: Image, max_depth_m: float) -> Image: ...
+
+# Compute normals [H, W, 3] towards the camera from depth [H, W] in meters, over `radius` pixels.
 def normals(depth_m: Image, intrinsics: Intrinsics, radius: int) -> Image: ...
+
+# Back-project texels with depth to points [7, N]: coordinates, intensity, normal. A missing normal
+# is 0 0 0.
 def points(texels: Image, normals: Image, intrinsics: Intrinsics) -> Image: ...
+
+# Compute the Hessian [8, 8] and the gradient [8] of all residuals, and seven sums. The sums are
+# visible points, then count, inliers and weighted squares of the photometric and the geometric
+# residuals.
+# `noise` is floor, growth and nearest depth; `gate` and `occlusion` are relative to the depth.
 def normal_equations(
     points: Image,
     texels: Image,

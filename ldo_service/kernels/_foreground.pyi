@@ -1,3 +1,5 @@
+"""Binding of surfaces and foregrounds of depth images, `kernels/foreground.hpp`."""
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,12 +13,27 @@ def surfaces(
     min_cosine: float,
     labels: NDArray[np.int32],
 ) -> NDArray[np.int64]:
-    """Write to `labels` [H, W] which smooth piece of a depth image each pixel belongs to, 0 on
-    edges and where depth is missing, and return the pixels of each label, [S].
+    """Label the smooth pieces of a depth image.
 
-    Pieces are numbered in the order of their first pixels, row by row. Releases the GIL. Raises
-    ValueError for arrays that do not fit. One thread; where a cosine is at its threshold the
-    outcome may differ between instruction sets. `ldo_service.regions.foreground` says more.
+    Pieces are numbered in the order of their first pixels, row by row. The function releases the
+    GIL and runs on one thread. Where a cosine is at its threshold, the result may differ between
+    instruction sets. `ldo_service.regions.foreground` describes the method and its settings.
+
+    Args:
+        depth_m: Depth, [H, W], meters; missing where it is not above 0.
+        fx: Focal length, pixels.
+        fy: Focal length, pixels.
+        cx: Principal point, pixels.
+        cy: Principal point, pixels.
+        max_step: Maximum relative step of depth within 3x3 pixels of one surface.
+        min_cosine: Minimum cosine of normals 4 px apart on one surface.
+        labels: Output, [H, W]: the piece of each pixel; 0 on edges and where depth is missing.
+
+    Returns:
+        The number of pixels of each label, [S].
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, or a number is out of range.
     """
 
 def foreground(
@@ -33,11 +50,27 @@ def foreground(
     grow_px: int,
     mask: NDArray[np.uint8],
 ) -> None:
-    """Write to `mask` [h, w], a window of the image whose first pixel lies at (row, column), what
-    of it is the object in its middle: 1, else 0.
+    """Write the mask of the object in the middle of a window of the image.
 
-    `labels` [H, W] and `sizes` [S] as `surfaces` returns them. Releases the GIL. Raises ValueError
-    for arrays that do not fit and windows that are empty or beyond the image. One thread; where a
-    depth is at the edge of a bin of the mode the outcome may differ between instruction sets.
-    `ldo_service.regions.foreground` says more.
+    The function releases the GIL and runs on one thread. Where a depth is at the edge of a bin of
+    the mode, the result may differ between instruction sets. `ldo_service.regions.foreground`
+    describes the method and its settings.
+
+    Args:
+        depth_m: Depth, [H, W], meters; missing where it is not above 0.
+        focal_px: Focal length, pixels.
+        labels: Labels that `surfaces` wrote, [H, W].
+        sizes: Sizes that `surfaces` returned, [S].
+        row: Row of the window's first pixel.
+        column: Column of the window's first pixel.
+        min_inside: Minimum fraction of a surface inside the window.
+        max_gap: Maximum relative step of depth within 3x3 pixels of one object.
+        depth_bin: Width of a bin of the depth mode, fraction of depth.
+        near_mode: Maximum distance from the mode, fraction of depth.
+        grow_px: Number of pixels by which the mask grows.
+        mask: Output, [h, w], a window within the image: 1 on the object, else 0.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, a number is out of range, or the
+            window is empty or reaches beyond the image.
     """

@@ -1,3 +1,5 @@
+"""Binding of the label kernels, `kernels/labels.hpp`."""
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,13 +24,37 @@ def assign(
     z: NDArray[np.float32],
     threads: int = 1,
 ) -> None:
-    """Write to `region` [V] which of M regions each of rows[indices] belongs to, -1 where none,
-    -2 where it is not expected; the overlap with it to `overlap` [V], its depth (m) to `z` [V].
+    """Match each of the Gaussians `indices` with one of M regions of an image.
 
-    `boxes` [M, 4]; `scores` [M]; `rects` [M, 4] column, row, width, height of the rectangle whose
-    summed-area table [height + 1, width + 1] is the next in `sums`; width 0: all of the box.
-    Releases the GIL. Raises ValueError for arrays that do not fit and indices that do not ascend.
-    Bitwise equal for any number of threads. `ldo_service.semantics.label_assignment` says more.
+    The function releases the GIL. The result is bitwise equal for any number of threads.
+    `ldo_service.semantics.label_assignment` describes the rule.
+
+    Args:
+        rows: Gaussians of the map, [N, 16].
+        indices: Rows to assign, [V], ascending.
+        T_camera_map: Upper rows of the transform from the map to the camera, [3, 4].
+        fx: Focal length, pixels.
+        fy: Focal length, pixels.
+        cx: Principal point, pixels.
+        cy: Principal point, pixels.
+        depth_m: Depth of the image, [H, W], meters; 0 where not measured.
+        boxes: Boxes x0 y0 x1 y1 of the regions, [M, 4], pixels.
+        scores: Scores of the regions, [M], 0..1.
+        rects: Column, row, width and height of the rectangle that each region's table covers,
+            [M, 4]; width 0 selects the whole box.
+        sums: Summed-area tables [height + 1, width + 1] of the rectangles, one after the other.
+        by_iou: Whether overlap is the IoU; else it is the covered fraction of the splat.
+        min_overlap: Overlap that a region must exceed.
+        max_depth_gap_m: Maximum distance between a Gaussian and the measured surface, meters.
+        region: Output, [V]: number of the region; -1 for no region, -2 for a Gaussian that is not
+            expected in the image.
+        overlap: Output, [V]: overlap with that region.
+        z: Output, [V]: depth of the Gaussian, meters.
+        threads: Number of threads.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, indices do not ascend, or a
+            number is out of range.
     """
 
 def update(
@@ -45,12 +71,29 @@ def update(
     hold_back: float,
     threads: int = 1,
 ) -> None:
-    """One observation of each of labels[indices], rows [N, 32] of bytes, in place.
+    """Update the label rows `indices` by one observation each, in place.
 
-    `observed` [V]: a label, -1 for a miss, -2 for none; `confidence` [V] of labels; `extent_m` [V]
-    of the label's object, or of the smallest object that is worth missing. Releases the GIL.
-    Raises ValueError for arrays that do not fit and indices that do not ascend. Bitwise equal for
-    any number of threads. `ldo_service.semantics.gaussian_labels` says more.
+    The function releases the GIL. The result is bitwise equal for any number of threads.
+    `ldo_service.semantics.gaussian_labels` describes the rules and their settings.
+
+    Args:
+        labels: Label rows, [N, 32] bytes, changed in place.
+        indices: Rows to update, [V], ascending.
+        observed: Observed labels, [V]; -1 for a miss, -2 for no observation.
+        confidence: Confidences of the labels, [V], 0..1.
+        extent_m: Extent of the label's object, [V], meters; for a miss, the minimum extent of an
+            object that counts as missed.
+        is_corrected: Whether the corrected average is used; else the paper's.
+        keep: Factor on earlier observations, in [0, 1).
+        miss_weight: Evidence of a miss for background, 0..1.
+        miss_limit: Misses in a row that reset a row to background, for the paper's average.
+        usual_extent_m: Extent of objects where it is unknown, meters.
+        hold_back: Damping of uncertain observations of settled Gaussians, 0..1.
+        threads: Number of threads.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, indices do not ascend, or a
+            number is out of range.
     """
 
 def agree(
@@ -62,10 +105,24 @@ def agree(
     rate: float,
     threads: int = 1,
 ) -> tuple[float, float]:
-    """A step of labels[indices] towards their neighbours, in place; the literal and the expected
-    disagreement before it, summed over them.
+    """Move the label distributions of the rows `indices` towards their neighbors, in place.
 
-    `rows` [N, 16] float32; `labels` [N, 32] bytes. Releases the GIL. Raises ValueError for arrays
-    that do not fit and indices that do not ascend. Bitwise equal for any number of threads.
-    `ldo_service.semantics.gaussian_labels` says more.
+    The function releases the GIL. The result is bitwise equal for any number of threads.
+    `ldo_service.semantics.gaussian_labels` describes the step.
+
+    Args:
+        rows: Gaussians of the map, [N, 16].
+        labels: Label rows, [N, 32] bytes, changed in place.
+        indices: Rows to update, [V], ascending; neighbors are among them.
+        sigma_m: Length scale of the weights, meters.
+        radius_m: Maximum distance of a neighbor, meters.
+        rate: Size of the step, 0..1.
+        threads: Number of threads.
+
+    Returns:
+        The literal and the expected disagreement before the step, summed over the Gaussians.
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, indices do not ascend, or a
+            number is out of range.
     """

@@ -1,8 +1,10 @@
+"""Binding of the rasterizer, `kernels/rasterize.hpp`."""
+
 import numpy as np
 from numpy.typing import NDArray
 
 def isa() -> str:
-    """Instruction set that this process runs with: avx512, avx2 or baseline."""
+    """Return the instruction set of this process: avx512, avx2 or baseline."""
 
 def rasterize(
     rows: NDArray[np.float32],
@@ -17,39 +19,59 @@ def rasterize(
     memory: Pass | None = None,
     bounds: Bounds | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Colour [H, W, 3], weighted depth [H, W], median depth [H, W] and opacity [H, W].
+    """Render Gaussians for a pinhole camera.
 
-    `rows` [N, 16] and `T_camera_map` [3, 4] are contiguous; `ldo_service.gaussians.renderer` says
-    what they hold. Releases the GIL. Raises ValueError for wrong shapes, types, strides, sizes
-    and cameras. Bitwise equal for any number of threads. With `memory`, scratch is kept in it for
-    the next call, and what it held of a rendering is lost: fresh pages cost up to half a rendering.
-    With `bounds`, blocks of rows that are out of view are not read; the images have the same bits.
+    The function releases the GIL. The result is bitwise equal for any number of threads.
+    `ldo_service.gaussians.renderer` describes the fields of the rows and the images.
+
+    Args:
+        rows: Gaussians of the map, [N, 16], contiguous.
+        T_camera_map: Upper rows of the transform from the map to the camera, [3, 4], contiguous.
+        fx: Focal length, pixels.
+        fy: Focal length, pixels.
+        cx: Principal point, pixels.
+        cy: Principal point, pixels.
+        width: Width of the images, pixels.
+        height: Height of the images, pixels.
+        threads: Number of threads.
+        memory: Scratch memory kept for the next call, because fresh pages cost up to half a
+            rendering. The previous rendering in it is lost.
+        bounds: Bounds of the blocks of these rows. Blocks out of view are not read; the images are
+            bitwise equal to those without bounds.
+
+    Returns:
+        Color [H, W, 3], weighted depth [H, W], median depth [H, W] and opacity [H, W].
+
+    Raises:
+        ValueError: An array has the wrong shape, type or strides, the image size or the camera is
+            invalid, or another thread uses `memory` or `bounds`.
     """
 
 class Bounds:
-    """Where each block of 256 consecutive rows lies, for one array of rows.
+    """Bounds of each block of 256 consecutive rows, for one array of rows.
 
-    Whoever changes rows says so before the next rendering. Rows that came behind the last, or
-    that lie elsewhere in memory than at the last rendering, are noticed. One call at a time.
+    The owner of the rows must report changed rows before the next rendering, by `forget` or
+    `forget_rows`. A rendering detects by itself rows that were appended, and an array that moved
+    in memory. Only one call at a time may use the bounds.
     """
 
     def __init__(self) -> None: ...
     def forget(self, first: int = 0, last: int = ...) -> None:
-        """Rows [first, last) have changed; without arguments, all of them."""
+        """Mark rows [first, last) as changed; without arguments, all rows."""
 
     def forget_rows(self, indices: NDArray[np.uint32]) -> None:
-        """These rows have changed."""
+        """Mark the rows `indices` [M] as changed."""
 
 class Pass:
-    """What the gradients of one rendering need, and memory that the next rendering uses again.
+    """Data of one rendering that its gradients need; the next rendering reuses the memory.
 
-    One call at a time may use it: a second one, from another thread, raises ValueError.
+    Only one call at a time may use a pass: a second one, from another thread, raises ValueError.
     """
 
     def __init__(self) -> None: ...
     @property
     def visible(self) -> int:
-        """Number V of Gaussians that may touch the image last rendered."""
+        """Number V of Gaussians that may touch the last rendered image."""
 
 def contributions(
     forward: Pass,
@@ -58,11 +80,21 @@ def contributions(
     top: NDArray[np.int32],
     threads: int = 1,
 ) -> None:
-    """Who made the image that was last rendered with `forward`.
+    """Compute the contributions of Gaussians to the image last rendered with `forward`.
 
-    Writes the V row numbers, ascending, to `indices` [V], the Gaussians' weights summed over the
-    pixels to `weights` [V], and to `top` [H, W] the row with the largest weight, or -1; of equal
-    weights the nearer one's. Bitwise equal for any number of threads.
+    The result is bitwise equal for any number of threads.
+
+    Args:
+        forward: Pass of the rendering, with V visible Gaussians.
+        indices: Output, [V]: row numbers of the visible Gaussians, ascending.
+        weights: Output, [V]: weights of these Gaussians, summed over the pixels.
+        top: Output, [H, W]: row with the largest weight at each pixel; -1 if no Gaussian has
+            weight. Of equal weights the nearer Gaussian counts.
+        threads: Number of threads.
+
+    Raises:
+        ValueError: `forward` holds no rendering or is in use, or an array has the wrong shape, type
+            or strides.
     """
 
 def rasterize_planes(
@@ -78,11 +110,29 @@ def rasterize_planes(
     bounds: Bounds | None = None,
     tiles: NDArray[np.uint8] | None = None,
 ) -> int:
-    """Write red, green, blue, weighted depth and opacity to `planes` [5, H, W].
+    """Render red, green, blue, weighted depth and opacity to planes.
 
-    Where `tiles` [ceil(H / 16), ceil(W / 16)] is 0, the planes are zero and cost nothing.
+    The function releases the GIL. The result is bitwise equal for any number of threads.
 
-    Returns the number V of Gaussians that may touch the image. Otherwise as `rasterise`.
+    Args:
+        forward: Pass that records the rendering for `backpropagate` and `descend`.
+        rows: Gaussians of the map, [N, 16].
+        T_camera_map: Upper rows of the transform from the map to the camera, [3, 4].
+        fx: Focal length, pixels.
+        fy: Focal length, pixels.
+        cx: Principal point, pixels.
+        cy: Principal point, pixels.
+        planes: Output, [5, H, W].
+        threads: Number of threads.
+        bounds: Bounds of the blocks of these rows, as for `rasterize`.
+        tiles: Tiles to render, [ceil(H / 16), ceil(W / 16)]. Where it is 0, the planes are zero and
+            are not computed. None renders all tiles.
+
+    Returns:
+        The number V of Gaussians that may touch the image.
+
+    Raises:
+        ValueError: As for `rasterize`, or `tiles` does not fit.
     """
 
 def backpropagate(
@@ -96,11 +146,27 @@ def backpropagate(
     needle_log_ratio: float = 0.0,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """Derivatives of L, given those by the planes that `rasterise_planes` last wrote.
+    """Compute the derivatives of a loss L from those by the planes of the last rendering.
 
-    `rows` and `planes` must be as they were then. Writes the V row numbers, ascending, to
-    `indices` [V] and dL/drow to `row_gradients` [V, 16], with the sum of the Gaussian's weights
-    in field 14; returns dL/dxi [6] for T_map_camera exp(xi), rotation first.
+    Args:
+        forward: Pass of the last `rasterize_planes`, with V visible Gaussians.
+        rows: Rows of that rendering, [N, 16], unchanged.
+        planes: Planes of that rendering, [5, H, W], unchanged.
+        gradients: Derivatives of L by the planes, [5, H, W].
+        indices: Output, [V]: row numbers of the visible Gaussians, ascending.
+        row_gradients: Output, [V, 16]: derivatives of L by these rows, with the sum of the
+            Gaussian's weights in field 14.
+        needle_weight: Weight of the penalty on needles, which is added to L.
+        needle_log_ratio: Logarithm of the ratio of the longest to the middle axis from which the
+            penalty applies.
+        threads: Number of threads.
+
+    Returns:
+        The derivative of L by xi of T_map_camera exp(xi), [6], rotation first.
+
+    Raises:
+        ValueError: `forward` holds no rendering of these rows or is in use, or an array has the
+            wrong shape, type or strides.
     """
 
 def descend(
@@ -122,10 +188,34 @@ def descend(
     max_sigma_px: float = ...,
     threads: int = 1,
 ) -> NDArray[np.float64]:
-    """`backpropagate` and `adam_step` in one, without writing the gradients of the rows out.
+    """Run `backpropagate` and `adam_step` in one pass that never stores the row gradients.
 
-    `rows`, `mean`, `square` and `steps` change in place, as do the bits that `adam_step` changes;
-    then standard deviations of what moved are cut to `max_sigma_px` of the view; inf: none is.
-    Writes the V row numbers to `indices` [V] and the Gaussians' weights to `weights` [V]; returns
-    dL/dxi [6]. The rendering is used up.
+    `rows`, `mean`, `square` and `steps` change in place, to the same bits as by `adam_step`. Then
+    the standard deviations of rows that moved are limited to `max_sigma_px`. The rendering cannot
+    be used again.
+
+    Args:
+        forward: Pass of the last `rasterize_planes`, with V visible Gaussians.
+        rows: Rows of that rendering, [N, 16], changed in place.
+        mean: First moments of the gradients, [N, 16], changed in place.
+        square: Second moments of the gradients, [N, 16], changed in place.
+        steps: Number of steps of each row, [N], changed in place.
+        rates: Learning rate per field, [16].
+        beta1: Decay rate of `mean`, in [0, 1).
+        beta2: Decay rate of `square`, in [0, 1).
+        epsilon: Positive term that keeps the denominator from zero.
+        planes: Planes of that rendering, [5, H, W], unchanged.
+        gradients: Derivatives of the loss by the planes, [5, H, W].
+        indices: Output, [V]: row numbers of the visible Gaussians, ascending.
+        weights: Output, [V]: weights of these Gaussians, summed over the pixels.
+        needle_weight: Weight of the penalty on needles, as for `backpropagate`.
+        needle_log_ratio: Logarithm of the axis ratio of the penalty, as for `backpropagate`.
+        max_sigma_px: Maximum standard deviation in the view, pixels; inf sets no limit.
+        threads: Number of threads.
+
+    Returns:
+        The derivative of the loss by xi of T_map_camera exp(xi), [6], rotation first.
+
+    Raises:
+        ValueError: As for `backpropagate` and `adam_step`.
     """

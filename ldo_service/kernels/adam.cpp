@@ -1,4 +1,4 @@
-// Compiled once per instruction set, LDO_ISA.
+// Adam step on the rows of a view, compiled once per instruction set (macro LDO_ISA).
 #include "adam_step.hpp"
 #include "parallel.hpp"
 

@@ -1,21 +1,21 @@
-// Adam on the rows that a view reached. Interface; no instruction set here.
+// Interface of the Adam step on the rows that a view reached; independent of the instruction set.
 #pragma once
 #include <cstdint>
 
 namespace ldo {
 
-constexpr int kAdamFloats = 16;  // of one row
+constexpr int kAdamFloats = 16;  // Floats per row.
 
 struct AdamRates {
-  float rate[kAdamFloats];  // per field; 0 keeps it
+  float rate[kAdamFloats];  // Learning rate per field; 0 leaves the field unchanged.
   float beta1, beta2, epsilon;
 };
 
-struct AdamRows {  // N rows of 16 floats each
+struct AdamRows {  // N rows of 16 floats each.
   float* parameters;
-  float* mean;     // of the gradient
-  float* square;   // mean of its square
-  int32_t* steps;  // [N] that each row has made
+  float* mean;     // Running mean of the gradient.
+  float* square;   // Running mean of the squared gradient.
+  int32_t* steps;  // [N], number of steps of each row.
 };
 
 #define LDO_DECLARE_ADAM(isa)                                                               \

@@ -1,4 +1,4 @@
-// What the bindings that make steps of Adam ask of their arrays.
+// Argument checks of the bindings that run Adam steps.
 #pragma once
 #include <cmath>
 

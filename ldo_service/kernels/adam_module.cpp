@@ -1,4 +1,4 @@
-// Python binding of Adam: checks what comes in, picks the instruction set.
+// Python binding of the Adam step. It checks the arguments and selects the instruction set.
 #include "adam_arguments.hpp"
 #include "isa.hpp"
 
@@ -14,7 +14,7 @@ decltype(&baseline::adam_step) adam_step_for(Isa isa) {
   return baseline::adam_step;
 }
 
-decltype(&baseline::adam_step) chosen = nullptr;  // when the module is imported
+decltype(&baseline::adam_step) chosen = nullptr;  // Set when the module is imported.
 
 void require_indices(const uint32_t* indices, size_t m, size_t n) {
   bool ascend = m == 0 || indices[m - 1] < n;

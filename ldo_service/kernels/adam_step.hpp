@@ -1,7 +1,7 @@
 // One step of Adam on one row.
 //
-// Kingma and Ba, Adam, 2015, algorithm 1, with a step count per row: a row that no view reached
-// neither moves nor ages.
+// The step follows Kingma and Ba, Adam, 2015, algorithm 1, with one step count per row. A row that
+// no view reached keeps its values and its step count.
 #pragma once
 #include "adam.hpp"
 #include "buffer.hpp"
@@ -22,9 +22,9 @@ class AdamStep {
     }
   }
 
-  // Whether the row moved. Each belongs to one thread at a time.
+  // Update one row and return whether it moved. Only one thread at a time may process a row.
   bool operator()(uint32_t row, Floats gradient) const {
-    if (!any(Floats(0.0f) < abs(gradient))) return false;  // hidden behind others
+    if (!any(Floats(0.0f) < abs(gradient))) return false;  // The Gaussian is occluded.
     const int64_t at = static_cast<int64_t>(row) * kAdamFloats;
     const Correction& correction = corrections_[std::min(++rows_.steps[row], kCorrections - 1)];
     const Floats mean =
@@ -40,9 +40,10 @@ class AdamStep {
   }
 
  private:
-  static constexpr int32_t kCorrections = 1024;  // steps after which 1 - beta^steps is as good as 1
+  // Number of steps after which 1 - beta^steps is 1 in practice.
+  static constexpr int32_t kCorrections = 1024;
   struct Correction {
-    float mean, square;  // 1 / (1 - beta^steps)
+    float mean, square;  // Bias corrections 1 / (1 - beta^steps).
   };
   const AdamRows rows_;
   const AdamRates rates_;

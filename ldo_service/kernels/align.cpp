@@ -1,5 +1,6 @@
-// One thread, fixed order: points are taken in blocks, each block passes four vectorised steps
-// (project, sample, weigh, accumulate), and block sums are added in double precision.
+// The kernels run on one thread in a fixed order. Points are processed in blocks. Each block passes
+// four vectorized steps: project, sample, weigh, accumulate. Block sums are added in double
+// precision.
 #include "align.hpp"
 
 #include <cmath>
@@ -10,9 +11,10 @@ namespace {
 
 constexpr int kBlock = 256;
 constexpr int kLanes = 16;
-constexpr float kDegrees = 5.0f;  // of freedom of the t-distribution (Kerl et al. 2013, III.B)
+// Degrees of freedom of the t-distribution (Kerl et al. 2013, III.B).
+constexpr float kDegrees = 5.0f;
 constexpr float kInlierSigma = 3.0f;
-constexpr float kNearest = 1e-3f;  // metres: closer points do not project
+constexpr float kNearest = 1e-3f;  // Meters; closer points are not projected.
 
 float smaller(float a, float b) { return a < b ? a : b; }
 float larger(float a, float b) { return a > b ? a : b; }
@@ -39,7 +41,7 @@ void halve(const float* values, int width, int height, float tolerance, int leas
   }
 }
 
-// Per pixel over two; 0 where one is clipped.
+// Return the central difference per pixel; 0 where either value is clipped.
 float difference(float after, float before) {
   return (after > 0) & (before > 0) ? 0.5f * (after - before) : 0.0f;
 }
@@ -63,7 +65,7 @@ void pack(const float* image, const float* depth, int width, int height, float m
   }
 }
 
-// The neighbours of a pixel lie on its surface when their depth differs by less than this.
+// Return the maximum depth difference between a pixel and its neighbors on the same surface.
 float surface_step(float depth, int radius) { return 0.015f * radius * depth + 0.01f; }
 
 bool on_surface(float depth, float neighbor, float step) {
@@ -85,7 +87,7 @@ void normals(const float* depth, int width, int height, const Pinhole& camera, i
           !on_surface(z, up, step) || !on_surface(z, down, step))
         continue;
       const float rx = (x - camera.cx) * ifx, ry = (y - camera.cy) * ify;
-      const float az = right - left, bz = down - up;  // a: along u, b: along v
+      const float az = right - left, bz = down - up;  // Vector a points along u, vector b along v.
       const float ax = rx * az + radius * ifx * (right + left), ay = ry * az;
       const float bx = rx * bz, by = ry * bz + radius * ify * (down + up);
       const float nx = ay * bz - az * by, ny = az * bx - ax * bz, nz = ax * by - ay * bx;
@@ -117,18 +119,18 @@ std::int64_t points(const float* texels, const float* normals, int width, int he
   return n;
 }
 
-// What one block of points needs between the steps; rows of kBlock floats.
+// Intermediate values of one block of points; rows of kBlock floats.
 struct alignas(64) Block {
-  float point[kPointRows][kBlock];        // reference frame, as stored
-  float x[kBlock], y[kBlock], z[kBlock];  // target camera frame
-  float du[kBlock], dv[kBlock];           // fractions of the bilinear sample
-  int corner[kBlock], nearest[kBlock];    // texel indices
-  float column[kBlock], row[kBlock];      // the nearest pixel
+  float point[kPointRows][kBlock];        // Reference frame, as stored.
+  float x[kBlock], y[kBlock], z[kBlock];  // Target camera frame.
+  float du[kBlock], dv[kBlock];           // Fractions of the bilinear sample.
+  int corner[kBlock], nearest[kBlock];    // Texel indices.
+  float column[kBlock], row[kBlock];      // Nearest pixel.
   float visible[kBlock];
   float intensity[kBlock], gradient_u[kBlock], gradient_v[kBlock], depth[kBlock];
   // sqrt(w) [J | r] of the photometric observations, then of the geometric ones.
   float rows[kUnknowns + 1][2 * kBlock];
-  float photometric[3][kBlock], geometric[3][kBlock];  // used, inlier, w (r/sigma)^2
+  float photometric[3][kBlock], geometric[3][kBlock];  // Used, inlier, w (r/sigma)^2.
 };
 
 void load(const Problem& p, std::int64_t first, Block& b) {
@@ -219,7 +221,7 @@ void weigh_photometric(const Problem& p, Block& b) {
   }
 }
 
-// r = n . (p - q), n = R n_reference, q the target's surface at the nearest pixel.
+// r = n . (p - q) with n = R n_reference; q is the target's surface at the nearest pixel.
 void weigh_geometric(const Problem& p, Block& b) {
   const float* T = p.T_camera_reference;
   const float ifx = 1.0f / p.camera.fx, ify = 1.0f / p.camera.fy;
@@ -255,7 +257,7 @@ void weigh_geometric(const Problem& p, Block& b) {
   }
 }
 
-// Lanes are added pairwise in a fixed order, whatever the width of the machine's vectors.
+// Add the lanes pairwise in a fixed order, independent of the machine's vector width.
 float folded(float* lanes) {
   for (int half = kLanes / 2; half > 0; half /= 2)
     for (int l = 0; l < half; ++l) lanes[l] += lanes[l + half];
@@ -279,7 +281,8 @@ double sum(const float* a) {
 void accumulate(const Block& b, Equations& e) {
   for (int r = 0; r < kUnknowns; ++r) {
     for (int c = r; c <= kUnknowns; ++c) {
-      const bool affine = r >= 6 || c == 6 || c == 7;  // gain and bias: photometric only
+      // Geometric residuals do not depend on gain and bias.
+      const bool affine = r >= 6 || c == 6 || c == 7;
       const double value = dot(b.rows[r], b.rows[c], affine ? kBlock : 2 * kBlock);
       if (c == kUnknowns)
         e.gradient[r] += value;

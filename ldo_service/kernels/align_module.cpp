@@ -1,4 +1,4 @@
-// Binds the alignment kernels as ldo_service.kernels._align; every argument is checked here.
+// Python binding of the alignment kernels (ldo_service.kernels._align). It checks every argument.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/string.h>
@@ -33,7 +33,7 @@ const Kernels& kernels(ldo::Isa isa) {
   return baseline();
 }
 
-const Kernels* chosen = nullptr;  // set when the module is imported
+const Kernels* chosen = nullptr;  // Set when the module is imported.
 
 void require(bool condition, const std::string& message) {
   if (!condition) throw nb::value_error(message.c_str());
@@ -159,7 +159,8 @@ Output points(Input<3> texels, Input<3> normals, const Intrinsics& intrinsics) {
 void require_rigid(const Pose& T) {
   bool rigid = std::isfinite(T(0, 3)) && std::isfinite(T(1, 3)) && std::isfinite(T(2, 3)) &&
                T(3, 0) == 0 && T(3, 1) == 0 && T(3, 2) == 0 && T(3, 3) == 1;
-  for (int a = 0; a < 3; ++a) {  // rows are orthonormal, and the third is the others' product
+  // Rows must be orthonormal, and the third must be the cross product of the first two.
+  for (int a = 0; a < 3; ++a) {
     const int b = (a + 1) % 3, c = (a + 2) % 3;
     const double square = T(a, 0) * T(a, 0) + T(a, 1) * T(a, 1) + T(a, 2) * T(a, 2);
     const double inner = T(0, a) * T(0, b) + T(1, a) * T(1, b) + T(2, a) * T(2, b);

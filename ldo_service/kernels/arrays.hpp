@@ -1,4 +1,4 @@
-// What every binding asks of its arrays, said in the same words.
+// Argument checks that all bindings share, with the same error messages.
 #pragma once
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -27,7 +27,7 @@ const char* type_name() {
   if constexpr (std::is_same_v<T, uint32_t>) return "uint32";
 }
 
-// The values of an array whose type is T and whose last axis is fastest, without gaps.
+// Return the values of an array of type T. It must be contiguous, with the last axis fastest.
 template <class T, class AnyArray>
 auto* values_of(const AnyArray& array, const std::string& name) {
   require(array.dtype() == nb::dtype<T>() && array.device_type() == nb::device::cpu::value,

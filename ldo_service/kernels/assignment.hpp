@@ -1,4 +1,4 @@
-// Which region of an image each Gaussian belongs to.
+// Assignment of Gaussians to the regions of an image.
 #pragma once
 #include <cmath>
 #include <limits>
@@ -9,19 +9,20 @@
 
 namespace ldo::LDO_ISA {
 
-// Boxes of two standard deviations around sixteen splats, cut to the image.
+// Boxes of two standard deviations around sixteen splats, clipped to the image.
 struct SplatBoxes {
   float x0[kLanes], y0[kLanes], x1[kLanes], y1[kLanes], z[kLanes];
-  float u[kLanes], v[kLanes];  // the pixel of the centre
-  uint32_t expected;  // bit i: lane i is in the image, on the surface that was measured there
+  float u[kLanes], v[kLanes];  // Pixel of the center.
+  uint32_t expected;  // Bit i is set if lane i is in the image and on the surface measured there.
 };
 
+// Projection of Gaussians to the boxes of their splats.
 class SplatBoxer {
  public:
   SplatBoxer(const View& view, const float* depth_m, float max_gap_m)
       : view_(view), project_(view_), depth_m_(depth_m), max_gap_m_(max_gap_m) {}
 
-  // Of the rows that `indices` [count] name.
+  // Compute the boxes of the rows `indices` [count].
   void operator()(const float* rows, const uint32_t* indices, int count, SplatBoxes& out) const {
     alignas(64) float columns[kRowFloats][kLanes];
     gather(rows, indices, count, columns);
@@ -65,7 +66,8 @@ class SplatBoxer {
     for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
   }
 
-  // Of the pixels that hold these points: just short of the image's end a half rounds up.
+  // Return the depth at the pixels that contain these points. Just below the image's end, u + 0.5
+  // can round up to the width, hence the minimum.
   Floats depth_at(Floats u, Floats v) const {
     alignas(64) float column[kLanes], row[kLanes], depth_m[kLanes];
     min(u + 0.5f, view_.width - 1.0f).store(column);
@@ -82,8 +84,8 @@ class SplatBoxer {
   const float max_gap_m_;
 };
 
-// Pixels of a region left of x and above y, fractions of pixels included: between the entries of
-// the table, which is bilinear where the mask is constant.
+// Return the area of a region left of x and above y in pixels, fractions included. It is
+// interpolated between the entries of the table, which is bilinear where the mask is constant.
 inline double sum_before(const int32_t* sums, int width, int height, double x, double y) {
   x = std::min(std::max(x, 0.0), static_cast<double>(width));
   y = std::min(std::max(y, 0.0), static_cast<double>(height));
@@ -96,6 +98,7 @@ inline double sum_before(const int32_t* sums, int width, int height, double x, d
          (below[0] * (1 - fx) + below[1] * fx) * fy;
 }
 
+// Region of an image: a box, or the mask in a rectangle.
 class Region {
  public:
   Region(const Regions& regions, int64_t j)
@@ -110,15 +113,15 @@ class Region {
     }
   }
 
-  // Square pixels that the splat of a lane and the region share, over those of the splat, or over
-  // those of either.
+  // Return the area that the splat of a lane and the region share, divided by the area of the
+  // splat. If `by_iou` is set, divide by the area of their union instead.
   float overlap(const SplatBoxes& s, int i, bool by_iou) const {
     const double splat = static_cast<double>(s.x1[i] - s.x0[i]) * (s.y1[i] - s.y0[i]);
     const double shared = sums_ == nullptr ? within_box(s, i) : within_mask(s, i);
     return static_cast<float>(shared / (by_iou ? area_ + splat - shared : splat));
   }
 
-  // Whether the centre of the splat lies in it.
+  // Return whether the region contains the center of the splat.
   bool holds(const SplatBoxes& s, int i) const {
     const float u = s.u[i], v = s.v[i];
     if (!(u >= bound[0] && u < bound[2] && v >= bound[1] && v < bound[3])) return false;
@@ -152,12 +155,12 @@ class Region {
   double area_;
 };
 
-// All regions, and which of them sixteen splats may meet.
+// Regions of the image, with a search for those that sixteen splats may overlap.
 class Candidates {
  public:
   explicit Candidates(const Regions& regions) {
     const int64_t padded = (regions.m + kLanes - 1) / kLanes * kLanes;
-    // Nothing meets those that only fill up a vector.
+    // The NaN bounds that pad the last vector overlap no splat.
     for (auto& bound : bounds_) bound.assign(padded, std::numeric_limits<float>::quiet_NaN());
     for (int64_t j = 0; j < regions.m; ++j) {
       regions_.emplace_back(regions, j);
@@ -165,7 +168,7 @@ class Candidates {
     }
   }
 
-  // f(number, region) of those that meet the box about all of the splats, in order.
+  // Call f(number, region), in order, for the regions that overlap the box around all splats.
   template <class F>
   void each_near(const SplatBoxes& s, F f) const {
     if (s.expected == 0) return;
@@ -183,11 +186,12 @@ class Candidates {
 
  private:
   std::vector<Region> regions_;
-  std::vector<float> bounds_[4];  // as of each region
+  std::vector<float> bounds_[4];  // Component k of `bound` of each region.
 };
 
-// Of sixteen splats the region whose reliability, overlap times score, is largest: the first of
-// equals. Writes it, and the overlap, for the first `count`.
+// Selection of the region with the largest reliability for each of sixteen splats. Reliability is
+// overlap times score; of equal values the first region is selected. The constructor and `enter`
+// write the region and the overlap of the first `count` splats.
 class Contest {
  public:
   Contest(uint32_t expected, int count, int32_t* region, float* overlap)

@@ -5,16 +5,16 @@
 namespace ldo::LDO_ISA {
 
 constexpr float kLog2MaxAlpha = -0.0144995697f;  // log2(0.99)
-constexpr float kStop = 1e-4f;                   // a pixel with less transmittance takes no more
-constexpr int kBlocks = 16;                      // of 4x4 pixels in a tile
-constexpr int kBatch = 256;                      // splats looked at before the blocks are blended
+constexpr float kStop = 1e-4f;                   // A pixel with less transmittance is complete.
+constexpr int kBlocks = 16;                      // Blocks of 4x4 pixels in a tile.
+constexpr int kBatch = 256;                      // Splats gathered before the blocks are blended.
 
-struct Block {  // sixteen pixels
+struct Block {  // Sixteen pixels.
   Floats transmittance = 1.0f, red = 0.0f, green = 0.0f, blue = 0.0f, depth = 0.0f;
-  Floats median_depth = 1e30f;  // farther than any
+  Floats median_depth = 1e30f;  // Farther than any splat.
 };
 
-struct Lanes {  // column and row of each lane in its 4x4 block
+struct Lanes {  // Column and row of each lane in its 4x4 block.
   Lanes() {
     alignas(64) float column[kLanes], row[kLanes];
     for (int i = 0; i < kLanes; ++i) {
@@ -27,7 +27,7 @@ struct Lanes {  // column and row of each lane in its 4x4 block
   Floats x, y;
 };
 
-// The 4x4 pixels at (x, y), as far as they lie in the image.
+// Block of 4x4 pixels at (x, y), clipped to the image.
 class PixelBlock {
  public:
   PixelBlock(int x, int y, const View& view)
@@ -36,7 +36,7 @@ class PixelBlock {
         columns_(std::min(4, view.width - x)),
         rows_(std::min(4, view.height - y)) {}
 
-  Floats load(const float* plane) const {  // zero outside
+  Floats load(const float* plane) const {  // Pixels outside the image are zero.
     if (columns_ == 4 && rows_ == 4) return Floats::load_rows(plane + first_, stride_);
     alignas(64) float pixels[kLanes] = {};
     each_row([&](int row, auto columns) {
@@ -55,7 +55,7 @@ class PixelBlock {
  private:
   template <class F>
   void each_row(F f) const {
-    if (columns_ == 4 && rows_ == 4) {  // of known size: plain moves
+    if (columns_ == 4 && rows_ == 4) {  // A constant size compiles to plain moves.
       for (int row = 0; row < 4; ++row) f(row, std::integral_constant<int, 4>{});
     } else {
       for (int row = 0; columns_ > 0 && row < rows_; ++row) f(row, columns_);
@@ -65,8 +65,9 @@ class PixelBlock {
   const int columns_, rows_;
 };
 
-// Bit i is set where the ellipse alpha >= 1/255 reaches block i of the tile at (x, y): on the two
-// sides of the block nearest to the centre, the ridge line finds the point of largest alpha.
+// Return a mask with bit i set if the ellipse alpha >= 1/255 reaches block i of the tile at (x, y).
+// The ridge lines give the point of largest alpha on the two sides of the block nearest to the
+// center.
 inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, float y) {
   const Floats x0 = lanes.x * 4.0f + (x - s.u), x1 = x0 + 3.0f;
   const Floats y0 = lanes.y * 4.0f + (y - s.v), y1 = y0 + 3.0f;
@@ -76,23 +77,23 @@ inline uint32_t touched_blocks(const Splat& s, const Lanes& lanes, float x, floa
   const auto exponent = [&](Floats dx, Floats dy) {
     return dx * (dx * s.a + dy * s.b) + dy * dy * s.c;
   };
-  // The slack keeps rounding from dropping a pixel that the blending would count.
+  // The slack prevents rounding from dropping a pixel that the blending would count.
   const float least = kLog2MinAlpha - s.log2_opacity - 1e-3f;
   return bits(max(exponent(side_x, best_y), exponent(best_x, side_y)) >= least);
 }
 
-// alpha of one splat at sixteen pixels, before it is capped and where it is too weak to count:
-// log2 alpha = a dx^2 + b dx dy + c dy^2 + log2 o.
+// Return log2 alpha = a dx^2 + b dx dy + c dy^2 + log2 o of one splat at sixteen pixels. The cap at
+// 0.99 and the minimum of 1/255 are not applied yet.
 [[gnu::always_inline]] inline Floats log2_alpha_of(const Splat& s, Floats dx, Floats dy) {
   return dx * (dx * s.a + dy * s.b) + (dy * dy * s.c + s.log2_opacity);
 }
 
-constexpr float kCapped = 0.98999f;  // an alpha from here on was capped, but for rounding
+constexpr float kCapped = 0.98999f;  // An alpha from here on was capped, up to rounding.
 [[gnu::always_inline]] inline Floats capped_alpha(Floats log2_alpha) {
   return select(log2_alpha >= kLog2MinAlpha, exp2(min(log2_alpha, kLog2MaxAlpha)), 0.0f);
 }
 
-// Adds one splat to sixteen pixels at (px, py).
+// Add one splat to sixteen pixels at (px, py).
 template <bool WithMedian>
 [[gnu::always_inline]] inline void blend_splat(const Splat& s, Floats px, Floats py, Block& block) {
   const Floats weight = capped_alpha(log2_alpha_of(s, px - s.u, py - s.v)) * block.transmittance;
@@ -101,24 +102,26 @@ template <bool WithMedian>
   block.blue = block.blue + weight * s.color[2];
   block.depth = block.depth + weight * s.z;
   block.transmittance = block.transmittance - weight;
-  // Splats come by increasing z: the least behind which less than half is left is the first.
+  // Splats arrive by increasing z. The minimum is therefore the first z behind which less than half
+  // of the transmittance is left.
   if constexpr (WithMedian)
     block.median_depth =
         select(block.transmittance < 0.5f, min(block.median_depth, s.z), block.median_depth);
 }
 
-// What the forward pass over a tile leaves for the backward pass.
+// Record of the forward pass over a tile, for the backward pass.
 struct TileRecord {
-  uint32_t* touched;  // per splat of the tile's list, as far as it was looked at
-  uint32_t* blended;  // [kBlocks] how many splats each block blended
+  // Blocks that each splat of the tile's list touches, up to the last splat examined.
+  uint32_t* touched;
+  uint32_t* blended;  // [kBlocks], number of splats that each block blended.
 };
 
-// Calls f(first, places, count) for the splats that block b blended, front to back, sixteen at a
-// time: they are at places first + places[i] of the tile's list of n, i < count.
+// Call f(first, places, count) for the splats that block b blended, front to back, sixteen at a
+// time. Their positions in the tile's list of n splats are first + places[i], i < count.
 template <class F>
 [[gnu::always_inline]] inline void each_sixteen_blended(const TileRecord& record, int b, int64_t n,
                                                         const F& f) {
-  constexpr int kLookedAt = 2048;  // splats of the list together
+  constexpr int kLookedAt = 2048;  // Splats of the list that are searched at once.
   int64_t left = record.blended[b];
   for (int64_t first = 0; left > 0; first += kLookedAt) {
     alignas(64) uint32_t places[kLookedAt + kLanes];
@@ -130,6 +133,7 @@ template <class F>
   }
 }
 
+// Images of one tile during the forward pass.
 class Tile {
  public:
   Tile(int column, int row, const View& view) : x_(column * kTile), y_(row * kTile), view_(view) {
@@ -206,7 +210,7 @@ class Tile {
       }
     };
     if (WithMedian && any(block.transmittance >= 0.5f)) {
-      blend_while(std::true_type{}, 0.5f);  // then no pixel's median changes any more
+      blend_while(std::true_type{}, 0.5f);  // The medians are final after this loop.
       is_open = any(block.transmittance >= kStop);
     }
     if (is_open) blend_while(std::false_type{}, kStop);
@@ -235,7 +239,7 @@ class Tile {
   const int x_, y_;
   const View& view_;
   const Lanes lanes_;
-  uint32_t open_ = 0;  // blocks in the image with a pixel that light still passes
+  uint32_t open_ = 0;  // Blocks in the image with a pixel whose transmittance is at least kStop.
   Block blocks_[kBlocks];
   Splat batch_[kBatch];
   uint32_t blended_[kBlocks] = {};

@@ -1,12 +1,12 @@
-// Derivative of the blending of one tile, front to back as the blending itself.
+// Derivative of the blending of one tile, computed front to back like the blending itself.
 //
-// With w_i = alpha_i T_i and q_i = dL/dC . c_i + dL/dD z_i + dL/dO, the part of L that a pixel
-// owes to splat i is w_i q_i, and
-//   dL/d ln(alpha_i) = w_i (q_i - m_i),  m_i = sum_{j > i} w_j q_j / T_{i+1}:
-// what the splat shows against the mean of what it hides. The sum over all j is known from the
-// images and what is in front is taken off on the way, so that m is known behind every sixteenth
-// splat; from there m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i leads back through the sixteen
-// without a division, and the rounding of m shrinks as T_{i+1} / T_i.
+// Let w_i = alpha_i T_i and q_i = dL/dC . c_i + dL/dD z_i + dL/dO. Splat i contributes w_i q_i to
+// the part of L of a pixel. The derivative is
+//   dL/d ln(alpha_i) = w_i (q_i - m_i),  m_i = sum_{j > i} w_j q_j / T_{i+1}.
+// This compares the value q_i of the splat with the mean value m_i of the splats behind it. The sum
+// over all j is known from the images. Subtracting the splats in front gives m behind every
+// sixteenth splat. From there, m_{i-1} = alpha_i q_i + (1 - alpha_i) m_i leads back through the
+// sixteen splats without a division. The rounding error of m shrinks as T_{i+1} / T_i.
 #pragma once
 #include "blend.hpp"
 
@@ -19,15 +19,15 @@ enum SplatSum {
   kVy,
   kVxx,
   kVxy,
-  kVyy,  // v, v dx, v dy, v dx^2, v dx dy, v dy^2
+  kVyy,  // The six sums up to here: v, v dx, v dy, v dx^2, v dx dy, v dy^2.
   kWeightRed,
   kWeightGreen,
-  kWeightBlue,   // w dL/dC
+  kWeightBlue,   // The three sums of w dL/dC.
   kWeightDepth,  // w dL/dD
   kWeightSum,    // w
   kSplatSums,
 };
-constexpr int kSumFloats = 16;  // one cache line
+constexpr int kSumFloats = 16;  // One cache line.
 
 // Sums over columns x of f, f x and f x^2, for x = -1.5, -0.5, 0.5, 1.5.
 struct Moments {
@@ -40,14 +40,14 @@ struct Moments {
   Floats zeroth, first, second;
 };
 
-// Sixteen pixels on the way from front to back, sixteen splats at a time.
+// State of sixteen pixels during the pass from front to back, sixteen splats at a time.
 struct BlockGradient {
-  Floats px, py;             // pixels
-  Floats gradient[kPlanes];  // of L by the images
-  Floats behind;             // sum of w q over the splats that are still to come
+  Floats px, py;             // Pixel coordinates.
+  Floats gradient[kPlanes];  // Gradient of L by the images.
+  Floats behind;             // Sum of w q over the splats that are not processed yet.
   Floats transmittance = 1.0f;
 
-  // Weights and v of the next splats, which `next(i)` gives.
+  // Compute the weights and v of the next `count` splats, which `next(i)` returns.
   template <class Next>
   [[gnu::always_inline]] inline void differentiate(int count, const Next& next, FloatsRow* weights,
                                                    FloatsRow* v) {
@@ -75,12 +75,13 @@ struct BlockGradient {
   }
 
  private:
-  // Keeps 0 / 0 away. What the floor does to pixels below it is far below what they count.
+  // Floor that prevents 0 / 0. Its effect on pixels below it is far smaller than their
+  // contribution.
   static constexpr float kLeastTransmittance = 1e-30f;
 };
 
-// Moments of v, by pixel with a lane per splat, about the splats' means (mx, my) as seen from the
-// centre of the block.
+// Compute the moments of v about the splats' means (mx, my), given relative to the center of the
+// block. Each vector of `v` holds one pixel, with one lane per splat.
 [[gnu::always_inline]] inline void moments_about_mean(const Floats (&v)[kLanes], Floats mx,
                                                       Floats my, Floats* out) {
   const Moments r0(v[0], v[1], v[2], v[3]), r1(v[4], v[5], v[6], v[7]),
@@ -97,13 +98,14 @@ struct BlockGradient {
   out[kVyy] = by_y.second - my * (y + out[kVy]);
 }
 
+// Gradient sums of the splats of one tile.
 class TileGradient {
  public:
   TileGradient(int column, int row, const View& view, const float* planes, const float* gradients)
       : x_(column * kTile), y_(row * kTile), view_(view), planes_(planes), gradients_(gradients) {}
 
-  // Writes kSumFloats for each of the n splats of the list. Behind it lie `ahead` splats of the
-  // next tile, which are fetched meanwhile.
+  // Write kSumFloats sums for each of the n splats of the list. The next `ahead` entries of the
+  // list are splats of the next tile, which are prefetched meanwhile.
   void operator()(const Splat* splats, const uint32_t* list, int64_t n, int64_t ahead,
                   const TileRecord& record, float* sums) {
     std::memset(sums, 0, n * kSumFloats * sizeof(float));
@@ -116,7 +118,7 @@ class TileGradient {
   }
 
  private:
-  // Row `row` of the next tile's pixels, which lies in as many places as there are images.
+  // Prefetch row `row` of the next tile's pixels, which lies in a separate place for each image.
   [[gnu::always_inline]] inline void prefetch_row(int row) const {
     if (x_ + kTile >= view_.width || y_ + row >= view_.height) return;
     const int64_t size = static_cast<int64_t>(view_.width) * view_.height;
@@ -127,7 +129,7 @@ class TileGradient {
     }
   }
 
-  static constexpr int kFactors = 5;  // what weights are summed with: dL/dC, dL/dD and one
+  static constexpr int kFactors = 5;  // Factors of the weights in the sums: dL/dC, dL/dD and one.
 
   void differentiate_block(int b, const Splat* splats, const uint32_t* list, int64_t n,
                            const TileRecord& record, float* sums) {
@@ -174,7 +176,8 @@ class TileGradient {
     };
     block.differentiate(count, next, weights, v);
     Floats by_pixel[kLanes], out[kLanes];
-    transpose(weights, count, by_pixel);  // first: these do not wait for v
+    // The weights come first, because they do not depend on v.
+    transpose(weights, count, by_pixel);
     sum_weights(by_pixel, out + kWeightRed);
     transpose(v, count, by_pixel);
     moments_about_mean(by_pixel, Floats::load(mean_x), Floats::load(mean_y), out);
@@ -186,7 +189,8 @@ class TileGradient {
     }
   }
 
-  // Weights by pixel, a lane per splat.
+  // Sum the weights times the factors. Each vector of `weights` holds one pixel, with one lane per
+  // splat.
   [[gnu::always_inline]] inline void sum_weights(const Floats (&weights)[kLanes],
                                                  Floats* out) const {
     Floats sums[kFactors] = {0.0f, 0.0f, 0.0f, 0.0f, 0.0f};
@@ -200,7 +204,7 @@ class TileGradient {
   const View& view_;
   const float *planes_, *gradients_;
   const Lanes lanes_;
-  alignas(64) float factors_[kFactors][kLanes];  // of the open block
+  alignas(64) float factors_[kFactors][kLanes];  // Factors of the open block.
 };
 
 }  // namespace ldo::LDO_ISA

@@ -1,4 +1,4 @@
-// What of a box is the object that fills its middle.
+// Foreground of a box: the object that fills its middle.
 #pragma once
 #include <cmath>
 #include <limits>
@@ -10,9 +10,10 @@
 
 namespace ldo::LDO_ISA {
 
-constexpr double kLeastShare = 0.1;  // of the pixels about the mode, in a part of the object
+// Minimum fraction of the near-mode pixels that a part of the object holds.
+constexpr double kLeastShare = 0.1;
 
-// Floats of a window, with zeros about them.
+// Floats of a window, surrounded by zeros.
 class Plane {
  public:
   Plane(int width, int height)
@@ -26,7 +27,8 @@ class Plane {
   Buffer<float> values_;
 };
 
-// The commonest depth, in bins of a share of it, each smoothed with its neighbours.
+// Mode of depths. The width of a bin is a fraction of its depth, and each bin is smoothed with its
+// neighbors.
 class DepthMode {
  public:
   DepthMode(double bin_share, size_t most_pixels)
@@ -47,12 +49,12 @@ class DepthMode {
     }
   }
 
-  // Metres; 0 of none.
+  // Return the mode in meters; 0 if no depth was added.
   double value() const {
     if (size_ == 0) return 0.0;
     const int *begin = bins_.data(), *end = begin + size_;
     const int low = *std::min_element(begin, end), high = *std::max_element(begin, end);
-    std::vector<int64_t> counts(high - low + 3, 0);  // and an empty one on each side
+    std::vector<int64_t> counts(high - low + 3, 0);  // One more empty bin lies on each side.
     for (const int* bin = begin; bin < end; ++bin) ++counts[*bin - low + 1];
     int64_t most = 0;
     int best = 0;
@@ -73,7 +75,7 @@ class DepthMode {
   }
 
   const double bin_share_;
-  Buffer<int> bins_;  // of the depths that are measured
+  Buffer<int> bins_;  // Bins of the measured depths.
   size_t size_ = 0;
 };
 
@@ -89,7 +91,7 @@ class BoxForeground {
         belongs_(window.width, window.height),
         mask_(window.width, window.height) {}
 
-  // Writes `mask` [height, width] of the window, 0 or 1. False for labels that have no size.
+  // Write `mask` [height, width] of the window, 0 or 1. Return false if a label has no size.
   bool write(uint8_t* mask) {
     std::fill_n(mask, static_cast<int64_t>(window_.height) * window_.width, uint8_t{0});
     if (!find_mode()) return true;
@@ -102,10 +104,10 @@ class BoxForeground {
   }
 
  private:
-  int64_t at(int y) const {  // the first pixel of a row of the window, in the image
+  int64_t at(int y) const {  // Index in the image of the first pixel of a window row.
     return static_cast<int64_t>(window_.row + y) * image_.width + window_.column;
   }
-  // Of a side, what is not in the middle half, before it and behind it.
+  // Return the length before the middle half of a side, which equals the length after it.
   static int margin(int side) { return side / 4; }
 
   bool find_mode() {
@@ -117,7 +119,7 @@ class BoxForeground {
     return mode_m_ > 0.0;
   }
 
-  struct Run {  // pixels of equal label
+  struct Run {  // Pixels of a row with equal label.
     int row, begin, end;
     int32_t label;
   };
@@ -134,8 +136,9 @@ class BoxForeground {
     return out;
   }
 
-  // The depth of what lies on surfaces that are mostly inside, or on edges, not too far from the
-  // mode: no further than the box is wide. False for labels that have no size.
+  // Copy the depths of pixels that may belong to the object. Such a pixel lies on an edge, or on a
+  // surface that is mostly inside the box. It is closer to the mode than the box is wide, or than
+  // near_mode times the mode if that is more. Return false if a label has no size.
   bool find_what_belongs() {
     const std::vector<Run> all = runs();
     std::vector<int64_t> inside(found_.count, 0);
@@ -160,8 +163,8 @@ class BoxForeground {
     return true;
   }
 
-  // Of what belongs, without steps: the parts that have a tenth or more of the pixels about the
-  // mode in the middle. False where there are none.
+  // Keep the connected parts without depth steps that hold at least a tenth of the near-mode pixels
+  // in the middle. Return false if the middle has no near-mode pixel.
   bool keep_what_hangs_together() {
     const Components parts(joined());
     std::vector<int64_t> seeds(parts.count() + 1, 0);
@@ -206,7 +209,7 @@ class BoxForeground {
     return count;
   }
 
-  // By a pixel, over what belongs at the depth beside it.
+  // Grow the mask by one pixel, over pixels of `belongs_` at the depth of a neighbor in the mask.
   void grow() {
     Plane grown(window_.width, window_.height);
     const float near = static_cast<float>(rule_.near_mode);
@@ -233,7 +236,7 @@ class BoxForeground {
   const Window window_;
   const ForegroundRule rule_;
   double mode_m_ = 0.0;
-  Plane belongs_, mask_;  // depth of what is in it, 0 of what is not
+  Plane belongs_, mask_;  // Depth of the pixels inside, 0 of the others.
 };
 
 }  // namespace ldo::LDO_ISA

@@ -1,4 +1,4 @@
-// Uninitialised memory for scratch, aligned to a cache line and freed with its scope.
+// Uninitialized scratch memory, aligned to a cache line and freed with its scope.
 #pragma once
 #include <cstddef>
 #include <cstdlib>
@@ -13,8 +13,8 @@ namespace ldo::LDO_ISA {
 
 constexpr size_t kCacheLine = 64, kHugePage = size_t{1} << 21;
 
-// Memory that is kept is worth huge pages, where the system has them: what is read in random order
-// then misses the cache only, and not the page table as well.
+// Allocate memory. Memory that is kept uses huge pages where the system has them. Reads in random
+// order then miss only the cache, and not the page table as well.
 inline void* allocate(size_t bytes, bool kept) {
   const bool huge = kept && bytes >= kHugePage;
   const size_t alignment = huge ? kHugePage : kCacheLine;
@@ -22,11 +22,12 @@ inline void* allocate(size_t bytes, bool kept) {
   void* memory = std::aligned_alloc(alignment, size);
   if (memory == nullptr && size > 0) throw std::bad_alloc();
 #if defined(__linux__)
-  if (huge) madvise(memory, size, MADV_HUGEPAGE);  // advice: may fail
+  if (huge) madvise(memory, size, MADV_HUGEPAGE);  // The call is advice and may fail.
 #endif
   return memory;
 }
 
+// Growing array of uninitialized items.
 template <class T>
 class Buffer {
   static_assert(std::is_trivially_copyable_v<T>);
@@ -35,11 +36,11 @@ class Buffer {
   Buffer() = default;
   explicit Buffer(size_t size) { resize(size); }
 
-  // Say before the first `resize` that the buffer will be used again and again.
+  // Declare that the buffer will be used repeatedly. Call this before the first `resize`.
   void keep() { kept_ = true; }
 
-  // Room for `size` items, whose values are then undefined. Only growth asks for memory: it is
-  // worth keeping, because the first touch of every fresh page costs more than its use.
+  // Make room for `size` items, whose values are then undefined. Memory is allocated only on growth
+  // and then kept, because the first touch of every fresh page costs more than its use.
   void resize(size_t size) {
     size_ = size;
     if (size <= capacity_) return;

@@ -1,4 +1,4 @@
-// Pixels of an image that are set, and the parts of them that hang together.
+// Binary images and their connected components.
 #pragma once
 #include <algorithm>
 #include <cstdint>
@@ -6,6 +6,7 @@
 
 namespace ldo::LDO_ISA {
 
+// Binary image with one bit per pixel.
 class BitImage {
  public:
   BitImage(int width, int height)
@@ -13,7 +14,8 @@ class BitImage {
 
   const uint64_t* row(int y) const { return bits_.data() + y * words; }
 
-  // Sixteen pixels from a column on that sixteen divides; those beyond the image are not set.
+  // Set the pixels marked in `lanes`, of the sixteen from `column`, which is a multiple of sixteen.
+  // Pixels beyond the image are not set.
   void set(int y, int column, uint32_t lanes) {
     lanes &= within(column, 0, width);
     bits_[y * words + column / 64] |= static_cast<uint64_t>(lanes) << column % 64;
@@ -21,25 +23,25 @@ class BitImage {
   void clear_others(int y, int column, uint32_t lanes) {
     bits_[y * words + column / 64] &= ~(static_cast<uint64_t>(~lanes & 0xffff) << column % 64);
   }
-  // Those of the sixteen from a column on that lie in columns [left, right).
+  // Return the bits of the sixteen pixels from `column` that lie in columns [left, right).
   static uint32_t within(int column, int left, int right) {
     const auto before = [&](int end) { return (1u << std::clamp(end - column, 0, 16)) - 1; };
     return before(right) & ~before(left);
   }
 
   const int width, height;
-  const int64_t words;  // in a row
+  const int64_t words;  // Words per row.
 
  private:
   std::vector<uint64_t> bits_;
 };
 
-// The parts of an image that hang together by sides of pixels, as runs of columns. They are
-// numbered from 1 on, in the order of their first pixels, row by row.
+// Components of an image, connected by the sides of pixels, as runs of columns. They are numbered
+// from 1, in the order of their first pixels, row by row.
 class Components {
  public:
   struct Run {
-    int begin, end;  // columns
+    int begin, end;  // Columns.
     int32_t part;
   };
 
@@ -58,7 +60,7 @@ class Components {
 
   int32_t count() const { return count_; }
 
-  // f(run) for those of a row, from left to right.
+  // Call f(run) for the runs of a row, from left to right.
   template <class F>
   void each_run(int y, F f) const {
     for (size_t k = starts_[y]; k < starts_[y + 1]; ++k) f(runs_[k]);
@@ -86,8 +88,8 @@ class Components {
     begin = -1;
   }
 
-  // Until they are numbered, the part of a run is one before it that it hangs together with, or
-  // itself.
+  // Connect the runs of a row with those of the row above. Until the runs are numbered, the part of
+  // a run is an earlier run that it is connected to, or the run itself.
   void join(size_t above, size_t here) {
     size_t first = above;
     for (size_t k = here; k < runs_.size(); ++k) {
@@ -111,7 +113,7 @@ class Components {
   }
 
   std::vector<Run> runs_;
-  std::vector<size_t> starts_;  // of the rows
+  std::vector<size_t> starts_;  // First run of each row.
   int32_t count_ = 0;
 };
 

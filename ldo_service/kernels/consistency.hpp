@@ -1,4 +1,4 @@
-// Neighbours that disagree about what they are, and a step towards each other.
+// Consistency step, which moves the label distributions of neighbors towards each other.
 #pragma once
 #include <limits>
 
@@ -18,7 +18,7 @@ inline uint8_t top_label(const LabelRow& row) {
   return row.weights[0] > background(row) ? row.ids[0] : static_cast<uint8_t>(kBackground);
 }
 
-// Sixteen Gaussians or fewer, as columns.
+// Columns of at most sixteen Gaussians.
 class Neighbors16 {
  public:
   Neighbors16(const float* rows, const uint32_t* indices, const LabelRow* labels,
@@ -33,7 +33,7 @@ class Neighbors16 {
     }
   }
 
-  int labels() const { return n_labels_; }  // background included
+  int labels() const { return n_labels_; }  // Number of labels, including background.
   uint8_t label(int l) const { return label_[l]; }
   float share(int l, Floats weights) const { return sum(weights * Floats::load(share_[l])); }
   float differing(uint8_t top, Floats weights) const {
@@ -41,8 +41,8 @@ class Neighbors16 {
     return sum(select((tops >= own) & (own >= tops), 0.0f, weights));
   }
 
-  // exp(-d^2 / sigma^2) / |N| of each within the radius of `mean`, but for the one in lane
-  // `self`, which may be in none.
+  // Return exp(-d^2 / sigma^2) / |N| of each Gaussian within the radius of `mean`, else 0. The
+  // Gaussian in lane `self` is excluded; -1 excludes none.
   Floats weights(const float* mean, int self, const ConsistencyRule& rule) const {
     const Floats x = Floats::load(mean_[0]) - mean[0], y = Floats::load(mean_[1]) - mean[1],
                  z = Floats::load(mean_[2]) - mean[2];
@@ -71,7 +71,7 @@ class Neighbors16 {
   }
 
   static constexpr int kMost = 1 + kLanes * kSlots;
-  alignas(64) float mean_[3][kLanes];  // none is near those that only fill up the vector
+  alignas(64) float mean_[3][kLanes];  // Infinity in unused lanes, so that they are never near.
   alignas(64) float top_[kLanes] = {};
   int n_labels_ = 1;
   uint8_t label_[kMost];
@@ -82,7 +82,7 @@ class ConsistencyStep {
  public:
   explicit ConsistencyStep(const ConsistencyRule& rule) : rule_(rule) {}
 
-  // Writes `row`, which was `before`.
+  // Update `row`, whose value before the step is `before`.
   void operator()(const Neighbors16& around, Floats weights, const LabelRow& before, LabelRow& row,
                   Disagreement& sums) const {
     const float mass = sum(weights);

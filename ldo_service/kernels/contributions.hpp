@@ -1,4 +1,4 @@
-// Which splats the pixels of a tile owe their colour to.
+// Contributions of splats to the pixels of a tile.
 #pragma once
 #include "blend.hpp"
 
@@ -9,9 +9,9 @@ class TileContributions {
   TileContributions(int column, int row, const View& view)
       : x_(column * kTile), y_(row * kTile), view_(view) {}
 
-  // Writes the weights of the n splats of the list, summed over the pixels of the tile, and for
-  // each pixel to `top`, an image, the row of the Gaussian with the largest weight: the first of
-  // equals, -1 where none has any.
+  // Write the weights of the n splats of the list, summed over the pixels of the tile. Write to the
+  // image `top` the row of the Gaussian with the largest weight at each pixel. Of equal weights the
+  // first splat counts; -1 if no splat has weight.
   void operator()(const VisibleSplats& visible, const uint32_t* list, int64_t n,
                   const TileRecord& record, float* weights, int32_t* top) const {
     std::fill(weights, weights + n, 0.0f);
@@ -27,7 +27,7 @@ class TileContributions {
   }
 
  private:
-  struct Sight {  // of sixteen pixels, from front to back
+  struct Sight {  // State of sixteen pixels, from front to back.
     Sight(const Lanes& lanes, int x, int y, const View& view)
         : px(lanes.x + static_cast<float>(x)), py(lanes.y + static_cast<float>(y)) {
       const Mask inside =
@@ -35,7 +35,8 @@ class TileContributions {
       transmittance = select(inside, 1.0f, 0.0f);
     }
     Floats px, py, transmittance;
-    Floats largest = 0.0f, place = 0.0f;  // weight so far, and where in the list: exact below 2^24
+    // Largest weight so far, and its position in the list, exact below 2^24.
+    Floats largest = 0.0f, place = 0.0f;
   };
 
   void add_sixteen(Sight& sight, const Splat* splats, const uint32_t* list, int64_t first,

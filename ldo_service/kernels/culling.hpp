@@ -1,5 +1,5 @@
-// Which blocks of consecutive rows a view may show. A block is left out only where the projection
-// would draw none of its rows, so that the images are the same to the bit.
+// Culling of blocks of consecutive rows. A block is skipped only if the projection would draw none
+// of its rows, so that the images stay bitwise equal.
 #pragma once
 #include <cmath>
 
@@ -8,9 +8,10 @@
 
 namespace ldo::LDO_ISA {
 
-constexpr float kMinNorm2 = 1e-30f;  // of a quaternion; shorter ones do not make a clean rotation
+// Minimum squared norm of a quaternion; a shorter one gives no accurate rotation.
+constexpr float kMinNorm2 = 1e-30f;
 
-// The bound of some rows, looked at sixteen at a time.
+// Bound of some rows, accumulated sixteen at a time.
 class Measure {
  public:
   void add(const float (&columns)[kRowFloats][kLanes], int count) {
@@ -49,12 +50,13 @@ class Measure {
   Floats log_sigma_ = -kFar;
 };
 
-// The half spaces of the map, n . mean + d + s sigma >= 0, that hold every Gaussian that is drawn.
+// Half spaces of the map, n . mean + d + s sigma >= 0, that contain every Gaussian that is drawn.
 //
-// The box of a splat reaches to r = sqrt(2 ln(255 o) S_uu) on both sides of u = fx x / z + cx, with
-// S_uu = 0.3 + |du . axes|^2 <= 0.3 + (fx / z)^2 m^2 sigma^2, where m^2 bounds
-// |row_0 - clamp(x / z) row_2|^2 of T_camera_map; hence r z <= 3.33 (0.55 z + fx m sigma), and
-// u + r >= 0 and u - r <= width - 1, times z > 0, are linear in the mean. The same goes for v.
+// The box of a splat extends by r = sqrt(2 ln(255 o) S_uu) on both sides of u = fx x / z + cx. Its
+// variance is S_uu = 0.3 + |du . axes|^2 <= 0.3 + (fx / z)^2 m^2 sigma^2. Here m^2 bounds
+// |row_0 - clamp(x / z) row_2|^2 of T_camera_map. Hence r z <= 3.33 (0.55 z + fx m sigma). The
+// conditions u + r >= 0 and u - r <= width - 1, times z > 0, are therefore linear in the mean. The
+// same holds for v.
 class ViewFrustum {
  public:
   explicit ViewFrustum(const View& view) {
@@ -66,7 +68,7 @@ class ViewFrustum {
     sides_[kSides - 1].offset -= kNearPlane;
   }
 
-  // Whether all of a block lies outside. NaN says no.
+  // Return whether all of a block lies outside. NaN gives false.
   bool misses(const BlockBound& bound) const {
     for (const Side& side : sides_) {
       float value = side.offset + side.per_sigma * bound.sigma;
@@ -81,14 +83,15 @@ class ViewFrustum {
 
  private:
   static constexpr int kSides = 5;
-  static constexpr float kReachSigmas = 3.34f;     // more than sqrt(2 ln 255)
-  static constexpr float kLowPassSigma = 0.5478f;  // more than sqrt(kLowPass)
-  static constexpr float kSlack = 1e-4f;           // of each term: the projection rounds as well
+  static constexpr float kReachSigmas = 3.34f;     // More than sqrt(2 ln 255).
+  static constexpr float kLowPassSigma = 0.5478f;  // More than sqrt(kLowPass).
+  // Fraction of each term, because the projection rounds as well.
+  static constexpr float kSlack = 1e-4f;
   struct Side {
     float normal[3], slack[3], offset, per_sigma;
   };
 
-  // The two sides across image axis `row`: 0 for u, 1 for v.
+  // Add the two sides across image axis `row`: 0 for u, 1 for v.
   void add_sides(const View& view, int row, float focal, float center, int size, float tangent) {
     const float *a = view.T_camera_map + 4 * row, *b = view.T_camera_map + 8;
     const auto dot = [](const float* p, const float* q) {
@@ -101,7 +104,7 @@ class ViewFrustum {
     add(view, row, -focal, static_cast<float>(size - 1) - center + margin, per_sigma);
   }
 
-  // by_row p[row] + by_z p.z + per_sigma sigma >= 0 for points p of the camera frame.
+  // Add the side by_row p[row] + by_z p.z + per_sigma sigma >= 0 for points p of the camera frame.
   void add(const View& view, int row, float by_row, float by_z, float per_sigma) {
     const float *a = view.T_camera_map + 4 * row, *b = view.T_camera_map + 8;
     Side& side = sides_[count_++];

@@ -1,4 +1,4 @@
-// Compiled once per instruction set, LDO_ISA.
+// Surfaces and foregrounds, compiled once per instruction set (macro LDO_ISA).
 #include "foreground.hpp"
 
 #include "box_foreground.hpp"

@@ -1,6 +1,6 @@
-// Smooth surfaces of a depth image, and what of a box is the object. Interface; no instruction set
-// here. Images are dense and row-major, pixel centres at integers; depth that is not above 0 is
-// missing.
+// Interface of the smooth surfaces of a depth image and of the object in a box. It is independent
+// of the instruction set. Images are dense and row-major, pixel centers at integers. Depth that is
+// not above 0 is missing.
 #pragma once
 #include <cstdint>
 #include <vector>
@@ -8,34 +8,34 @@
 namespace ldo {
 
 struct DepthImage {
-  const float* depth_m;  // [height, width]
+  const float* depth_m;  // [height, width], meters.
   int width, height;
 };
 
 struct Pinhole {
-  double fx, fy, cx, cy;  // pixels
+  double fx, fy, cx, cy;  // Pixels.
 };
 
 struct SurfaceRule {
-  float max_ratio;   // of depths within 3x3 pixels of one surface, below it
-  float min_cosine;  // of normals 4 px apart on one surface
+  float max_ratio;   // Depths within 3x3 pixels of one surface have a ratio below this.
+  float min_cosine;  // Minimum cosine of normals 4 px apart on one surface.
 };
 
 struct SurfaceLabels {
-  const int32_t* labels;  // [height, width], 0 on edges
-  const int64_t* sizes;   // [count] pixels of each label
+  const int32_t* labels;  // [height, width], 0 on edges.
+  const int64_t* sizes;   // [count], pixels of each label.
   int64_t count;
 };
 
-struct Window {  // pixels of an image
+struct Window {  // Window of an image, in pixels.
   int row, column, height, width;
 };
 
 struct ForegroundRule {
-  double min_inside;  // share of a surface
-  float max_ratio;    // of depths within 3x3 pixels of one object, or below it
-  double depth_bin;   // share of depth
-  double near_mode;   // share of depth
+  double min_inside;  // Minimum fraction of a surface inside the box.
+  float max_ratio;    // Maximum ratio of depths within 3x3 pixels of one object.
+  double depth_bin;   // Width of a bin of the depth mode, fraction of depth.
+  double near_mode;   // Maximum distance from the mode, fraction of depth.
   int grow_px;
 };
 
@@ -43,7 +43,7 @@ struct ForegroundRule {
   namespace isa {                                                                       \
   std::vector<int64_t> surfaces(const DepthImage& image, const Pinhole& camera,         \
                                 const SurfaceRule& rule, int32_t* labels);              \
-  /* False for labels that have no size. */                                             \
+  /* Return false if a label has no size. */                                            \
   bool foreground(const DepthImage& image, double focal_px, const SurfaceLabels& found, \
                   const Window& window, const ForegroundRule& rule, uint8_t* mask);     \
   }

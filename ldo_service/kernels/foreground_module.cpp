@@ -1,4 +1,4 @@
-// Python binding of surfaces and foregrounds: checks what comes in, picks the instruction set.
+// Python binding of surfaces and foregrounds. It checks arguments and selects the instruction set.
 #include <algorithm>
 #include <cmath>
 #include <memory>
@@ -24,9 +24,9 @@ Kernels kernels_for(Isa isa) {
   return {baseline::surfaces, baseline::foreground};
 }
 
-Kernels kernels;  // chosen when the module is imported
+Kernels kernels;  // Set when the module is imported.
 
-constexpr double kMost = 1e6;  // of a share: far within the range of a float
+constexpr double kMost = 1e6;  // Maximum of a fraction, far within the range of a float.
 
 DepthImage image_of(const Array& depth_m) {
   require(depth_m.ndim() == 2 && depth_m.size() > 0, "depth_m must have shape [H, W].");
@@ -35,7 +35,7 @@ DepthImage image_of(const Array& depth_m) {
   return {values_of<float>(depth_m, "depth_m"), static_cast<int>(width), static_cast<int>(height)};
 }
 
-// As NumPy rounds it: a share in double precision, one more than it in single.
+// Return 1 + share as NumPy rounds it: the sum in double precision, the result in single.
 float ratio_of(double share, const std::string& name) {
   require(share >= 0 && share <= kMost, name + " must lie in 0..1e6.");
   return static_cast<float>(1.0 + share);

@@ -1,4 +1,4 @@
-// The Gaussian window of SSIM (11 taps, sigma 1.5), along rows and across them.
+// Gaussian window of SSIM (11 taps, sigma 1.5), along rows and across them.
 #pragma once
 #include <type_traits>
 
@@ -6,16 +6,16 @@
 
 namespace ldo::LDO_ISA {
 
-constexpr int kReach = 5;  // taps on each side of the middle one
+constexpr int kReach = 5;  // Taps on each side of the middle one.
 constexpr int kTaps = 2 * kReach + 1;
-// exp(-k^2 / (2 1.5^2)) / sum, for k = 0 .. 5
+// exp(-k^2 / (2 1.5^2)) / sum, for k = 0 .. 5.
 constexpr float kTap[kReach + 1] = {0.26601171f, 0.21300553f, 0.10936069f,
                                     0.03600077f, 0.00759876f, 0.00102838f};
 
 template <int K>
 using Offset = std::integral_constant<int, K>;
 
-// Adds the taps K, K + 1, ... on both sides to `sum`.
+// Add the taps K, K + 1, ... on both sides to `sum`.
 template <int K, class At>
 [[gnu::always_inline]] inline Floats add_taps(const At& at, Floats sum) {
   if constexpr (K > kReach)
@@ -24,21 +24,21 @@ template <int K, class At>
     return add_taps<K + 1>(at, sum + (at(Offset<K>()) + at(Offset<-K>())) * kTap[K]);
 }
 
-// The windowed sum at sixteen places, of which `at(Offset<k>())` gives the values k to the right or
-// below.
+// Return the windowed sum at sixteen places. `at(Offset<k>())` returns the values k places to the
+// right or below.
 template <class At>
 [[gnu::always_inline]] inline Floats window(const At& at) {
   return add_taps<1>(at, at(Offset<0>()) * kTap[0]);
 }
 
-// Columns of an image that are worked on together, and as many more on each side as windows of
-// windows read, in whole vectors. A constant, so that rows lie at known distances.
+// Columns of an image that are processed together, and a margin on each side for windows of
+// windows, in whole vectors. The width is constant, so that rows lie at known distances.
 constexpr int kMargin = kLanes;
 constexpr int kStrip = 320;
 constexpr int kColumns = kStrip + 2 * kMargin;
 static_assert(kMargin >= 2 * kReach && kStrip % kLanes == 0);
 
-// The last rows of a few images of one strip, found by their row number, which may be negative.
+// Ring of the last rows of a few images of one strip. Row numbers may be negative.
 template <int Images>
 class RowRing {
  public:
@@ -46,7 +46,7 @@ class RowRing {
 
   void clear(int y) { std::memset(rows_[(y + kTaps) % kTaps], 0, sizeof rows_[0]); }
 
-  // The rows about y, to be windowed downwards.
+  // Rows around y, for the vertical window.
   class Around {
    public:
     Around(RowRing& ring, int y) {

@@ -1,4 +1,4 @@
-// Rows of images that are worked on from top to bottom, and the inverse depth of an image in them.
+// Ring of image rows for processing from top to bottom, and the inverse depth of an image in it.
 #pragma once
 #include <algorithm>
 
@@ -7,17 +7,18 @@
 
 namespace ldo::LDO_ISA {
 
-// Of a row or column beyond the edge the one that it mirrors, the edge itself not doubled.
+// Return the row or column that `i` mirrors at the edge. The edge itself is not repeated.
 inline int mirrored(int i, int size) {
   if (size == 1) return 0;
   while (i < 0 || i >= size) i = i < 0 ? -i : 2 * (size - 1) - i;
   return i;
 }
 
-// Floats in a row whose first one lies on a cache line, with a whole vector more on each side.
+// Return the floats per row. Its first pixel lies on a cache line, with one more vector on each
+// side.
 inline int padded(int width) { return (width + kLanes - 1) / kLanes * kLanes + 2 * kLanes; }
 
-// Writes what is `reach` pixels beyond both ends of a row.
+// Write the mirrored values of `reach` pixels beyond both ends of a row.
 inline void mirror_ends(float* row, int width, int reach) {
   for (int k = 1; k <= reach; ++k) {
     row[-k] = row[mirrored(-k, width)];
@@ -25,14 +26,14 @@ inline void mirror_ends(float* row, int width, int reach) {
   }
 }
 
-// f(column) for the first column of each vector of a row.
+// Call f(column) for the first column of each vector of a row.
 template <class F>
 [[gnu::always_inline]] inline void each_vector(int width, F f) {
   for (int column = 0; column < width; column += kLanes) f(column);
 }
 
-// The last rows of a few images, found by their number: up to two from the newest where those
-// beyond the image are asked for too.
+// Ring of the last five rows of a few images. Row numbers beyond the image are mirrored. The rows
+// from y - 2 to y + 2 are available once row y + 2, if there is one, is written.
 class RowsOfImages {
  public:
   RowsOfImages(int images, int width, int height)
@@ -52,10 +53,10 @@ class RowsOfImages {
   Buffer<float> rows_;
 };
 
-// 1 / depth, 0 where it is missing: row by row, and the least and the largest of 3x3 pixels.
+// Inverse depth row by row, 0 where depth is missing, and its minimum and maximum over 3x3 pixels.
 class InverseDepth {
  public:
-  // Of a window of an image whose rows lie `stride` apart.
+  // Create the inverse depth of a window of an image whose rows lie `stride` floats apart.
   InverseDepth(const float* depth_m, int64_t stride, int width, int height)
       : depth_m_(depth_m),
         stride_(stride),
@@ -80,8 +81,8 @@ class InverseDepth {
 
   const float* row(int y) { return rows_.row(kInverse, y); }
 
-  // f(column, low, high) for each vector of row y, once the one below it is loaded, where there is
-  // one.
+  // Call f(column, low, high) for each vector of row y. The row below, if there is one, must be
+  // loaded.
   template <class F>
   void each_extreme(int y, F f) {
     const float *low[3], *high[3];
@@ -97,7 +98,7 @@ class InverseDepth {
 
  private:
   enum Image { kInverse, kLow, kHigh, kImages };
-  static constexpr float kNearest = 1e-6f;  // metres
+  static constexpr float kNearest = 1e-6f;  // Meters.
 
   const float* const depth_m_;
   const int64_t stride_;

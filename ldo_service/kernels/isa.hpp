@@ -1,4 +1,5 @@
-// Which instruction set a kernel runs with: the widest this machine has, or what LDO_ISA names.
+// Selection of the instruction set: the widest that this machine has, or the one that LDO_ISA
+// names.
 #pragma once
 #include <cstdlib>
 #include <stdexcept>
@@ -30,8 +31,9 @@ inline bool has(Isa isa) {
   return isa == Isa::baseline;
 }
 
-// Read once, when a module is imported. Throws std::runtime_error for a set that is unknown or
-// that this machine lacks: a run that asked for one must not silently get another.
+// Return the instruction set to use; called once, when a module is imported. It throws
+// std::runtime_error for a set that is unknown or that this machine lacks. A run that requests one
+// set must not silently use another.
 inline Isa chosen_isa() {
   const char* forced = std::getenv("LDO_ISA");
   const bool any = forced == nullptr || *forced == '\0';

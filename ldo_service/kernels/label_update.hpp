@@ -1,4 +1,4 @@
-// What one Gaussian is taken for, after one more look.
+// Update of a Gaussian's label distribution by one observation.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -7,8 +7,8 @@
 
 namespace ldo::LDO_ISA {
 
-// Slots are kept heaviest first: of equals the older one. A label that finds no room, or makes
-// room for itself, puts the lighter one's weight on `other`.
+// Label slots of a Gaussian, heaviest first; of equal weights the older label comes first. If all
+// slots are taken, the lightest label gives its weight to `other`.
 class Slots {
  public:
   explicit Slots(LabelRow& row) : row_(row) {}
@@ -29,7 +29,7 @@ class Slots {
  private:
   void raise(int k, float weight) { place(k, row_.ids[k], weight); }
 
-  // Writes slot k and moves it before lighter ones.
+  // Write slot k and move it before lighter ones.
   void place(int k, uint8_t id, float weight) {
     for (; k > 0 && row_.weights[k - 1] < weight; --k) {
       row_.weights[k] = row_.weights[k - 1];
@@ -39,7 +39,8 @@ class Slots {
     row_.ids[k] = id;
   }
 
-  // All slots are taken: the lightest label, which may be the new one, gives way.
+  // Resolve full slots: the weight of the lightest label, which may be the new one, goes to
+  // `other`.
   void put_on_other(uint8_t id, float weight) {
     int other = -1;
     for (int k = 0; k < kSlots; ++k)
@@ -54,7 +55,7 @@ class Slots {
     add(kOther, given);
   }
 
-  // There is no slot of `other` yet: the two lightest of six labels become one.
+  // Create the slot of `other` by merging the two lightest of six labels.
   void merge_two_lightest(uint8_t id, float weight) {
     const int last = kSlots - 1;
     float given = row_.weights[last] + weight;
@@ -81,7 +82,7 @@ class Slots {
   LabelRow& row_;
 };
 
-// -sum p log p, in nats.
+// Return -sum p log p, in nats.
 inline float entropy(const LabelRow& row) {
   float rest = 1.0f, sum = 0.0f;
   for (float p : row.weights) {
@@ -114,7 +115,7 @@ class LabelUpdate {
     row.misses = 0;
   }
 
-  // The object is large enough here that the detector should have seen it.
+  // Count a miss. Fade the labels if the object is large enough here for the detector to see it.
   void doubt(LabelRow& row, float extent_m) const {
     row.misses += row.misses < 255;
     const float known_m =
@@ -128,14 +129,15 @@ class LabelUpdate {
     row = LabelRow{};
   }
 
-  // Share of an observation in the mean of all, whose weights fade by `keep` at each.
+  // Add an observation to the evidence. Return its fraction of the mean of all observations, whose
+  // weights fade by `keep` at each observation.
   float step_of(LabelRow& row, float weight) const {
     if (!(weight > 0.0f)) return 0.0f;
     row.evidence = rule_.keep * row.evidence + weight;
     return weight / row.evidence;
   }
 
-  // Factor on the step: below 1 for uncertain observations of what is settled.
+  // Return the factor on the step, below 1 for uncertain observations of settled Gaussians.
   float held_back(const LabelRow& row, float confidence) const {
     if (rule_.hold_back == 0.0f || row.weights[0] == 0.0f) return 1.0f;
     return 1.0f - rule_.hold_back * std::exp(-2.0f * entropy(row)) * (1.0f - confidence);

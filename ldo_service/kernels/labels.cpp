@@ -1,4 +1,4 @@
-// Compiled once per instruction set, LDO_ISA.
+// Label kernels, compiled once per instruction set (macro LDO_ISA).
 #include <vector>
 
 #include "assignment.hpp"
@@ -7,7 +7,7 @@
 
 namespace ldo::LDO_ISA {
 
-constexpr int64_t kJob = 4096;  // Gaussians
+constexpr int64_t kJob = 4096;  // Gaussians per job.
 
 template <class F>
 void each_job(int64_t v, int threads, const F& f) {
@@ -48,7 +48,7 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
   const Voxels voxels(rows, indices, v, 2.0f * rule.sigma_m);
   Buffer<LabelRow> before(v);
   for (int64_t i = 0; i < v; ++i) before[i] = labels[indices[i]];
-  // Elsewhere all is background, and agrees.
+  // Other voxels hold only background, where neighbors agree.
   const auto active = voxels.about([&](uint32_t place) { return before[place].weights[0] > 0.0f; });
   const ConsistencyStep step(rule);
   const int64_t n = static_cast<int64_t>(active.size());
@@ -62,11 +62,11 @@ Disagreement agree(const float* rows, LabelRow* labels, const uint32_t* indices,
       const uint32_t* members = voxels.begin(active[a]);
       const int64_t last = voxels.count(active[a]) - 1;
       for (int64_t k = 0; k <= last; ++k) {
-        // They lie apart in memory: asked for some turns before they are read.
+        // Members lie apart in memory, so they are prefetched some iterations before they are read.
         const uint32_t i = members[k], later = indices[members[std::min(k + kAhead, last)]];
         __builtin_prefetch(rows + static_cast<int64_t>(later) * kRowFloats);
         __builtin_prefetch(labels + later, 1);
-        if (is_bare && before[i].weights[0] == 0.0f) continue;  // all is background
+        if (is_bare && before[i].weights[0] == 0.0f) continue;  // Every label here is background.
         const float* mean = rows + static_cast<int64_t>(indices[i]) * kRowFloats;
         const Floats weights = around.weights(mean, k < kOwn ? static_cast<int>(k) : -1, rule);
         step(around, weights, before[i], labels[indices[i]], sums[job]);

@@ -1,5 +1,5 @@
-// Labels on Gaussians: which region of an image each belongs to, what it has been seen as, and
-// what its neighbours say. Interface; no instruction set here.
+// Interface of the labels of Gaussians: assignment to image regions, update by observations and
+// consistency of neighbors. It is independent of the instruction set.
 #pragma once
 #include <cstdint>
 
@@ -7,66 +7,67 @@
 
 namespace ldo {
 
-constexpr int kSlots = 5;  // labels that a Gaussian keeps beside background
+constexpr int kSlots = 5;  // Labels per Gaussian, background excluded.
 enum Label : uint8_t { kBackground = 0, kOther = 1 };
 
-// A distribution over labels: those of the slots, heaviest first, and background, which has the
-// rest. All zero: nothing but background, and never seen.
+// Distribution over labels: the labels in the slots, heaviest first, and background with the rest.
+// If all fields are zero, the Gaussian is background and was never observed.
 struct LabelRow {
   float weights[kSlots];
-  float evidence;      // sum of the weights of all observations, those of long ago faded
-  uint16_t extent_mm;  // of the object that it was last seen as a part of
-  uint8_t misses;      // keyframes since it was last seen as a part of one
+  float evidence;      // Sum of the weights of all observations, older ones faded.
+  uint16_t extent_mm;  // Extent of the object that it was last observed as a part of.
+  uint8_t misses;      // Keyframes with a miss since that observation.
   uint8_t ids[kSlots];
 };
 static_assert(sizeof(LabelRow) == 32);
 
-// M regions of an image, each a box, or what of a rectangle of pixels a summed-area table says.
+// M regions of an image. Each is a box, or a mask given by the summed-area table of a rectangle.
 struct Regions {
   int64_t m;
-  const float* boxes;      // [M, 4] x0 y0 x1 y1, pixels
-  const float* scores;     // [M]
-  const int32_t* rects;    // [M, 4] column, row, width, height; width 0: all of the box
-  const int64_t* offsets;  // [M] where the table [height + 1, width + 1] begins
+  const float* boxes;      // [M, 4], x0 y0 x1 y1, pixels.
+  const float* scores;     // [M].
+  const int32_t* rects;    // [M, 4], column, row, width, height; width 0 selects the whole box.
+  const int64_t* offsets;  // [M], start of each table [height + 1, width + 1] in `sums`.
   const int32_t* sums;
 };
 
 struct AssignmentRule {
-  bool by_iou;            // or by the share of the splat
-  float min_overlap;      // of that
-  float max_depth_gap_m;  // between a Gaussian and the surface that was measured
+  bool by_iou;            // Overlap is the IoU; if false, the covered fraction of the splat.
+  float min_overlap;      // Minimum overlap of an assigned region.
+  float max_depth_gap_m;  // Maximum distance between a Gaussian and the measured surface.
 };
 
 enum Outcome : int32_t { kUnexpected = -2, kUnmatched = -1 };
 
-struct Assignments {  // [V] each
-  int32_t* region;    // an Outcome, or the number of the region
-  float* overlap;     // with it
-  float* z;           // metres
+struct Assignments {  // Each array is [V].
+  int32_t* region;    // An Outcome, or the number of the region.
+  float* overlap;     // Overlap with that region.
+  float* z;           // Meters.
 };
 
 enum Observed : int16_t { kNotSeen = -2, kMiss = -1 };
 
-struct Observations {       // [V] each
-  const int16_t* label;     // or an Observed
-  const float* confidence;  // of a label
-  const float* extent_m;    // of its object; of a miss, how large an object is worth missing
+struct Observations {       // Each array is [V].
+  const int16_t* label;     // Label, or an Observed value.
+  const float* confidence;  // Confidence of a label.
+  // Extent of the label's object; of a miss, the minimum extent of an object that counts as missed.
+  const float* extent_m;
 };
 
 struct UpdateRule {
   bool is_corrected;
-  float keep;         // lambda
-  float miss_weight;  // evidence for background
+  float keep;         // Lambda of the moving average.
+  float miss_weight;  // Evidence of a miss for background.
   int miss_limit;
-  float usual_extent_m;  // of objects, where nothing is known
-  float hold_back;       // 0..1, of uncertain observations of settled Gaussians
+  float usual_extent_m;  // Extent of objects where it is unknown.
+  float hold_back;       // Damping of uncertain observations of settled Gaussians, 0..1.
 };
 
 struct ConsistencyRule {
   float sigma_m, radius_m, rate;
 };
 
-struct Disagreement {  // summed over Gaussians
+struct Disagreement {  // Disagreement between neighbors, summed over Gaussians.
   double literal = 0.0, expected = 0.0;
 };
 

@@ -1,4 +1,4 @@
-// Python binding of labels on Gaussians: checks what comes in, picks the instruction set.
+// Python binding of the label kernels. It checks the arguments and selects the instruction set.
 #include <cmath>
 #include <vector>
 
@@ -24,15 +24,16 @@ Kernels kernels_for(Isa isa) {
   return {baseline::assign, baseline::update, baseline::agree};
 }
 
-Kernels kernels;  // chosen when the module is imported
+Kernels kernels;  // Set when the module is imported.
 
-// Rows that are named twice would be written by two threads.
+// Check the indices and return them. Two threads would write a row that is listed twice.
 const uint32_t* indices_of(const Array& indices, size_t n) {
   require(indices.ndim() == 1, "indices must have shape [V].");
   const uint32_t* which = values_of<uint32_t>(indices, "indices");
   const size_t v = indices.shape(0);
   bool is_wrong = v > 0 && which[v - 1] >= n;
-  for (size_t i = 1; i < v; ++i) is_wrong |= which[i - 1] >= which[i];  // all: that is a vector's
+  // The loop checks all pairs, so that it vectorizes.
+  for (size_t i = 1; i < v; ++i) is_wrong |= which[i - 1] >= which[i];
   require(!is_wrong, "indices must ascend and be below the number of rows.");
   return which;
 }

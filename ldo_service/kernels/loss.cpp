@@ -1,8 +1,8 @@
-// Compiled once per instruction set, LDO_ISA.
+// Image loss, compiled once per instruction set (macro LDO_ISA).
 //
-// SSIM (Wang et al. 2004) needs of the frame y and the rendering x the windowed means of x, y,
-// x^2 + y^2 and x y. Rows stream through two rings of eleven: the means, then the derivatives of
-// SSIM by three of them, which the same window carries back to the pixels.
+// SSIM (Wang et al. 2004) of the frame y and the rendering x needs the windowed means of x, y,
+// x^2 + y^2 and x y. Rows stream through two rings of eleven rows: the means, then the derivatives
+// of SSIM by three of them. The same window carries the derivatives back to the pixels.
 #include "loss.hpp"
 
 #include <algorithm>
@@ -15,23 +15,24 @@
 namespace ldo::LDO_ISA {
 namespace {
 
-constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // of SSIM, for values in 0..1
-constexpr int kBand = 240;  // most rows of one job; more lose less at the seams, fewer share better
+constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;  // Constants of SSIM, for values in 0..1.
+// Maximum rows of a job: more rows lose less at the seams, fewer rows balance the threads better.
+constexpr int kBand = 240;
 
 inline Floats sign(Floats x) {
   return select(x < 0.0f, -1.0f, select(Floats(0.0f) < x, 1.0f, 0.0f));
 }
 
-struct RowSums {  // of one channel of one row of a strip
+struct RowSums {  // Sums of one channel of one row of a strip.
   float l1 = 0, ssim = 0, squares = 0;
 };
 
-struct Part {  // of the image: what one job works on
+struct Part {  // Part of the image that one job processes.
   int channel, left, right, top, bottom;
 };
 
-// An image cut into parts of about equal size, so that they take equal time: at least two strips
-// of each channel, as six parts share better among a few threads than three.
+// Division of an image into parts of about equal size, so that they take equal time. Each channel
+// has at least two strips: six parts balance better among a few threads than three.
 struct Cut {
   Cut(int width, int height)
       : width(width),
@@ -41,7 +42,7 @@ struct Cut {
         bands(ceil(height, kBand)),
         band(ceil(height, bands)) {}
 
-  int columns() const { return 3 * strips; }  // strips of all channels
+  int columns() const { return 3 * strips; }  // Strips of all channels.
   int parts() const { return columns() * bands; }
   int column_of(int part) const { return part / bands; }
   Part part(int number) const {
@@ -51,13 +52,13 @@ struct Cut {
             std::min(height, top + band)};
   }
 
-  const int width, height, strip, strips, bands, band;  // pixels of a strip, rows of a band
+  const int width, height, strip, strips, bands, band;  // A strip is in pixels, a band in rows.
 
  private:
   static int ceil(int n, int piece) { return (n + piece - 1) / piece; }
 };
 
-// One part of the image; `sums` has one entry for each of its rows.
+// Loss of one part of the image. `sums` has one entry for each row of the image.
 class PartLoss {
  public:
   PartLoss(const LossInput& in, const Part& part, float* gradients, RowSums* sums)
@@ -90,13 +91,13 @@ class PartLoss {
   bool is_inside(int y) const { return y >= 0 && y < in_.height; }
   float* pixels(int image) { return pixels_[image] + kLanes; }
 
-  // f(column) for the first column of each vector in [begin, end).
+  // Call f(column) for the first column of each vector in [begin, end).
   template <class F>
   static void each_vector(int begin, int end, F f) {
     for (int i = begin; i < end; i += kLanes) f(i);
   }
 
-  // x and y of a row of pixels, exposure and mask applied; zero outside the image.
+  // Load x and y of a row of pixels, with exposure and mask applied; zero outside the image.
   void load(int row) {
     const int begin = std::max(0, -first_column_),
               end = std::min(end_ + kMargin, in_.width - first_column_);
@@ -161,13 +162,13 @@ class PartLoss {
       across(pixels(image), derivatives_.row(row, image), kMargin, end_);
   }
 
-  // Lanes of the vector at a column that show columns [left, right) of the image.
+  // Return the lanes of the vector at a column that lie in columns [left, right) of the image.
   Mask is_between(int column, int left, int right) const {
     const Floats x = lanes_ + static_cast<float>(first_column_ + column);
     return (x >= static_cast<float>(left)) & (x < static_cast<float>(right));
   }
 
-  // L1 and all derivatives of a row whose SSIM windows are complete.
+  // Compute L1 and all derivatives of a row whose SSIM windows are complete.
   void finish(int row) {
     load(row);
     const RowRing<kDerivatives>::Around derivative(derivatives_, row);
@@ -203,20 +204,21 @@ class PartLoss {
 
   const LossInput& in_;
   const Part part_;
-  const int first_column_;  // of the image, where column 0 of the rows below lies
-  const int end_;           // column behind the last vector with pixels of this part
+  const int first_column_;  // Image column of column 0 of the rows below.
+  const int end_;           // Column after the last vector with pixels of this part.
   const float* rendered_;
   const uint8_t* target_;
   float* gradients_;
   const float gain_, bias_;
   RowSums* sums_;
   const Floats lanes_ = Floats::ramp();
-  alignas(64) float pixels_[kMeans][kColumns + 2 * kLanes];  // one row, zeros on both sides
+  alignas(64) float pixels_[kMeans][kColumns + 2 * kLanes];  // One row, with zeros on both sides.
   RowRing<kMeans> means_;
   RowRing<kDerivatives> derivatives_;
 };
 
-// The depths that count, sixteen at a time; zero: not measured, or masked.
+// Call f(pixel, count, depths) for each sixteen depths of a row. A depth is zero where it was not
+// measured or is masked.
 template <class F>
 void each_depth(const LossInput& in, int64_t row, F f) {
   const int64_t begin = row * in.width;
@@ -230,7 +232,8 @@ void each_depth(const LossInput& in, int64_t row, F f) {
   }
 }
 
-// The derivative needs the number of depths that count, so that is found first.
+// Compute the depth loss and its derivative. The derivative needs the number of depths that count,
+// so the first loop finds it.
 void depth_loss(const LossInput& in, LossOutput& out) {
   const int64_t size = static_cast<int64_t>(in.width) * in.height;
   const float* rendered = in.planes + 3 * size;
@@ -265,7 +268,7 @@ void image_loss(const LossInput& in, int threads, LossOutput& out) {
   const Cut cut(in.width, in.height);
   Buffer<RowSums> sums(static_cast<size_t>(cut.columns()) * in.height);
   Team(threads).each(1 + cut.parts(), [&](int64_t job) {
-    if (job == 0) return depth_loss(in, out);  // takes about as long as one part
+    if (job == 0) return depth_loss(in, out);  // The depth loss takes about as long as one part.
     const int number = static_cast<int>(job - 1);
     RowSums* rows = &sums[static_cast<size_t>(cut.column_of(number)) * in.height];
     PartLoss(in, cut.part(number), out.gradients, rows).run();

@@ -1,4 +1,5 @@
-// How far a rendering is from a frame, and its derivative by every pixel. No instruction set here.
+// Interface of the loss between a rendering and a frame and of its derivative by every pixel. It is
+// independent of the instruction set.
 #pragma once
 #include <cstdint>
 
@@ -10,18 +11,18 @@ struct LossWeights {
 
 struct LossInput {
   int width, height;
-  const float* planes;    // red, green, blue, depth in metres, opacity; height x width each
-  const uint8_t* color;   // of the frame: red, green, blue planes, 0..255
-  const float* depth;     // of the frame, metres, 0 where not measured
-  const uint8_t* mask;    // 0: the pixel does not count; null: all do
-  const float* exposure;  // gains of the three channels, then biases
+  const float* planes;    // Red, green, blue, depth in meters, opacity; height x width each.
+  const uint8_t* color;   // Red, green and blue planes of the frame, 0..255.
+  const float* depth;     // Depth of the frame in meters, 0 where not measured.
+  const uint8_t* mask;    // Pixels with 0 do not count; null counts all pixels.
+  const float* exposure;  // Gains of the three channels, then biases.
   LossWeights weights;
 };
 
 struct LossOutput {
-  float* gradients;          // by the five planes
-  double l1, d_ssim, depth;  // means, without their weights
-  double squared_error;      // mean over pixels and channels
+  float* gradients;          // Derivatives by the five planes.
+  double l1, d_ssim, depth;  // Means, without their weights.
+  double squared_error;      // Mean over pixels and channels.
 };
 
 #define LDO_DECLARE_LOSS(isa)                                         \

@@ -1,4 +1,4 @@
-// Python binding of the loss: checks what comes in, picks the instruction set.
+// Python binding of the loss. It checks the arguments and selects the instruction set.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
@@ -21,7 +21,7 @@ decltype(&baseline::image_loss) image_loss_for(Isa isa) {
   return baseline::image_loss;
 }
 
-decltype(&baseline::image_loss) chosen = nullptr;  // when the module is imported
+decltype(&baseline::image_loss) chosen = nullptr;  // Set when the module is imported.
 
 using Terms = std::tuple<double, double, double, double>;
 

@@ -1,4 +1,4 @@
-// Gaussians in voxels, and the few around each voxel that stand for its neighbourhood.
+// Gaussians in voxels, and a sample of the Gaussians around each voxel.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -10,7 +10,7 @@
 
 namespace ldo::LDO_ISA {
 
-// Own voxel first, then those that share a face, an edge, a corner.
+// Steps from a voxel to itself, then to those that share a face, an edge, a corner.
 struct Stencil {
   int8_t step[27][3];
   constexpr Stencil() : step{} {
@@ -28,15 +28,16 @@ struct Stencil {
 };
 inline constexpr Stencil kStencil;
 
-constexpr int64_t kOwn = kLanes / 2;  // the first of a voxel stand for it
+constexpr int64_t kOwn = kLanes / 2;  // Maximum number of Gaussians sampled from the voxel itself.
 
 class Voxels {
  public:
-  // Of the rows that `indices` [v] name: their places in that list, by voxel, in order. Voxels are
-  // numbered as they appear. Rows that are not finite are in none.
+  // Sort the rows `indices` [v] into voxels. The members of a voxel are positions in that list,
+  // ascending. Voxels are numbered in order of appearance. Rows that are not finite belong to no
+  // voxel.
   Voxels(const float* rows, const uint32_t* indices, int64_t v, float edge_m)
       : table_(size_t{1} << table_bits_, -1), cell_of_(v), members_(v) {
-    // In blocks: no key waits for a row that another branches on.
+    // Keys are computed in blocks. Loading a row then never waits for a branch on another key.
     uint64_t keys[64];
     for (int64_t begin = 0; begin < v; begin += 64) {
       const int64_t n = std::min<int64_t>(64, v - begin);
@@ -55,11 +56,12 @@ class Voxels {
   const uint32_t* begin(int64_t cell) const { return members_.data() + starts_[cell]; }
   int64_t count(int64_t cell) const { return starts_[cell + 1] - starts_[cell]; }
 
-  // The voxels, ascending, that hold a member of which `is_one` is true, or touch one that does.
+  // Return the voxels, ascending, that hold a member for which `is_one` is true, or touch such a
+  // voxel.
   template <class F>
   std::vector<int64_t> about(const F& is_one) const {
     std::vector<uint8_t> has_one(keys_.size(), 0), is_about(keys_.size(), 0);
-    for (size_t i = 0; i < cell_of_.size(); ++i)  // in the order of memory, not of voxels
+    for (size_t i = 0; i < cell_of_.size(); ++i)  // Memory order, not voxel order.
       if (cell_of_[i] >= 0 && is_one(static_cast<uint32_t>(i))) has_one[cell_of_[i]] = 1;
     for (int64_t cell = 0; cell < size(); ++cell) {
       if (!has_one[cell]) continue;
@@ -74,8 +76,9 @@ class Voxels {
     return out;
   }
 
-  // Up to sixteen Gaussians: the first kOwn of the voxel, then the first of each of those around
-  // it, nearest voxels first, the second of each, and so on.
+  // Write at most sixteen Gaussians to `out` and return their number. The first kOwn of the voxel
+  // come first. Then follow the first of each voxel around it, nearest voxels first, the second of
+  // each, and so on.
   int around(int64_t cell, uint32_t (&out)[kLanes]) const {
     int64_t cells[27], n_cells = 0, most = 0;
     for (const auto& step : kStencil.step) {
@@ -93,7 +96,7 @@ class Voxels {
   }
 
  private:
-  static constexpr int64_t kHalf = int64_t{1} << 20, kMask = (kHalf << 1) - 1;  // 21 bits an axis
+  static constexpr int64_t kHalf = int64_t{1} << 20, kMask = (kHalf << 1) - 1;  // 21 bits per axis.
   static constexpr uint64_t kNowhere = ~uint64_t{0};
 
   static uint64_t packed(int64_t x, int64_t y, int64_t z) {
@@ -103,7 +106,8 @@ class Voxels {
     const auto axis = [&](int shift) { return static_cast<int64_t>(key >> shift) & kMask; };
     return packed(axis(42) + step[0], axis(21) + step[1], axis(0) + step[2]);
   }
-  // By the highest bits of the product, as the others know nothing of x.
+  // Return the slot from the highest bits of the product, because the other bits do not depend on
+  // x.
   size_t slot_of(uint64_t key) const {
     return static_cast<size_t>(key * 0x9e3779b97f4a7c15u >> (64 - table_bits_));
   }
@@ -126,8 +130,9 @@ class Voxels {
     return table_[slot] >= 0 ? table_[slot] : added(key, slot);
   }
 
-  // The table goes by voxels, not by Gaussians: it stays in the cache. Three of four slots are
-  // empty, so that most are right at once: a wrong guess of the processor costs more.
+  // Add a voxel to the table. The table is indexed by voxel, not by Gaussian, so that it stays in
+  // the cache. Three of four slots are empty, so that most lookups hit at once. A mispredicted
+  // branch costs more than the space.
   int32_t added(uint64_t key, size_t slot) {
     const int32_t cell = static_cast<int32_t>(keys_.size());
     keys_.push_back(key);
@@ -141,7 +146,7 @@ class Voxels {
     return cell;
   }
 
-  // Where the voxel is in the table, or where it would be.
+  // Return the slot of a voxel in the table, or the slot where it would be.
   size_t slot_for(uint64_t key) const {
     size_t slot = slot_of(key);
     while (table_[slot] >= 0 && keys_[table_[slot]] != key) slot = (slot + 1) & (table_.size() - 1);
@@ -157,7 +162,7 @@ class Voxels {
   }
 
   int table_bits_ = 6;
-  std::vector<int32_t> table_;  // of voxels by key, -1 where it is empty
+  std::vector<int32_t> table_;  // Voxels by key; -1 in an empty slot.
   Buffer<int32_t> cell_of_;
   Buffer<uint32_t> members_;
   std::vector<uint64_t> keys_;

@@ -1,7 +1,7 @@
-// Jobs that may run side by side.
+// Jobs that run in parallel.
 //
-// Every job writes its own part of the output. Where sums of floats are taken, the work is cut into
-// jobs without looking at the number of threads: then the result has the same bits for any number.
+// Every job writes its own part of the output. Where floats are summed, the division into jobs does
+// not depend on the number of threads. The result is then bitwise equal for any number.
 #pragma once
 #include <pthread.h>
 #include <unistd.h>
@@ -38,24 +38,24 @@ class Round {
   const void* const function_;
   const int64_t jobs_;
   std::atomic<int64_t> next_{0};
-  std::atomic<int> working_{0};  // helpers
-  int seats_ = 0;                // for helpers that have not come yet
+  std::atomic<int> working_{0};  // Helpers at work.
+  int seats_ = 0;                // Seats that no helper has taken yet.
   std::condition_variable left_;
 };
 
-// Threads that help with the rounds of every call in this process, and sleep in between. There are
-// as many as calls that ran at once had seats for.
+// Threads that help with the rounds of every call in this process, and block between rounds. Their
+// number grows to the number of seats that are open at once.
 class Helpers {
  public:
-  // A forked child has none of its parent's threads, and starts anew. Never destroyed: they sleep
-  // in here until the process ends.
+  // Return the helpers of this process. A forked child has none of its parent's threads and creates
+  // its own. The object is never destroyed, because its threads block in it until the process ends.
   static Helpers& of_this_process() {
     static std::atomic<Helpers*> known{nullptr};
     Helpers* helpers = known;
     while (helpers == nullptr || helpers->process_ != getpid()) {
       Helpers* fresh = new Helpers;
       if (known.compare_exchange_strong(helpers, fresh)) return *fresh;
-      delete fresh;  // another thread was quicker
+      delete fresh;  // Another thread was faster.
     }
     return *helpers;
   }
@@ -72,7 +72,8 @@ class Helpers {
     for (int i = 0; i < seats; ++i) opened_.notify_one();
   }
 
-  // Waits for the helpers that have begun; one that wakes later finds the round closed.
+  // Wait for the helpers that have begun, and close the round. A helper that starts later finds the
+  // round closed.
   void close(Round& round) {
     yield_while([&] { return round.working_ > 0; });
     std::unique_lock<std::mutex> lock(mutex_);
@@ -82,9 +83,10 @@ class Helpers {
   }
 
  private:
-  // Says whether there was a thread to be had: if not, those that are do the work.
+  // Start a helper. Return false if the system has no more threads; the existing ones then do the
+  // work.
   bool start_one() {
-    sigset_t every, before;  // signals are for the threads of Python
+    sigset_t every, before;  // Python's threads handle all signals.
     sigfillset(&every);
     pthread_sigmask(SIG_SETMASK, &every, &before);
     bool is_started = true;
@@ -122,7 +124,8 @@ class Helpers {
     return round;
   }
 
-  // The next round is mostly a few microseconds away, and sleeping costs more.
+  // Yield while the condition holds, at most 1024 times. The next round is usually a few
+  // microseconds away, and blocking costs more.
   template <class Condition>
   static void yield_while(Condition condition) {
     for (int i = 0; i < 1024 && condition(); ++i) std::this_thread::yield();
@@ -132,17 +135,17 @@ class Helpers {
   std::mutex mutex_;
   std::condition_variable opened_;
   std::vector<Round*> rounds_;
-  std::atomic<int> seats_{0};  // of all rounds
-  int idle_ = 0;               // helpers that work on nothing
+  std::atomic<int> seats_{0};  // Open seats of all rounds.
+  int idle_ = 0;               // Helpers without work.
 };
 
-// The threads of one call, the caller included.
+// Threads of one call, the caller included.
 class Team {
  public:
   explicit Team(int threads) : size_(threads) {}
   int size() const { return size_; }
 
-  // Calls f(job) for every job in [0, jobs); returns when all are done. f must not throw.
+  // Call f(job) for every job in [0, jobs) and return when all are done. f must not throw.
   template <class F>
   void each(int64_t jobs, const F& f) {
     const int64_t seats = std::min<int64_t>(size_, jobs) - 1;

@@ -1,5 +1,6 @@
-// From Gaussians in the map to splats in the image (EWA splatting, Zwicker et al. 2001; the
-// clamped Jacobian and the low-pass of Kerbl et al. 2023, sec. 4 and its code).
+// Projection of Gaussians in the map to splats in the image. It is EWA splatting (Zwicker et al.
+// 2001), with the clamped Jacobian and the low-pass filter of Kerbl et al. 2023, sec. 4 and its
+// code.
 #pragma once
 #include <algorithm>
 
@@ -8,17 +9,17 @@
 
 namespace ldo::LDO_ISA {
 
-constexpr float kNearPlane = 0.05f;  // metres
-constexpr float kLowPass = 0.3f;     // px^2, added to the image covariance
+constexpr float kNearPlane = 0.05f;  // Meters.
+constexpr float kLowPass = 0.3f;     // Low-pass filter added to the image covariance, px^2.
 constexpr float kLog2e = 1.44269504f;
-constexpr float kLog2MinAlpha = -7.99435344f;  // log2(1 / 255): weaker contributions are dropped
+constexpr float kLog2MinAlpha = -7.99435344f;  // log2(1 / 255); weaker contributions are dropped.
 
 // log2 alpha(x, y) = a dx^2 + b dx dy + c dy^2 + log2_opacity, with dx = x - u, dy = y - v.
 struct alignas(64) Splat {
   float u, v;
   float a, b, c;
   float log2_opacity;
-  float x_slope, y_slope;  // the ridge lines dx = x_slope dy and dy = y_slope dx
+  float x_slope, y_slope;  // Slopes of the ridge lines dx = x_slope dy and dy = y_slope dx.
   float color[3];
   float z;
 };
@@ -26,12 +27,12 @@ struct alignas(64) Splat {
 // Tiles [x0, x1] x [y0, y1] that a splat may touch.
 struct TileRange {
   uint16_t x0, y0, x1, y1;
-  uint32_t first_pair;  // of the splat and its tiles, among the pairs of its piece
+  uint32_t first_pair;  // First pair of the splat and a tile, among the pairs of its piece.
 };
 
 inline uint32_t area(const TileRange& r) { return (r.x1 - r.x0 + 1) * (r.y1 - r.y0 + 1); }
 
-// Rows [0, count) as columns of sixteen; missing ones are zero.
+// Transpose rows [0, count) to columns of sixteen; missing rows are zero.
 inline void transpose_rows(const float* rows, int count, float (&columns)[kRowFloats][kLanes]) {
   Floats matrix[kLanes];
   for (int i = 0; i < kLanes; ++i)
@@ -40,7 +41,8 @@ inline void transpose_rows(const float* rows, int count, float (&columns)[kRowFl
   for (int j = 0; j < kRowFloats; ++j) matrix[j].store(columns[j]);
 }
 
-// NaN and infinity times zero are NaN, and NaN fails every comparison.
+// Return the lanes with finite fields. NaN and infinity times zero are NaN, and NaN fails every
+// comparison.
 inline Mask is_finite(const float (&columns)[kRowFloats][kLanes]) {
   Floats sum = 0.0f;
   for (int j = 0; j < kFields; ++j) sum = sum + Floats::load(columns[j]);
@@ -53,7 +55,7 @@ struct Vector3 {
 
 inline Floats dot(const Vector3& a, const Vector3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
-struct Axes {  // columns of a rotation, each scaled by a standard deviation
+struct Axes {  // Columns of a rotation, each scaled by a standard deviation.
   Vector3 axis[3];
 };
 
@@ -74,14 +76,15 @@ inline Axes principal_axes(const float (&columns)[kRowFloats][kLanes]) {
            {(xz + wy) * s2, (yz - wx) * s2, (one - xx - yy) * s2}}};
 }
 
-// Sixteen projected Gaussians: what a Splat needs, one array a field.
+// Sixteen projected Gaussians: the values of a Splat, with one array per field.
 struct SplatColumns {
   float u[kLanes], v[kLanes], a[kLanes], b[kLanes], c[kLanes], log2_opacity[kLanes];
   float x_slope[kLanes], y_slope[kLanes], z[kLanes];
-  float x_radius[kLanes], y_radius[kLanes];  // of the box where alpha >= 1/255
-  uint32_t drawn;  // bit i: lane i is finite, beyond the near plane and strong enough
+  float x_radius[kLanes], y_radius[kLanes];  // Half size of the box where alpha >= 1/255.
+  uint32_t drawn;  // Bit i is set if lane i is finite, beyond the near plane and strong enough.
 };
 
+// Projection of sixteen Gaussians at a time into a view.
 struct Projection {
   explicit Projection(const View& view) : view(view) {
     const float margin_x = 0.15f * view.width / view.fx, margin_y = 0.15f * view.height / view.fy;
@@ -99,8 +102,9 @@ struct Projection {
     return {row(0), row(1), row(2)};
   }
 
-  // Rows of J R: the derivative of (u, v) with respect to a point of the map, linearised at
-  // a direction clamped to a little more than the image, where the affine model still holds.
+  // Compute the rows of J R, the derivative of (u, v) with respect to a point of the map. It is
+  // linearized at a direction clamped to slightly more than the image, where the affine model still
+  // holds.
   void jacobian(Floats x, Floats y, Floats inverse_z, Vector3& du, Vector3& dv) const {
     const float* T = view.T_camera_map;
     const Floats ju = inverse_z * view.fx, jv = inverse_z * view.fy;
@@ -117,7 +121,7 @@ struct Projection {
     Vector3 du, dv;
     jacobian(x, y, inverse_z, du, dv);
 
-    Floats uu = kLowPass, uv = 0.0f, vv = kLowPass;  // image covariance, px^2
+    Floats uu = kLowPass, uv = 0.0f, vv = kLowPass;  // Image covariance, px^2.
     for (const Vector3& axis : principal_axes(columns).axis) {
       const Floats su = dot(du, axis), sv = dot(dv, axis);
       uu = uu + su * su;
@@ -127,7 +131,8 @@ struct Projection {
     const Floats scale = Floats(-0.5f * kLog2e) / (uu * vv - uv * uv);
     const Floats log2_opacity =
         Floats(0.0f) - log2(Floats(1.0f) + exp(Floats(0.0f) - column(kOpacity)));
-    const Floats reach = (log2_opacity - kLog2MinAlpha) * (2.0f / kLog2e);  // of q = d' C^-1 d
+    // Maximum of q = d' C^-1 d.
+    const Floats reach = (log2_opacity - kLog2MinAlpha) * (2.0f / kLog2e);
 
     (x * view.fx + view.cx).store(out.u);
     (y * view.fy + view.cy).store(out.v);
@@ -144,11 +149,11 @@ struct Projection {
   }
 
   const View& view;
-  float min_x, max_x, min_y, max_y;  // of x / z and y / z
+  float min_x, max_x, min_y, max_y;  // Limits of x / z and y / z.
 };
 
-// First and last pixel of [0, size) within `radius` of `center`; false where there is none, which
-// includes NaN.
+// Find the first and last pixel of [0, size) within `radius` of `center`. Return false if there is
+// none, which includes NaN.
 inline bool pixels_within(float center, float radius, int size, int& first, int& last) {
   const float low = std::max(center - radius, 0.0f), high = std::min(center + radius, size - 1.0f);
   if (!(low <= high)) return false;

@@ -15,7 +15,7 @@ inline Vector3 cross(const Vector3& a, const Vector3& b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
-struct PoseSums {  // derivative by xi of T_map_camera exp(xi), lane by lane
+struct PoseSums {  // Derivative by xi of T_map_camera exp(xi), lane by lane.
   Vector3 rotation{0.0f, 0.0f, 0.0f}, translation{0.0f, 0.0f, 0.0f};
 };
 
@@ -25,7 +25,7 @@ struct ProjectionGradient {
         per_weight(penalty.weight / (static_cast<float>(view.width) * view.height)),
         log_ratio(penalty.log_ratio) {}
 
-  // From sixteen Gaussians and their sums, one a lane, to the derivatives of their fields.
+  // Convert the sums of sixteen Gaussians, one per lane, to the derivatives of their fields.
   void operator()(const float (&columns)[kRowFloats][kLanes], const Floats (&sums)[kLanes],
                   Floats (&out)[kLanes], PoseSums& pose) const {
     const auto column = [&](int j) { return Floats::load(columns[j]); };
@@ -36,7 +36,7 @@ struct ProjectionGradient {
     projection.jacobian(x, y, inverse_z, du, dv);
     const Axes axes = principal_axes(columns);
 
-    // image covariance S and its inverse K
+    // Image covariance S and its inverse K.
     Floats uu = kLowPass, uv = 0.0f, vv = kLowPass, along_u[3], along_v[3];
     for (int k = 0; k < 3; ++k) {
       along_u[k] = dot(du, axes.axis[k]);
@@ -70,7 +70,7 @@ struct ProjectionGradient {
     rotation_gradient(columns, g_axis, out + kQuat);
     penalise_needles(columns, sums[kWeightSum], out + kLogScale);
 
-    // through the Jacobian and the perspective division to the point in the camera frame
+    // Point in the camera frame, through the Jacobian and the perspective division.
     const Vector3 g_row_u = to_camera_axes(g_du), g_row_v = to_camera_axes(g_dv);
     const Floats ju = inverse_z * projection.view.fx, jv = inverse_z * projection.view.fy;
     const Floats ku = ju * clamp(x, projection.min_x, projection.max_x),
@@ -92,7 +92,7 @@ struct ProjectionGradient {
     out[kWeight] = sums[kWeightSum];
     out[kWeight + 1] = 0.0f;
 
-    // T_camera_map' = exp(-xi) T_camera_map turns and moves both the point and the rows of J R
+    // T_camera_map' = exp(-xi) T_camera_map rotates and moves both the point and the rows of J R.
     const Vector3 row_u{ju, 0.0f, Floats(0.0f) - ku}, row_v{0.0f, jv, Floats(0.0f) - kv};
     pose.rotation = pose.rotation - cross(p, g) - cross(g_row_u, row_u) - cross(g_row_v, row_v);
     pose.translation = pose.translation - g;
@@ -115,7 +115,8 @@ struct ProjectionGradient {
     return {column(0), column(1), column(2)};
   }
 
-  // From derivatives by the scaled axes to those by the quaternion (w, x, y, z) of any length.
+  // Convert derivatives by the scaled axes to derivatives by the quaternion (w, x, y, z), of any
+  // length.
   static void rotation_gradient(const float (&columns)[kRowFloats][kLanes], Vector3 (&g_axis)[3],
                                 Floats* out) {
     const auto column = [&](int j) { return Floats::load(columns[j]); };
@@ -123,7 +124,7 @@ struct ProjectionGradient {
     const Floats shorten = Floats(1.0f) / sqrt(w * w + x * x + y * y + z * z);
     w = w * shorten, x = x * shorten, y = y * shorten, z = z * shorten;
     for (int k = 0; k < 3; ++k) g_axis[k] = g_axis[k] * exp(column(kLogScale + k));
-    const auto& [c0, c1, c2] = g_axis;  // dL/dR by columns
+    const auto& [c0, c1, c2] = g_axis;  // dL/dR by columns.
     const Floats g_w = x * (c1.z - c2.y) + y * (c2.x - c0.z) + z * (c0.y - c1.x);
     const Floats g_x =
         w * (c1.z - c2.y) + y * (c1.x + c0.y) + z * (c2.x + c0.z) - x * 2.0f * (c1.y + c2.z);
@@ -131,7 +132,7 @@ struct ProjectionGradient {
         w * (c2.x - c0.z) + x * (c1.x + c0.y) + z * (c2.y + c1.z) - y * 2.0f * (c0.x + c2.z);
     const Floats g_z =
         w * (c0.y - c1.x) + x * (c2.x + c0.z) + y * (c2.y + c1.z) - z * 2.0f * (c0.x + c1.y);
-    const Floats radial = w * g_w + x * g_x + y * g_y + z * g_z;  // the length changes nothing
+    const Floats radial = w * g_w + x * g_x + y * g_y + z * g_z;  // The length has no effect.
     const Floats twice = shorten * 2.0f;
     out[0] = (g_w - w * radial) * twice;
     out[1] = (g_x - x * radial) * twice;

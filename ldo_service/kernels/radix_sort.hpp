@@ -9,11 +9,11 @@ struct Keyed {
   uint32_t key, value;
 };
 
-constexpr int kMaxDigitBits = 12;  // the histogram and the ends of all bins stay in cache
+constexpr int kMaxDigitBits = 12;  // The histogram and the ends of all bins stay in the cache.
 
-// The pieces in which an array of n is sorted: one for a thread alone, some for each of several, of
-// which one may be held up. A stable sort has one result only, so that here the number of threads
-// may decide how the work is cut.
+// Pieces in which an array of n items is sorted. A single thread sorts one piece. Several threads
+// sort four pieces each, because one of them may be delayed. A stable sort has only one result, so
+// the number of threads may decide the division.
 struct Pieces {
   Pieces(int64_t n, const Team& team) : n(n) {
     const int64_t wanted = team.size() == 1 ? 1 : int64_t{4} * team.size();
@@ -25,8 +25,9 @@ struct Pieces {
   int64_t n, length;
 };
 
-// Turns counts of bins, which lie `stride` apart for each piece, into the places where each piece
-// starts writing each bin: bins in order, and within a bin the pieces in order. Returns the total.
+// Turn the counts of bins, which lie `stride` apart for each piece, into the positions where each
+// piece starts writing each bin. Bins are in order, and within a bin the pieces are in order.
+// Return the total.
 inline uint32_t to_offsets(uint32_t* counts, int64_t pieces, int64_t bins, int64_t stride) {
   uint32_t sum = 0;
   for (int64_t bin = 0; bin < bins; ++bin)
@@ -62,8 +63,8 @@ inline void sort_by(Digit digit, const Keyed* from, Keyed* to, const Pieces& pie
   });
 }
 
-// Sorts items[0, n) by key, all in [lowest, highest]; equal keys keep their order. `spare` is as
-// large and is overwritten. Returns the one of the two that holds the result.
+// Sort items[0, n) by key, all in [lowest, highest]; equal keys keep their order. `spare` has the
+// same size and is overwritten. Return the array that holds the result: `items` or `spare`.
 inline Keyed* radix_sort(Keyed* items, Keyed* spare, int64_t n, uint32_t lowest, uint32_t highest,
                          Team& team) {
   const int bits = highest == lowest ? 0 : 32 - __builtin_clz(highest - lowest);

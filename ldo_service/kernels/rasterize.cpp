@@ -1,4 +1,4 @@
-// Compiled once per instruction set, LDO_ISA.
+// Rasterizer, compiled once per instruction set (macro LDO_ISA).
 #include "rasterize.hpp"
 
 #include "adam_step.hpp"
@@ -18,15 +18,15 @@ struct RecordedPass final : Pass {
   }
   VisibleSplats splats;
   TileLists lists;
-  Buffer<uint32_t> touched;  // [lists.splats] per splat of a tile: the blocks that it reaches
-  Buffer<uint32_t> blended;  // [tiles, kBlocks] splats
-  Buffer<float> sums;        // [lists.splats, kSumFloats]
+  Buffer<uint32_t> touched;  // [lists.splats], blocks that each splat of a tile reaches.
+  Buffer<uint32_t> blended;  // [tiles, kBlocks], number of splats.
+  Buffer<float> sums;        // [lists.splats, kSumFloats].
 
   int64_t size_of_tile(int64_t tile) const {
     const bool exists = tile < static_cast<int64_t>(lists.columns) * lists.rows;
     return exists ? lists.start[tile + 1] - lists.start[tile] : 0;
   }
-  // Of the pairs with tiles that are not wanted.
+  // Return the sums of all pairs with tiles that are not wanted.
   float* sums_of_nothing(int floats) {
     return &sums[int64_t{lists.start[lists.start.size() - 1]} * floats];
   }
@@ -35,8 +35,8 @@ struct RecordedPass final : Pass {
   }
 };
 
-// Tiles beside each other share splats and cache lines of the image, and one fetches what the next
-// will read: a job takes a few.
+// Call f for every tile. A job takes a few adjacent tiles, because they share splats and cache
+// lines of the image, and one prefetches what the next will read.
 template <class F>
 void each_tile(const TileLists& lists, Team& team, const F& f) {
   constexpr int64_t kJobTiles = 4;
@@ -50,7 +50,7 @@ void each_tile(const TileLists& lists, Team& team, const F& f) {
   });
 }
 
-// Sums over the tiles of each splat in turn, in the order of the tiles.
+// Sums over the tiles of one splat after the other, in the order of the tiles.
 class SumsOverTiles {
  public:
   SumsOverTiles(const RecordedPass& pass, int64_t piece)
@@ -68,14 +68,15 @@ class SumsOverTiles {
   }
 
  private:
-  static constexpr int kAhead = 64;  // pairs: they lie in the order of the tiles
+  // Pairs to prefetch ahead; the sums of pairs lie in the order of the tiles.
+  static constexpr int kAhead = 64;
   const float* sums_of(uint32_t slot) const { return sums_ + int64_t{slot} * kSumFloats; }
   const float* sums_;
   const uint32_t *slot_, *end_;
 };
 
-// Calls take(place among the visible, row number, gradient) for the splats of one piece of the
-// Gaussians, which are differentiated sixteen at a time.
+// Call take(position among the visible, row number, gradient) for the splats of one piece of the
+// Gaussians. They are differentiated sixteen at a time.
 template <class Take>
 void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& differentiate,
                          int64_t piece, PoseSums& pose, const Take& take) {
@@ -86,7 +87,7 @@ void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& dif
     const int64_t first = piece * kProjectionPiece + done, to = counts.first_splat + done;
     const uint32_t* gaussians = &pass.splats.gaussians[first];
     Floats matrix[kLanes], sums[kLanes], gradient[kLanes];
-    for (int k = 0; k < kLanes; ++k) {  // the last is repeated, with no gradient
+    for (int k = 0; k < kLanes; ++k) {  // The last row is repeated, with no gradient.
       matrix[k] = Floats::load(pass.rows + int64_t{gaussians[std::min(k, count - 1)]} * kRowFloats);
       sums[k] = k < count ? sum_over_tiles.next(pass.splats.tiles[first + k]) : Floats(0.0f);
     }
@@ -100,7 +101,7 @@ void differentiate_piece(const RecordedPass& pass, const ProjectionGradient& dif
   }
 }
 
-// Projects, sorts and blends, keeps the record, and gives each finished tile to `store`.
+// Project, sort and blend, keep the record, and pass each finished tile to `store`.
 template <bool WithMedian, class Store>
 void blend_tiles(const Gaussians& gaussians, const View& view, const uint8_t* wanted, int threads,
                  Pass& opaque, const Store& store) {
@@ -146,7 +147,7 @@ void add_up(const Buffer<PoseSums>& poses, double* out) {
   }
 }
 
-// Cuts a row to the size that a view allows.
+// Limit on the size of a row in a view.
 class SizeBound {
  public:
   SizeBound(const View& view, SizeLimit limit)
@@ -163,7 +164,8 @@ class SizeBound {
   const float per_depth_;
 };
 
-// From the derivatives by the images to those by the rows, which `take` gets one by one.
+// Convert the derivatives by the images to derivatives by the rows, and pass those to `take` one by
+// one.
 template <class Take>
 void differentiate(Pass& opaque, const float* planes, const float* gradients, NeedlePenalty penalty,
                    int threads, double* by_pose, const Take& take) {
@@ -228,7 +230,7 @@ void backpropagate(Pass& pass, const float* planes, const float* gradients, Need
                 });
 }
 
-// In place: nothing reads a row again once its gradient is known.
+// The step runs in place, because no row is read again once its gradient is known.
 void descend(Pass& pass, const float* planes, const float* gradients, NeedlePenalty penalty,
              SizeLimit size, AdamRows rows, const AdamRates& rates, int threads, Reached out) {
   const AdamStep step(rows, rates);

@@ -1,4 +1,4 @@
-// Python binding of the rasteriser: checks what comes in, picks the instruction set.
+// Python binding of the rasterizer. It checks the arguments and selects the instruction set.
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
@@ -17,14 +17,14 @@
 namespace ldo {
 namespace {
 
-constexpr int kMaxSide = 32768;             // pixels
-constexpr int64_t kMaxGaussians = 1 << 27;  // splats are counted with 32 bits
+constexpr int kMaxSide = 32768;             // Pixels.
+constexpr int64_t kMaxGaussians = 1 << 27;  // Splats are counted with 32 bits.
 
-Isa isa = Isa::baseline;  // chosen when the module is imported
+Isa isa = Isa::baseline;  // Set when the module is imported.
 
 using Image = nb::ndarray<nb::numpy, float>;
 
-// The functions of the chosen instruction set.
+// Functions of the chosen instruction set.
 struct Kernels {
   decltype(&baseline::rasterize) rasterize;
   decltype(&baseline::contributions) contributions;
@@ -49,9 +49,9 @@ Kernels kernels_for(Isa isa) {
 }
 #undef LDO_KERNELS
 
-Kernels kernels;  // chosen with isa
+Kernels kernels;  // Set together with `isa`.
 
-// A thing that is used by one call at a time.
+// Lock on an object that only one call at a time may use.
 class Exclusive {
  public:
   explicit Exclusive(std::mutex& busy) : lock_(busy, std::try_to_lock) {
@@ -62,7 +62,7 @@ class Exclusive {
   std::unique_lock<std::mutex> lock_;
 };
 
-// A pass as Python holds it.
+// Pass object of Python.
 class PassOfPython {
  public:
   PassOfPython() : pass_(kernels.new_pass()) {}
@@ -83,10 +83,10 @@ class PassOfPython {
   std::mutex busy_;
 };
 
-// The bounds of the blocks of an array of rows, which tells of every change.
+// Bounds of the blocks of an array of rows. The owner of the rows must report every change.
 class BoundsOfPython {
  public:
-  // Rows [first, last) have changed.
+  // Mark rows [first, last) as changed.
   void forget(int64_t first, int64_t last) {
     const Exclusive use(busy_);
     require(0 <= first && first <= last, "rows [first, last) must not be negative.");
@@ -112,7 +112,7 @@ class BoundsOfPython {
   };
 
  private:
-  // Rows that moved in memory, or came behind the others, are not known.
+  // Return the bounds of `rows`. Rows that moved in memory, or were appended, have unknown bounds.
   BlockBound* follow(const float* rows, int64_t n) {
     if (rows != rows_) blocks_.clear();
     if (n > n_ && n_ / kBlockRows < static_cast<int64_t>(blocks_.size()))
@@ -157,7 +157,7 @@ Image image(float* data, std::initializer_list<size_t> shape) {
   return Image(data, shape, owner);
 }
 
-// The rows that a rendering looks at: all of them, or those whose bounds come near the view.
+// Rows that a rendering reads: all of them, or those whose bounds come near the view.
 class Seen {
  public:
   Seen(const Array& rows, BoundsOfPython* bounds)
@@ -244,7 +244,7 @@ PoseGradient pose_gradient(std::unique_ptr<double[]> values) {
   return PoseGradient(values.release(), {6}, owner);
 }
 
-// What every derivative of a rendering is asked for with, checked.
+// Checked arguments that all derivatives of a rendering share.
 struct Backward {
   template <class AnyArray>
   Backward(PassOfPython& held, const AnyArray& rows, const Array& planes, const Array& gradients,
@@ -303,7 +303,7 @@ PoseGradient descend(PassOfPython& held, const WritableArray& rows, const Writab
   std::unique_ptr<double[]> pose(new double[6]);
   const Reached out{values_of<uint32_t>(indices, "indices"), values_of<float>(weights, "weights"),
                     pose.get()};
-  held.is_rendered = false;  // the rows are about to change
+  held.is_rendered = false;  // The rows are about to change.
   {
     nb::gil_scoped_release release;
     kernels.descend(*b.pass, b.images, b.by_images, b.penalty, {max_sigma_px}, state, hyper,

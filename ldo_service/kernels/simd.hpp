@@ -1,9 +1,9 @@
-// Sixteen float lanes: one 4x4 block of pixels, or sixteen Gaussians.
+// Vectors of sixteen float lanes: one 4x4 block of pixels, or sixteen Gaussians.
 //
-// Written with the vector extensions of GCC and Clang. A value is an array of native registers
-// (1 of 64, 2 of 32 or 4 of 16 bytes), because one 64-byte vector on a narrower machine has its
+// The code uses the vector extensions of GCC and Clang. A value is an array of native registers:
+// 1 of 64, 2 of 32 or 4 of 16 bytes. One 64-byte vector on a narrower machine would have its
 // compares and selects lowered to scalar code. Everything lives in a namespace named after the
-// instruction set, so that the linker never merges an inline function of one translation unit
+// instruction set. The linker therefore never merges an inline function of one translation unit
 // with that of another, compiled for a different machine.
 #pragma once
 #include <cstdint>
@@ -23,20 +23,20 @@ constexpr int kRegisterBytes = 32;
 constexpr int kRegisterBytes = 16;
 #endif
 constexpr int kRegisters = kLanes * 4 / kRegisterBytes;
-constexpr int kPerRegister = kLanes / kRegisters;  // lanes
+constexpr int kPerRegister = kLanes / kRegisters;  // Lanes.
 
 typedef float FloatRegister __attribute__((vector_size(kRegisterBytes)));
 typedef int32_t IntRegister __attribute__((vector_size(kRegisterBytes)));
 static_assert(sizeof(FloatRegister) == kRegisterBytes);
 
-// Applies f to every register index; unrolled, so that the arrays live in registers.
+// Apply f to every register index. The loop is unrolled, so that the arrays live in registers.
 template <class F>
 [[gnu::always_inline]] inline void each_register(F f) {
 #pragma GCC unroll 4
   for (int k = 0; k < kRegisters; ++k) f(k);
 }
 
-struct Mask {  // per lane: all bits set, or none
+struct Mask {  // Each lane has all bits set, or none.
   IntRegister v[kRegisters];
 };
 
@@ -44,11 +44,11 @@ struct Floats {
   FloatRegister v[kRegisters];
 
   Floats() = default;
-  Floats(float x) {  // implicit: a scalar stands for sixteen equal lanes
-    each_register([&](int k) { v[k] = x - FloatRegister{}; });  // x - 0 folds, 0 + x does not
+  Floats(float x) {  // Implicit: a scalar becomes sixteen equal lanes.
+    each_register([&](int k) { v[k] = x - FloatRegister{}; });  // x - 0 folds; 0 + x does not.
   }
   static Floats load(const float* p) {
-    Floats out;  // register by register: GCC copies 64 bytes at once through the stack
+    Floats out;  // Copies register by register: GCC copies 64 bytes at once through the stack.
     each_register([&](int k) { std::memcpy(&out.v[k], p + k * kPerRegister, kRegisterBytes); });
     return out;
   }
@@ -56,7 +56,7 @@ struct Floats {
     each_register([&](int k) { std::memcpy(p + k * kPerRegister, &v[k], kRegisterBytes); });
   }
 
-  static Floats load_first(const float* p, int n) {  // the others are zero
+  static Floats load_first(const float* p, int n) {  // The other lanes are zero.
     if (n == kLanes) return load(p);
     alignas(64) float lanes[kLanes] = {};
     std::memcpy(lanes, p, n * sizeof(float));
@@ -74,7 +74,7 @@ struct Floats {
     return load(lanes);
   }
 
-  // Four lanes from each of four rows that lie `stride` floats apart.
+  // Load four lanes from each of four rows that lie `stride` floats apart.
   static Floats load_rows(const float* p, int64_t stride) {
 #if defined(__AVX512F__)
     const auto row = [&](int i) { return _mm_loadu_ps(p + i * stride); };
@@ -127,7 +127,8 @@ inline Floats select(Mask m, Floats yes, Floats no) {
   return out;
 }
 
-// From `a < b ? a : b` the compilers make two instructions where the machine has one.
+// Return the lower value of each lane. Compilers turn `a < b ? a : b` into two instructions where
+// the machine has one.
 inline FloatRegister least(FloatRegister a, FloatRegister b) {
 #if defined(__AVX512F__)
   return _mm512_min_ps(a, b);
@@ -166,7 +167,7 @@ inline Floats max(Floats a, Floats b) {
 
 inline Floats clamp(Floats x, Floats low, Floats high) { return min(max(x, low), high); }
 
-// Bit i of the result is lane i of the mask.
+// Return the mask as bits: bit i is lane i.
 inline uint32_t bits(Mask m) {
 #if defined(__AVX512DQ__)
   return _mm512_movepi32_mask(reinterpret_cast<__m512i>(m.v[0]));
@@ -191,8 +192,8 @@ inline uint32_t bits(Mask m) {
 
 inline bool any(Mask m) { return bits(m) != 0; }
 
-// 2^x for x in [-126, 126], relative error below 4e-7. Adding 1.5 * 2^23 leaves the nearest integer
-// in the low bits; a minimax polynomial does the fraction in [-0.5, 0.5].
+// Return 2^x for x in [-126, 126], relative error below 4e-7. Adding 1.5 * 2^23 leaves the nearest
+// integer in the low bits. A minimax polynomial approximates the fraction in [-0.5, 0.5].
 inline Floats exp2(Floats x) {
   Floats out;
   each_register([&](int k) {
@@ -209,12 +210,12 @@ inline Floats exp2(Floats x) {
   return out;
 }
 
-// log2 of normal x > 0, absolute error below 1e-6: exponent plus the series of atanh.
+// Return log2 of normal x > 0, absolute error below 1e-6: the exponent plus the series of atanh.
 inline Floats log2(Floats x) {
   Floats out;
   each_register([&](int k) {
     const IntRegister i = reinterpret_cast<IntRegister>(x.v[k]);
-    const IntRegister e = (i - 0x3f3504f3) >> 23;  // mantissa in [sqrt(1/2), sqrt(2))
+    const IntRegister e = (i - 0x3f3504f3) >> 23;  // Mantissa in [sqrt(1/2), sqrt(2)).
     const FloatRegister m = reinterpret_cast<FloatRegister>(i - (e << 23));
     const FloatRegister s = (m - 1.0f) / (m + 1.0f), s2 = s * s;
     FloatRegister p = s2 * 0.41219858f + 0.57707801f;
@@ -244,8 +245,9 @@ inline Floats sqrt(Floats x) {
   return out;
 }
 
-// Sum of the lanes, in an order that is the same on every machine: the lower half takes what the
-// upper half has, again and again. In halves of registers no compiler joins it with a product.
+// Return the sum of the lanes, in an order that is the same on every machine. The upper half is
+// repeatedly added to the lower half. In halves of registers, no compiler joins the addition with a
+// product.
 inline float sum(Floats x) {
 #if defined(__AVX512F__)
   const __m256 eight = _mm512_castps512_ps256(x.v[0]) + _mm512_extractf32x8_ps(x.v[0], 1);
@@ -260,7 +262,7 @@ inline float sum(Floats x) {
 #endif
 }
 
-inline float lowest(Floats x) {  // of the lanes
+inline float lowest(Floats x) {  // Minimum of the lanes.
 #if defined(__AVX512F__)
   return _mm512_reduce_min_ps(x.v[0]);
 #else
@@ -274,20 +276,20 @@ inline float lowest(Floats x) {  // of the lanes
 }
 inline float highest(Floats x) { return -lowest(Floats(0.0f) - x); }
 
-// 1 / x for normal x, relative error below 1e-6.
+// Return 1 / x for normal x, relative error below 1e-6.
 inline Floats reciprocal(Floats x) {
 #if defined(__AVX512F__)
   Floats out;
   const __m512 guess = _mm512_rcp14_ps(x.v[0]);
   out.v[0] = guess * (2.0f - x.v[0] * guess);
   return out;
-#else  // the narrower guess differs between makers of processors
+#else  // Narrower approximations differ between processor vendors.
   return Floats(1.0f) / x;
 #endif
 }
 
-// The sixteen values at `p`, on a cache line, and those about them. Shifted in registers where the
-// machine can: loads that straddle cache lines cost twice.
+// Sixteen values at `p`, which lies on a cache line, and the values around them. They are shifted
+// in registers where the machine can, because loads that straddle cache lines cost twice.
 class Neighbors {
  public:
 #if defined(__AVX512F__)
@@ -296,7 +298,7 @@ class Neighbors {
         middle_(_mm512_load_si512(p)),
         right_(_mm512_load_si512(p + kLanes)) {}
 
-  template <int Right>  // the values so many places to the right, or to the left
+  template <int Right>  // Values `Right` places to the right; to the left if it is negative.
   [[gnu::always_inline]] inline Floats at() const {
     __m512i out = middle_;
     if constexpr (Right > 0) out = _mm512_alignr_epi32(right_, middle_, Right);
@@ -324,7 +326,7 @@ class Neighbors {
 inline Floats abs(Floats x) { return max(x, Floats(0.0f) - x); }
 
 #if defined(__AVX2__)
-struct SetBits {  // of every byte: which they are, from the lowest, and how many
+struct SetBits {  // Set bits of every byte, from the lowest, and their number.
   struct {
     uint8_t index[8];
     uint8_t count;
@@ -338,8 +340,8 @@ struct SetBits {  // of every byte: which they are, from the lowest, and how man
 inline constexpr SetBits kSetBits;
 #endif
 
-// Writes the i in [0, n) whose words[i] has the bit set, in order; returns how many. Without
-// branches, as the bits follow no pattern. `out` has room for kLanes beyond n.
+// Write the i in [0, n) whose words[i] has the bit set, in order, and return their number. The loop
+// has no branches, because the bits follow no pattern. `out` has room for kLanes beyond n.
 inline int indices_with_bit(const uint32_t* words, int n, int bit, uint32_t* out) {
   int count = 0;
 #if defined(__AVX512F__)

@@ -1,4 +1,4 @@
-// Pixels of a depth image about which there is neither a step nor a crease.
+// Smooth pixels of a depth image, which have no depth step and no crease around them.
 #pragma once
 #include "components.hpp"
 #include "foreground.hpp"
@@ -6,15 +6,17 @@
 
 namespace ldo::LDO_ISA {
 
-// exp(-k^2 / (2 1.5^2)) / sum, for k = 0, 1, 2. Blurred so before normals are taken, 0.58 of a
-// Kinect's pixels lie in pieces below 200 px, 0.78 without. With a sigma of 2 px, 1.3 points of
-// mIoU are lost in the apartment.
+// exp(-k^2 / (2 1.5^2)) / sum, for k = 0, 1, 2. If inverse depth is blurred like this before
+// normals are computed, 0.58 of a Kinect's pixels lie in pieces below 200 px; without the blur,
+// 0.78 do. A sigma of 2 px loses 1.3 points of mIoU in the apartment.
 constexpr float kBlur[3] = {0.29208172f, 0.23388074f, 0.12007839f};
-constexpr double kSobel = 128.0;               // what the 5x5 operator makes of a slope of 1
-constexpr int kApart = 2;                      // px from a pixel to either of two normals
-constexpr float kLeastSquare = 1e-9f * 1e-9f;  // of a normal, before it has unit length
+constexpr double kSobel = 128.0;  // Response of the 5x5 operator to a slope of 1.
+constexpr int kApart = 2;         // Distance from a pixel to either of two normals, px.
+// Minimum squared length of a normal, before it has unit length.
+constexpr float kLeastSquare = 1e-9f * 1e-9f;
 
-// Goes down the image once: what its steps tell each other are a few rows, which stay in the cache.
+// Detection of smooth pixels in one pass down the image. Its steps exchange a few rows, which stay
+// in the cache.
 class Smoothness {
  public:
   Smoothness(const DepthImage& image, const Pinhole& camera, const SurfaceRule& rule)
@@ -44,12 +46,13 @@ class Smoothness {
   }
 
  private:
-  // kAlong: slope along the row, kMean: mean along it; both still to be taken down the image.
+  // kAlong is the slope along the row, kMean the mean along it. The vertical part of both operators
+  // is applied later.
   enum Image { kBlurred, kAlong, kMean, kNormalX, kNormalY, kNormalZ, kSquare, kImages };
 
   bool is_row(int y) const { return y >= 0 && y < image_.height; }
 
-  // The rows from two above y to two below, each in place of an index.
+  // Rows from two above y to two below, as pointers that replace a lookup.
   struct Five {
     template <class Row>
     explicit Five(const Row& row_of, int y) {
@@ -96,7 +99,8 @@ class Smoothness {
     });
   }
 
-  // Of the plane n . p = d through 5x5 pixels, as 1 / z = n . ray / d; of any length.
+  // Compute the normals of the plane n . p = d through 5x5 pixels, as 1 / z = n . ray / d. They may
+  // have any length.
   void find_normals(int y) {
     const Five along = five(kAlong, y), mean = five(kMean, y);
     const float per_x = static_cast<float>(camera_.fx / kSobel),
@@ -120,7 +124,7 @@ class Smoothness {
     });
   }
 
-  struct Normals {  // of a row
+  struct Normals {  // Normals of a row.
     const float *x, *y, *z, *square;
   };
   Normals normals(int y) {
@@ -128,8 +132,8 @@ class Smoothness {
             rows_.row(kSquare, y)};
   }
 
-  // Of sixteen pairs from columns i and j on: whether their cosine is above the rule's. Squared, as
-  // neither normal is divided by its length.
+  // Return the bits of those of the sixteen pairs from columns i and j whose cosine exceeds the
+  // rule's. Squares are compared, because neither normal is divided by its length.
   uint32_t are_alike(const Normals& a, int i, const Normals& b, int j) const {
     const auto product = [&](const float* p, const float* q) {
       return Floats::load(p + i) * Floats::load(q + j);
@@ -159,7 +163,7 @@ class Smoothness {
   const SurfaceRule rule_;
   InverseDepth inverse_;
   RowsOfImages rows_;
-  Buffer<float> blurred_down_, ray_x_;  // with a vector more on each side
+  Buffer<float> blurred_down_, ray_x_;  // One more vector lies on each side.
 };
 
 }  // namespace ldo::LDO_ISA

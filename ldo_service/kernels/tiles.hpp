@@ -1,4 +1,4 @@
-// Which splats each tile of 16x16 pixels blends, in which order.
+// Lists of the splats that each tile of 16x16 pixels blends, in blending order.
 #pragma once
 #include "culling.hpp"
 #include "radix_sort.hpp"
@@ -6,31 +6,33 @@
 namespace ldo::LDO_ISA {
 
 constexpr int64_t kPieceBlocks = 16;
-constexpr int64_t kProjectionPiece = kPieceBlocks * kBlockRows;  // Gaussians
+constexpr int64_t kProjectionPiece = kPieceBlocks * kBlockRows;  // Gaussians.
 
-struct PieceCounts {  // of the splats of a piece, and their pairs with tiles
+struct PieceCounts {  // Numbers of the splats of a piece and of their pairs with tiles.
   int64_t splats;
   uint32_t pairs;
-  int64_t first_splat = 0, first_pair = 0;  // among all
+  int64_t first_splat = 0, first_pair = 0;  // Positions among all pieces.
 };
 
+// Splats of a rendering, piece by piece, and their order by depth.
 struct VisibleSplats {
-  Buffer<uint32_t> blocks;  // of rows that may be in view, ascending
-  Buffer<Splat> splats;     // those of piece p of the blocks start at p * kProjectionPiece
+  Buffer<uint32_t> blocks;  // Blocks of rows that may be in view, ascending.
+  Buffer<Splat> splats;     // Splats of piece p of the blocks start at p * kProjectionPiece.
   Buffer<TileRange> tiles;
-  Buffer<uint32_t> gaussians;  // row of each splat
-  Buffer<PieceCounts> counts;  // of each piece
-  Buffer<Keyed> depths;  // by (z, index of the Gaussian): key = bits of z, value = place in splats
-  Buffer<Keyed> spare;   // for sorting
+  Buffer<uint32_t> gaussians;  // Row of each splat.
+  Buffer<PieceCounts> counts;  // Counts of each piece.
+  // Sorted by (z, index of the Gaussian); key = bits of z, value = position in splats.
+  Buffer<Keyed> depths;
+  Buffer<Keyed> spare;  // Memory for sorting.
   int64_t count = 0;
-  int64_t pairs = 0;  // of a splat and a tile of its range
+  int64_t pairs = 0;  // Pairs of a splat and a tile of its range.
 
   int64_t first_pair(uint32_t splat) const {
     return counts[splat / kProjectionPiece].first_pair + tiles[splat].first_pair;
   }
 };
 
-// The tiles of an image, all or some of which are wanted.
+// Tiles of an image; all or some of them are wanted.
 struct TileGrid {
   TileGrid(const View& view, const uint8_t* wanted)
       : columns((view.width + kTile - 1) / kTile),
@@ -51,7 +53,8 @@ struct TileGrid {
   const uint8_t* wanted_;
 };
 
-// Appends the visible splats of the blocks of a piece, and measures the blocks that are not known.
+// Projection of one piece. It appends the visible splats of the blocks, and measures the blocks
+// whose bound is unknown.
 class PieceProjection {
  public:
   PieceProjection(const Gaussians& gaussians, const Projection& project, const TileGrid& grid,
@@ -123,7 +126,7 @@ class PieceProjection {
   alignas(64) SplatColumns splats_;
 };
 
-// Says where the splats and the pairs of each piece begin among all.
+// Compute where the splats and the pairs of each piece begin among all.
 inline void sum_counts(VisibleSplats& visible) {
   visible.count = visible.pairs = 0;
   for (size_t piece = 0; piece < visible.counts.size(); ++piece) {
@@ -135,8 +138,8 @@ inline void sum_counts(VisibleSplats& visible) {
   }
 }
 
-// Depths are positive, so their bits order as they do. Ties fall to the lower index, because
-// splats are in the order of the Gaussians and the sort is stable.
+// Sort the splats by depth. Depths are positive, so their bits have the same order. Ties go to the
+// lower index, because splats are in the order of the Gaussians and the sort is stable.
 inline void order_by_depth(VisibleSplats& visible, Team& team) {
   const size_t pieces = visible.counts.size();
   Buffer<uint32_t> lowest(pieces), highest(pieces);
@@ -182,25 +185,26 @@ inline void project(const Gaussians& gaussians, const View& view, const TileGrid
   order_by_depth(out, team);
 }
 
-constexpr int kPrefetchAhead = 24;  // splats, while those of a tile are read in list order
+// Splats to prefetch ahead, while those of a tile are read in list order.
+constexpr int kPrefetchAhead = 24;
 
 struct TileLists {
   int columns = 0, rows = 0;
-  Buffer<uint32_t> start;   // [columns * rows + 1] into splats
-  Buffer<uint32_t> splats;  // front to back within a tile; kPrefetchAhead zeros at the end
-  // Where in `splats` each pair of a splat and a tile went: splats as in VisibleSplats, and the
-  // tiles of their ranges row by row. Pairs with a tile that is not wanted all went behind the
-  // last.
+  Buffer<uint32_t> start;   // [columns * rows + 1], positions in splats.
+  Buffer<uint32_t> splats;  // Front to back within a tile; kPrefetchAhead zeros at the end.
+  // Position in `splats` of each pair of a splat and a tile. Splats are ordered as in
+  // VisibleSplats, and the tiles of their ranges row by row. All pairs with a tile that is not
+  // wanted share the position after the last.
   Buffer<uint32_t> slots;
 };
 
-// How many splats touch each tile. Each range is added at its corners, without a loop over its
-// tiles, and the sums over rows and columns of these are the counts.
+// Number of splats that touch each tile. Each range is added at its corners, without a loop over
+// its tiles. The sums of these over rows and columns are the counts.
 class TileCounts {
  public:
   static int64_t room(const TileGrid& grid) { return int64_t{grid.columns + 1} * (grid.rows + 1); }
 
-  // `counts` has that room.
+  // Create counts of zero in `counts`, which holds room(grid) values.
   TileCounts(const TileGrid& grid, uint32_t* counts)
       : grid_(grid), stride_(grid.columns + 1), counts_(counts) {
     std::fill_n(counts_, room(grid), 0u);
@@ -214,9 +218,10 @@ class TileCounts {
     ++below[range.x1 + 1];
   }
 
-  // Leaves the counts of the wanted tiles, row by row, and zeros for the others.
+  // Replace the corner values by the counts of the wanted tiles, row by row, and zeros for the
+  // others.
   void finish() {
-    uint32_t* out = counts_;  // never ahead of what is read
+    uint32_t* out = counts_;  // Writing never overtakes reading.
     for (int row = 0; row < grid_.rows; ++row) {
       uint32_t sum = 0;
       for (int column = 0; column < grid_.columns; ++column, ++out) {
@@ -234,13 +239,13 @@ class TileCounts {
   uint32_t* counts_;
 };
 
-// f(place of the pair among those of the splat, tile) for the tiles of a range, row by row.
+// Call f(position of the pair among those of the splat, tile) for the tiles of a range, row by row.
 template <class F>
 [[gnu::always_inline]] inline void each_pair(const TileRange& range, int columns, const F& f) {
   uint32_t x = range.x0, tile = range.y0 * columns + range.x0;
   const uint32_t to_next_row = columns - (range.x1 - range.x0);
   const uint32_t pairs = area(range);
-  for (uint32_t pair = 0; pair < pairs; ++pair) {  // one loop: fewer mispredicted branches
+  for (uint32_t pair = 0; pair < pairs; ++pair) {  // A single loop has fewer mispredicted branches.
     f(pair, tile);
     const bool at_end = x == range.x1;
     x = at_end ? range.x0 : x + 1;
@@ -248,7 +253,7 @@ template <class F>
   }
 }
 
-// f(splat, its range) for places [begin, end) of the splats in the order of their depths.
+// Call f(splat, its range) for positions [begin, end) of the splats in the order of their depths.
 template <class F>
 [[gnu::always_inline]] inline void each_by_depth(const VisibleSplats& visible, int64_t begin,
                                                  int64_t end, const F& f) {
@@ -259,7 +264,7 @@ template <class F>
   }
 }
 
-// A counting sort by tile of the splats in depth order.
+// Sort the splats, which are in depth order, by tile (counting sort).
 inline void list_by_tile(const VisibleSplats& visible, const TileGrid& grid, Team& team,
                          TileLists& out) {
   out.columns = grid.columns;

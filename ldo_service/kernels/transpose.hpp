@@ -1,4 +1,4 @@
-// A 16x16 matrix of floats turned about its diagonal, in registers.
+// Transpose of a 16x16 matrix of floats, in registers.
 #pragma once
 #include <utility>
 
@@ -6,7 +6,7 @@
 
 namespace ldo::LDO_ISA {
 
-// The lanes of two registers, of which there are kPerRegister each, in a new order.
+// Return the lanes of two registers, of kPerRegister each, in a new order.
 template <class Pattern, int... Lane>
 FloatRegister shuffle(FloatRegister a, FloatRegister b, std::integer_sequence<int, Lane...>) {
   return __builtin_shufflevector(a, b, Pattern::source(Lane)...);
@@ -16,7 +16,8 @@ FloatRegister shuffle(FloatRegister a, FloatRegister b) {
   return shuffle<Pattern>(a, b, std::make_integer_sequence<int, kPerRegister>());
 }
 
-// In each group of four lanes, a's and b's in turn, pieces of `Width`; from the low or high half.
+// Pattern that alternates pieces of `Width` lanes of a and b in each group of four lanes, from the
+// low or high half.
 template <int Width, bool High>
 struct Interleave {
   static constexpr int source(int lane) {
@@ -26,7 +27,8 @@ struct Interleave {
   }
 };
 
-// Swaps what lies off the diagonal of a 2x2 matrix of pieces of `Width` lanes, rows a and b.
+// Pattern that swaps the off-diagonal pieces of `Width` lanes in a 2x2 matrix of pieces, rows a and
+// b.
 template <int Width, bool Second>
 struct Swap {
   static constexpr int source(int lane) {
@@ -35,7 +37,7 @@ struct Swap {
   }
 };
 
-// Swaps the blocks of Width x Width that lie off the diagonals of blocks twice as large.
+// Swap the off-diagonal blocks of Width x Width in blocks twice as large.
 template <int Width>
 void transpose_blocks(Floats (&rows)[kLanes]) {
   for (int i = 0; i < kLanes; ++i) {
@@ -47,7 +49,7 @@ void transpose_blocks(Floats (&rows)[kLanes]) {
         b.v[k] = shuffle<Swap<Width, true>>(a.v[k], b.v[k]);
         a.v[k] = first;
       });
-    } else {  // whole registers change places
+    } else {  // Whole registers change places.
       constexpr int step = Width / kPerRegister;
       for (int k = 0; k < kRegisters; ++k)
         if (!(k & step)) std::swap(a.v[k + step], b.v[k]);
@@ -55,9 +57,9 @@ void transpose_blocks(Floats (&rows)[kLanes]) {
   }
 }
 
-// rows[i] lane j <-> rows[j] lane i.
+// Swap rows[i] lane j with rows[j] lane i.
 inline void transpose(Floats (&rows)[kLanes]) {
-  for (int i = 0; i < kLanes; i += 4)  // blocks of 4x4
+  for (int i = 0; i < kLanes; i += 4)  // Blocks of 4x4.
     each_register([&](int k) {
       FloatRegister &a = rows[i].v[k], &b = rows[i + 1].v[k], &c = rows[i + 2].v[k],
                     &d = rows[i + 3].v[k];
@@ -74,11 +76,11 @@ inline void transpose(Floats (&rows)[kLanes]) {
   transpose_blocks<8>(rows);
 }
 
-// Sixteen floats in memory. Rows of `Floats` that are found by a number known only at run time lie
-// in these: GCC copies the structs through general registers.
+// Sixteen floats in memory, for rows of `Floats` with indices known only at run time. GCC would
+// copy the structs through general registers.
 using FloatsRow = float[kLanes];
 
-// The columns of `count` rows in memory; missing rows are zero.
+// Transpose `count` rows in memory; missing rows are zero.
 inline void transpose(const FloatsRow* rows, int count, Floats (&columns)[kLanes]) {
   for (int i = 0; i < kLanes; ++i) columns[i] = i < count ? Floats::load(rows[i]) : Floats(0.0f);
   transpose(columns);
