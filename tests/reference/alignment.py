@@ -1,4 +1,4 @@
-"""The normal equations in plain NumPy, float64: the judge of the kernel. See `equations`."""
+"""NumPy reference implementation of `alignment.normal_equations`, in float64."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def normal_equations(
     appearance: BrightnessModel,
     config: ResidualConfig,
 ) -> NormalEquations:
-    """What `equations.normal_equations` computes, to rounding."""
+    """Compute the result of `alignment.normal_equations`, equal up to rounding."""
     points = points.astype(float)
     R, camera = T_camera_reference[:3, :3], target.camera
     p = se3.transform(T_camera_reference, points[:3].T)
@@ -58,7 +58,7 @@ def photometric(
     v: np.ndarray,
     appearance: BrightnessModel,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals [N] and Jacobians [N, 8] of camera points p [N, 3] seen at pixels (u, v)."""
+    """Return residuals [N] and Jacobians [N, 8] of camera points p [N, 3] at pixels (u, v) [N]."""
     intensity, gradient_u, gradient_v = bilinear(target.texels[..., :3], u, v).T
     x, y, z = p.T
     gx, gy = gradient_u * target.camera.fx / z, gradient_v * target.camera.fy / z
@@ -68,19 +68,25 @@ def photometric(
 
 
 def is_unclipped(target: Level, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Whether none of the four pixels around (u, v) [N] is clipped."""
+    """Return where none of the four pixels around (u, v) [N] is clipped, [N] bool."""
     column, row = u.astype(int), v.astype(int)
     around = [target.texels[row + i, column + j, 0] for i in (0, 1) for j in (0, 1)]
     return np.min(around, axis=0) > 0
 
 
 def geometric(p: np.ndarray, n: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals [N] and Jacobians [N, 8]; the normals turn with the reference."""
+    """Return residuals [N] and Jacobians [N, 8]; the normals rotate with the reference.
+
+    Args:
+        p: Points in the camera frame, [N, 3], meters.
+        n: Normals in the camera frame, [N, 3].
+        q: Points of the target at the nearest pixels, [N, 3], meters.
+    """
     return np.sum(n * (p - q), axis=1), np.column_stack([np.cross(n, q), -n, np.zeros((len(p), 2))])
 
 
 def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Samples [N, C] of an image [H, W, C] at pixel coordinates u, v [N]."""
+    """Sample an image [H, W, C] at pixel coordinates u, v [N]; return [N, C]."""
     column, row = u.astype(int), v.astype(int)
     du, dv = (u - column)[:, None], (v - row)[:, None]
     upper = (1 - du) * image[row, column] + du * image[row, column + 1]
@@ -91,6 +97,7 @@ def bilinear(image: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def _weighted(
     r: np.ndarray, J: np.ndarray, sigma: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, ResidualStatistics]:
+    """Return the Hessian, the gradient and the statistics of robustly weighted residuals."""
     squares = (r / sigma) ** 2
     weights = (DEGREES_OF_FREEDOM + 1) / (DEGREES_OF_FREEDOM + squares)
     scaled = J * (weights / sigma**2)[:, None]

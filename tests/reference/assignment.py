@@ -1,4 +1,4 @@
-"""The plain twin of `assignment.assign`, in float64, for boxes and for masks as they are."""
+"""NumPy reference implementation of `assign_gaussians`, in float64, for boxes and masks."""
 
 from collections.abc import Sequence
 
@@ -20,7 +20,18 @@ def assign_reference(
     masks: Sequence[np.ndarray] | None,
     config: AssignmentConfig,
 ) -> Assignment:
-    """Of all rows; `masks` [H, W] bool, one a box, or None."""
+    """Match all rows with regions.
+
+    Args:
+        rows: Gaussians of the map, [N, 16].
+        camera: Camera of the depth image.
+        T_camera_map: Transform from the map to the camera, [4, 4].
+        depth_m: Depth, [H, W], meters; 0 where not measured.
+        boxes: Boxes x0 y0 x1 y1, [M, 4], pixels.
+        scores: Scores of the boxes, [M].
+        masks: One mask [H, W] bool per box; None assigns by the boxes.
+        config: Rule and thresholds.
+    """
     means, covariances, z = project(rows.astype(float), camera, T_camera_map)
     half = 2 * np.sqrt(covariances[:, [0, 1], [0, 1]])
     far = np.array([camera.width, camera.height]) - 0.5
@@ -40,6 +51,7 @@ def assign_reference(
 def _expected(
     means: np.ndarray, z: np.ndarray, depth_m: np.ndarray, config: AssignmentConfig
 ) -> np.ndarray:
+    """Return the Gaussians [N] bool in the image and on the surface measured there."""
     height, width = depth_m.shape
     inside = np.all((means >= -0.5) & (means < [width - 0.5, height - 0.5]), axis=1) & (z >= 0.05)
     column, row = np.floor(np.where(inside[:, None], means, 0) + 0.5).astype(int).T
@@ -55,6 +67,7 @@ def _overlap(
     mask: np.ndarray | None,
     rule: str,
 ) -> float:
+    """Return the overlap of the splat box `low`..`high` with a region, by the rule."""
     if mask is None:
         holds = bool(np.all(center >= box[:2]) and np.all(center < box[2:]))
         shared = np.prod(np.maximum(np.minimum(high, box[2:]) - np.maximum(low, box[:2]), 0))

@@ -1,4 +1,4 @@
-"""The plain twin of `consistency.agree`."""
+"""NumPy reference implementation of `smooth_labels`."""
 
 from itertools import product
 
@@ -19,7 +19,7 @@ STEPS = sorted(product((-1, 0, 1), repeat=3), key=lambda s: (sum(x * x for x in 
 def agree_reference(
     rows: np.ndarray, labels: np.ndarray, indices: np.ndarray, config: ConsistencyConfig
 ) -> tuple[np.ndarray, Disagreement]:
-    """The distributions [V, 256] after the step, dense, and the disagreement before it."""
+    """Return the dense distributions [V, 256] after the step, and the disagreement before it."""
     means = rows[indices, :3].astype(float)
     p = distribution(labels[indices], MAX_LABELS).astype(float)
     top = top_labels(labels[indices])
@@ -42,7 +42,7 @@ def agree_reference(
 
 
 def neighborhood(members: dict[tuple[int, ...], list[int]], voxel: tuple[int, ...]) -> list[int]:
-    """Up to MOST Gaussians that stand for what is around a voxel."""
+    """Return at most MOST Gaussians as a sample of the neighborhood of a voxel."""
     own, *others = (members.get(tuple(np.add(voxel, step)), []) for step in STEPS)
     out = own[:SAME_VOXEL]
     for turn in range(max(map(len, others), default=0)):

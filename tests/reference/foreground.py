@@ -1,4 +1,4 @@
-"""The plain twin of `foreground.surfaces` and `foreground.foreground`, by OpenCV."""
+"""OpenCV reference implementation of `foreground.surfaces` and `foreground.foreground`."""
 
 from math import exp
 
@@ -8,14 +8,15 @@ import numpy as np
 from ldo_service.geometry import Camera
 from ldo_service.regions.foreground import Foreground, ForegroundConfig, SmoothSurfaces, pixels_of
 
-BLUR_PX = 1.5  # before normals are taken: `kernels/smoothness.hpp` says why
+# Blur before normals are computed; `kernels/smoothness.hpp` gives the reason.
+BLUR_PX = 1.5
 _3X3 = np.ones((3, 3), np.uint8)
 
 
 def surfaces_reference(
     depth_m: np.ndarray, camera: Camera, config: ForegroundConfig
 ) -> SmoothSurfaces:
-    """Pieces of depth [H, W] without steps and creases, connected by their sides."""
+    """Find pieces of depth [H, W] without steps and creases, connected by the sides of pixels."""
     inverse = _inverse(depth_m)
     low, high = cv2.erode(inverse, _3X3), cv2.dilate(inverse, _3X3)
     smooth = (low > 0) & (high < (1 + config.max_step) * low)
@@ -35,7 +36,10 @@ def foreground_reference(
     camera: Camera,
     config: ForegroundConfig,
 ) -> Foreground:
-    """What is at the depth of the middle, on surfaces that mostly lie in the box x0 y0 x1 y1."""
+    """Find the object in a box x0 y0 x1 y1, in pixels.
+
+    The object is at the depth of the middle of the box, on surfaces that lie mostly inside it.
+    """
     rows, columns = pixels_of(box, depth_m.shape)
     depth, labels = depth_m[rows, columns], found.labels[rows, columns]
     nothing = Foreground(rows.start, columns.start, np.zeros(depth.shape, bool))
@@ -50,7 +54,9 @@ def foreground_reference(
 
 
 def mode_of(depth_m: np.ndarray, bin_share: float) -> float:
-    """The commonest depth, in bins of a share of it, each smoothed with its neighbours; 0 of none.
+    """Compute the mode of depths; 0 if no depth is measured.
+
+    The width of a bin is a fraction of its depth, and each bin is smoothed with its neighbors.
 
     >>> round(mode_of(np.array([0.0, 2.0, 2.01, 2.02, 5.0]), 0.05), 1)
     2.0
@@ -64,13 +70,16 @@ def mode_of(depth_m: np.ndarray, bin_share: float) -> float:
 
 
 def _inverse(depth_m: np.ndarray) -> np.ndarray:
-    """1 / depth, float32, 0 where it is missing."""
+    """Return 1 / depth as float32, 0 where depth is missing."""
     one = np.float32(1)
     return np.where(depth_m > 0, one / np.maximum(depth_m, np.float32(1e-6)), np.float32(0))
 
 
 def _normals(inverse: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
-    """Images [H, W] float32 of x, y, z: plane n . p = d through 5x5 pixels, 1 / z = n . ray / d."""
+    """Compute unit normals as images [H, W] float32 of x, y and z.
+
+    Each is the normal of the plane n . p = d through 5x5 pixels, fitted as 1 / z = n . ray / d.
+    """
     n_x = cv2.Sobel(inverse, cv2.CV_32F, 1, 0, ksize=5, scale=camera.fx / 128)
     n_y = cv2.Sobel(inverse, cv2.CV_32F, 0, 1, ksize=5, scale=camera.fy / 128)
     u, v = np.arange(camera.width), np.arange(camera.height)[:, None]
@@ -82,13 +91,15 @@ def _normals(inverse: np.ndarray, camera: Camera) -> tuple[np.ndarray, ...]:
 
 
 def _inside(labels: np.ndarray, sizes: np.ndarray, share: float) -> np.ndarray:
+    """Return where pixels lie on edges or on surfaces mostly inside the box, [h, w] bool."""
     here = np.bincount(labels.ravel(), minlength=len(sizes))
     is_inside = here >= share * sizes
-    is_inside[0] = True  # edges belong to what they are edges of
+    is_inside[0] = True  # Edges belong to the adjacent object.
     return is_inside[labels]
 
 
 def _middle(shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Return the rows and columns of the middle half."""
     height, width = shape
     return slice(height // 4, height - height // 4), slice(width // 4, width - width // 4)
 
@@ -96,7 +107,10 @@ def _middle(shape: tuple[int, ...]) -> tuple[slice, slice]:
 def _grown_from_middle(
     belongs: np.ndarray, depth: np.ndarray, mode_m: float, config: ForegroundConfig
 ) -> np.ndarray | None:
-    """Of what belongs: what hangs together with a tenth or more of the pixels about the mode."""
+    """Return the parts of `belongs` with at least a tenth of the near-mode pixels, grown.
+
+    None means that no pixel in the middle is near the mode.
+    """
     inverse = _inverse(depth)
     joined = cv2.dilate(inverse, _3X3) <= (1 + config.max_gap) * cv2.erode(inverse, _3X3)
     core = belongs & joined

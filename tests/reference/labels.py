@@ -1,4 +1,4 @@
-"""The plain twins of `labels.observe`: as the kernel does it, and dense, which forgets nothing."""
+"""Reference implementations of `gaussian_labels.observe`: with slots, and with every label."""
 
 from math import exp, log
 
@@ -16,7 +16,7 @@ from ldo_service.semantics.gaussian_labels import (
 
 
 def observe_reference(labels: np.ndarray, seen: Observations, config: LabelConfig) -> None:
-    """What `labels.observe` does, to rounding."""
+    """Update labels like `gaussian_labels.observe`, equal up to rounding."""
     rows = fields(labels)
     columns = (seen.indices, seen.labels, seen.confidences, seen.extents_m)
     for i, label, confidence, extent_m in zip(*columns, strict=True):
@@ -33,7 +33,7 @@ def observe_reference(labels: np.ndarray, seen: Observations, config: LabelConfi
 def observe_dense(
     p: np.ndarray, labels: np.ndarray, seen: Observations, config: LabelConfig
 ) -> None:
-    """The same on distributions [N, C] that keep every label; `labels` has the other fields."""
+    """Update distributions [N, C] that keep every label; `labels` holds the other fields."""
     rows = fields(labels)
     columns = (seen.indices, seen.labels, seen.confidences, seen.extents_m)
     for i, label, confidence, extent_m in zip(*columns, strict=True):
@@ -48,6 +48,7 @@ def observe_dense(
 
 
 def _dense_entropy(p: dict[int, float]) -> float:
+    """Compute the entropy in nats of labels `p` and background, which has the rest."""
     rest = 1 - sum(p.values())
     return -sum(w * log(w) for w in (*p.values(), rest) if w > 0)
 
@@ -61,7 +62,7 @@ def _step(
     extent_m: float,
     config: LabelConfig,
 ) -> float:
-    """a of p <- (1 - a) p + a onehot, and the evidence after it."""
+    """Return the step a of p <- (1 - a) p + a onehot, and update the evidence of `row`."""
     if label < MISS or (label == MISS and config.ema == "paper"):
         return 0.0
     held = 1 - config.hold_back * exp(-2 * entropy) * (1 - confidence) if has_label else 1.0
@@ -76,6 +77,7 @@ def _step(
 
 
 def _count(row: np.ndarray, label: int, extent_m: float, config: LabelConfig) -> None:
+    """Update the misses and the extent of `row`."""
     if label > MISS:
         row["misses"], row["extent_mm"] = 0, min(int(np.float32(1000) * extent_m), 65535)
     elif label == MISS:
@@ -85,7 +87,10 @@ def _count(row: np.ndarray, label: int, extent_m: float, config: LabelConfig) ->
 
 
 def _kept(p: dict[int, float], newest: int) -> dict[int, float]:
-    """At most SLOTS labels: the lightest, of equals the newest, give their weight to `other`."""
+    """Keep at most SLOTS labels.
+
+    The lightest labels give their weight to `other`; of equal weights the newest label does.
+    """
     if len(p) <= SLOTS:
         return p
     p = dict(p)
@@ -96,5 +101,6 @@ def _kept(p: dict[int, float], newest: int) -> dict[int, float]:
 
 
 def _write(row: np.ndarray, p: dict[int, float]) -> None:
+    """Write the labels `p` to the slots of `row`, heaviest first."""
     heaviest = sorted(p.items(), key=lambda item: -item[1]) + [(BACKGROUND, 0.0)] * SLOTS
     row["ids"], row["weights"] = zip(*heaviest[:SLOTS], strict=True)

@@ -1,4 +1,4 @@
-"""The plain twin of `image_loss`, which `autograd` differentiates."""
+"""NumPy reference implementation of `image_loss`, which `autograd` can differentiate."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ WINDOW = WINDOW / WINDOW.sum()
 
 
 def windowed_mean(image: Any, xp: Any = np) -> Any:
-    """Image [H, W, C] under the 11x11 Gaussian window, zero beyond its edges."""
+    """Filter an image [H, W, C] with the 11x11 Gaussian window; it is zero beyond its edges."""
     for axis in (0, 1):
         length = image.shape[axis]
         padding = [(5, 5) if k == axis else (0, 0) for k in range(3)]
@@ -20,7 +20,7 @@ def windowed_mean(image: Any, xp: Any = np) -> Any:
 
 
 def ssim(a: Any, b: Any, xp: Any = np) -> Any:
-    """Structural similarity [H, W, C] of images in 0..1 (Wang et al. 2004)."""
+    """Compute the structural similarity [H, W, C] of images in 0..1 (Wang et al. 2004)."""
     c1, c2 = 0.01**2, 0.03**2
     mean_a, mean_b = windowed_mean(a, xp), windowed_mean(b, xp)
     variance_a = windowed_mean(a * a, xp) - mean_a**2
@@ -39,8 +39,17 @@ def loss_reference(
     weights: tuple[float, float, float],
     xp: Any = np,
 ) -> Any:
-    """As `image_loss`, with weights (l1, d_ssim, depth), mask [H, W] of 0 and 1, and the frame's
-    colour planes [3, H, W] in 0..1."""
+    """Compute the total loss of `image_loss`.
+
+    Args:
+        planes: Red, green, blue, weighted depth and opacity, [5, H, W].
+        exposure: Gains and biases of the three channels, [2, 3].
+        color: Color planes of the frame, [3, H, W], 0..1.
+        depth_m: Depth of the frame, [H, W], meters; 0 where not measured.
+        mask: Pixels that count, [H, W], 0 or 1.
+        weights: Weights of L1, D-SSIM and depth.
+        xp: Array module, `numpy` or `autograd.numpy`.
+    """
     rendered = xp.transpose(planes[:3], (1, 2, 0)) * exposure[0] + exposure[1]
     rendered = rendered * mask[..., None]
     target = color.transpose(1, 2, 0) * mask[..., None]

@@ -1,7 +1,7 @@
-"""The plain twin of `render`: every Gaussian in every pixel, in one screenful of array code.
+"""NumPy reference implementation of `render`, with every Gaussian in every pixel.
 
-Slow and memory hungry (H W N), meant for small scenes in tests. It assigns to no array, and takes
-the array module as `xp`, so that `autograd.numpy` differentiates it.
+It is slow, needs memory for H W N values, and is meant for small scenes in tests. It assigns to no
+array and takes the array module as `xp`, so that `autograd.numpy` can differentiate it.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from ldo_service.geometry import Camera
 
 
 def rotations(quats: Any, xp: Any = np) -> Any:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz of any length."""
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4] wxyz of any length."""
     w, x, y, z = (quats / xp.sqrt(xp.sum(quats**2, axis=1, keepdims=True))).T
     return xp.stack(
         [
@@ -26,7 +26,7 @@ def rotations(quats: Any, xp: Any = np) -> Any:
 
 
 def project(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np) -> tuple[Any, Any, Any]:
-    """Image means [N, 2], image covariances [N, 2, 2] in px^2, and depths [N] in metres."""
+    """Compute image means [N, 2], image covariances [N, 2, 2] in px^2, and depths [N] in meters."""
     R, t = T_camera_map[:3, :3], T_camera_map[:3, 3]
     p = rows[:, :3] @ R.T + t
     z = xp.maximum(p[:, 2], 0.05)
@@ -56,7 +56,7 @@ def project(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np) -> tuple
 
 
 def render_reference(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np) -> Rendering:
-    """As `render`, in the precision of `rows`, and without its early stop at T < 1e-4."""
+    """Render like `render`, in the precision of `rows`, without the early stop at T < 1e-4."""
     means, covariances, z = project(rows, camera, T_camera_map, xp)
     order = np.argsort(z, kind="stable")
     order = order[z[order] >= 0.05]
@@ -64,12 +64,12 @@ def render_reference(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np)
     opacities, colors = 1 / (1 + xp.exp(-rows[order, 10])), rows[order, 11:14]
 
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    d = xp.stack([u, v], -1)[..., None, :] - means  # [H, W, N, 2]
+    d = xp.stack([u, v], -1)[..., None, :] - means  # [H, W, N, 2].
     q = xp.einsum("hwni,nij,hwnj->hwn", d, xp.linalg.inv(covariances), d)
     alpha = xp.minimum(opacities * xp.exp(-0.5 * q), 0.99)
     alpha = xp.where(alpha >= 1 / 255, alpha, 0.0)
     log_pass = xp.log(1 - alpha)
-    after = xp.cumsum(log_pass, axis=2)  # log transmittance behind each Gaussian
+    after = xp.cumsum(log_pass, axis=2)  # Log transmittance behind each Gaussian.
     weights = alpha * xp.exp(after - log_pass)
 
     behind_half = np.concatenate([after < np.log(0.5), np.ones_like(u[..., None], bool)], axis=2)
@@ -80,7 +80,7 @@ def render_reference(rows: Any, camera: Camera, T_camera_map: Any, xp: Any = np)
 
 
 def contributions_reference(weights: np.ndarray, order: np.ndarray) -> Contributions:
-    """From weights [H, W, N] of Gaussians near to far, which are rows `order` [N]."""
+    """Compute contributions from weights [H, W, N] of the rows `order` [N], near to far."""
     nobody = np.full((*weights.shape[:2], 1), np.finfo(weights.dtype).tiny)
     top = np.append(order, -1)[np.argmax(np.concatenate([weights, nobody], axis=2), axis=2)]
     by_row = np.zeros(max(order, default=-1) + 1)
