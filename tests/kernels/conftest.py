@@ -1,4 +1,4 @@
-"""Kernels in processes of their own, once per instruction set that this machine has."""
+"""Fixture that runs kernels in separate processes, once per instruction set of this machine."""
 
 import os
 import subprocess
@@ -23,7 +23,7 @@ np.savez(sys.argv[2], **result)
 def with_isa(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Callable[[str, Arrays], Arrays]:
-    """Runs Python lines that fill `result` from `given`, both dicts of arrays."""
+    """Return a function that runs Python lines, which fill `result` from `given`."""
 
     def run(body: str, given: Arrays) -> Arrays:
         folder: Path = tmp_path_factory.mktemp(request.param)

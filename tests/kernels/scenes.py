@@ -1,4 +1,4 @@
-"""Gaussians at random before a camera that is off its middle."""
+"""Scenes of random Gaussians, and a camera with its principal point off the middle."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ def camera_of(width: int, height: int) -> Camera:
 
 
 def gaussians(n: int, seed: int, *, depth_m: tuple[float, float] = (0.5, 4.0)) -> np.ndarray:
-    """Rows in front of the origin, a third of them beyond the edges of the image."""
+    """Return rows in front of the origin, a third of them beyond the edges of the image."""
     rng = np.random.default_rng(seed)
     z = rng.uniform(*depth_m, n)
     rows = np.zeros((n, 16), np.float32)

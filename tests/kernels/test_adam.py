@@ -1,4 +1,4 @@
-"""The Adam kernel against ten plain lines."""
+"""Tests of the Adam kernel against a NumPy implementation of ten lines."""
 
 from collections.abc import Callable
 
@@ -20,7 +20,7 @@ for k in range(6):
 
 
 def adam_reference(state: dict, which: np.ndarray, gradients: np.ndarray) -> None:
-    """Kingma and Ba 2015, algorithm 1, in float64 on the rows with any gradient."""
+    """Apply Kingma and Ba 2015, algorithm 1, in float64 to the rows with any gradient."""
     which, g = which[gradients.any(axis=1)], gradients[gradients.any(axis=1)].astype(float)
     state["steps"][which] += 1
     t = state["steps"][which, None]
@@ -31,6 +31,7 @@ def adam_reference(state: dict, which: np.ndarray, gradients: np.ndarray) -> Non
 
 
 def state_of(n: int) -> dict[str, np.ndarray]:
+    """Return the state of n random rows before their first step."""
     rng = np.random.default_rng(0)
     zeros = np.zeros((n, 16), np.float32)
     rows = rng.normal(size=(n, 16)).astype(np.float32)
@@ -38,7 +39,7 @@ def state_of(n: int) -> dict[str, np.ndarray]:
 
 
 def gradients_of(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of about half of n rows, a tenth of which have none."""
+    """Return gradients of about half of n rows; a tenth of these gradients are zero."""
     rng = np.random.default_rng(seed)
     which = np.flatnonzero(rng.uniform(size=n) < 0.5).astype(np.uint32)
     gradients = rng.normal(size=(len(which), 16)).astype(np.float32)

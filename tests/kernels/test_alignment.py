@@ -1,4 +1,4 @@
-"""The bindings: values against NumPy, and what they refuse."""
+"""Tests of the alignment kernels: values against NumPy, and rejected arguments."""
 
 import os
 import subprocess
@@ -24,7 +24,7 @@ SCALARS = {
 
 
 def problem() -> dict:
-    """A slanted, textured plane and a camera that moved a little."""
+    """Return the arguments of a slanted, textured plane and a camera that moved slightly."""
     v, u = np.mgrid[:48, :64].astype(np.float32)
     depth_m = (2.0 + 0.004 * u + 0.006 * v).astype(np.float32)
     image = (120 + 60 * np.sin(0.3 * u) * np.cos(0.2 * v)).astype(np.float32)
@@ -199,6 +199,7 @@ def test_arrays_of_another_layout_are_not_converted_in_silence(image: np.ndarray
 
 
 def run_with(isa: str, program: str) -> subprocess.CompletedProcess[str]:
+    """Run a Python program with a forced instruction set."""
     return subprocess.run(
         [sys.executable, "-c", program],
         env={**os.environ, "LDO_ISA": isa},

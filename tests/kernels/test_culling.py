@@ -1,4 +1,4 @@
-"""Rows out of view are not read, and nothing else changes by a bit."""
+"""Tests that culling skips rows out of view and leaves the images bitwise equal."""
 
 from collections.abc import Callable
 
@@ -25,7 +25,7 @@ for k, T in enumerate(given["poses"]):
 
 
 def patches(n: int, seed: int = 0) -> np.ndarray:
-    """Rows in runs that are small in space, all around the origin; a few of them are large."""
+    """Return rows in spatially small runs around the origin; a few rows are large."""
     rng = np.random.default_rng(seed)
     center = rng.normal(size=(n // 100 + 1, 3)) * 2
     rows = np.zeros((n, 16), np.float32)
@@ -39,11 +39,13 @@ def patches(n: int, seed: int = 0) -> np.ndarray:
 
 
 def poses(n: int, seed: int = 1) -> np.ndarray:
+    """Return random transforms [n, 4, 4]."""
     rng = np.random.default_rng(seed)
     return np.stack([se3.exp(xi) for xi in rng.normal(size=(n, 6))])
 
 
 def assert_same_images(rows: np.ndarray, bounds: _rasterize.Bounds, T: np.ndarray) -> None:
+    """Check that the images with and without bounds are bitwise equal."""
     with_bounds, without = render(rows, CAMERA, T, bounds=bounds), render(rows, CAMERA, T)
     for name in ("color", "weighted_depth_m", "median_depth_m", "opacity"):
         assert getattr(with_bounds, name).tobytes() == getattr(without, name).tobytes(), name
@@ -57,7 +59,7 @@ def test_culling_changes_no_bit_of_the_images(with_isa: Callable) -> None:
 
 @pytest.mark.parametrize("edge", range(4))
 def test_gaussian_that_slides_out_of_view_is_drawn_as_long_as_a_pixel_shows_it(edge: int) -> None:
-    """The bound is tight: it lets go a little after the image does, and never before."""
+    """Check that the bound excludes the block soon after the image does, and never before."""
     axis, sign = divmod(edge, 2)
     drawn, read = [], []
     for step in np.linspace(0, 3, 150):
@@ -67,7 +69,8 @@ def test_gaussian_that_slides_out_of_view_is_drawn_as_long_as_a_pixel_shows_it(e
         bounds = _rasterize.Bounds()
         render(rows, CAMERA, np.eye(4), bounds=bounds)
         drawn.append(render(rows, CAMERA, np.eye(4)).opacity.any())
-        rows[:] = 0, 0, 2, *[np.log(0.05)] * 3, 1, 0, 0, 0, 9, 1, 1, 1, 0, 0  # behind its back
+        # The bounds are not notified.
+        rows[:] = 0, 0, 2, *[np.log(0.05)] * 3, 1, 0, 0, 0, 9, 1, 1, 1, 0, 0
         read.append(render(rows, CAMERA, np.eye(4), bounds=bounds).opacity.any())
     assert all(r for d, r in zip(drawn, read, strict=True) if d)
     assert 0 < sum(drawn) <= sum(read) < sum(drawn) + 20
@@ -78,7 +81,7 @@ def test_gradients_are_the_same_with_culling() -> None:
     by_planes = np.random.default_rng(2).normal(size=(5, 40, 52)).astype(np.float32)
     bounds = _rasterize.Bounds()
     both = []
-    for given in (None, bounds, bounds):  # the last with known bounds
+    for given in (None, bounds, bounds):  # The last uses known bounds.
         rasterizer = Rasterizer()
         rasterizer.render(rows, CAMERA, T, bounds=given)
         both.append(rasterizer.gradients(by_planes))
@@ -89,6 +92,7 @@ def test_gradients_are_the_same_with_culling() -> None:
 
 
 def map_of(n: int) -> GaussianMap:
+    """Return a map of n rows from five keyframes."""
     gaussians = GaussianMap(capacity=2 * n)
     for keyframe, part in enumerate(np.array_split(patches(n), 5)):
         gaussians.add(part, keyframe)
@@ -114,7 +118,7 @@ CHANGES: dict[str, Callable[[GaussianMap], object]] = {
 @pytest.mark.parametrize("change", CHANGES)
 def test_whatever_happens_to_the_map_is_seen(change: str) -> None:
     gaussians, views = map_of(5_000), poses(12, 8)
-    for T in views:  # every bound is known before the change
+    for T in views:  # Every bound is known before the change.
         assert_same_images(gaussians.rows, gaussians.bounds, T)
     CHANGES[change](gaussians)
     for T in views:
@@ -141,7 +145,7 @@ def test_blocks_out_of_view_are_not_read() -> None:
     rows, bounds = patches(4 * BLOCK), _rasterize.Bounds()
     rows[:BLOCK, :3], rows[:BLOCK, 3:6] = (0, 0, -5), np.log(0.01)
     before = render(rows, CAMERA, np.eye(4), bounds=bounds)
-    rows[:BLOCK, :3] = (0, 0, 1)  # nobody is told
+    rows[:BLOCK, :3] = (0, 0, 1)  # The bounds are not notified.
     after = render(rows, CAMERA, np.eye(4), bounds=bounds)
     assert before.opacity.tobytes() == after.opacity.tobytes()
     bounds.forget(10, 11)

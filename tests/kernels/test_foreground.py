@@ -1,4 +1,4 @@
-"""Surfaces and foregrounds against their plain twins, with every instruction set."""
+"""Tests of surfaces and foregrounds against the reference, with every instruction set."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ from ldo_service.regions.foreground import ForegroundConfig, SmoothSurfaces
 from tests.reference.foreground import foreground_reference, surfaces_reference
 
 CONFIG = ForegroundConfig()
-# whole vectors and words, cut ones, and sides below the nine pixels that a normal's pair reads
+# Whole and partial vectors and words, and sides below the nine pixels that a pair of normals reads.
 SIZES = ((120, 160), (64, 128), (97, 131), (9, 70), (33, 5), (4, 4), (3, 8), (2, 17), (1, 40))
 SIZES += ((40, 1), (1, 1))
 COMPARE_ALL = """
@@ -35,8 +35,10 @@ def camera(height: int, width: int) -> Camera:
 
 
 def scene(height: int, width: int) -> np.ndarray:
-    """A slanted wall with a crease and boxes before it: noise on the left, holes and what is no
-    depth on the right."""
+    """Return depth of a slanted wall with a crease and boxes in front of it.
+
+    The left has noise; the right has holes and invalid values.
+    """
     rng = np.random.default_rng(height * width)
     v, u = np.indices((height, width))
     depth_m = 2.5 + 0.8 * np.abs(u / width - 0.4) + 0.3 * v / height
@@ -51,7 +53,7 @@ def scene(height: int, width: int) -> np.ndarray:
 
 
 def boxes(height: int, width: int) -> np.ndarray:
-    """Some within the image, some across its border, one around it, one beside it."""
+    """Return boxes within the image, across its border, around it and next to it."""
     rng = np.random.default_rng(width)
     low = rng.uniform(-0.2, 0.8, (12, 2)) * [width, height]
     some = np.concatenate([low, low + rng.uniform(0.1, 0.6, (12, 2)) * [width, height]], axis=1)
@@ -60,12 +62,14 @@ def boxes(height: int, width: int) -> np.ndarray:
 
 
 def plain(height: int, width: int) -> tuple[np.ndarray, SmoothSurfaces]:
+    """Return the depth of the scene and its surfaces by the reference."""
     depth_m = scene(height, width)
     return depth_m, surfaces_reference(depth_m, camera(height, width), CONFIG)
 
 
 @pytest.fixture(scope="module")
 def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
+    """Return labels, sizes and masks of every scene by the kernels."""
     given = {}
     for size in SIZES:
         name, (depth_m, found) = "{}x{}".format(*size), plain(*size)
@@ -78,7 +82,8 @@ def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
 def test_surfaces_are_those_of_the_plain_twin(size: tuple[int, int], by_kernel: dict) -> None:
     _, wanted = plain(*size)
     labels = by_kernel["{}x{}/labels".format(*size)]
-    differ = (labels > 0) != (wanted.labels > 0)  # by rounding, where a cosine is at its threshold
+    # Rounding decides where a cosine is at its threshold.
+    differ = (labels > 0) != (wanted.labels > 0)
     assert np.count_nonzero(differ) <= 1e-4 * differ.size
     if not differ.any():
         np.testing.assert_array_equal(labels, wanted.labels)
@@ -105,7 +110,7 @@ def test_foregrounds_are_those_of_the_plain_twin(size: tuple[int, int], by_kerne
 
 
 def test_scenes_have_steps_creases_holes_and_things() -> None:
-    """So that the comparisons above compare something."""
+    """Check that the scenes make the comparisons above meaningful."""
     depth_m, found = plain(97, 131)
     assert len(found.sizes) > 8
     assert 0.2 < np.mean(found.labels > 0) < 0.9
@@ -118,8 +123,10 @@ def test_scenes_have_steps_creases_holes_and_things() -> None:
 
 
 def test_pieces_hang_together_by_sides_alone_however_they_wind() -> None:
-    """Blocks of depth in a labyrinth without any: of a block its middle, and what joins it to the
-    next, are smooth."""
+    """Check a labyrinth of blocks with depth.
+
+    The middle of a block, and the pixels that connect it to the next, are smooth.
+    """
     labyrinth = np.random.default_rng(0).random((40, 60)) < 0.6
     depth_m = np.kron(labyrinth, np.ones((3, 3))).astype(np.float32)
     labels = np.empty(depth_m.shape, np.int32)
@@ -131,6 +138,7 @@ def test_pieces_hang_together_by_sides_alone_however_they_wind() -> None:
 
 
 def given_to_foreground(**changes: object) -> tuple:
+    """Return valid arguments of `_foreground.foreground`, in order, with some changed."""
     depth_m, labels = np.ones((20, 30), np.float32), np.zeros((20, 30), np.int32)
     told = {
         "depth_m": depth_m,
@@ -197,7 +205,7 @@ def test_what_does_not_fit_a_depth_image_is_refused(changes: dict, message: str)
 def test_a_mask_is_written_whole() -> None:
     told = given_to_foreground()
     _foreground.foreground(*told)
-    assert told[-1].all()  # all is at one depth, on edges
+    assert told[-1].all()  # The depth is constant, and all pixels are on edges.
     nothing = given_to_foreground(depth_m=np.zeros((20, 30), np.float32))
     _foreground.foreground(*nothing)
     assert not nothing[-1].any()

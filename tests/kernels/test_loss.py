@@ -1,4 +1,4 @@
-"""The loss kernel against its plain twin and that one's derivative."""
+"""Tests of the loss kernel against the reference and its derivative."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,8 @@ from ldo_service.kernels import _loss
 from tests.reference.loss import loss_reference, ssim
 
 WEIGHTS = (0.8, 0.2, 0.7)
-SIZES = ((23, 37), (48, 64), (5, 3), (250, 17), (1, 1))  # below a window, across a band
+# Some are smaller than a window, one is taller than a band.
+SIZES = ((23, 37), (48, 64), (5, 3), (250, 17), (1, 1))
 COMPARE_ALL = """
 from ldo_service.kernels import _loss
 for name in {key.split("/")[0] for key in given}:
@@ -24,6 +25,7 @@ for name in {key.split("/")[0] for key in given}:
 
 
 def scene(height: int, width: int) -> dict[str, np.ndarray]:
+    """Return random arguments of the loss."""
     rng = np.random.default_rng(height)
     depth_m = rng.uniform(0, 1, (height, width)).astype(np.float32)
     return {
@@ -36,12 +38,14 @@ def scene(height: int, width: int) -> dict[str, np.ndarray]:
 
 
 def twin(planes: np.ndarray, exposure: np.ndarray, given: dict) -> float:
+    """Compute the loss by the reference, in a form that `autograd` can differentiate."""
     color, mask = given["color"] / 255, given["mask"].astype(float)
     return loss_reference(planes, exposure, color, given["depth_m"], mask, WEIGHTS, anp)
 
 
 @pytest.fixture(scope="module")
 def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
+    """Return terms and derivatives of every scene by the kernel."""
     given = {f"{h}x{w}/{k}": v for h, w in SIZES for k, v in scene(h, w).items()}
     return with_isa(COMPARE_ALL, given)
 
@@ -60,6 +64,7 @@ def test_kernel_agrees_with_its_plain_twin_and_its_derivative(
 
 
 def loss_of(given: dict, **changes: object) -> tuple[float, np.ndarray]:
+    """Return the total loss of a scene, with some arguments changed, and its derivatives."""
     given = given | changes
     by_planes = np.zeros_like(given["planes"])
     loss = image_loss(

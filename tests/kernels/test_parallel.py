@@ -1,4 +1,4 @@
-"""The threads of the kernels: who may call at once, and what becomes of them between calls."""
+"""Tests of the kernels' threads: concurrent calls, and their state between calls."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ from ldo_service.geometry import se3
 CAMERA = bench_camera(96, 64)
 ROWS = walls(5000, CAMERA)
 
-# What the programs below begin with.
+# Beginning of the programs below.
 PROGRAM = """
 import os, threading, time
 from pathlib import Path
@@ -33,7 +33,7 @@ def tasks():
 
 
 def run(body: str) -> None:
-    """Runs Python lines in a process of their own, which must end well and in silence."""
+    """Run Python lines in a separate process, which must exit with 0 and print no error."""
     done = subprocess.run(
         [sys.executable, "-W", "error", "-W", "ignore::DeprecationWarning", "-c", PROGRAM + body],
         capture_output=True,
@@ -43,6 +43,7 @@ def run(body: str) -> None:
 
 
 def planes_of(threads: int, step: int) -> bytes:
+    """Render the scene from one of several poses and return the bytes of the planes."""
     T_camera_map = se3.exp([0, 0.02 * step, 0, 0, 0, 0])
     return Rasterizer(threads=threads).render(ROWS, CAMERA, T_camera_map).tobytes()
 

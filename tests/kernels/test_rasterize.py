@@ -1,4 +1,4 @@
-"""The kernel against its plain twin, with every instruction set that this machine has."""
+"""Tests of the rasterizer against the reference, with every instruction set of this machine."""
 
 import os
 import subprocess
@@ -40,12 +40,14 @@ np.savez(sys.argv[2], isa=_rasterize.isa(), **images)
 
 
 def ties() -> np.ndarray:
+    """Return rows at only three different depths."""
     rows = gaussians(120, 2)
     rows[:, 2] = np.random.default_rng(2).integers(1, 4, len(rows))
     return rows
 
 
 def turned() -> np.ndarray:
+    """Return the transform of a rotated and translated camera."""
     return se3.exp(np.array([0.2, -0.3, 0.1, 0.1, -0.2, 0.3]))
 
 
@@ -65,6 +67,7 @@ SETS = ("baseline", "avx2", "avx512")
 
 @pytest.fixture(scope="module")
 def by_reference() -> dict[str, Rendering]:
+    """Return the rendering of every scene by the reference."""
     return {
         name: render_reference(rows.astype(float), camera, T.astype(np.float32).astype(float))
         for name, (rows, camera, T) in SCENES.items()
@@ -73,6 +76,7 @@ def by_reference() -> dict[str, Rendering]:
 
 @pytest.fixture(scope="module", params=SETS)
 def by_kernel(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict:
+    """Return the images and contributions of every scene by the kernel."""
     folder = tmp_path_factory.mktemp(request.param)
     arrays = {}
     for name, (rows, c, T) in SCENES.items():
@@ -89,6 +93,7 @@ def by_kernel(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathF
 
 
 def run_with(forced: str, program: str, *arguments: Path) -> subprocess.CompletedProcess:
+    """Run a Python program with a forced instruction set."""
     return subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
         env=os.environ | {"LDO_ISA": forced},
@@ -100,13 +105,14 @@ def run_with(forced: str, program: str, *arguments: Path) -> subprocess.Complete
 @pytest.mark.parametrize("scene", SCENES)
 def test_kernel_agrees_with_its_plain_twin(scene: str, by_kernel: dict, by_reference: dict) -> None:
     expected = by_reference[scene]
-    tolerance_m = 4.0 * 2e-4  # what the early stop may leave out at z = 4 m, and rounding
+    # The early stop may drop this much at z = 4 m, and rounding adds to it.
+    tolerance_m = 4.0 * 2e-4
     for k, (name, atol) in enumerate(zip(IMAGES, (2e-4, tolerance_m, 0, 2e-4), strict=True)):
         actual, wanted = by_kernel[f"{scene}/{k}"], getattr(expected, name)
         assert actual.shape == wanted.shape
         if name != "median_depth_m":
             np.testing.assert_allclose(actual, wanted, atol=atol, err_msg=name)
-        else:  # a step at T = 1/2, where the last bit decides
+        else:  # The median has a step at T = 1/2, where the last bit decides.
             assert np.mean(np.abs(actual - wanted) > 1e-5) < 0.003
 
 
@@ -122,13 +128,14 @@ def test_contributions_agree_with_the_plain_twin(
     pixels = top.size
     np.testing.assert_allclose(by_row, wanted, atol=2e-4 * pixels**0.5, rtol=1e-5)
     assert set(indices[weights > 0]) >= set(np.flatnonzero(wanted > 0.03 * pixels))
-    assert np.mean(top != expected.top) < 0.003  # where two weights are equal but for rounding
+    # The top differs where two weights are equal up to rounding.
+    assert np.mean(top != expected.top) < 0.003
 
 
 def test_nearer_of_two_equal_weights_is_on_top() -> None:
     rows = np.repeat(gaussians(1, 0), 2, axis=0)
-    rows[:, :3], rows[:, 3:6] = (0, 0, 1), 9  # so wide that alpha is the opacity
-    rows[:, 10] = [0, 20]  # one half, then all that is left
+    rows[:, :3], rows[:, 3:6] = (0, 0, 1), 9  # Wide enough that alpha is the opacity.
+    rows[:, 10] = [0, 20]  # One half, then the rest.
     rows[1, 2] = 2
     seen = render(rows, Camera(9, 9, 20, 20, 4, 4), np.eye(4), contributions=True).contributions
     assert seen is not None

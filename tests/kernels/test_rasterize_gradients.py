@@ -1,5 +1,7 @@
-"""The backward kernel against the float64 derivative of the plain twin, on every instruction set
-that this machine has."""
+"""Tests of the backward kernel against the float64 derivative of the reference.
+
+They run with every instruction set that this machine has.
+"""
 
 import threading
 from collections.abc import Callable
@@ -39,7 +41,7 @@ for name in {key.split("/")[0] for key in given}:
 
 
 def nearly_opaque() -> np.ndarray:
-    """Alphas beyond the cap of 0.99 in the middle of each, where only the colour has a say."""
+    """Return Gaussians with alpha above the cap of 0.99 in the middle, where only color matters."""
     rows = gaussians(60, 3)
     rows[:, 10] = 8
     return rows
@@ -58,23 +60,26 @@ SCENES = {
 
 
 def by_planes_of(camera: Camera) -> np.ndarray:
+    """Return random derivatives by the planes, [5, H, W]."""
     rng = np.random.default_rng(camera.width)
     return rng.normal(size=(5, camera.height, camera.width)).astype(np.float32)
 
 
 def loss(rows: np.ndarray, camera: Camera, T: np.ndarray) -> float:
-    """sum(G * planes), so that G is the gradient by the planes."""
+    """Compute sum(G * planes), so that G is the gradient by the planes."""
     G, seen = by_planes_of(camera), render_reference(rows, camera, T, anp)
     by_color = anp.sum(np.moveaxis(G[:3], 0, -1) * seen.color)
     return by_color + anp.sum(G[3] * seen.weighted_depth_m) + anp.sum(G[4] * seen.opacity)
 
 
 def as_kernel_sees(T: np.ndarray) -> np.ndarray:
+    """Round a transform to float32, like the kernel."""
     return T.astype(np.float32).astype(float)
 
 
 @pytest.fixture(scope="module")
 def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
+    """Return planes and gradients of every scene by the kernel."""
     given = {}
     for name, (rows, c, T) in SCENES.items():
         given[f"{name}/rows"], given[f"{name}/T"] = rows, T
@@ -85,6 +90,7 @@ def by_kernel(with_isa: Callable) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def by_reference() -> dict[str, np.ndarray]:
+    """Return the derivatives of the rows of every scene by the reference."""
     return {
         name: grad(loss)(rows.astype(float), camera, as_kernel_sees(T))
         for name, (rows, camera, T) in SCENES.items()
@@ -143,14 +149,14 @@ def test_early_stop_leaves_out_the_same_splats_forward_and_backward() -> None:
     hidden = gradients.rows[:, 14] == 0
     assert 0.1 < hidden.mean() < 0.9
     assert not gradients.rows[hidden].any()
-    # sum of weights over Gaussians is the sum of opacities over pixels
+    # The sum of weights over Gaussians is the sum of opacities over pixels.
     np.testing.assert_allclose(gradients.rows[:, 14].sum(), planes[4].sum(), rtol=1e-5)
 
 
 def test_needle_penalty_shortens_the_longest_axis_and_widens_the_middle_one() -> None:
     rows = gaussians(40, 11)
     rows[:, 3:6] = np.log([0.5, 0.05, 0.01])
-    rows[20:, 3:6] = np.log([0.01, 0.06, 0.05])  # a disc: below the ratio
+    rows[20:, 3:6] = np.log([0.01, 0.06, 0.05])  # A disc, below the ratio.
     rasterizer = Rasterizer()
     rasterizer.render(rows, camera_of(24, 24), np.eye(4))
     gradients = rasterizer.gradients(
@@ -212,6 +218,7 @@ def test_pass_that_another_thread_uses_is_refused() -> None:
 
 
 def rendered(n: int = 5) -> tuple[_rasterize.Pass, dict]:
+    """Render n rows and return the pass with valid arguments of `backpropagate`."""
     rows, forward, planes = gaussians(n, 0), _rasterize.Pass(), np.zeros((5, 9, 9), np.float32)
     T = np.eye(4, dtype=np.float32)[:3]
     visible = _rasterize.rasterize_planes(forward, rows, T, 9.0, 9.0, 4.0, 4.0, planes)

@@ -1,4 +1,4 @@
-"""Renderings, losses and gradients of some tiles, against those of the whole image, masked."""
+"""Tests of renderings, losses and gradients of some tiles against the masked whole image."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,13 @@ from ldo_service.gaussians import Exposure, LossWeights, Rasterizer, RowGradient
 from ldo_service.gaussians.loss import tile_mask
 from ldo_service.geometry import Camera
 
-CAMERA = Camera(75, 50, 60.0, 62.0, 35.0, 27.0)  # 5 x 4 tiles, the last of which are cut
+CAMERA = Camera(75, 50, 60.0, 62.0, 35.0, 27.0)  # 5 x 4 tiles; the last ones are cut.
 TILES = np.array([[0, 1, 0, 0, 1], [0, 0, 0, 0, 0], [1, 0, 1, 1, 0], [0, 0, 0, 0, 1]], np.uint8)
 INSIDE = tile_mask(TILES, 50, 75).astype(bool)
 
 
 def gaussians(n: int) -> np.ndarray:
+    """Return random rows in front of the camera."""
     rng = np.random.default_rng(n)
     rows = np.zeros((n, 16), np.float32)
     rows[:, 2] = rng.uniform(0.5, 4, n)
@@ -34,6 +35,7 @@ def test_wanted_tiles_have_the_bits_of_the_whole_image_and_the_others_are_zero()
 
 
 def by_row(gradients: RowGradients, n: int) -> np.ndarray:
+    """Return the gradients as an array [n, 16], zero for rows without one."""
     out = np.zeros((n, 16), np.float32)
     out[gradients.indices] = gradients.rows
     return out
