@@ -1,4 +1,4 @@
-"""The map of 3D Gaussians: what it holds, how it is seen, how it grows and how it is optimised."""
+"""The map of 3D Gaussians: model, rendering, densification and optimization."""
 
 from .adam import Adam, AdamConfig
 from .densification import DensificationConfig, densify

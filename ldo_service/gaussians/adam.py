@@ -1,4 +1,4 @@
-"""Adam on the Gaussians that a view reaches. The kernel is `kernels/adam.cpp`."""
+"""Adam optimizer for the Gaussians in view. The kernel is `kernels/adam.cpp`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,51 +16,56 @@ from .renderer import AdamStep, Rasterizer, RowGradients, VisibleGaussians
 
 @dataclass(frozen=True, slots=True)
 class AdamConfig:
-    """Step lengths per iteration. 5 to 10 times those of 3DGS, because a keyframe gets tens of
-    iterations and not thousands (ALGORITHMS: 4.5 s of the usual rates are reached in 0.35 s)."""
+    """Step lengths per iteration.
+
+    They are 5 to 10 times those of 3DGS, because a keyframe gets tens of iterations and not
+    thousands. They reach in 0.35 s what the usual rates reach in 4.5 s (ALGORITHMS).
+    """
 
     mean_m: float = 5e-4
     log_scale: float = 0.06
     quat: float = 0.01
     opacity_logit: float = 0.1
     color: float = 0.01
-    beta1: float = 0.9  # Kingma and Ba 2015
-    beta2: float = 0.95  # usual 0.999 remembers longer than a keyframe is worked on
-    epsilon: float = 1e-15  # as 3DGS: gradients are means over pixels, about 1e-7
+    beta1: float = 0.9  # Kingma and Ba, 2015.
+    beta2: float = 0.95  # The usual 0.999 averages over more iterations than a keyframe gets.
+    epsilon: float = 1e-15  # The value of 3DGS: gradients are means over pixels, about 1e-7.
 
     def __post_init__(self) -> None:
         rates = (self.mean_m, self.log_scale, self.quat, self.opacity_logit, self.color)
         if not min(rates) >= 0:
             raise ConfigError(
                 named(self, "mean_m", "log_scale", "quat", "opacity_logit", "color")
-                + ": learning rates must not be negative."
+                + ": learning rates must be at least 0."
             )
         if not (0 <= self.beta1 < 1 and 0 <= self.beta2 < 1 and self.epsilon > 0):
             raise ConfigError(
                 named(self, "beta1", "beta2", "epsilon")
-                + ": betas must lie in [0, 1), epsilon above 0."
+                + ": beta1 and beta2 must lie in [0, 1), epsilon must be positive."
             )
 
     def rates(self) -> np.ndarray:
-        """Per field of a row [16] float32."""
+        """Return the learning rate of each field of a row, [16] float32."""
         groups = ((self.mean_m, 3), (self.log_scale, 3), (self.quat, 4), (self.opacity_logit, 1))
         out = [rate for rate, n in (*groups, (self.color, 3), (0.0, 2)) for _ in range(n)]
         return np.array(out, np.float32)
 
 
 class Adam:
-    """Moments of the gradients beside the rows of a map, found by the Gaussians' ids.
+    """Adam's moments for the rows of a map, matched to Gaussians by id.
 
-    A Gaussian that no view reaches neither moves nor ages: each has a step count of its own.
+    A Gaussian that no view reaches does not move and its moments do not decay: each Gaussian
+    has its own step count.
     """
 
     def __init__(self, config: AdamConfig | None = None) -> None:
         self.config = config or AdamConfig()
         self._rates = self.config.rates()
         self._ids = np.zeros(0, np.int64)
-        self._moments = [aligned_rows(0), aligned_rows(0)]  # with room to grow
+        self._moments = [aligned_rows(0), aligned_rows(0)]  # May have spare capacity.
         self._steps = np.zeros(0, np.int32)
-        self._followed: tuple[ref[GaussianMap], int] | None = None  # whose ids, and which of them
+        # The map and its `membership` that `_ids` matches.
+        self._followed: tuple[ref[GaussianMap], int] | None = None
 
     def step(
         self,
@@ -70,13 +75,19 @@ class Adam:
         rate: float = 1.0,
         threads: int = 1,
     ) -> None:
-        """One step against the gradients, in place, `rate` times as long as configured.
+        """Take one step against the gradients, in place.
 
             m <- b1 m + (1 - b1) g,  v <- b2 v + (1 - b2) g^2
             row <- row - rate (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + epsilon)
 
-        Gaussians without any gradient (hidden, or not in `indices`) stay as they are.
-        Kingma and Ba, 2015, algorithm 1. Bitwise equal for any number of threads.
+        Gaussians without any gradient (hidden, or not in `indices`) stay as they are. The result is
+        bitwise equal for any number of threads. Source: Kingma and Ba, 2015, algorithm 1.
+
+        Args:
+            gaussians: The map; its rows change.
+            gradients: Gradients of its visible rows.
+            rate: Factor on the configured learning rates.
+            threads: Threads of the kernel.
         """
         step = self._step(gaussians, rate)
         _adam.adam_step(
@@ -105,8 +116,22 @@ class Adam:
         needle_ratio: float = 1.0,
         max_sigma_px: float = inf,
     ) -> VisibleGaussians:
-        """`step` against the gradients of what `rasteriser` last rendered of this map, which are
-        never written out; `Rasterizer` says what `by_planes`, needles and `max_sigma_px` are."""
+        """Compute the gradients of the last rendering and take the step in one pass.
+
+        The result is that of `step`, but the gradients are never written to memory.
+
+        Args:
+            gaussians: The map; its rows change.
+            rasterizer: The rasterizer that last rendered this map.
+            by_planes: dL/dplanes, see `Rasterizer.descend`.
+            rate: Factor on the configured learning rates.
+            needle_weight: See `Rasterizer.gradients`.
+            needle_ratio: See `Rasterizer.gradients`.
+            max_sigma_px: See `Rasterizer.descend`.
+
+        Returns:
+            The Gaussians that the step reached.
+        """
         reached = rasterizer.descend(
             by_planes,
             self._step(gaussians, rate),
@@ -126,12 +151,12 @@ class Adam:
         return AdamStep(gaussians.rows, mean, square, self._steps, rates, *betas, config.epsilon)
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
-        """[N] int32, how many steps each Gaussian has made. A view."""
+        """Return the number of steps of each Gaussian, [N] int32; a view."""
         self._follow(gaussians)
         return self._steps
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """A copy of everything, as named arrays."""
+        """Return a copy of the state as named arrays."""
         mean, square = (moment[: len(self._ids)].copy() for moment in self._moments)
         return {
             "ids": self._ids.copy(),
@@ -141,7 +166,7 @@ class Adam:
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Become what `state` is the snapshot of, exactly."""
+        """Restore the exact state of a `snapshot`."""
         self._followed = None
         self._ids, self._steps = state["ids"].copy(), state["steps"].copy()
         self._reserve(len(self._ids))
@@ -149,7 +174,10 @@ class Adam:
             moment[: len(saved)], moment[len(saved) :] = saved, 0
 
     def _follow(self, gaussians: GaussianMap) -> None:
-        """Forget the Gaussians that went; those that came, or came back, begin with zeros."""
+        """Match the state to the map.
+
+        The state of removed Gaussians is dropped; new and returned Gaussians start at zero.
+        """
         followed = ref(gaussians), gaussians.membership
         if followed == self._followed:
             return
@@ -168,7 +196,7 @@ class Adam:
         self._ids = ids.copy()
 
     def _sort_out(self, ids: np.ndarray) -> None:
-        """Bring the state of the Gaussians that stay to their new places; zeros elsewhere."""
+        """Move the state of the remaining Gaussians to their new rows; other rows get zeros."""
         n = len(self._ids)
         old_places = np.searchsorted(self._ids, ids)
         stays = np.append(self._ids, -1)[old_places] == ids

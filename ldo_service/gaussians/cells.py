@@ -1,4 +1,7 @@
-"""A quadtree over an image: small cells on edges, large ones on flats. Each becomes a Gaussian."""
+"""Quadtree over an image: small cells at edges, large ones on uniform areas.
+
+Densification makes one Gaussian from each cell.
+"""
 
 from dataclasses import dataclass
 
@@ -8,7 +11,15 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class QuadtreeCells:
-    """M squares of pixels that do not overlap: rows [row, row + size), columns likewise; int64."""
+    """M square cells of pixels that do not overlap.
+
+    A cell covers the rows [row, row + size) and the columns [column, column + size).
+
+    Attributes:
+        row: First row, [M] int64.
+        column: First column, [M] int64.
+        size: Edge in pixels, [M] int64.
+    """
 
     row: np.ndarray
     column: np.ndarray
@@ -19,16 +30,23 @@ class QuadtreeCells:
 
     @property
     def u(self) -> np.ndarray:
-        """Pixel coordinate of the centres [M], to the right."""
+        """Horizontal pixel coordinate of the centers, [M], to the right."""
         return self.column + (self.size - 1) / 2
 
     @property
     def v(self) -> np.ndarray:
-        """Pixel coordinate of the centres [M], down."""
+        """Vertical pixel coordinate of the centers, [M], down."""
         return self.row + (self.size - 1) / 2
 
     def mean_of(self, image: np.ndarray) -> np.ndarray:
-        """Mean of an image [H, W] or [H, W, C] over each cell, [M] or [M, C] float32."""
+        """Return the mean of an image over each cell.
+
+        Args:
+            image: [H, W] or [H, W, C].
+
+        Returns:
+            [M] or [M, C] float32.
+        """
         out = np.empty((len(self), *image.shape[2:]), np.float32)
         for size in np.unique(self.size).tolist():
             blocks = _means(image.astype(np.float32, copy=False), size)
@@ -46,14 +64,20 @@ def quadtree(
     max_contrast: float,
     max_depth_step: float,
 ) -> QuadtreeCells:
-    """Split cells of `coarsest_px`, a power of 2, in four until each is uniform.
+    """Split square cells into four until each is uniform.
 
-    A cell is uniform where the image gradient over it and a rim of one pixel amounts to no more
-    than `max_contrast` in any channel (0..1), the depth in it varies by no more than the share
-    `max_depth_step`, and all its pixels are wanted. A pixel that is not wanted belongs to no
-    cell; every other to exactly one.
+    A cell is uniform if three conditions hold. The image gradient over it and a rim of one pixel
+    amounts to at most `max_contrast` in every channel. Its depth varies by at most the fraction
+    `max_depth_step`. All its pixels are wanted.
 
-    color [H, W, 3] uint8, depth_m [H, W] float32, wanted [H, W] bool
+    Args:
+        color: [H, W, 3] uint8.
+        depth_m: [H, W] float32, meters.
+        wanted: Pixels to cover, [H, W] bool. Each of them belongs to exactly one cell, the other
+            pixels to none.
+        coarsest_px: Edge of the largest cells, a power of 2.
+        max_contrast: Largest contrast of a uniform cell, 0..1.
+        max_depth_step: Largest depth difference in a uniform cell, as a fraction of its depth.
     """
     color, depth_m = _padded(color, coarsest_px), _padded(depth_m, coarsest_px)
     wanted = _padded(wanted.astype(np.uint8), coarsest_px)
@@ -74,20 +98,20 @@ def quadtree(
 
 
 def _padded(image: np.ndarray, multiple: int) -> np.ndarray:
-    """With zeros at the right and bottom, so that blocks of `multiple` pixels fit."""
+    """Pad with zeros at the right and bottom to a multiple of `multiple` pixels."""
     missing = [(0, -n % multiple) for n in image.shape[:2]]
     return np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
 
 
 def _means(image: np.ndarray, size: int) -> np.ndarray:
-    """Means of the blocks of size x size pixels that fit, [H // size, W // size, ...]."""
+    """Return the mean of each whole block of size x size pixels, [H // size, W // size, ...]."""
     height, width = (n // size for n in image.shape[:2])
     image = image[: height * size, : width * size]
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _greatest(image: np.ndarray, size: int, rim: int = 0) -> np.ndarray:
-    """Maxima of the blocks of size x size pixels and `rim` pixels around them."""
+    """Return the maximum of each block of size x size pixels and `rim` pixels around it."""
     window = np.ones((size + 2 * rim,) * 2, np.uint8)
     return cv2.dilate(image, window, anchor=(rim, rim))[::size, ::size]
 

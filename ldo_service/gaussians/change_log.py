@@ -1,4 +1,4 @@
-"""What of a map its followers do not know yet."""
+"""Log of the map changes that map replicas have not received yet."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,12 @@ from .model import GaussianMap
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Changes:
-    """removed  [R] int64, ids, ascending
-    changed  [C] rows of the map whose parameters are other than was told
-    added    [A] rows of the map that were never told of
+    """Changes of the map since the last `ChangeLog.drain`.
+
+    Attributes:
+        removed: Ids of removed Gaussians, [R] int64, ascending.
+        changed: Rows of the map with parameters other than the published ones, [C].
+        added: Rows of the map that were never published, [A].
     """
 
     removed: np.ndarray
@@ -20,52 +23,56 @@ class Changes:
 
 
 class ChangeLog:
-    """Beside a map: who changes the map says so here.
+    """Unpublished changes of a map; every change of the map must be marked here.
 
-    Followers get new Gaussians at once and the parameters of old ones now and then, because the
-    optimiser touches most of what is in view at every keyframe. Motions by anchor are theirs to
-    apply: they change no row here.
+    New Gaussians are published at once. Parameters of old ones are published from time to time,
+    because the Gaussian optimizer changes most of what is in view at every keyframe. Replicas
+    apply the motions of anchor keyframes themselves, so these mark no row here.
     """
 
     def __init__(self) -> None:
-        self._next_untold = 0  # ids from here on were never told
-        self._is_changed = np.zeros(0, bool)  # per row of the map, as it was last seen
+        self._next_untold = 0  # Smallest id that was never published.
+        self._is_changed = np.zeros(0, bool)  # One value per row of the map.
         self._removed: list[np.ndarray] = []
 
     def mark_added(self, gaussians: GaussianMap) -> None:
-        """Rows were appended."""
+        """Record that rows were appended."""
         new = len(gaussians) - len(self._is_changed)
         self._is_changed = np.concatenate([self._is_changed, np.zeros(new, bool)])
 
     def changed(self, mask: np.ndarray) -> None:
-        """The rows where `mask` [N] is true were written to."""
+        """Record that the rows where `mask` [N] is true were written to."""
         self._is_changed |= mask
 
     def mark_removed(self, gaussians: GaussianMap, mask: np.ndarray) -> None:
-        """The rows where `mask` [N] is true are about to go."""
+        """Record that the rows where `mask` [N] is true are about to be removed."""
         ids = gaussians.ids[mask]
         self._removed.append(ids[ids < self._next_untold])
         self._is_changed = self._is_changed[~mask]
 
     def lost(self, ids: np.ndarray) -> None:
-        """These [L] are gone for good, from where nobody looked."""
+        """Record that offloaded Gaussians with these ids [L] are lost for good."""
         self._removed.append(ids[ids < self._next_untold])
 
     def mark_loaded(self, gaussians: GaussianMap, ids: np.ndarray) -> None:
-        """Rows came back as followers hold them."""
+        """Record that offloaded Gaussians were loaded with the parameters that replicas hold."""
         is_changed = np.zeros(len(gaussians), bool)
         is_changed[~np.isin(gaussians.ids, ids, assume_unique=True)] = self._is_changed
         self._is_changed = is_changed
 
     def drain(self, gaussians: GaussianMap, *, with_changed: bool) -> Changes:
-        """What is to be told now; it counts as told. Without `with_changed` the rows that changed
-        wait for another time."""
+        """Return the changes to publish now and mark them as published.
+
+        Args:
+            gaussians: The map.
+            with_changed: Include changed rows; otherwise they stay pending.
+        """
         first_new = int(np.searchsorted(gaussians.ids, self._next_untold))
         changed = np.zeros(0, np.int64)
         if with_changed:
             changed = np.flatnonzero(self._is_changed[:first_new])
             self._is_changed[:] = False
-        self._is_changed[first_new:] = False  # told with what they are now
+        self._is_changed[first_new:] = False  # Added rows carry their current values.
         removed = np.sort(np.concatenate([np.zeros(0, np.int64), *self._removed]))
         self._removed.clear()
         if len(gaussians) > first_new:
@@ -73,7 +80,7 @@ class ChangeLog:
         return Changes(removed, changed, np.arange(first_new, len(gaussians)))
 
     def mark_all_published(self, gaussians: GaussianMap) -> None:
-        """Followers know the whole map, which may be another than it was."""
+        """Record that replicas hold the whole map, which may be a different one than before."""
         newest = int(gaussians.ids[-1]) if len(gaussians) else -1
         self._next_untold = max(self._next_untold, newest + 1)
         self._is_changed = np.zeros(len(gaussians), bool)

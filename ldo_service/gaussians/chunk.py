@@ -1,4 +1,4 @@
-"""Gaussians of one anchor, as arrays and as bytes."""
+"""Chunks: Gaussians of one anchor keyframe, as arrays and as bytes."""
 
 import struct
 from collections.abc import Iterable
@@ -11,13 +11,20 @@ from ldo_service.errors import DataError
 
 from .model import LABEL_BYTES, ROW, GaussianBatch, transform_rows
 
-_HEADER = struct.Struct("<qq")  # anchor, Gaussians
-_LEVEL = 1  # of zstd
+_HEADER = struct.Struct("<qq")  # Anchor, number of Gaussians.
+_LEVEL = 1  # Compression level of zstd.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Chunk:
-    """ids [M] int64 ascending, rows [M, 16] float32 in the map, labels [M, 32] uint8."""
+    """Gaussians of one anchor keyframe.
+
+    Attributes:
+        anchor: Id of the anchor keyframe.
+        ids: [M] int64, ascending.
+        rows: [M, 16] float32, in the map frame (see `gaussians.model`).
+        labels: [M, 32] uint8.
+    """
 
     anchor: int
     ids: np.ndarray
@@ -26,15 +33,21 @@ class Chunk:
 
     @property
     def anchors(self) -> np.ndarray:
-        """[M] int32, as GaussianMap keeps them."""
+        """The anchor of each Gaussian as in `GaussianMap`, [M] int32."""
         return np.full(len(self.ids), self.anchor, np.int32)
 
     def piece(self) -> GaussianBatch:
+        """Return the chunk as a batch."""
         return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 
     def moved(self, motions: Iterable[np.ndarray]) -> "Chunk":
-        """By one motion T_new_old [4, 4] of the anchor after the other, to the bits that
-        `GaussianMap.move_anchors` gives. Itself without any."""
+        """Return the chunk after motions of its anchor.
+
+        The result is bitwise equal to that of `GaussianMap.move_anchors`.
+
+        Args:
+            motions: Transforms T_new_old [4, 4], in the order of the motions.
+        """
         rows = self.rows
         for T_new_old in motions:
             rows = transform_rows(rows, T_new_old)
@@ -42,8 +55,11 @@ class Chunk:
 
 
 def pack(chunk: Chunk) -> bytes:
-    """Ids as differences, rows and labels byte by byte, as the same byte of neighbours is often
-    equal."""
+    """Compress a chunk to bytes.
+
+    Ids are stored as differences; rows and labels are stored byte by byte, because the same byte
+    of neighboring Gaussians is often equal.
+    """
     steps = np.diff(chunk.ids, prepend=0).astype("<i8")
     planes = np.ascontiguousarray(chunk.rows, "<f4").view(np.uint8).T
     arrays = steps, planes, np.ascontiguousarray(chunk.labels.T)
@@ -52,7 +68,11 @@ def pack(chunk: Chunk) -> bytes:
 
 
 def unpack(data: bytes | memoryview) -> Chunk:
-    """The chunk of which `data` is the packed form. Raises DataError for other bytes."""
+    """Return the chunk from its packed form.
+
+    Raises:
+        DataError: The bytes are not a packed chunk, or an earlier version wrote them.
+    """
     try:
         body = zstandard.ZstdDecompressor().decompress(data)
         anchor, count = _HEADER.unpack_from(body)

@@ -1,6 +1,7 @@
-"""Densification: new Gaussians where the map does not explain a keyframe, more of them on edges.
+"""Densification: new Gaussians where the map does not explain a keyframe.
 
-Cells of the depth image become flat Gaussians on the surface that was seen.
+Cells of the depth image become flat Gaussians on the observed surface; cells are smaller at
+edges, so Gaussians are denser there.
 """
 
 from dataclasses import dataclass, replace
@@ -16,8 +17,9 @@ from .cells import QuadtreeCells, quadtree
 from .model import ROW, GaussianMap
 from .renderer import Rendering, render
 
-# Of the 0.3 px^2 that the renderer adds to every splat, taken back here: more is sharper, all of
-# it leaves cracks between Gaussians of one pixel when they are seen from nearer.
+# Densification subtracts this much of the 0.3 px^2 that the renderer adds to every splat. A larger
+# value gives sharper images. Subtracting all of it leaves cracks between Gaussians of one pixel
+# when the camera comes nearer.
 LOW_PASS_TAKEN_BACK_PX2 = 0.2
 
 
@@ -33,13 +35,22 @@ def surfels(
     max_stretch: float,
     opacity: float,
 ) -> np.ndarray:
-    """Rows [M, 16] float32, one per cell: mean colour, mean depth, seen from here as a disc.
+    """Return one flat Gaussian per cell, rows [M, 16] float32, with its mean color and mean depth.
 
-    Seen from this camera each is round, with a standard deviation of sigma_per_spacing times the
-    side of its cell: along the slope of the surface it is longer by 1 / cos of the angle between
-    normal and ray, at most `max_stretch`. Along the normal it is `thickness` times that.
+    From this camera each Gaussian looks round, with a standard deviation of `sigma_per_spacing`
+    times the side of its cell. Along the slope of the surface it is longer by 1 / cos of the
+    angle between normal and ray. Along the normal it is `thickness` times as long.
 
-    color [H, W, 3] uint8; depth_m [H, W] float32, > 0 in every cell; T_map_camera [4, 4]
+    Args:
+        cells: The cells.
+        color: [H, W, 3] uint8.
+        depth_m: [H, W] float32, > 0 in every cell.
+        camera: Intrinsics.
+        T_map_camera: Camera pose, [4, 4].
+        sigma_per_spacing: Standard deviation as a fraction of the cell's side.
+        thickness: Standard deviation along the normal as a fraction of the one across the slope.
+        max_stretch: Largest factor along the slope.
+        opacity: Opacity of each Gaussian, 0..1.
     """
     rays = camera.rays_at(cells.u, cells.v)
     z = cells.mean_of(depth_m).astype(float)
@@ -61,10 +72,11 @@ def surfels(
 def normals_of(
     cells: QuadtreeCells, rays: np.ndarray, z: np.ndarray, depth_m: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Unit surface normals [M, 3], camera frame, away from the camera.
+    """Return unit surface normals [M, 3] in the camera frame, pointing away from the camera.
 
     On a plane n . p = d the inverse depth is affine in the pixel, 1 / z = n . ray / d, so its
-    slopes hold the normal. Where 5x5 pixels are not one smooth measured surface: the ray.
+    slopes give the normal. If the 5x5 pixels are not one smooth measured surface, the normal is
+    the viewing ray.
     """
     inverse = np.where(depth_m > 0, 1 / np.maximum(depth_m, 1e-6), 0).astype(np.float32)
     window = np.ones((5, 5), np.uint8)
@@ -84,19 +96,27 @@ def normals_of(
 
 
 def slope_axes(normals: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotations [M, 3, 3] with columns: down the slope, across it, normal; and |cos| [M] of the
-    angle between normal and ray. All vectors are [M, 3] in one frame."""
+    """Return the axes of each surfel and the cosine between its normal and its viewing ray.
+
+    Args:
+        normals: Unit normals, [M, 3].
+        rays: Viewing rays, [M, 3], in the same frame.
+
+    Returns:
+        Rotations [M, 3, 3] with the columns down the slope, across the slope and normal; and
+        |cos| [M] of the angle between normal and ray.
+    """
     unit_rays = _unit(rays)
     cosines = np.sum(normals * unit_rays, axis=1, keepdims=True)
     slope = unit_rays - cosines * normals
-    facing = np.linalg.norm(slope, axis=1, keepdims=True) < 1e-3  # any direction will do
+    facing = np.linalg.norm(slope, axis=1, keepdims=True) < 1e-3  # Any direction works.
     x_or_y = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0, 0]], [[0, 1.0, 0]])
     slope = _unit(np.where(facing, np.cross(normals, x_or_y), slope))
     return np.stack([slope, np.cross(normals, slope), normals], axis=-1), np.abs(cosines[:, 0])
 
 
 def _two_from_edges(index: np.ndarray, length: int) -> np.ndarray:
-    """Pixel indices moved to where the 5x5 window of a slope lies in the image, if it can."""
+    """Return pixel indices clipped so that their 5x5 window lies in the image, if it fits."""
     return index.clip(min(2, length // 2), max(length - 3, length // 2))
 
 
@@ -106,36 +126,49 @@ def _unit(v: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class DensificationConfig:
-    """Figures: change of PSNR against these defaults (28.2 dB) on frames held out of 75 of a
-    Replica apartment with true poses, every 5th inserted, nothing optimised, pixels without
-    opacity left out. The defaults were chosen on the same frames."""
+    """Settings of the densification.
 
-    # Where the map explains a pixel (paper, III.A).
-    max_transmittance: float = 0.3  # 0.5: -0.5 dB, 4 % fewer Gaussians
-    in_front: float = 0.05  # share of the rendered depth by which a new surface is nearer
-    # A surface as near that the map shows so close by is the same: edges are noisy. With 0 each lap
-    # of a flat adds 5 % of the map again, poses exact, and kitchen views lose 0.7 dB.
+    The dB values below are changes of PSNR against these defaults (28.2 dB). They were measured
+    on held-out frames of 75 frames of a Replica apartment with ground-truth poses. Every 5th
+    frame was inserted, nothing was optimized, and pixels without opacity were excluded. The
+    defaults were chosen on the same frames.
+    """
+
+    # Criteria by which the map explains a pixel (paper, III.A).
+    max_transmittance: float = 0.3  # Larger is unexplained. 0.5: -0.5 dB, 4 % fewer Gaussians.
+    # New surface is nearer than the rendered depth by at least this fraction of it.
+    in_front: float = 0.05
+    # A nearer surface is not new if the map shows it within this distance, because depth is noisy
+    # at edges. With 0, each lap of an apartment adds 5 % of the map again although the poses are
+    # exact, and kitchen views lose 0.7 dB.
     edge_px: int = 2
-    # Mean error of the channels, 0..1. Off until colours are optimised: 0.1 gives +0.3 dB for
-    # +57 % Gaussians, and adds as much at every visit: the same 5 frames six times over grow the
-    # map from 101 k to 369 k Gaussians, where it stays at 79 k without.
+    # Mean error of the channels, 0..1; a larger one is unexplained. Off because colors are not yet
+    # optimized then. 0.1 gives +0.3 dB for +57 % Gaussians, and adds as many at every visit.
+    # Inserting the same 5 frames six times then grows the map from 101 k to 369 k Gaussians;
+    # without, it stays at 79 k.
     max_color_error: float = inf
-    overlap_px: int = 2  # beyond the unexplained: closes seams; 0: -1.2 dB
-    hole_px: int = 4  # holes about this wide get the depth around them; black holes cap PSNR
+    overlap_px: int = 2  # Margin around unexplained pixels; it closes seams. 0: -1.2 dB.
+    # Width of the holes that get the depth around them. Black holes limit the PSNR.
+    hole_px: int = 4
 
-    # Where Gaussians go.
-    coarsest_px: int = 4  # one Gaussian per 4x4 pixels on flats; 2: +0.4 dB, twice as many
-    max_contrast: float = 0.3  # of one cell and its rim, 0..1; 0.2 gives 30 % more Gaussians, and
-    # no better image once they are optimised
-    max_depth_step: float = 0.05  # of one cell, share of its depth: it lies on one surface
+    # Placement of the Gaussians.
+    # Largest cell: one Gaussian per 4x4 pixels on uniform areas. 2: +0.4 dB, twice as many.
+    coarsest_px: int = 4
+    # Largest contrast of one cell and its rim, 0..1. 0.2 gives 30 % more Gaussians, and no better
+    # image once they are optimized.
+    max_contrast: float = 0.3
+    # Largest depth difference in one cell as a fraction of its depth; more is not one surface.
+    max_depth_step: float = 0.05
 
-    # What they look like.
-    sigma_per_spacing: float = 0.6  # 0.5: cracks, -2.0 dB; 0.7: blur, -0.6 dB
-    thickness: float = 0.1  # share of the width; 0.03 to 0.3 look the same
-    max_stretch: float = 4.0  # along a slope: 1 / cos of 75 deg, where normals become unsure
-    opacity: float = 0.95  # 0.9: -0.2 dB, dark grids on walls seen from nearer
-    color_steps: int = 1  # corrections by the residual; 0: -1.1 dB, 3: -0.4 dB (overfits)
-    max_color_step: float = 0.1  # 0..1; a larger residual is the fault of an older Gaussian
+    # Shape and color of the Gaussians.
+    # Standard deviation as a fraction of the spacing. 0.5: cracks, -2.0 dB; 0.7: blur, -0.6 dB.
+    sigma_per_spacing: float = 0.6
+    thickness: float = 0.1  # Fraction of the width; 0.03 to 0.3 look the same.
+    # Largest factor along a slope: 1 / cos of 75 deg, beyond which normals are unreliable.
+    max_stretch: float = 4.0
+    opacity: float = 0.95  # 0.9: -0.2 dB, dark grids on walls when the camera comes nearer.
+    color_steps: int = 1  # Color corrections by the residual. 0: -1.1 dB; 3: -0.4 dB (overfits).
+    max_color_step: float = 0.1  # 0..1; an older Gaussian causes any larger residual.
 
     def __post_init__(self) -> None:
         if self.coarsest_px < 1 or self.coarsest_px & (self.coarsest_px - 1):
@@ -173,10 +206,21 @@ def densify(
 ) -> np.ndarray:
     """Add Gaussians anchored to `keyframe` where the map does not explain its frame.
 
-    T_map_camera [4, 4]; `frame` at the brightness of the map; `before` is the map as it is rendered
-    there, if the caller has it; pixels `left_out` [H, W] bool get none. Returns the ids [M] of the
-    new Gaussians, none where depth is missing. Old Gaussians stay as they are. Deterministic: no
-    random numbers, and the same bits for any number of threads.
+    Old Gaussians stay as they are. The result is deterministic: there are no random numbers, and
+    it is bitwise equal for any number of threads.
+
+    Args:
+        gaussians: The map; new Gaussians are appended.
+        frame: Color and depth of the keyframe, at the brightness of the map.
+        T_map_camera: Pose of the keyframe, [4, 4].
+        keyframe: Id of the keyframe.
+        config: Settings.
+        before: Rendering of the map at this pose, if the caller has it.
+        left_out: Ignore mask, [H, W] bool; these pixels get no Gaussians.
+        threads: Threads of the renderer.
+
+    Returns:
+        Ids [M] of the new Gaussians; pixels without depth get none.
     """
     config = config or DensificationConfig()
     T_camera_map = se3.inverse(T_map_camera)
@@ -185,7 +229,7 @@ def densify(
         rows, bounds = gaussians.rows, gaussians.bounds
         return render(rows, frame.camera, T_camera_map, bounds=bounds, threads=threads)
 
-    # What is missing?
+    # Find the unexplained pixels.
     before = before or seen()
     if left_out is not None:
         frame = _without(frame, left_out, before)
@@ -194,7 +238,7 @@ def densify(
     if left_out is not None:
         wanted &= ~left_out
 
-    # One Gaussian per cell.
+    # Add one Gaussian per cell.
     cells = quadtree(
         frame.color,
         depth_m,
@@ -216,7 +260,7 @@ def densify(
     )
     ids = gaussians.add(rows, keyframe)
 
-    # Undo the blur of overlapping neighbours.
+    # Undo the blur of overlapping neighbors.
     new_colors = gaussians.colors[len(gaussians) - len(ids) :]
     for _ in range(config.color_steps):
         correct_colors(new_colors, cells, frame, seen(), config.max_color_step)
@@ -227,7 +271,16 @@ def densify(
 def densification_mask(
     frame: RgbdFrame, rendering: Rendering, config: DensificationConfig
 ) -> np.ndarray:
-    """Pixels [H, W] bool that show what the map lacks, and `overlap_px` around them."""
+    """Return the pixels that show surface missing in the map, with a margin of `overlap_px`.
+
+    Args:
+        frame: The keyframe, at the brightness of the map.
+        rendering: The map at the pose of the keyframe.
+        config: Settings.
+
+    Returns:
+        Mask [H, W] bool.
+    """
     known = (frame.depth_m > 0) & (rendering.median_depth_m > 0)
     nearer = frame.depth_m < (1 - config.in_front) * nearest_around(
         rendering.median_depth_m, config.edge_px
@@ -241,21 +294,24 @@ def densification_mask(
 
 
 def _without(frame: RgbdFrame, left_out: np.ndarray, before: Rendering) -> RgbdFrame:
-    """There it looks as the map does, and nothing was measured."""
+    """Replace the masked pixels by the rendered color and remove their depth."""
     shown = (255 * before.color.clip(0, 1) + 0.5).astype(np.uint8)
     color = np.where(left_out[..., None], shown, frame.color)
     return replace(frame, color=color, depth_m=frame.depth_m * ~left_out)
 
 
 def nearest_around(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
-    """Least depth [H, W] within `radius_px`; infinite where there is none."""
+    """Return the least depth [H, W] within `radius_px`; infinite if nothing was measured there."""
     window = np.ones((2 * radius_px + 1,) * 2, np.uint8)
     return cv2.erode(np.where(depth_m > 0, depth_m, np.float32(inf)), window)
 
 
 def with_small_holes_filled(depth_m: np.ndarray, radius_px: int) -> np.ndarray:
-    """Depth [H, W] in which pixels without depth take the farthest around them, where at least
-    40 % of the window was measured: holes beside an object are shadows on what is behind it."""
+    """Return depth [H, W] with small holes filled by the farthest depth around them.
+
+    A pixel is filled only if at least 40 % of the window was measured. The farthest depth is
+    used because a hole next to an object is the sensor's shadow on the surface behind it.
+    """
     window = np.ones((2 * radius_px + 1,) * 2, np.uint8)
     measured = depth_m > 0
     support = cv2.boxFilter(measured.astype(np.float32), -1, window.shape)
@@ -269,8 +325,15 @@ def correct_colors(
     rendering: Rendering,
     max_step: float,
 ) -> None:
-    """Add to each of `colors` [M, 3], in place, what its cell lacks in the rendering, at most
-    `max_step`."""
+    """Add to each color the mean residual of its cell in the rendering.
+
+    Args:
+        colors: Colors of the new Gaussians, [M, 3], 0..1; changed in place.
+        cells: The cell of each Gaussian.
+        frame: The keyframe.
+        rendering: The map at its pose, with the new Gaussians.
+        max_step: Largest change of a channel.
+    """
     missing = cells.mean_of(_unit_range(frame.color) - rendering.color)
     colors += missing.clip(-max_step, max_step)
     np.clip(colors, 0, 1, out=colors)

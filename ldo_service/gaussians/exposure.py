@@ -1,59 +1,72 @@
-"""Brightness of one image beside the map's: gain and bias per channel."""
+"""Exposure of an image relative to the map: gain and bias per channel."""
 
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
-MIN_GAIN = 0.1  # below, nothing of the map's brightness can be told from the image
-MIN_BLOCK_PX = 8  # images are compared after averaging: a misplaced edge is no change of
-BLOCKS_ACROSS = 40  # brightness; so many blocks in a row say as much as more would
-SATURATED = 0.97  # of the range: beyond, the sensor says no more
-MIN_SHARE = 0.15  # of the image that must be comparable
+MIN_GAIN = 0.1  # A smaller gain does not determine the brightness of the map.
+# Images are compared as averages over blocks, so that a misplaced edge does not count as a change
+# of brightness.
+MIN_BLOCK_PX = 8
+BLOCKS_ACROSS = 40  # Blocks per image row; more give no more information.
+SATURATED = 0.97  # Fraction of the range above which the sensor saturates.
+MIN_SHARE = 0.15  # Fraction of the image that must be comparable.
 MIN_BLOCKS = 16
 OUTLIER_SIGMAS = 2.5
-MAX_GAIN = 3.0  # and its inverse: a stop and a half
+MAX_GAIN = 3.0  # The minimum is its inverse: a stop and a half.
 ROUNDS = 6
-# What is believed of a camera before its image is seen, standard deviations: it changes its gain,
-# and hardly adds anything. Where a wall fills the image the two cannot be told apart; with the bias
-# left free the map was painted with a gain of 1.7 there. Half of a flat, held out: 0.4 dB.
+# Prior of a camera as standard deviations: its gain changes, and its bias is nearly zero. Where a
+# wall fills the image, gain and bias are ambiguous. With a free bias, such an image gave a gain of
+# 1.7 and wrong colors in the map. The prior gains 0.4 dB on held-out frames of half an apartment.
 GAIN_SIGMA = 0.3
-BIAS_SIGMA = 0.02  # of the range
-PATCHES = 50  # that the blocks of an image are worth at most: neighbours err alike
-FIRST_SIGMA, MIN_SIGMA = 0.05, 0.01  # of a block's colour, at the first round and at the least
-MAX_SIGMA = 0.1  # beyond, the images show different things
+BIAS_SIGMA = 0.02  # Fraction of the range.
+# Most independent measurements in one image; errors of neighboring blocks are correlated.
+PATCHES = 50
+FIRST_SIGMA, MIN_SIGMA = 0.05, 0.01  # Deviation of a block's color: first round, minimum.
+MAX_SIGMA = 0.1  # The images show different surfaces if the deviation is larger.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Exposure:
-    """color_seen = gain * color_map + bias, per channel; gain, bias [3] float32."""
+    """Gain and bias per channel: color_seen = gain * color_map + bias.
+
+    Attributes:
+        gain: [3] float32.
+        bias: [3] float32, fraction of the range.
+    """
 
     gain: np.ndarray = field(default_factory=lambda: np.ones(3, np.float32))
     bias: np.ndarray = field(default_factory=lambda: np.zeros(3, np.float32))
 
     @classmethod
     def of(cls, matrix: np.ndarray) -> "Exposure":
-        """From gains and biases [2, 3]."""
+        """Return the exposure with the gains and biases of a matrix [2, 3]."""
         return cls(*np.array(matrix, np.float32))
 
     @property
     def matrix(self) -> np.ndarray:
-        """Gains, then biases [2, 3] float32."""
+        """Matrix [2, 3] float32: gains, then biases."""
         return np.array([self.gain, self.bias])
 
     def applied(self, color: np.ndarray) -> np.ndarray:
-        """The image [H, W, 3] as this camera would have exposed it, in 0..1."""
+        """Return an image [H, W, 3] of the map as this camera would have exposed it, in 0..1."""
         return (self.gain * color + self.bias).clip(0, 1)
 
     def removed(self, color: np.ndarray) -> np.ndarray:
-        """An image [H, W, 3] of this camera at the brightness of the map, in 0..1."""
+        """Return an image [H, W, 3] of this camera at the brightness of the map, in 0..1."""
         return ((color - self.bias) / np.maximum(self.gain, MIN_GAIN)).clip(0, 1)
 
 
 def fit_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
-    """Least squares fit of gain and bias that take `rendered` to `seen`, both [H, W, 3] in 0..1.
+    """Fit gain and bias from `rendered` to `seen` by least squares.
 
-    A channel without contrast gets gain one. For evaluation: it uses the image that is judged.
+    This is for evaluation, because it uses the image that is scored. A channel without contrast
+    gets a gain of one.
+
+    Args:
+        rendered: [H, W, 3], 0..1.
+        seen: [H, W, 3], 0..1.
     """
     x, y = rendered.reshape(-1, 3).astype(float), seen.reshape(-1, 3).astype(float)
     variance = x.var(axis=0)
@@ -65,13 +78,21 @@ def fit_exposure(rendered: np.ndarray, seen: np.ndarray) -> Exposure:
 def estimate_exposure(
     rendered: np.ndarray, opacity: np.ndarray, seen: np.ndarray, mask: np.ndarray | None = None
 ) -> Exposure | None:
-    """Gain and bias of an image against what the map shows at its pose, where it shows enough.
+    """Estimate gain and bias of an image relative to the rendering of the map at its pose.
 
-    rendered [3, H, W] in 0..1, opacity [H, W], seen [3, H, W] uint8, mask [H, W] uint8, 0 where a
-    pixel does not count. Least squares over averages of blocks of pixels that are opaque and not
-    saturated, without outliers (moved things, new surface), drawn to gain 1 and more so to bias 0.
-    None where these are too few, or the gain is none that a camera would choose, or leaves too much
-    unexplained: then the images show different things.
+    The estimate is a least-squares fit over averages of blocks of opaque, unsaturated pixels.
+    Outliers (moved objects, new surface) are removed. A prior draws the gain to 1 and, more
+    strongly, the bias to 0.
+
+    Args:
+        rendered: Rendered color, [3, H, W], 0..1.
+        opacity: Rendered opacity, [H, W].
+        seen: Image of the camera, [3, H, W] uint8.
+        mask: Pixels to use, [H, W] uint8; 0 where a pixel is ignored.
+
+    Returns:
+        The exposure. None if the images show different surfaces: too few blocks are comparable,
+        no camera would choose the gain, or the residual is too large.
     """
     x = np.stack([_averaged(plane) for plane in rendered])
     y = np.stack([_averaged(plane) for plane in seen]) * np.float32(1 / 255)
@@ -89,7 +110,7 @@ def estimate_exposure(
 
 
 def _averaged(plane: np.ndarray) -> np.ndarray:
-    """Means of square blocks of [H, W]; what is left at two of the edges has none."""
+    """Return the means of square blocks of [H, W]; incomplete blocks at two edges are omitted."""
     block = max(MIN_BLOCK_PX, plane.shape[1] // BLOCKS_ACROSS)
     height, width = (n // block for n in plane.shape)
     plane = np.ascontiguousarray(plane[: height * block, : width * block], np.float32)
@@ -97,11 +118,18 @@ def _averaged(plane: np.ndarray) -> np.ndarray:
 
 
 def _robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float, float]:
-    """Slope a and offset b of y over x, both [M], and the deviation sigma of all from that line, by
-    the median of the absolute residuals (MAD).
+    """Fit a line to y over x with outlier rejection.
 
-    The a and b of the least  w sum (y - a x - b)^2 / sigma^2 + (a - 1)^2 / GAIN_SIGMA^2
-    + b^2 / BIAS_SIGMA^2,  w = min(PATCHES / M, 1), of those that are no outliers.
+    The fit minimizes w sum (y - a x - b)^2 / sigma^2 + (a - 1)^2 / GAIN_SIGMA^2
+    + b^2 / BIAS_SIGMA^2 over the inliers, with w = min(PATCHES / M, 1).
+
+    Args:
+        x: [M].
+        y: [M].
+
+    Returns:
+        Slope a, offset b, and the deviation sigma of all points from that line, by the median
+        of the absolute residuals (MAD).
     """
     gain_weight, bias_weight = GAIN_SIGMA**-2, BIAS_SIGMA**-2
     x, y = x.astype(float), y.astype(float)

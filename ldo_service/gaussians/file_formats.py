@@ -1,17 +1,18 @@
 """Files of Gaussians that other programs read: PLY, .splat and .spz.
 
-.ply    the file of 3D Gaussian splatting, as its viewers read it and other programs write it
-.splat  32 bytes per Gaussian, the weightiest first, no header:
-            position 3 float32 | scale 3 float32, metres | RGBA 4 uint8 | quaternion wxyz 4 uint8
-        A byte of the quaternion is 128 (1 + q), so a rotation is good to about half a degree. Axes
-        are those of the map. Format: https://github.com/antimatter15/splat
-.spz    quantized and compressed, about a tenth of a PLY: means are fixed point (0.24 mm, up to
-        2 km), log scales in steps of 1/16, opacity and color bytes, quaternions good to about a
-        tenth of a degree. Format: https://github.com/nianticlabs/spz
+.ply    the format of 3D Gaussian splatting and its viewers
+.splat  32 bytes per Gaussian, those with the largest weight first, no header:
+            position 3 float32 | scale 3 float32, meters | RGBA 4 uint8 | quaternion wxyz 4 uint8
+        A byte of the quaternion is 128 (1 + q), so a rotation is accurate to about half a degree.
+        Axes are those of the map. Format: https://github.com/antimatter15/splat
+.spz    quantized and compressed, about a tenth of a PLY.
+        Means are fixed point (0.24 mm, up to 2 km), log scales have steps of 1/16, opacity and
+        color are bytes, and quaternions are accurate to about a tenth of a degree.
+        Format: https://github.com/nianticlabs/spz
 
-An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not turn what it
-is given, so the map (x right, y down, z forward) is turned here, as Niantic's library turns RDF to
-RUB. (`GSData.save` would write a PLY, whatever the name of the file.)
+An .spz file has the axes of OpenGL: x right, y up, z back. `gsply.write_spz` does not convert
+axes. This module converts the map (x right, y down, z forward) as Niantic's library converts RDF
+to RUB. (`GSData.save` writes a PLY, whatever the file name.)
 """
 
 import logging
@@ -28,17 +29,18 @@ from .model import aligned_rows
 
 log = logging.getLogger(__name__)
 
-SH_C0 = 0.28209479177387814  # of the constant spherical harmonic, 1 / (2 sqrt(pi))
+SH_C0 = 0.28209479177387814  # The constant spherical harmonic, 1 / (2 sqrt(pi)).
 PROPERTIES = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 OF_A_ROW = (
     *("x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-    *("opacity", "f_dc_0", "f_dc_1", "f_dc_2"),  # where the row has RGB
+    *("opacity", "f_dc_0", "f_dc_1", "f_dc_2"),  # Columns of RGB in a row.
 )
 COLUMNS = {name: column for column, name in enumerate(OF_A_ROW)}
-FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}  # byte orders
+# Byte order of NumPy by format name.
+FORMATS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 TYPES = {
     name: kind
     for kind, names in (
@@ -53,20 +55,22 @@ TYPES = {
     )
     for name in names
 }
-MAX_LINE = 4096  # bytes of a header line; more is no header
+MAX_LINE = 4096  # Bytes of the longest line that a header may have.
 
 SPLAT = np.dtype(
     [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quaternion", "u1", 4)]
 )
 
-OPENGL = np.array([1, -1, -1], np.float32)  # axes of OpenGL in those of the map, and back
-OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # the same mirroring F of a rotation: F R F
+OPENGL = np.array([1, -1, -1], np.float32)  # Map axes to OpenGL axes, and back.
+OPENGL_QUAT = np.array([1, 1, -1, -1], np.float32)  # The same conversion F of a rotation: F R F.
 
 
 def write_ply(path: Path, rows: np.ndarray) -> None:
-    """Write Gaussian rows [N, 16] (see `gaussians.model`): means in metres, log scales,
-    quaternion wxyz, here of length one, logit of the opacity, colour as the constant spherical
-    harmonic."""
+    """Write Gaussian rows [N, 16] (see `gaussians.model`) as PLY.
+
+    Means are in meters, scales are logarithms, quaternions (wxyz) have length one, opacity is a
+    logit, and color is the constant spherical harmonic.
+    """
     table = np.zeros((len(rows), len(PROPERTIES)), "<f4")
     for name, column in COLUMNS.items():
         table[:, PROPERTIES.index(name)] = rows[:, column]
@@ -81,12 +85,17 @@ def write_ply(path: Path, rows: np.ndarray) -> None:
 
 
 def read_ply(path: Path) -> np.ndarray:
-    """Gaussian rows [N, 16] float32 (see `gaussians.model`) of a PLY file of any program.
+    """Read Gaussians from a PLY file of any program.
 
-    Properties may come in any order and of any type, in text or binary. Normals and whatever else
-    is beside the Gaussians are ignored; so is view-dependent colour (`f_rest_*`), with a warning.
-    Raises DataError for a file that is cut off or too long, lacks a property, or holds NaN,
-    infinity or a quaternion of length zero.
+    Properties may have any order and any type, in text or binary. Normals and other properties
+    and elements are ignored. View-dependent color (`f_rest_*`) is ignored with a warning.
+
+    Returns:
+        Gaussian rows [N, 16] float32 (see `gaussians.model`).
+
+    Raises:
+        DataError: The file is cut off or too long, lacks a property, or holds NaN, infinity or a
+            quaternion of length zero.
     """
     try:
         with path.open("rb") as file:
@@ -95,22 +104,25 @@ def read_ply(path: Path) -> np.ndarray:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     if any(name.startswith("f_rest_") for name in header.properties):
-        log.warning("%s: colour that depends on the view (f_rest_*) is left out", path)
+        log.warning(
+            "%s: view-dependent color (f_rest_*) is not supported and is ignored; no action needed",
+            path,
+        )
     return _rows(path, vertices)
 
 
 def harmonics(colors: np.ndarray) -> np.ndarray:
-    """Coefficients [N, 3] of the constant spherical harmonic of RGB [N, 3], 0..1."""
+    """Return the coefficients [N, 3] of the constant spherical harmonic for RGB [N, 3], 0..1."""
     return (colors - 0.5) / SH_C0
 
 
 # --- reading --------------------------------------------------------------------------------------
 @dataclass(frozen=True, slots=True)
 class _Header:
-    byte_order: str  # of numpy; empty: text
+    byte_order: str  # Byte order of NumPy; empty for text.
     count: int
-    properties: dict[str, str]  # of a vertex: numpy type by name, in order of the file
-    is_last: bool  # no other element follows the vertices
+    properties: dict[str, str]  # NumPy type of each property of a vertex, in file order.
+    is_last: bool  # The vertices are the last element.
 
 
 def _read_header(path: Path, file: BinaryIO) -> _Header:
@@ -126,16 +138,16 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
             case ["property", "list", _, _, _] if elements and list(elements)[-1] != "vertex":
                 pass
             case _:
-                raise DataError(f"{path}: cannot make sense of {' '.join(words)!r} in its header.")
+                raise DataError(f"{path}: its header has an unknown line {' '.join(words)!r}.")
     if byte_order is None:
         raise DataError(f"{path}: its header names no format, so it is no PLY file.")
     if next(iter(elements), None) != "vertex":
-        raise DataError(f"{path}: its first element is not `vertex`: is it a map of Gaussians?")
+        raise DataError(f"{path}: its first element is not `vertex`, so it is no map of Gaussians.")
     return _Header(byte_order, *elements["vertex"], is_last=len(elements) == 1)
 
 
 def _header_lines(path: Path, file: BinaryIO) -> Iterator[list[str]]:
-    """The words of each line between `ply` and `end_header`, without comments."""
+    """Yield the words of each line between `ply` and `end_header`, without comments."""
     if file.readline(MAX_LINE).rstrip() != b"ply":
         raise DataError(f"{path} is no PLY file: it does not start with `ply`.")
     while line := file.readline(MAX_LINE):
@@ -151,8 +163,8 @@ def _read_vertices(path: Path, header: _Header, body: bytes) -> dict[str, np.nda
     missing = [name for name in COLUMNS if name not in header.properties]
     if missing:
         raise DataError(
-            f"{path} has no property {missing[0]}: it is no map of Gaussians as 3D Gaussian "
-            "splatting writes them."
+            f"{path} has no property {missing[0]}: it is no map of Gaussians in the format of 3D "
+            "Gaussian splatting."
         )
     if header.byte_order:
         return _binary_vertices(path, header, body)
@@ -180,40 +192,40 @@ def _require_size(path: Path, header: _Header, found: int, each: int, unit: str)
     expected = header.count * each
     if found < expected:
         raise DataError(
-            f"{path} is cut off: {header.count} Gaussians are {expected} {unit}, {found} are there."
+            f"{path} is cut off: {header.count} Gaussians need {expected} {unit}, the file holds "
+            f"{found}."
         )
     if found > expected and header.is_last:
         raise DataError(
-            f"{path} holds {found - expected} {unit} beyond the {header.count} Gaussians that its "
-            "header counts: header and content do not belong together."
+            f"{path} holds {found - expected} {unit} beyond the {header.count} Gaussians of its "
+            "header: header and content do not match."
         )
 
 
 def _rows(path: Path, vertices: dict[str, np.ndarray]) -> np.ndarray:
     rows = aligned_rows(len(vertices["x"]))
-    with np.errstate(over="ignore"):  # what float32 cannot hold is refused below
+    with np.errstate(over="ignore"):  # Overflow is rejected below.
         for name, column in COLUMNS.items():
             rows[:, column] = vertices[name]
     rows[:, 11:14] = rows[:, 11:14] * np.float32(SH_C0) + np.float32(0.5)
     bad = ~np.isfinite(rows).all(axis=1) | ~rows[:, 6:10].any(axis=1)
     if bad.any():
         raise DataError(
-            f"{path}: {bad.sum()} of {len(rows)} Gaussians, the first of them number "
-            f"{np.argmax(bad)}, hold NaN, infinity or a quaternion of length zero. Write the file "
-            "again without them."
+            f"{path}: {bad.sum()} of {len(rows)} Gaussians hold NaN, infinity or a quaternion of "
+            f"length zero (first: number {np.argmax(bad)}). Write the file again without them."
         )
     return rows
 
 
 def write_splat(path: Path, rows: np.ndarray) -> None:
-    """Write Gaussian rows [N, 16] (see `gaussians.model`); colours beyond 0..1 are clipped."""
+    """Write Gaussian rows [N, 16] (see `gaussians.model`) as .splat; colors are clipped to 0..1."""
     scales, opacities = np.exp(rows[:, 3:6]), 1 / (1 + np.exp(-rows[:, 10:11]))
     quats = rows[:, 6:10] / np.linalg.norm(rows[:, 6:10], axis=1, keepdims=True)
     splats = np.zeros(len(rows), SPLAT)
     splats["mean"], splats["scale"] = rows[:, 0:3], scales
     splats["rgba"] = _bytes(255 * np.hstack([rows[:, 11:14], opacities]))
     splats["quaternion"] = _bytes(128 + 128 * quats)
-    # Viewers draw while they load.
+    # Viewers draw while they load, so Gaussians with a large weight come first.
     weights = opacities[:, 0] * scales.prod(axis=1)
     path.write_bytes(splats[np.argsort(-weights, kind="stable")].tobytes())
 
@@ -223,20 +235,24 @@ def _bytes(values: np.ndarray) -> np.ndarray:
 
 
 def write_spz(path: Path, rows: np.ndarray) -> None:
-    """Write Gaussian rows [N, 16] (see `gaussians.model`). Raises ConfigError without gsply."""
+    """Write Gaussian rows [N, 16] (see `gaussians.model`) as .spz.
+
+    Raises:
+        ConfigError: The optional package gsply is not installed.
+    """
     try:
-        import gsply  # takes a third of a second, and is an extra
+        import gsply  # An optional package, whose import takes a third of a second.
     except ImportError as error:
         raise ConfigError(
-            f"writing .spz needs gsply ({error}). `pip install 'ldo-slam[viewer]'` brings it."
+            f"writing .spz needs gsply ({error}). Install it: `pip install 'ldo-slam[viewer]'`."
         ) from error
     gaussians = gsply.GSData.from_arrays(
         means=rows[:, 0:3] * OPENGL,
-        scales=np.ascontiguousarray(rows[:, 3:6]),  # logarithms, as in a PLY
+        scales=np.ascontiguousarray(rows[:, 3:6]),  # Logarithms, as in a PLY.
         quats=rows[:, 6:10] * OPENGL_QUAT,  # wxyz
-        opacities=np.ascontiguousarray(rows[:, 10]),  # logits
+        opacities=np.ascontiguousarray(rows[:, 10]),  # Logits.
         sh0=harmonics(rows[:, 11:14]),
         shN=None,
         format="ply",
     )
-    gsply.write_spz(path, gaussians, version=3)  # the container that every reader knows
+    gsply.write_spz(path, gaussians, version=3)  # The version that every reader supports.

@@ -1,4 +1,4 @@
-"""Fitting of the map to its keyframes: which of them each iteration takes, and the iterations."""
+"""Fitting of the map to its keyframes: the choice of keyframes and the iterations."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,41 +15,50 @@ from .model import GaussianMap
 from .optimizer import GaussianOptimizer, GaussianOptimizerConfig
 from .training_views import TrainingView, covisibility_ratio, sample_training_views, sampled_surface
 
-TRIES_PER_DRAW = 4  # of keyframes at random, where many see what sleeps
+# Random draws per keyframe that is needed; keyframes that see offloaded Gaussians are skipped.
+TRIES_PER_DRAW = 4
 
 
 @dataclass(frozen=True, slots=True)
 class ViewSamplingConfig:
-    """Which keyframes the map is fitted to when a new one comes. Random ones keep what was learnt:
-    +4.2 dB, covisible ones +1.1 dB in the ablations of others (ALGORITHMS, The map)."""
+    """Choice of the keyframes to which the map is fitted after a new one.
 
-    newest_share: float = 0.3
-    covisible_share: float = 0.3
-    min_shared: float = 0.3  # of the newest one's surface, to be covisible
-    recent: int = 32  # keyframes that are looked at for that, and
-    earlier: int = 32  # so many of those before, at random: bounded, however long the journey
+    Random keyframes preserve what earlier iterations fitted: they gain 4.2 dB, and covisible ones
+    1.1 dB, in published ablations (ALGORITHMS, The map).
+    """
+
+    newest_share: float = 0.3  # Fraction of the iterations that take the newest keyframe.
+    covisible_share: float = 0.3  # Fraction of the iterations that take a covisible keyframe.
+    min_shared: float = 0.3  # Least overlap of a covisible keyframe with the newest one.
+    recent: int = 32  # Last keyframes that are checked for covisibility.
+    # Random earlier keyframes that are checked too. The number is fixed, so the cost does not grow
+    # with the length of the run.
+    earlier: int = 32
 
     def __post_init__(self) -> None:
         shares = (self.newest_share, self.covisible_share)
         if not (min(shares) >= 0 and sum(shares) <= 1):
-            raise ConfigError(f"newest_share and covisible_share {shares} must not exceed 1.")
+            raise ConfigError(
+                named(self, "newest_share", "covisible_share")
+                + " must be at least 0 and add up to at most 1."
+            )
         if min(self.recent, self.earlier) < 0 or not 0 <= self.min_shared <= 1:
             raise ConfigError(
                 named(self, "min_shared", "recent", "earlier")
-                + ": counts must not be negative, min_shared within 0..1."
+                + ": recent and earlier must be at least 0, min_shared must lie in 0..1."
             )
 
 
 class Fitting:
-    """The optimizer of the map, and the choice of the keyframes that it takes.
+    """Gaussian optimizer with the choice of its keyframes.
 
     Args:
-        config: Parameters of the optimizer.
-        window: Which keyframes a new one is fitted with.
-        views: The keyframes to fit to.
-        is_awake: Returns whether all Gaussians that a keyframe may see are in memory. The others
-            are not fitted to: what is in memory would be bent to stand in for the rest.
-        seed: Of the random choice of keyframes.
+        config: Settings of the Gaussian optimizer.
+        window: Choice of the keyframes after a new one.
+        views: Keyframes to fit to.
+        is_awake: Returns whether all Gaussians that a keyframe may see are in memory. Other
+            keyframes are skipped: the resident Gaussians would move to replace the offloaded ones.
+        seed: Seed of the random choice of keyframes.
         threads: Threads of the renderer.
     """
 
@@ -67,14 +76,14 @@ class Fitting:
         self._window, self._views, self._is_awake = window, views, is_awake
         self._seed = seed
         self.iterations = 0
-        self.unusable = 0  # keyframes that were chosen and could not be fitted to
+        self.unusable = 0  # Keyframes that were chosen but skipped.
 
     def forget_view(self, keyframe: int) -> None:
-        """Drop what the optimizer keeps of a keyframe."""
+        """Drop the optimizer's state of a keyframe."""
         self._optimizer.forget_view(keyframe)
 
     def plan(self, newest: TrainingView, iterations: int) -> list[int]:
-        """Return which keyframe each iteration takes after a new one."""
+        """Return the keyframe of each iteration after a new keyframe."""
         window, rng = self._window, random_for(self._seed, newest.keyframe)
         older = [k for k in self._views.store.keyframes() if k != newest.keyframe]
         return sample_training_views(
@@ -90,7 +99,7 @@ class Fitting:
     def _covisible(
         self, newest: TrainingView, older: list[int], rng: np.random.Generator
     ) -> list[int]:
-        """Those of the recent keyframes, and of a few earlier ones, that see the same surface."""
+        """Return the keyframes with the same surface, of the recent ones and some earlier ones."""
         window = self._window
         split = max(0, len(older) - window.recent)
         earlier, recent = older[:split], older[split:]
@@ -104,12 +113,15 @@ class Fitting:
         return covisibility_ratio(p_map, self._views.cameras[keyframe], self._views.poses[keyframe])
 
     def plan_refinement(self, iterations: int, first: Sequence[int]) -> Iterable[int]:
-        """Return `first` and keyframes at random, in turn, until all of `first` are through."""
+        """Return `first` and random keyframes in turn, then random keyframes alone."""
         drawn = self._sample_keyframes(iterations - len(first))
         return (k for pair in zip_longest(first, drawn) for k in pair if k is not None)
 
     def _sample_keyframes(self, count: int) -> list[int]:
-        """So many keyframes at random, one perhaps more than once, that see nothing that sleeps."""
+        """Return random keyframes that see no offloaded Gaussians.
+
+        The result may have repetitions, and fewer than `count` keyframes if most draws are skipped.
+        """
         known = self._views.store.keyframes()
         if not known:
             return []
@@ -124,13 +136,15 @@ class Fitting:
         rates: tuple[float, float] = (1.0, 1.0),
         effort: float = inf,
     ) -> np.ndarray:
-        """Run one iteration for each keyframe of the plan that can be fitted to.
+        """Run one iteration for each usable keyframe of the plan.
+
+        A keyframe is usable if its images are readable and it sees no offloaded Gaussians.
 
         Args:
             gaussians: The map.
             plan: Keyframes, in the order of the iterations.
             rates: Factor of the learning rates at the first and at the last iteration.
-            effort: Iterations that reach the usual number of Gaussians, after which it ends.
+            effort: Limit of the work, in iterations that reach the usual number of Gaussians.
 
         Returns:
             Mask [N] of the Gaussians that changed.
@@ -151,15 +165,18 @@ class Fitting:
         return self._is_awake(keyframe) and self._views.is_readable(keyframe)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state of the optimizer."""
+        """Return the state of the Gaussian optimizer."""
         return self._optimizer.snapshot()
 
     def restore(self, state: Mapping[str, Any], iterations: int) -> None:
-        """Go on from a state of the optimizer after so many iterations."""
+        """Restore the state of the Gaussian optimizer after a number of iterations."""
         self._optimizer.restore(state)
         self.iterations = iterations
 
 
 def random_for(seed: int, *what: int) -> np.random.Generator:
-    """Return the random numbers of one piece of work, so none need to be kept between two."""
+    """Return a generator for one piece of work.
+
+    Its seed depends only on the arguments, so no generator state is saved.
+    """
     return np.random.default_rng([seed, *what])

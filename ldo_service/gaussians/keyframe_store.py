@@ -1,4 +1,4 @@
-"""Keyframe images on disk, the last used ones in memory, and the training views of them."""
+"""Keyframe images on disk with a cache in memory, and the training views made of them."""
 
 import logging
 from collections import OrderedDict
@@ -28,45 +28,52 @@ _DISK_FULL = (
 
 @dataclass(frozen=True, slots=True)
 class KeyframeStoreConfig:
-    cache_mb: float = 256.0  # in memory: 119 keyframes of 640x480 with 2.15 MB each
-    quota_mb: float = 4096.0  # on disk: some 8,000 keyframes of 640x480 with 0.5 MB each
-    most: int = 20_000  # on disk, however small: each takes 3 kB of memory too, for its view
-    newest_kept: int = 8  # that the quota never touches: they are worked on
+    """Limits of the keyframe store."""
+
+    cache_mb: float = 256.0  # Memory: 119 keyframes of 640x480 with 2.15 MB each.
+    quota_mb: float = 4096.0  # Disk: about 8,000 keyframes of 640x480 with 0.5 MB each.
+    # Maximum number of keyframes on disk; the view of each also takes 3 kB of memory.
+    most: int = 20_000
+    # Number of newest keyframes that the quota never removes, because the map is fitted to them.
+    newest_kept: int = 8
 
     def __post_init__(self) -> None:
         if not (self.cache_mb >= 0 and self.quota_mb > 0 and min(self.newest_kept, self.most) >= 1):
             raise ConfigError(
                 named(self, "cache_mb", "quota_mb", "most", "newest_kept")
-                + ": cache_mb must be at least 0, quota_mb positive, the others at least 1."
+                + ": cache_mb must be at least 0, quota_mb must be positive, most and newest_kept "
+                "must be at least 1."
             )
 
 
 class KeyframeStore:
-    """Finds in `folder` what an earlier store left there. Without a folder a temporary one is
-    used, which goes when the store does.
+    """Store of keyframe images in `folder`, including those of an earlier store.
 
-    Over the quota, keyframes are forgotten as described at `_most_redundant`. Where the disk takes
-    no more, a new keyframe lives as long as the cache holds it. What the store holds depends only
-    on what it was given, not on time. Not for two threads at once. Raises ConfigError for a folder
-    that cannot be used.
+    Without a folder, the store uses a temporary one and removes it with itself. Over the quota,
+    the store drops the most redundant keyframes (see `_most_redundant`). If the disk is full, a
+    new keyframe is available only while it is in the cache. The content depends only on the calls,
+    not on time. Not thread-safe.
+
+    Raises:
+        ConfigError: The folder cannot be used.
     """
 
     def __init__(self, folder: Path | None, config: KeyframeStoreConfig | None = None) -> None:
         self.config = config or KeyframeStoreConfig()
         self._files = ChecksummedFolder(folder, "keyframe", _DISK_FULL)
-        self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # last used last
+        self._cache: OrderedDict[int, KeyframeImages] = OrderedDict()  # Least recently used first.
         self._reads = self._forgotten = self._damaged = 0
         self._make_room()
 
     def put(self, images: KeyframeImages) -> None:
-        """Keep copies. A keyframe that is there already is replaced."""
+        """Store copies of the images; an existing keyframe is replaced."""
         images = images.owned()
         self._remember(images)
         self._files.write(images.keyframe, pack(images))
         self._make_room()
 
     def get(self, keyframe: int) -> KeyframeImages | None:
-        """The images, read-only, bit for bit; None when they are not, or no longer, there."""
+        """Return the read-only images, bitwise unchanged; None if the store does not have them."""
         images = self._cache.get(keyframe)
         if images is not None:
             self._cache.move_to_end(keyframe)
@@ -81,17 +88,18 @@ class KeyframeStore:
         return len(self._files.sizes.keys() | self._cache.keys())
 
     def keyframes(self) -> list[int]:
-        """Ids of all that are there, ascending."""
+        """Return the ids of all stored keyframes, ascending."""
         return sorted(self._files.sizes.keys() | self._cache.keys())
 
     def keep_only(self, keyframes: Iterable[int]) -> None:
-        """Drop all others: those that a restored checkpoint does not know."""
+        """Drop all other keyframes: those that a restored checkpoint does not contain."""
         kept = set(keyframes)
         for keyframe in self.keyframes():
             if keyframe not in kept:
                 self._drop(keyframe)
 
     def metrics(self) -> dict[str, float]:
+        """Return the counters of the store."""
         return {
             "keyframes_stored": len(self),
             "keyframes_disk_mb": sum(self._files.sizes.values()) / 1e6,
@@ -120,7 +128,12 @@ class KeyframeStore:
             if images.keyframe != keyframe:
                 raise DataError(f"the file holds keyframe {images.keyframe}")
         except DataError as error:
-            log.warning("keyframe %d is dropped, its images cannot be read: %s", keyframe, error)
+            log.warning(
+                "keyframe store: images of keyframe %d cannot be read (%s); they are dropped and "
+                "the map is no longer fitted to this keyframe",
+                keyframe,
+                error,
+            )
             self._damaged += 1
             self._drop(keyframe)
             return None
@@ -142,20 +155,26 @@ class KeyframeStore:
             self._forgotten += 1
 
     def _most_redundant(self) -> int | None:
-        """The keyframe on disk whose neighbours there have the closest ids, the oldest of several:
-        it saw least that they did not, and keyframes stay spread over the whole run. Never the
-        first, which fixes the map's place and brightness, nor the newest. None: nobody else."""
+        """Return the keyframe on disk that lies between the two closest ids.
+
+        Its neighbors probably saw the same surface, and the stored keyframes stay spread over the
+        whole run. Of several, the oldest is returned. The first keyframe, which fixes the pose and
+        the brightness of the map, and the newest ones are never returned.
+
+        Returns:
+            The keyframe, or None if there is no other.
+        """
         kept = np.array(sorted(self._files.sizes), np.int64)
         gaps = (kept[2:] - kept[:-2])[: max(0, len(kept) - 1 - self.config.newest_kept)]
         return int(kept[1 + np.argmin(gaps)]) if len(gaps) else None
 
 
 class KeyframeViews:
-    """Views by keyframe: where each stands is in memory, what it saw is in the store.
+    """Training views by keyframe: poses in memory, images in the store.
 
-    `poses` (T_map_camera [4, 4]) has every keyframe that ever was, for Gaussians hang on it: 136
-    bytes each. A view is there while its images are, and so are `cameras`, `exposures` and
-    `horizons`, in the same order: 1.5 kB each.
+    `poses` (T_map_camera [4, 4]) has every keyframe of the run, because Gaussians are anchored to
+    it: 136 bytes each. A view exists while its images are stored. `cameras`, `exposures` and
+    `horizons` have the same keyframes in the same order: 1.5 kB each.
     """
 
     def __init__(self, store: KeyframeStore) -> None:
@@ -166,9 +185,13 @@ class KeyframeViews:
         self.horizons: dict[int, MaxDepthGrid] = {}
 
     def add(self, view: TrainingView) -> list[int]:
-        """The newest one; those without images, of which only their poses are known from now on."""
+        """Add the newest keyframe.
+
+        Returns:
+            The keyframes that the store has dropped; only their poses remain.
+        """
         if not self.poses:
-            self.store.keep_only(())  # what another journey left in the folder
+            self.store.keep_only(())  # Images of an earlier run in the folder.
         self.store.put(KeyframeImages.of(view))
         self[view.keyframe] = view
         self.horizons[view.keyframe] = MaxDepthGrid.of(view.depth_m)
@@ -184,7 +207,11 @@ class KeyframeViews:
         return gone
 
     def mask_pixels(self, keyframe: int, pixels: np.ndarray) -> None:
-        """Those pixels [H, W] bool of its images count no more. Raises KeyError as a view does."""
+        """Exclude pixels [H, W] bool of a keyframe from fitting.
+
+        Raises:
+            KeyError: The images of the keyframe are dropped or unreadable.
+        """
         images = self.store.get(keyframe)
         if images is None:
             raise KeyError(keyframe)
@@ -192,7 +219,11 @@ class KeyframeViews:
         self.store.put(replace(images, mask=counts.astype(np.uint8)))
 
     def placed(self, keyframe: int) -> PlacedCamera:
-        """Its camera where it stands, and how far it saw. Raises KeyError as a view does."""
+        """Return the camera of a keyframe at its pose, with the farthest depth it saw.
+
+        Raises:
+            KeyError: The keyframe is unknown or its images are dropped.
+        """
         camera, T_map_camera = self.cameras[keyframe], self.poses[keyframe]
         return PlacedCamera(camera, T_map_camera, self.horizons[keyframe])
 
@@ -203,18 +234,22 @@ class KeyframeViews:
         return len(self.poses)
 
     def is_readable(self, keyframe: int) -> bool:
-        """Whether its images are still there, and undamaged."""
+        """Return whether the images of a keyframe exist and are undamaged."""
         return self.store.get(keyframe) is not None
 
     def __getitem__(self, keyframe: int) -> TrainingView:
-        """Raises KeyError when its images were forgotten or cannot be read."""
+        """Return the training view of a keyframe.
+
+        Raises:
+            KeyError: The images of the keyframe are dropped or unreadable.
+        """
         images = self.store.get(keyframe)
         if images is None:
             raise KeyError(keyframe)
         return images.view(self.poses[keyframe], self.exposures[keyframe])
 
     def __setitem__(self, keyframe: int, view: TrainingView) -> None:
-        """Take over its camera, pose and exposure."""
+        """Set camera, pose and exposure of a keyframe from its view."""
         self.cameras[keyframe] = view.camera
         self.poses[keyframe] = view.T_map_camera
         self.exposures[keyframe] = view.exposure
@@ -232,7 +267,7 @@ class KeyframeViews:
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Become what `state` is the snapshot of; images of later keyframes are dropped."""
+        """Restore the state of a `snapshot`; images of later keyframes are dropped."""
         keyframes = state["keyframes"]
         self.cameras = dict(zip(keyframes, (Camera(*c) for c in state["cameras"]), strict=True))
         self.poses.become(state["placed"], state["T_map_camera"])

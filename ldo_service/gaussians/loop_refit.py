@@ -1,4 +1,4 @@
-"""What corrections leave to do: surface that the map holds twice, and views it no longer fits."""
+"""Work after pose corrections: deduplication of Gaussians and refit iterations."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from .map_builder import MapBuilder
 
 @dataclass(frozen=True, slots=True)
 class LoopRefitConfig:
-    """See the fields of these names in `MapperConfig`."""
+    """Settings of the refit; see the fields of these names in `MapperConfig`."""
 
     mending_min_m: float
     mending_min_rad: float
@@ -28,25 +28,34 @@ class LoopRefitConfig:
 
 
 class LoopRefit:
-    """Of a map that is corrected now and then.
+    """Scheduler of the deduplication and refit iterations after pose corrections.
 
-    A keyframe that a correction moves far may lie over surface that the map holds already: it is to
-    be mended. One that it moves far against the first, which holds the frame of the map, is torn:
-    the map was fitted to it and others where they are no longer, and is due some iterations for it,
-    half of them against it, half against any keyframe. What is left as it was sees the same
-    surface, and would be bent to fit the torn ones alone. All is done little by little, so that new
-    keyframes wait no longer than they must.
+    A keyframe that a correction moves far may overlap surface that the map already holds. It is
+    queued for deduplication.
+
+    The first keyframe holds the map frame. A keyframe that moves far relative to it gets pending
+    refit iterations, because the map was fitted to the old relative poses. Half of its iterations
+    take this keyframe, half take any keyframe. Unmoved keyframes see the same surface: fitting to
+    the moved ones alone would make the map worse for them.
+
+    The work is spread over the following keyframes, to keep the latency of new keyframes low.
     """
 
     def __init__(self, map_: MapBuilder, config: LoopRefitConfig) -> None:
         self.config = config
         self._map = map_
-        self._mended = 0  # Gaussians that the map held twice
-        self._to_mend: list[int] = []  # keyframes, ascending
-        self._due: dict[int, int] = {}  # iterations by torn keyframe
+        self._mended = 0  # Duplicate Gaussians removed.
+        self._to_mend: list[int] = []  # Keyframes to deduplicate, ascending.
+        self._due: dict[int, int] = {}  # Pending refit iterations by keyframe.
 
     def mark_moved(self, T_map: KeyframePoses) -> None:
-        """Before the Gaussians of keyframes are moved to where these are by now."""
+        """Schedule work for the keyframes that a correction moves far.
+
+        Call it before the Gaussians move with their anchors.
+
+        Args:
+            T_map: The corrected poses of the keyframes.
+        """
         placed, config = self._map.views.poses, self.config
         keyframes = np.fromiter(placed, np.int64)
         T_now, T_before = T_map.of(placed), placed.of(placed)
@@ -61,23 +70,30 @@ class LoopRefit:
         self._forget()
 
     def _forget(self) -> None:
-        """Those that are through, and those without images."""
+        """Drop keyframes without pending iterations or without images."""
         known = self._map.views.cameras
         self._due = {k: left for k, left in self._due.items() if left > 0 and k in known}
 
     @property
     def pending_iterations(self) -> int:
-        """Iterations, at most `due_iterations` for each keyframe with images."""
+        """Number of pending refit iterations.
+
+        It is at most `due_iterations` for each keyframe with images.
+        """
         return sum(self._due.values())
 
     @property
     def mending_iterations(self) -> int:
-        """That are done with the next keyframe."""
+        """Number of iterations after deduplication that run with the next keyframe."""
         config = self.config
         return config.mending_iterations * min(config.mended_keyframes, len(self._to_mend))
 
     def with_keyframe(self, *, is_behind: bool) -> None:
-        """A share of the work; what is due waits while keyframes do (`is_behind`)."""
+        """Do the part of the work that belongs to one new keyframe.
+
+        Args:
+            is_behind: More keyframes are queued; pending refit iterations then wait.
+        """
         self._deduplicate(self.config.mended_keyframes, self.config.mending_iterations)
         if not self._due or is_behind:
             return
@@ -87,18 +103,24 @@ class LoopRefit:
             self.refine(min(most, payable), effort=most)
 
     def at_end(self) -> None:
-        """Without iterations: they could move keyframes, and nobody takes a refinement any more."""
+        """Deduplicate at the end of the run, without iterations.
+
+        Iterations could move keyframes, and no more refinements are published then.
+        """
         self._deduplicate(self.config.mended_at_end, iterations=0)
 
     def _deduplicate(self, most: int, iterations: int) -> None:
-        """The newest first."""
+        """Deduplicate at most `most` keyframes, the newest first."""
         for _ in range(min(most, len(self._to_mend))):
             self._mended += self._map.deduplicate_keyframe(self._to_mend.pop(), iterations)
 
     def refine(
         self, iterations: int, rates: tuple[float, float] = (1.0, 1.0), effort: float = inf
     ) -> None:
-        """Iterations of the optimiser, see `MapBuilder.refine`: first those that are due."""
+        """Run iterations of the Gaussian optimizer, pending refit iterations first.
+
+        See `MapBuilder.refine` for the arguments.
+        """
         awake = self._resident_keyframes()
         visits = np.repeat(awake, [-(-self._due[k] // 2) for k in awake]).astype(np.int64)
         order = np.random.default_rng(self.pending_iterations).permutation(visits)
@@ -109,7 +131,10 @@ class LoopRefit:
         self._forget()
 
     def _resident_keyframes(self) -> list[int]:
-        """Torn keyframes that see nothing that sleeps: nothing can be fitted to the others."""
+        """Return the keyframes with pending iterations that see no offloaded Gaussians.
+
+        The optimizer cannot fit to the other keyframes.
+        """
         self._forget()
         return [k for k in self._due if self._map.is_resident(k)]
 
@@ -118,12 +143,13 @@ class LoopRefit:
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._to_mend = list(state["to_mend"])
-        self._due = dict(state.get("due", {}))  # states of old know nothing of it
+        self._due = dict(state.get("due", {}))  # Missing in old checkpoints.
 
     def metrics(self) -> dict[str, float]:
         return {
             "keyframes_to_deduplicate": len(self._to_mend),
-            "gaussians_deduplicated": self._mended,  # held twice after a correction, and removed
-            # to fit the map again where corrections have torn it
+            # Gaussians held twice after a correction, and removed.
+            "gaussians_deduplicated": self._mended,
+            # Iterations to refit the map to keyframes that corrections moved.
             "iterations_pending": self.pending_iterations,
         }

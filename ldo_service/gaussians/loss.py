@@ -1,5 +1,7 @@
-"""How far a rendering is from a frame. The kernel is `kernels/loss.cpp`, its plain twin
-`tests/reference/loss.py`."""
+"""Image loss between a rendering and a frame.
+
+The kernel is `kernels/loss.cpp`; its NumPy reference implementation is `tests/reference/loss.py`.
+"""
 
 from dataclasses import dataclass
 from math import log10
@@ -11,30 +13,33 @@ from ldo_service.kernels import _loss
 
 from .exposure import Exposure
 
-TILE = 16  # pixels across
+TILE = 16  # Edge in pixels.
 
 
 @dataclass(frozen=True, slots=True)
 class LossWeights:
-    l1: float = 0.8  # Kerbl et al. 2023, eq. 7: (1 - lambda) L1 + lambda D-SSIM,
-    d_ssim: float = 0.2  # lambda = 0.2
-    depth: float = 0.5  # per metre of mean depth error
+    """Weights of the terms of the image loss."""
+
+    # Kerbl et al., 2023, eq. 7: (1 - lambda) L1 + lambda D-SSIM with lambda = 0.2.
+    l1: float = 0.8
+    d_ssim: float = 0.2
+    depth: float = 0.5  # Weight per meter of mean depth error.
 
     def __post_init__(self) -> None:
         if not min(self.l1, self.d_ssim, self.depth) >= 0:
             raise ConfigError(
-                named(self, "l1", "d_ssim", "depth") + ": weights must not be negative."
+                named(self, "l1", "d_ssim", "depth") + ": weights must be at least 0."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class ImageLoss:
-    """total = weighted sum of l1, d_ssim and depth_m, which are means over the image."""
+    """Loss of an image and its terms, which are means over the image."""
 
-    total: float
-    l1: float  # of colours in 0..1
-    d_ssim: float  # 1 - SSIM
-    depth_m: float  # over the pixels whose depth was measured
+    total: float  # Weighted sum of l1, d_ssim and depth_m.
+    l1: float  # Mean absolute error of colors in 0..1.
+    d_ssim: float  # 1 - SSIM.
+    depth_m: float  # Mean over the pixels with measured depth.
     psnr_db: float
 
 
@@ -50,21 +55,29 @@ def image_loss(
     tiles: np.ndarray | None = None,
     threads: int = 1,
 ) -> ImageLoss:
-    """Compare a rendering with a frame, and write dL/dplanes to `by_planes` [5, H, W] float32.
+    """Compare a rendering with a frame and compute dL/dplanes.
 
         L = l1 mean|x - y| + d_ssim (1 - mean SSIM(x, y)) + depth mean|D - d|,  x = gain C + bias
 
-    planes   [5, H, W] float32: colours C, weighted depth D in metres, opacity (unused)
-    color    [3, H, W] uint8, y = color / 255
-    depth_m  [H, W] float32, d; 0 where not measured, which does not count
-    mask     [H, W] uint8: where it is 0 both images are taken as black and depth does not count
-    tiles    [ceil(H / 16), ceil(W / 16)] uint8: the pixels of tiles where it is 0 are masked, and
-             means are over the pixels of the others alone, of which there must be some
-    SSIM has an 11x11 Gaussian window of sigma 1.5 px and sees zeros beyond the image, as in 3DGS
-    (Wang et al. 2004; Kerbl et al. 2023). Raises ValueError for arrays that do not fit. Bitwise
-    equal for any number of threads.
+    SSIM has an 11x11 Gaussian window of sigma 1.5 px and zeros beyond the image, as in 3DGS
+    (Wang et al., 2004; Kerbl et al., 2023). The result is bitwise equal for any number of threads.
+
+    Args:
+        planes: Rendering [5, H, W] float32: colors C, weighted depth D in meters, opacity (unused).
+        color: Frame [3, H, W] uint8; y = color / 255.
+        depth_m: Depth d of the frame, [H, W] float32; 0 where not measured, which is ignored.
+        exposure: Gain and bias of the frame.
+        weights: Weights of the terms.
+        by_planes: dL/dplanes, [5, H, W] float32; overwritten.
+        mask: [H, W] uint8. Where it is 0, both images are black and depth is ignored.
+        tiles: [ceil(H / 16), ceil(W / 16)] uint8. Pixels of tiles where it is 0 are masked, and
+            means are over the other pixels. At least one tile must not be 0.
+        threads: Threads of the kernel.
+
+    Raises:
+        ValueError: The shapes of the arrays do not match.
     """
-    share = 1.0  # of the pixels
+    share = 1.0  # Fraction of the pixels that are used.
     if tiles is not None:
         inside = tile_mask(tiles, *depth_m.shape)
         share = float(np.mean(inside))
@@ -92,12 +105,18 @@ def image_loss(
 
 
 def tile_mask(tiles: np.ndarray, height: int, width: int) -> np.ndarray:
-    """The pixels [H, W] uint8 of the tiles where `tiles` [ceil(H / 16), ceil(W / 16)] is not 0.
+    """Return the mask [H, W] uint8 of the pixels in tiles that are not 0.
 
-    Raises ValueError for tiles of another shape, and where none is wanted.
+    Args:
+        tiles: [ceil(H / 16), ceil(W / 16)].
+        height: H.
+        width: W.
+
+    Raises:
+        ValueError: The tiles have another shape, or all are 0.
     """
     shape = -(-height // TILE), -(-width // TILE)
     if tiles.shape != shape or not tiles.any():
-        raise ValueError(f"tiles {tiles.shape} must have shape {shape} and a tile that is wanted.")
+        raise ValueError(f"tiles {tiles.shape} must have shape {shape} and a value that is not 0.")
     pixels = (tiles != 0).repeat(TILE, axis=0).repeat(TILE, axis=1)[:height, :width]
     return np.ascontiguousarray(pixels, np.uint8)

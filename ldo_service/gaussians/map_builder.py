@@ -1,4 +1,4 @@
-"""How keyframes become a map: grown where it lacks something, fitted to a window, bounded."""
+"""Construction of the map from keyframes: densification, optimization, pruning and offloading."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,11 +32,14 @@ from .visibility import (
     plan_offload,
 )
 
-MAX_ITERATIONS_PER_EFFORT = 2  # iterations that count as one when they reach next to nothing
+# Iterations per unit of effort: an iteration that reaches almost no Gaussians counts half.
+MAX_ITERATIONS_PER_EFFORT = 2
 
 
 @dataclass(frozen=True, slots=True)
 class MapBuilderConfig:
+    """Settings of the map builder and of its parts."""
+
     insertion: DensificationConfig = field(default_factory=DensificationConfig)
     optimiser: GaussianOptimizerConfig = field(default_factory=GaussianOptimizerConfig)
     window: ViewSamplingConfig = field(default_factory=ViewSamplingConfig)
@@ -44,25 +47,26 @@ class MapBuilderConfig:
     merging: DeduplicationConfig = field(default_factory=DeduplicationConfig)
     store: KeyframeStoreConfig = field(default_factory=KeyframeStoreConfig)
     sleep: OffloadConfig = field(default_factory=OffloadConfig)
-    recent_cameras: int = 8  # what the last keyframes see stays awake
-    prune_keyframes: int = 5  # between two prunings
-    refined_m: float = 2e-4  # a keyframe that the optimiser moved by so much, or
-    refined_rad: float = 2e-4  # turned by so much, is told of
-    seed: int = 0  # of the choice of keyframes
+    recent_cameras: int = 8  # Number of last keyframes whose visible Gaussians stay in memory.
+    prune_keyframes: int = 5  # Keyframes between two prunings.
+    # Least translation and rotation of a keyframe by the Gaussian optimizer that is published.
+    refined_m: float = 2e-4
+    refined_rad: float = 2e-4
+    seed: int = 0  # Seed of the random choice of keyframes.
 
     def __post_init__(self) -> None:
         if self.prune_keyframes < 1 or min(self.refined_m, self.refined_rad, self.seed) < 0:
             raise ConfigError(
                 named(self, "prune_keyframes", "refined_m", "refined_rad", "seed")
-                + ": prune_keyframes at least 1, the others not negative."
+                + ": prune_keyframes must be at least 1, the others at least 0."
             )
 
 
 class MapBuilder:
-    """The map and all that is needed to go on with it.
+    """The map with its keyframes, its optimizer and its change log.
 
-    Deterministic: the same keyframes, corrections and iterations in the same order give the same
-    bits, for any number of threads and after `restore`. Not for two threads at once.
+    Deterministic: the same keyframes, corrections and iterations in the same order give bitwise
+    equal maps, for any number of threads and after `restore`. Not thread-safe.
     """
 
     def __init__(
@@ -72,7 +76,13 @@ class MapBuilder:
         folder: Path | None = None,
         threads: int = 1,
     ) -> None:
-        """Images of keyframes and sleeping Gaussians go to `folder`, or to a temporary one."""
+        """Create an empty map.
+
+        Args:
+            config: Settings.
+            folder: Folder for keyframe images and offloaded Gaussians; None for a temporary one.
+            threads: Threads of the renderer and the optimizer.
+        """
         self.config = config or MapBuilderConfig()
         self.gaussians = GaussianMap()
         self.sleeping = OffloadedGaussians(folder and folder / "gaussians")
@@ -87,9 +97,10 @@ class MapBuilder:
             threads=threads,
         )
         self._log = ChangeLog()
-        self._told = PoseTable()  # T_map_keyframe that others know, of those with images
+        self._told = PoseTable()  # Published T_map_keyframe of the keyframes with images.
         self._newest: int | None = None
-        self._shown: tuple[int, Rendering] | None = None  # of a keyframe, while the map stays
+        # Cached rendering of one keyframe; None after a change of the map.
+        self._shown: tuple[int, Rendering] | None = None
         self._pruned = self._excess = 0
 
     # --- keyframes --------------------------------------------------------------------------------
@@ -101,12 +112,17 @@ class MapBuilder:
         iterations: int,
         dynamic_mask: np.ndarray | None = None,
     ) -> None:
-        """Take in a keyframe, later than all before, and fit the map to its window.
+        """Add a keyframe, later than all before, and fit the map to it and some others.
 
-        T_map_camera [4, 4]; `iterations` of the optimiser that reach the usual number of Gaussians:
-        fewer where more are in view, so that a keyframe costs the same however dense the map is;
-        `dynamic_mask` [H, W] bool: pixels that are neither mapped nor fitted.
-        Its Gaussians hang on it.
+        The new Gaussians are anchored to the keyframe.
+
+        Args:
+            frame: Color and depth of the keyframe.
+            T_map_camera: Pose of the keyframe, [4, 4].
+            keyframe: Id of the keyframe.
+            iterations: Iterations that reach the usual number of Gaussians. Fewer are run where
+                more Gaussians are in view, so a keyframe costs the same in a dense map.
+            dynamic_mask: Pixels that are neither mapped nor fitted, [H, W] bool.
         """
         self._wake(PlacedCamera(frame.camera, T_map_camera, MaxDepthGrid.of(frame.depth_m)))
         self._shown = None
@@ -130,7 +146,7 @@ class MapBuilder:
     def render_from(
         self, camera: Camera, T_map_camera: np.ndarray, *, contributions: bool = False
     ) -> Rendering:
-        """What the map shows there, of what is awake."""
+        """Render the resident Gaussians from a camera pose."""
         return render(
             self.gaussians.rows,
             camera,
@@ -142,7 +158,10 @@ class MapBuilder:
         )
 
     def render_keyframe(self, keyframe: int, *, contributions: bool = False) -> Rendering:
-        """What it shows where a keyframe stands; rendered once while the map does not change."""
+        """Render the map at the pose of a keyframe, or return the cached rendering.
+
+        The cache is valid until the map changes.
+        """
         if self._shown is None or self._shown[0] != keyframe:
             self._shown = None
         if self._shown is None or (contributions and self._shown[1].contributions is None):
@@ -153,7 +172,10 @@ class MapBuilder:
     def _exposure(
         self, frame: RgbdFrame, before: Rendering, dynamic_mask: np.ndarray | None
     ) -> Exposure:
-        """Against the map; where too little of it is in view, as the keyframe before."""
+        """Estimate the exposure of a frame relative to the map.
+
+        If the map covers too little of the image, use the exposure of the previous keyframe.
+        """
         rendered, seen = before.color.transpose(2, 0, 1), frame.color.transpose(2, 0, 1)
         counts = None if dynamic_mask is None else (~dynamic_mask).astype(np.uint8)
         estimated = estimate_exposure(rendered, before.opacity, seen, counts)
@@ -184,10 +206,20 @@ class MapBuilder:
         self._log.mark_added(self.gaussians)
 
     def remove_masked(self, keyframe: int, pixels: np.ndarray) -> int:
-        """What a keyframe shows there, [H, W] bool, turned out not to belong to the map: it is
-        fitted no more, and the Gaussians that the keyframe put there go. How many did.
+        """Remove pixels of a keyframe from the map, because they show moving objects.
 
-        Raises KeyError for a keyframe without images.
+        The pixels are excluded from fitting, and the Gaussians that the keyframe placed there are
+        removed.
+
+        Args:
+            keyframe: Id of the keyframe.
+            pixels: Mask, [H, W] bool.
+
+        Returns:
+            Number of removed Gaussians.
+
+        Raises:
+            KeyError: The images of the keyframe are dropped or unreadable.
         """
         self._wake(self.views.placed(keyframe))
         self._shown = None
@@ -209,9 +241,19 @@ class MapBuilder:
         first: Sequence[int] = (),
         effort: float = inf,
     ) -> int:
-        """Fit to random keyframes, with steps that shrink or grow from one rate to the other; until
-        all of `first` are through, to one of them and one at random in turn. How many iterations it
-        were: fewer where `effort` was spent, or where most keyframes see what sleeps.
+        """Fit the map to random keyframes.
+
+        Until all of `first` are taken, they alternate with random keyframes.
+
+        Args:
+            iterations: Number of iterations.
+            rates: Factor of the learning rates at the first and at the last iteration.
+            first: Keyframes to take first.
+            effort: Limit of the work, in iterations that reach the usual number of Gaussians.
+
+        Returns:
+            Number of iterations that were run. It is smaller if `effort` was spent, or if most
+            keyframes see offloaded Gaussians.
         """
         self._shown, before = None, self._fitting.iterations
         self._fit(self._fitting.plan_refinement(iterations, first), rates, effort)
@@ -225,16 +267,25 @@ class MapBuilder:
         return touched
 
     def is_resident(self, keyframe: int) -> bool:
-        """Whether all is awake that it may see: else what is would be bent to stand in for it."""
+        """Return whether all Gaussians that a keyframe may see are in memory.
+
+        Otherwise fitting to the keyframe would move the resident Gaussians to replace the others.
+        """
         return not self.sleeping.visible_chunks(self.views.placed(keyframe), self._reach_m)
 
     # --- after a correction -----------------------------------------------------------------------
     def deduplicate_keyframe(self, keyframe: int, iterations: int) -> int:
-        """A keyframe that was laid over earlier ones: what the map holds twice there is held once,
-        and a few iterations fit it to the keyframe. How many Gaussians went; none where its images
-        are forgotten.
+        """Remove Gaussians of a keyframe that duplicate older ones, after a loop closure.
 
-        One keyframe at a time, so that nobody waits long.
+        A few iterations then fit the map to the keyframe. The caller passes one keyframe at a time,
+        so that new keyframes do not wait long.
+
+        Args:
+            keyframe: Id of the keyframe; nothing is done if its images are dropped.
+            iterations: Number of iterations.
+
+        Returns:
+            Number of removed Gaussians.
         """
         if keyframe not in self.views.cameras:
             return 0
@@ -249,15 +300,18 @@ class MapBuilder:
 
     # --- pruning ----------------------------------------------------------------------------------
     def _prune_misshapen(self, touched: np.ndarray) -> None:
-        """Among those that the window reached, so that it costs no more in a larger map."""
+        """Prune among the touched Gaussians only, so the cost does not grow with the map."""
         among = np.flatnonzero(touched)
         mask = np.zeros(len(self.gaussians), bool)
         mask[among] = prunable_mask(self.gaussians.rows[among], self.config.pruning)
         self._remove(mask)
 
     def _prune_unconfirmed(self, newest: int) -> None:
-        """Of the Gaussians of two keyframes: of one that others have followed by now, and of an
-        earlier one, at random, since the map goes on changing around it."""
+        """Prune the hidden Gaussians of two keyframes.
+
+        One of them has just received the last of its `confirm_keyframes` later keyframes. The other
+        is a random earlier one, because the map around it keeps changing.
+        """
         age, pruning = self.config.pruning.confirm_keyframes, self.config.pruning
         older = [k for k in self.views.store.keyframes() if k < newest][: 1 - age or None]
         if not older or pruning.min_weight_px == 0:
@@ -285,19 +339,22 @@ class MapBuilder:
 
     # --- labels -----------------------------------------------------------------------------------
     def visible_contributions(self, keyframe: int) -> Contributions:
-        """The Gaussians that make its image, woken if they slept."""
+        """Return the contributions of the Gaussians to the image of a keyframe.
+
+        Offloaded Gaussians that it may see are loaded first.
+        """
         self._wake(self.views.placed(keyframe))
         shown = self.render_keyframe(keyframe, contributions=True).contributions
         assert shown is not None
         return shown
 
     def mark_relabeled(self, indices: np.ndarray) -> None:
-        """These rows have other labels than followers know."""
+        """Record that the labels of these rows differ from the published ones."""
         mask = np.zeros(len(self.gaussians), bool)
         mask[indices] = True
         self._log.changed(mask)
 
-    # --- sleep ------------------------------------------------------------------------------------
+    # --- offloading -------------------------------------------------------------------------------
     @property
     def _reach_m(self) -> float:
         return self.config.sleep.reach_m
@@ -310,8 +367,10 @@ class MapBuilder:
         self._log.mark_loaded(self.gaussians, ids)
 
     def offload_excess(self) -> None:
-        """Let Gaussians sleep where there are too many. To be called when followers know all that
-        changed: to them sleeping Gaussians are as before."""
+        """Offload Gaussians to disk if too many are in memory.
+
+        Call it when all changes are published: replicas do not distinguish offloaded Gaussians.
+        """
         if len(self.gaussians) <= self.config.sleep.max_active:
             return
         keyframes = list(self.views.cameras)[-self.config.recent_cameras :]
@@ -326,21 +385,24 @@ class MapBuilder:
         self._log.mark_all_published(self.gaussians)
 
     def size(self) -> int:
-        """Gaussians, awake and asleep."""
+        """Return the number of Gaussians, resident and offloaded."""
         return len(self.gaussians) + len(self.sleeping)
 
     def batches(self) -> Iterator[GaussianBatch]:
-        """The whole map, in pieces; ids ascend throughout."""
+        """Yield the whole map in batches; ids ascend throughout."""
         yield from iter_all_gaussians(self.gaussians, self.sleeping)
 
-    # --- telling others ---------------------------------------------------------------------------
+    # --- publication ------------------------------------------------------------------------------
     def changes(self, *, with_changed: bool) -> Changes:
-        """What followers of the map do not know yet; see `ChangeLog.drain`."""
+        """Return the changes to publish; see `ChangeLog.drain`."""
         self._log.lost(self.sleeping.pop_lost_ids(self.gaussians))
         return self._log.drain(self.gaussians, with_changed=with_changed)
 
     def refined(self) -> dict[int, np.ndarray]:
-        """T_map_keyframe of keyframes that the optimiser moved since others were told."""
+        """Return the keyframe poses to publish that the Gaussian optimizer moved, T_map_keyframe.
+
+        The poses count as published then.
+        """
         poses = self.views.poses
         is_news = se3.transforms_differ(
             poses.of(self._told),
@@ -353,7 +415,11 @@ class MapBuilder:
         return moved
 
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Keyframes were corrected: what hangs on each goes with it, and its view."""
+        """Move keyframes, their views and the Gaussians anchored to them, after a pose correction.
+
+        Args:
+            T_new_old: Transforms [4, 4] by keyframe id, see `GaussianMap.move_anchors`.
+        """
         T_map = {k: T @ self.views.poses[k] for k, T in T_new_old.items()}
         self._shown = None
         self.gaussians.move_anchors(T_new_old)
@@ -363,7 +429,7 @@ class MapBuilder:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, Any]:
-        """A copy of everything but the images in the store."""
+        """Return a copy of the state without the images in the store."""
         return {
             "map": self.gaussians.snapshot(),
             "sleeping": self.sleeping.snapshot(),
@@ -375,11 +441,11 @@ class MapBuilder:
         }
 
     def saved(self) -> None:
-        """The last snapshot is where a successor will find it."""
+        """Record that the last snapshot is saved, so files that it does not name can be removed."""
         self.sleeping.saved()
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Go on from a snapshot: followers are taken to know the whole map."""
+        """Restore the state of a snapshot; replicas are assumed to hold the whole map."""
         self.gaussians = GaussianMap.restore(state["map"])
         self._fitting.restore(state["optimiser"], state["iterations"])
         self.views.restore(state["views"])
@@ -393,8 +459,10 @@ class MapBuilder:
             "gaussians": len(self.gaussians),
             "gaussians_pruned": self._pruned,
             "iterations": self._fitting.iterations,
-            "keyframes_skipped": self._fitting.unusable,  # chosen; gone, or see what sleeps
-            "gaussians_over_limit": self._excess,  # they may be looked at, so they do not sleep
+            # Chosen for fitting, but dropped, unreadable or with offloaded Gaussians in view.
+            "keyframes_skipped": self._fitting.unusable,
+            # Kept in memory beyond the limit, because recent keyframes may see them.
+            "gaussians_over_limit": self._excess,
             **self.sleeping.metrics(),
             **self.views.store.metrics(),
         }

@@ -1,5 +1,4 @@
-"""The map: Gaussians in rows of one cache line, with stable ids, the keyframes they hang on, and
-what they have been seen as."""
+"""Map model: Gaussians in rows of one cache line, with ids, anchor keyframes and labels."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,18 +9,21 @@ from ldo_service.errors import DataError
 from ldo_service.geometry import se3
 from ldo_service.kernels._rasterize import Bounds
 
-ROW = 16  # floats: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused
-LABEL_BYTES = 32  # per Gaussian; what they mean: `semantics.labels`. Zeros: nobody has seen it
-_CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache
+# Floats of a row: mean 3, log scale 3, quaternion wxyz 4, opacity logit, rgb 3, 2 unused.
+ROW = 16
+# Bytes of labels per Gaussian (see `semantics.gaussian_labels`); all zero without observations.
+LABEL_BYTES = 32
+_CHUNK = 65536  # Gaussians that are moved at a time, to stay in cache.
 
 
 class GaussianBatch(NamedTuple):
-    """Some Gaussians of a map, in order.
+    """Batch of Gaussians of a map, in order.
 
-    ids     [M] int64
-    rows    [M, 16] float32
-    anchors [M] int32
-    labels  [M, 32] uint8
+    Attributes:
+        ids: [M] int64.
+        rows: [M, 16] float32, see `ROW`.
+        anchors: [M] int32, ids of the anchor keyframes.
+        labels: [M, 32] uint8.
     """
 
     ids: np.ndarray
@@ -30,11 +32,12 @@ class GaussianBatch(NamedTuple):
     labels: np.ndarray
 
     def at(self, where: np.ndarray | slice) -> "GaussianBatch":
+        """Return the Gaussians at some indices, a mask or a slice."""
         return GaussianBatch(*(array[where] for array in self))
 
 
 def new_labels(n: int) -> np.ndarray:
-    """Labels [n, 32] of Gaussians that nobody has seen."""
+    """Return the labels [n, 32] of Gaussians without observations."""
     return np.zeros((n, LABEL_BYTES), np.uint8)
 
 
@@ -42,10 +45,13 @@ class GaussianMap:
     """Gaussians in the map frame, in order of insertion.
 
     `rows`, its columns (`means`, ...), `ids`, `anchors` and `labels` are views without a copy,
-    valid until Gaussians come or go. Who writes through `rows` calls `touch` before the next
-    rendering. `version` grows with every change but those of labels, which no rendering shows;
-    `membership` when Gaussians may have come or gone. `bounds` says to `render` where the rows lie,
-    so that it reads those in view only. A Gaussian takes 108 bytes, 32 of them its labels.
+    valid until Gaussians are added or removed. After writing through `rows`, call `touch` before
+    the next rendering. A Gaussian takes 108 bytes, 32 of them for its labels.
+
+    Attributes:
+        version: Grows with every change except changes of labels, which no rendering shows.
+        membership: Grows when Gaussians may have been added or removed.
+        bounds: Bounds of the rows in space. `render` uses them to read only the rows in view.
     """
 
     def __init__(self, capacity: int = 4096) -> None:
@@ -64,57 +70,61 @@ class GaussianMap:
 
     @property
     def rows(self) -> np.ndarray:
-        """[N, 16] float32, as `render` takes them."""
+        """Rows as `render` takes them, [N, 16] float32."""
         return self._rows[: self._size]
 
     @property
     def means(self) -> np.ndarray:
-        """[N, 3] metres, map frame."""
+        """Means in the map frame, [N, 3], meters."""
         return self.rows[:, 0:3]
 
     @property
     def log_scales(self) -> np.ndarray:
-        """[N, 3] log of the standard deviations in metres."""
+        """Logarithms of the standard deviations in meters, [N, 3]."""
         return self.rows[:, 3:6]
 
     @property
     def quats(self) -> np.ndarray:
-        """[N, 4] wxyz, rotate the Gaussians' axes to the map frame."""
+        """Rotations from the axes of the Gaussians to the map frame, [N, 4] wxyz."""
         return self.rows[:, 6:10]
 
     @property
     def opacity_logits(self) -> np.ndarray:
-        """[N]"""
+        """Logits of the opacities, [N]."""
         return self.rows[:, 10]
 
     @property
     def colors(self) -> np.ndarray:
-        """[N, 3] RGB, 0..1."""
+        """RGB colors in 0..1, [N, 3]."""
         return self.rows[:, 11:14]
 
     @property
     def ids(self) -> np.ndarray:
-        """[N] int64, ascending, never used twice."""
+        """Ids, [N] int64, ascending and never reused."""
         return self._ids[: self._size]
 
     @property
     def anchors(self) -> np.ndarray:
-        """[N] int32, id of the keyframe that each Gaussian moves with."""
+        """Ids of the anchor keyframes that the Gaussians move with, [N] int32."""
         return self._anchors[: self._size]
 
     @property
     def labels(self) -> np.ndarray:
-        """[N, 32] uint8, what each has been seen as: see `semantics.labels`."""
+        """Label distributions, [N, 32] uint8; see `semantics.gaussian_labels`."""
         return self._labels[: self._size]
 
     @property
     def _arrays(self) -> GaussianBatch:
-        """With the room behind the last Gaussian."""
+        """Arrays of all fields with their spare capacity."""
         return GaussianBatch(self._ids, self._rows, self._anchors, self._labels)
 
     def touch(self, rows: np.ndarray | slice | None = None) -> None:
-        """Say what was written through a view: the rows with these numbers (uint32, or a slice
-        without a step). Without an argument anything may have changed, which is always safe."""
+        """Record that rows were written through a view.
+
+        Args:
+            rows: Indices (uint32) or a slice without a step. None means that anything may have
+                changed, which is always safe.
+        """
         self.version += 1
         if rows is None:
             self.membership += 1
@@ -126,9 +136,17 @@ class GaussianMap:
             self.bounds.forget_rows(rows)
 
     def add(self, rows: np.ndarray, anchor: int) -> np.ndarray:
-        """Append rows [M, 16] that hang on keyframe `anchor`; returns their ids [M].
+        """Append Gaussians.
 
-        Raises ValueError for another shape, and for NaN or infinity.
+        Args:
+            rows: [M, 16].
+            anchor: Id of their anchor keyframe.
+
+        Returns:
+            Their ids [M].
+
+        Raises:
+            ValueError: The rows have another shape, or hold NaN or infinity.
         """
         ids = np.arange(self._next_id, self._next_id + len(rows))
         self.append(ids, rows, np.full(len(rows), anchor, np.int32))
@@ -141,10 +159,17 @@ class GaussianMap:
         anchors: np.ndarray,
         labels: np.ndarray | None = None,
     ) -> None:
-        """Append Gaussians that another map gave their ids [M], above all in this one, to follow
-        it. Without labels [M, 32] nobody has seen them.
+        """Append Gaussians with ids of another map, to replicate it.
 
-        Raises ValueError for other shapes, ids that do not ascend, NaN and infinity.
+        Args:
+            ids: [M], ascending and greater than all ids that this map ever had.
+            rows: [M, 16].
+            anchors: [M].
+            labels: [M, 32]; None for Gaussians without observations.
+
+        Raises:
+            ValueError: An array has another shape, the ids do not ascend, or the rows hold NaN or
+                infinity.
         """
         new = _piece(ids, rows, anchors, labels)
         if len(ids) and (ids[0] < self._next_id or np.any(np.diff(ids) <= 0)):
@@ -159,14 +184,18 @@ class GaussianMap:
         self.touch(slice(start, stop))
 
     def remove(self, mask: np.ndarray) -> int:
-        """Drop the Gaussians where mask [N] is true; the others keep their order and ids.
+        """Remove the Gaussians where mask [N] is true; the others keep their order and ids.
 
-        Returns how many went. Raises ValueError for a mask of another size or type.
+        Returns:
+            Number of removed Gaussians.
+
+        Raises:
+            ValueError: The mask has another size or type.
         """
         self._require_mask(mask)
         if not np.any(mask):
             return 0
-        first = int(np.argmax(mask))  # what comes before stays in place
+        first = int(np.argmax(mask))  # Earlier rows stay in place.
         keep = ~mask[first:]
         size = first + int(np.count_nonzero(keep))
         for array in self._arrays:
@@ -177,13 +206,14 @@ class GaussianMap:
         return removed
 
     def all(self) -> GaussianBatch:
-        """All of them, without a copy."""
+        """Return all Gaussians without a copy."""
         return GaussianBatch(self.ids, self.rows, self.anchors, self.labels)
 
     def extract(self, mask: np.ndarray) -> GaussianBatch:
-        """Remove the Gaussians where mask [N] is true, to keep them elsewhere for a while.
+        """Remove the Gaussians where mask [N] is true and return copies of them.
 
-        Returns copies. Raises ValueError as `remove`.
+        Raises:
+            ValueError: The mask has another size or type.
         """
         self._require_mask(mask)
         taken = self.all().at(mask)
@@ -197,15 +227,22 @@ class GaussianMap:
         anchors: np.ndarray,
         labels: np.ndarray | None = None,
     ) -> None:
-        """Put Gaussians that this map gave their ids [M], and that are absent now, where they
-        were among the others: `ids` ascend again. They may come in any order; without labels
-        [M, 32] nobody has seen them.
+        """Insert Gaussians that were extracted from this map, so that ids ascend again.
 
-        Raises ValueError for other shapes, NaN and infinity, an id that is present, given twice
-        or never was this map's. Linear in N.
+        The cost is linear in N.
+
+        Args:
+            ids: [M], in any order, assigned by this map and absent now.
+            rows: [M, 16].
+            anchors: [M].
+            labels: [M, 32]; None for Gaussians without observations.
+
+        Raises:
+            ValueError: An array has another shape, or the rows hold NaN or infinity. Or an id is
+                present already, is given twice, or was never assigned by this map.
         """
         returned = _piece(ids, rows, anchors, labels).at(np.argsort(ids, kind="stable"))
-        before = np.searchsorted(self.ids, returned.ids)  # how many of those here come before each
+        before = np.searchsorted(self.ids, returned.ids)  # Number of present rows before each.
         self._require_absent(returned.ids, before)
         if len(ids) == 0:
             return
@@ -222,11 +259,16 @@ class GaussianMap:
         self.membership += 1
 
     def move_anchors(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """Move what hangs on each keyframe: mean <- T mean, quat <- q(T) quat.
+        """Move the Gaussians of some anchor keyframes: mean <- T mean, quat <- q(T) quat.
 
-        T_new_old  per keyframe id the transform [4, 4] from the old place in the map to the new
-                   one, T_map_keyframe(new) @ inverse(T_map_keyframe(old)); others stay.
-        Raises ValueError for a transform that is not finite. Linear in N, computed in float64.
+        The cost is linear in N. The computation uses float64.
+
+        Args:
+            T_new_old: Transform [4, 4] from the old place in the map to the new one, by keyframe
+                id: T_map_keyframe(new) @ inverse(T_map_keyframe(old)). Other Gaussians stay.
+
+        Raises:
+            ValueError: A transform is not [4, 4] and finite.
         """
         keyframes = np.array(sorted(T_new_old), np.int64)
         if len(keyframes) == 0 or self._size == 0:
@@ -241,7 +283,7 @@ class GaussianMap:
         self.touch()
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """A copy of everything, as named arrays."""
+        """Return a copy of the state as named arrays."""
         return {
             "rows": self.rows.copy(),
             "ids": self.ids.copy(),
@@ -253,12 +295,15 @@ class GaussianMap:
 
     @classmethod
     def restore(cls, state: Mapping[str, np.ndarray]) -> "GaussianMap":
-        """The map of which `state` is the snapshot, exactly. Raises DataError for one without
-        labels."""
+        """Return the map of a snapshot, bitwise equal.
+
+        Raises:
+            DataError: The snapshot has no labels, because an earlier version saved it.
+        """
         if "labels" not in state:
             raise DataError(
-                "the state has no labels of Gaussians: an earlier version saved it. Start with "
-                "another folder for states."
+                "the saved state has no labels of Gaussians, because an earlier version saved it. "
+                "Start with another state folder."
             )
         size = len(state["rows"])
         out = cls(max(size, 1))
@@ -274,9 +319,12 @@ class GaussianMap:
 
     def _require_absent(self, ids: np.ndarray, before: np.ndarray) -> None:
         if np.any(np.diff(ids) <= 0):
-            raise ValueError("an id comes back twice.")
+            raise ValueError("an id is given twice.")
         if len(ids) and not (ids[0] >= 0 and ids[-1] < self._next_id):
-            raise ValueError(f"ids {ids[0]} to {ids[-1]}: this map gave 0 to {self._next_id - 1}.")
+            raise ValueError(
+                f"ids {ids[0]} to {ids[-1]} must lie in the ids of this map, 0 to "
+                f"{self._next_id - 1}."
+            )
         inside = before < self._size
         present = self.ids[before[inside]] == ids[inside]
         if np.any(present):
@@ -293,14 +341,14 @@ class GaussianMap:
 
 
 def aligned_rows(capacity: int) -> np.ndarray:
-    """Zeroed rows [capacity, 16], each of which fills one 64-byte cache line."""
+    """Return zeroed rows [capacity, 16]; each row fills one 64-byte cache line."""
     memory = np.zeros(capacity * ROW + 16, np.float32)
     skip = (-memory.ctypes.data % 64) // 4
     return memory[skip : skip + capacity * ROW].reshape(capacity, ROW)
 
 
 def transform_rows(rows: np.ndarray, T_new_old: np.ndarray) -> np.ndarray:
-    """Copies of rows [M, 16] moved by T_new_old [4, 4], as `move_anchors` moves them."""
+    """Return copies of rows [M, 16] moved by T_new_old [4, 4], as in `GaussianMap.move_anchors`."""
     out = aligned_rows(len(rows))
     out[:] = rows
     T = np.asarray(T_new_old, float)[None]
@@ -325,7 +373,10 @@ def _piece(
 def _move(
     rows: np.ndarray, anchors: np.ndarray, keyframes: np.ndarray, T: np.ndarray, q: np.ndarray
 ) -> None:
-    """By columns: a product of many small matrices takes NumPy five times as long."""
+    """Move rows in place by the transforms T and rotations q of their anchors.
+
+    It works by columns: a product of many small matrices takes NumPy five times as long.
+    """
     which = np.minimum(np.searchsorted(keyframes, anchors), len(keyframes) - 1)
     moved = np.flatnonzero(keyframes[which] == anchors)
     which = which[moved]
@@ -337,7 +388,7 @@ def _move(
 
 
 def _product(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Hamilton product [M, 4] of quaternions wxyz: the rotation q, then p."""
+    """Return the Hamilton product [M, 4] of quaternions wxyz: the rotation q, then p."""
     pw, px, py, pz = p.T
     qw, qx, qy, qz = q.T
     return np.stack(

@@ -1,4 +1,4 @@
-"""Gaussians that sleep on disk, in chunks of one anchor's, until a camera comes near."""
+"""Gaussians offloaded to disk, in chunks of one anchor keyframe, until a camera comes near."""
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping
@@ -19,22 +19,25 @@ from .visibility import BoundingSpheres, PlacedCamera
 log = logging.getLogger(__name__)
 
 _DISK_FULL = "Gaussians stay in memory, which may run out: free some disk space."
-MAX_MOTIONS = 32  # of a chunk that are remembered; then
-SETTLED_AT_ONCE = 16  # chunks with more are written anew, so many at a motion: 2 ms each
+MAX_MOTIONS = 32  # Pending motions of a chunk; a chunk with more is rewritten.
+SETTLED_AT_ONCE = 16  # Chunks rewritten per call of `move`: 2 ms each.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Entry:
-    """What memory keeps of a chunk beside the number of its file: its ids are `count` of those
-    from the first to the last, `motions` what its anchor moved since it was written."""
+    """Entry of the table of chunks in memory, stored by the number of the chunk's file.
+
+    The chunk holds `count` of the ids from the first to the last.
+    """
 
     anchor: int
     first_id: int
     last_id: int
     count: int
-    center_map: np.ndarray  # [3] of a sphere around it, now
+    center_map: np.ndarray  # [3], current center of its bounding sphere in the map frame.
     radius_m: float
-    motions: tuple[np.ndarray, ...] = ()  # T_new_old [4, 4]
+    # Motions T_new_old [4, 4] of the anchor since the file was written.
+    motions: tuple[np.ndarray, ...] = ()
 
     def moved(self, T_new_old: np.ndarray) -> "_Entry":
         center = se3.transform(T_new_old, self.center_map)
@@ -43,52 +46,61 @@ class _Entry:
 
 @dataclass(frozen=True, slots=True)
 class LostIdRange:
-    """The ids from the first to the last that are nowhere else are lost."""
+    """Range of ids, inclusive; those of them that exist nowhere else are lost."""
 
     first_id: int
     last_id: int
 
 
 class OffloadedGaussians:
-    """Chunks of Gaussians in `folder`, as if they had never left the map: bit for bit what they
-    would be had they moved with their anchors while awake.
+    """Chunks of Gaussians in `folder`, loaded as if they had never left the map.
 
-    A chunk takes below 1 kB of memory. Without a folder a temporary one is used, which goes with
-    this object. Not for two threads at once. Raises ConfigError for a folder that cannot be used.
+    Loaded Gaussians are bitwise equal to Gaussians that stayed in memory and moved with their
+    anchors. A chunk takes less than 1 kB of memory. Without a folder, a temporary one is used
+    and removed with this object. Not thread-safe.
 
-    The folder belongs to one state: `restore` and, without it, the first `put` remove the chunks
-    that the state does not know. Files of chunks that woke stay until a `snapshot` without them is
-    `saved`: who goes on from the last saved state needs them.
+    The folder belongs to one state: `restore` and, without it, the first `put` remove chunks that
+    the state does not contain. Files of loaded chunks stay until a `snapshot` without them is
+    `saved`, because a restored process needs them.
+
+    Raises:
+        ConfigError: The folder cannot be used.
     """
 
     def __init__(self, folder: Path | None) -> None:
         self._files = ChecksummedFolder(folder, "gaussians", _DISK_FULL)
-        self._entries: dict[int, _Entry] = {}  # by number, ascending
+        self._entries: dict[int, _Entry] = {}  # Key: file number, ascending.
         self._next_number = 0
-        self._retired: list[int] = []  # since the last snapshot
-        self._retired_before: list[int] = []  # and before it
-        self._spheres: BoundingSpheres | None = None  # None when the entries changed
-        self._lost: list[LostIdRange] = []  # that nobody was told of
+        self._retired: list[int] = []  # Unused files, since the last snapshot.
+        self._retired_before: list[int] = []  # Unused files, before the last snapshot.
+        self._spheres: BoundingSpheres | None = None  # Cache; None after a change of the entries.
+        self._lost: list[LostIdRange] = []  # Ranges that `pop_lost_ids` will return.
         self._slept = self._awoken = self._damaged = 0
 
     def __len__(self) -> int:
-        """Gaussians that sleep."""
+        """Return the number of offloaded Gaussians."""
         return sum(entry.count for entry in self._entries.values())
 
     def numbers(self) -> list[int]:
-        """Those of the chunks, ascending."""
+        """Return the numbers of the chunks, ascending."""
         return list(self._entries)
 
     # --- one chunk --------------------------------------------------------------------------------
     def put(self, chunk: Chunk) -> int | None:
-        """Write a chunk; its number.
+        """Write a chunk to disk.
 
-        None when the disk does not take it: then it must stay awake. Raises ValueError for a chunk
-        without Gaussians, or with ids that do not ascend.
+        Returns:
+            The number of the chunk, or None if the disk rejects it; it must then stay in memory.
+
+        Raises:
+            ValueError: The chunk has no Gaussians, or its ids do not ascend.
         """
         ids, rows = chunk.ids, chunk.rows
         if len(ids) == 0 or len(ids) != len(rows) or np.any(np.diff(ids) <= 0):
-            raise ValueError(f"anchor {chunk.anchor}: {len(ids)} ids, must ascend, one per row.")
+            raise ValueError(
+                f"chunk of anchor {chunk.anchor}: its {len(ids)} ids must ascend, one per row, and "
+                "not be empty."
+            )
         if self._next_number == 0:
             self._remove_unknown()
         sphere = BoundingSpheres.around(rows, chunk.anchors)
@@ -97,25 +109,35 @@ class OffloadedGaussians:
         return self._write(chunk, entry)
 
     def load(self, number: int) -> Chunk:
-        """Take a chunk out, as its anchor stands now.
+        """Remove a chunk from the store and return it at the current pose of its anchor.
 
-        It is empty when its file is damaged, which is counted and logged: those Gaussians are lost.
-        Raises KeyError for a number that does not sleep.
+        The chunk is empty if its file is damaged. Its Gaussians are then lost, which is counted and
+        logged.
+
+        Raises:
+            KeyError: There is no such chunk.
         """
         chunk = self._read(number)
-        if number in self._entries:  # still: a damaged one is gone
+        if number in self._entries:  # Reading removes a damaged chunk.
             self._awoken += self._entries[number].count
             self._retire(number)
         return chunk
 
-    # --- many, between here and the map -----------------------------------------------------------
+    # --- many chunks, to and from the map ---------------------------------------------------------
     def offload_from(
         self, gaussians: GaussianMap, clumps: np.ndarray, chosen: Iterable[int]
     ) -> list[int]:
-        """Let the Gaussians of the chosen clumps fall asleep; the numbers of their chunks.
+        """Offload the Gaussians of some chunks from the map.
 
-        clumps [N] int, each of one anchor's Gaussians. Those that the disk does not take stay
-        awake. Linear in the size of the map.
+        The cost is linear in the size of the map. Gaussians that the disk rejects stay in memory.
+
+        Args:
+            gaussians: The map.
+            clumps: Chunk number of each Gaussian, [N] int; a chunk has one anchor.
+            chosen: Chunk numbers to offload.
+
+        Returns:
+            The file numbers of the chunks written.
         """
         mask = np.isin(clumps, np.array(sorted(chosen), np.int64))
         of_clump = clumps[mask]
@@ -131,8 +153,17 @@ class OffloadedGaussians:
         return numbers
 
     def load_into(self, gaussians: GaussianMap, numbers: Iterable[int]) -> np.ndarray:
-        """Wake chunks into the map they came from; their ids [M] ascending. Linear in the size of
-        the map."""
+        """Load chunks into the map that they came from.
+
+        The cost is linear in the size of the map.
+
+        Args:
+            gaussians: The map.
+            numbers: File numbers of the chunks.
+
+        Returns:
+            Ids [M] of the loaded Gaussians, ascending.
+        """
         chunks = [self.load(number) for number in sorted(numbers)]
         if not chunks:
             return np.zeros(0, np.int64)
@@ -140,10 +171,16 @@ class OffloadedGaussians:
         gaussians.reinsert(*woken)
         return np.sort(woken.ids)
 
-    # --- without waking ---------------------------------------------------------------------------
+    # --- access without loading -------------------------------------------------------------------
     def visible_chunks(self, camera: PlacedCamera, reach_m: float = inf) -> list[int]:
-        """Numbers, ascending, of the chunks that the camera may see up to `reach_m` away. No file
-        is read."""
+        """Return the numbers of the chunks that a camera may see, ascending.
+
+        No file is read.
+
+        Args:
+            camera: The camera.
+            reach_m: Largest distance of a visible chunk.
+        """
         if self._spheres is None:
             self._spheres = self._all_spheres()
         seen = camera.may_see(self._spheres.centers, self._spheres.radii_m, reach_m)
@@ -151,7 +188,7 @@ class OffloadedGaussians:
         return [numbers[k] for k in np.flatnonzero(seen)]
 
     def move(self, T_new_old: Mapping[int, np.ndarray]) -> None:
-        """What `GaussianMap.move_anchors` does to those that are awake."""
+        """Move offloaded Gaussians as `GaussianMap.move_anchors` moves resident ones."""
         for number, entry in self._entries.items():
             if entry.anchor in T_new_old:
                 self._entries[number] = entry.moved(T_new_old[entry.anchor])
@@ -161,8 +198,10 @@ class OffloadedGaussians:
             self._rewrite_chunk(number)
 
     def chunks(self) -> Iterator[Chunk]:
-        """All that sleep, by anchor, in order of their ids; those of one anchor in memory at a
-        time."""
+        """Yield all offloaded Gaussians by anchor, in order of their ids.
+
+        Only those of one anchor are in memory at a time.
+        """
         by_anchor: dict[int, list[int]] = {}
         for number in sorted(self._entries, key=lambda n: self._entries[n].first_id):
             by_anchor.setdefault(self._entries[number].anchor, []).append(number)
@@ -183,8 +222,14 @@ class OffloadedGaussians:
 
     # --- damage -----------------------------------------------------------------------------------
     def pop_lost_ids(self, gaussians: GaussianMap) -> np.ndarray:
-        """Ids [L], ascending, of which some were lost since the last call, and none is there now:
-        neither awake in the map they came from, nor asleep."""
+        """Return ids [L], ascending, from the ranges that lost Gaussians since the last call.
+
+        The result excludes ids that still exist, in memory or on disk. It may include ids of
+        Gaussians that were removed before.
+
+        Args:
+            gaussians: The map with the resident Gaussians.
+        """
         if not self._lost:
             return np.zeros(0, np.int64)
         lost, self._lost = self._lost, []
@@ -198,7 +243,7 @@ class OffloadedGaussians:
 
     # --- state ------------------------------------------------------------------------------------
     def snapshot(self) -> dict[str, np.ndarray]:
-        """The table of what sleeps, as named arrays; the Gaussians stay in their files."""
+        """Return the table of chunks as named arrays; the Gaussians stay in their files."""
         self._retired_before, self._retired = [*self._retired_before, *self._retired], []
         entries = list(self._entries.values())
         spheres = self._all_spheres()
@@ -217,14 +262,16 @@ class OffloadedGaussians:
         }
 
     def saved(self) -> None:
-        """The last snapshot is where a successor will find it: files that it does not name go."""
+        """Remove the files that the last snapshot does not name, because it is now saved."""
         for number in self._retired_before:
             self._files.remove(number)
         self._retired_before = []
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from a snapshot, with the files in this folder; chunks whose file is gone are
-        dropped, counted and logged."""
+        """Restore the table of a snapshot, with the files in this folder.
+
+        Chunks with missing files are dropped, counted and logged.
+        """
         names = ("anchors", "first_ids", "last_ids", "counts", "centers", "radii_m")
         columns = [state[name] if name == "centers" else state[name].tolist() for name in names]
         motions = np.split(state["motions"], np.cumsum(state["motion_counts"]))[:-1]
@@ -240,6 +287,7 @@ class OffloadedGaussians:
             self._lose(number, "their file is gone")
 
     def metrics(self) -> dict[str, float]:
+        """Return the counters of offloading."""
         return {
             "gaussians_offloaded": len(self),
             "chunks_offloaded": len(self._entries),
@@ -261,12 +309,18 @@ class OffloadedGaussians:
         return number
 
     def _read(self, number: int) -> Chunk:
-        """The chunk as it is now; an empty one, and the entry is gone, if damaged."""
+        """Return the chunk at the current pose of its anchor.
+
+        If its file is damaged, drop the entry and return an empty chunk.
+        """
         entry = self._entries[number]
         try:
             chunk = unpack(self._files.read(number))
             if (chunk.anchor, len(chunk.ids)) != (entry.anchor, entry.count):
-                raise DataError(f"the file holds {len(chunk.ids)} of anchor {chunk.anchor}")
+                raise DataError(
+                    f"the file holds {len(chunk.ids)} Gaussians of anchor {chunk.anchor}, "
+                    f"expected {entry.count} of anchor {entry.anchor}"
+                )
         except DataError as error:
             self._lose(number, str(error))
             rows = np.zeros((0, ROW), np.float32)
@@ -274,7 +328,7 @@ class OffloadedGaussians:
         return chunk.moved(entry.motions)
 
     def _rewrite_chunk(self, number: int) -> None:
-        """Write a chunk anew, as it is now, and forget how it came there."""
+        """Write a chunk at its current pose and drop its pending motions."""
         chunk, entry = self._read(number), self._entries.get(number)
         if entry is not None and self._write(chunk, replace(entry, motions=())) is not None:
             self._slept -= entry.count
@@ -283,7 +337,13 @@ class OffloadedGaussians:
     def _lose(self, number: int, reason: str) -> None:
         entry = self._entries.pop(number)
         count, anchor = entry.count, entry.anchor
-        log.error("anchor %d: %d of its sleeping Gaussians are lost: %s", anchor, count, reason)
+        log.error(
+            "offloading: %d Gaussians of anchor keyframe %d are lost (%s); the map has a gap there "
+            "until the camera returns",
+            count,
+            anchor,
+            reason,
+        )
         self._damaged += count
         self._spheres = None
         self._lost.append(LostIdRange(entry.first_id, entry.last_id))
@@ -292,7 +352,7 @@ class OffloadedGaussians:
     def _retire(self, number: int) -> None:
         del self._entries[number]
         self._spheres = None
-        if self._files.is_temporary:  # no successor will find it
+        if self._files.is_temporary:  # A restored process cannot use it.
             self._files.remove(number)
         else:
             self._retired.append(number)
@@ -303,7 +363,7 @@ class OffloadedGaussians:
 
 
 def _members(labels: np.ndarray) -> list[np.ndarray]:
-    """Where each label is in labels [N], ascending; label by label."""
+    """Return the indices of each label in labels [N], ascending, label by label."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(labels) else []
 
@@ -319,8 +379,11 @@ def _in_order(piece: GaussianBatch) -> GaussianBatch:
 def iter_all_gaussians(
     gaussians: GaussianMap, sleeping: OffloadedGaussians
 ) -> Iterator[GaussianBatch]:
-    """All Gaussians, awake or asleep, in pieces; ids ascend throughout, as those of one anchor
-    follow each other. Of those asleep, one anchor's are in memory at a time."""
+    """Yield all Gaussians, resident and offloaded, in batches; ids ascend throughout.
+
+    The ids of one anchor are consecutive. Only the offloaded Gaussians of one anchor are in
+    memory at a time.
+    """
     awake, start = gaussians.all(), 0
     for chunk in sleeping.chunks():
         first, last = map(int, np.searchsorted(awake.ids, chunk.ids[[0, -1]]))

@@ -1,4 +1,4 @@
-"""Optimization of the map against keyframes: Gaussians, exposures, and poses if wanted."""
+"""Optimization of the map against keyframes: Gaussians, exposures and, optionally, poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,18 +17,19 @@ from .model import GaussianMap
 from .renderer import Rasterizer
 from .training_views import TrainingView
 
-BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15  # a view is taken seldom: remember longer than the map
-WIDTH = 6  # of a twist
+# Steps of one view are rare, so its moments average over more steps than those of the map.
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+WIDTH = 6  # Size of a twist.
 
 
 class PoseAdam:
     """First and second moments of the gradients of each keyframe's pose."""
 
     def __init__(self) -> None:
-        self._moments: dict[int, np.ndarray] = {}  # [m, v, steps][WIDTH]
+        self._moments: dict[int, np.ndarray] = {}  # [m, v, steps][WIDTH].
 
     def direction(self, keyframe: int, gradient: np.ndarray) -> np.ndarray:
-        """Adam's step of unit rate [6]."""
+        """Update the moments of a keyframe and return Adam's step of unit rate, [6]."""
         mean, square, steps = self._moments.setdefault(keyframe, np.zeros((3, WIDTH)))
         steps += 1
         mean += (1 - BETA1) * (gradient - mean)
@@ -36,6 +37,7 @@ class PoseAdam:
         return mean / (1 - BETA1**steps) / (np.sqrt(square / (1 - BETA2**steps)) + EPSILON)
 
     def forget(self, keyframe: int) -> None:
+        """Drop the moments of a keyframe."""
         self._moments.pop(keyframe, None)
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -48,31 +50,37 @@ class PoseAdam:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         keyframes = state["keyframes"].tolist()
-        moments = state["keyframe_moments"][..., -WIDTH:]  # states of old have exposures before
+        moments = state["keyframe_moments"][..., -WIDTH:]  # Old checkpoints hold exposures first.
         self._moments = dict(zip(keyframes, moments.copy(), strict=True))
 
 
 @dataclass(frozen=True, slots=True)
 class GaussianOptimizerConfig:
+    """Settings of the Gaussian optimizer."""
+
     adam: AdamConfig = field(default_factory=AdamConfig)
     loss: LossWeights = field(default_factory=LossWeights)
-    needle_weight: float = 0.01  # of mean log(longest / middle axis) beyond max_needle_ratio
-    max_needle_ratio: float = 4.0  # what insertion gives to surfaces seen at a grazing angle
+    # Weight of the mean log(longest / middle axis) beyond max_needle_ratio.
+    needle_weight: float = 0.01
+    # The ratio that densification gives to surfaces seen at a grazing angle.
+    max_needle_ratio: float = 4.0
 
-    # Longest standard deviation where a view fits it; insertion gives 10 at most. Without a limit
-    # one grows over a whole wall and all that is seen there later: 3 dB of the first 240 frames of
-    # a flat, held out. 14 and 10 cost 0.3 and 0.6 dB of the kitchen.
+    # Longest standard deviation in a view that a step fits; densification gives at most 10. Without
+    # a limit, a single Gaussian grows over a whole wall and over what is observed there later. This
+    # costs 3 dB on held-out frames of the first 240 frames of an apartment. Limits of 14 and 10
+    # cost 0.3 and 0.6 dB in the kitchen.
     max_sigma_px: float = 20.0
 
-    # Half of an iteration's time is per pixel, half per Gaussian when it reaches so many.
+    # Number of Gaussians at which an iteration takes half its time per pixel, half per Gaussian.
     usual_reach: int = 60_000
 
-    # Per frame. 0 switches off.
-    # Of the way to the gain and bias that the map asks for now, at each visit; 1 is as good. Steps
-    # along a gradient, drawn to gain 1, lag behind: 2.3 dB of a flat whose gains vary by a fifth.
+    # Parameters of each frame; 0 switches their optimization off.
+    # Fraction of the way to the estimated gain and bias at each visit; 1 is as good. Gradient steps
+    # with a prior of gain 1 lag behind: this cost 2.3 dB in an apartment where gains vary by a
+    # fifth.
     exposure_share: float = 0.3
-    # Step of keyframe poses per iteration. 2e-4 gains 0.3 dB there, and adds 1 mm of noise to poses
-    # that are exact (90 frames of a Replica apartment: ATE 0.02 cm without, 0.13 cm with).
+    # Step of keyframe poses per iteration. 2e-4 gains 0.3 dB there. It adds 1 mm of noise to exact
+    # poses (90 frames of a Replica apartment: ATE 0.02 cm without, 0.13 cm with).
     rotation_rate_rad: float = 0.0
     translation_rate_m: float = 0.0
 
@@ -87,23 +95,30 @@ class GaussianOptimizerConfig:
                     "rotation_rate_rad",
                     "translation_rate_m",
                 )
-                + ": rates and weights must not be negative, exposure_share within 0..1."
+                + ": rates and weights must be at least 0, exposure_share must lie in 0..1."
             )
         if self.usual_reach < 1:
-            raise ConfigError(f"usual_reach={self.usual_reach} must be at least 1.")
+            raise ConfigError(named(self, "usual_reach") + " must be at least 1.")
         if not self.max_sigma_px > 0:
-            raise ConfigError(f"max_sigma_px={self.max_sigma_px} must be positive; inf: no limit.")
+            raise ConfigError(named(self, "max_sigma_px") + " must be positive; inf: no limit.")
         if not self.max_needle_ratio >= 1:
-            raise ConfigError(f"max_needle_ratio={self.max_needle_ratio} must be at least 1.")
+            raise ConfigError(named(self, "max_needle_ratio") + " must be at least 1.")
 
     @property
     def refines_poses(self) -> bool:
+        """Switch of the pose optimization: true if one of its rates is not 0."""
         return self.rotation_rate_rad > 0 or self.translation_rate_m > 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class IterationResult:
-    """What one iteration found, before it changed the map; `view` is as it left it."""
+    """Result of one iteration.
+
+    Attributes:
+        loss: Loss before the step.
+        view: View with its exposure and pose after the step.
+        reached: Number of Gaussians that may touch the image.
+    """
 
     loss: ImageLoss
     view: TrainingView
@@ -111,7 +126,7 @@ class IterationResult:
 
 
 class Views(Protocol):
-    """Where the optimiser finds a keyframe's view, and puts it with a new exposure and pose."""
+    """Views by keyframe, which the optimizer reads and updates with new exposures and poses."""
 
     def __getitem__(self, keyframe: int) -> TrainingView: ...
 
@@ -119,10 +134,10 @@ class Views(Protocol):
 
 
 class GaussianOptimizer:
-    """Moments of everything that is optimised, from one keyframe to the next.
+    """Optimizer of Gaussians, exposures and poses; it keeps all moments between calls.
 
-    Deterministic: the same map, views and generator give the same bits for any number of
-    threads. Not for two threads at once.
+    Deterministic: the same map, views and plan give bitwise equal results for any number of
+    threads. Not thread-safe.
     """
 
     def __init__(self, config: GaussianOptimizerConfig | None = None, *, threads: int = 1) -> None:
@@ -143,15 +158,23 @@ class GaussianOptimizer:
         fixed: int | None = None,
         effort: float = inf,
     ) -> list[ImageLoss]:
-        """One step against each view that `plan` names; their losses before the step.
+        """Take one step against each view of a plan.
 
-        Changes `gaussians` in place and puts views back with new exposures and poses.
-        rates  factor on all steps of the first and the last iteration, geometric between: 1 while
-               the map grows, less to settle at the end
-        fixed  the view whose pose and exposure stay, which fix the place and the brightness of
-               the map
-        effort the plan is left when its iterations add up to this; each counts for one if it
-               reaches `usual_reach` Gaussians, for more if it reaches more
+        `gaussians` changes in place. Views with new exposures and poses are written to `views`.
+
+        Args:
+            gaussians: The map.
+            views: Views by keyframe.
+            plan: Keyframes, in the order of the iterations.
+            rates: Factor on all steps of the first and the last iteration, geometric between: 1
+                while the map grows, less to converge at the end.
+            fixed: Keyframe with constant pose and exposure, which fix the pose and the brightness
+                of the map.
+            effort: Limit of the work. An iteration counts as (1 + r) / 2, where r is the number of
+                Gaussians that it reaches over `usual_reach`.
+
+        Returns:
+            Losses before each step.
         """
         losses, spent = [], 0.0
         for rate, keyframe in zip(np.geomspace(*rates, len(plan)), plan, strict=True):
@@ -173,13 +196,16 @@ class GaussianOptimizer:
         rate: float = 1.0,
         is_fixed: bool = False,
     ) -> IterationResult:
-        """One iteration against one view.
+        """Run one iteration against one view.
 
-        rate      factor on all steps
-        is_fixed  keep exposure and pose
+        Args:
+            gaussians: The map.
+            view: The view.
+            rate: Factor on all steps.
+            is_fixed: Keep exposure and pose.
         """
         config = self.config
-        # how it looks, and what is wrong
+        # Render and compute the loss.
         T_camera_map = se3.inverse(view.T_map_camera)
         planes = self._rasterizer.render(
             gaussians.rows, view.camera, T_camera_map, bounds=gaussians.bounds
@@ -197,7 +223,7 @@ class GaussianOptimizer:
             mask=view.mask,
             threads=self.threads,
         )
-        # who is to blame, and a step of each
+        # Compute the gradients and take a step.
         reached = self._adam.step_fused(
             gaussians,
             self._rasterizer,
@@ -236,18 +262,21 @@ class GaussianOptimizer:
         return replace(view, T_map_camera=T_map_camera)
 
     def steps(self, gaussians: GaussianMap) -> np.ndarray:
-        """[N] int32, how many steps each Gaussian has made: those whose count grew have changed."""
+        """Return the number of steps of each Gaussian, [N] int32.
+
+        A Gaussian changed if its number grew.
+        """
         return self._adam.steps(gaussians)
 
     def forget_view(self, keyframe: int) -> None:
-        """It will not be optimised against again."""
+        """Drop the moments of a keyframe that will not be optimized again."""
         self._poses.forget(keyframe)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """A copy of all moments, as named arrays."""
+        """Return a copy of all moments as named arrays."""
         return self._adam.snapshot() | self._poses.snapshot()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue as the optimiser of which `state` is the snapshot, exactly."""
+        """Restore the exact state of a `snapshot`."""
         self._adam.restore(state)
         self._poses.restore(state)

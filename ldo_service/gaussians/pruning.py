@@ -1,6 +1,6 @@
-"""Removal of Gaussians that the map does not need: transparent, oversized, or held twice.
+"""Pruning of Gaussians that are transparent, oversized, hidden or duplicates.
 
-A surface is held twice after a correction has laid one pass of the camera over an earlier one.
+Surface is duplicated when a correction moves one pass of the camera over an earlier one.
 """
 
 from dataclasses import dataclass
@@ -14,33 +14,47 @@ from ldo_service.geometry import se3
 
 @dataclass(frozen=True, slots=True)
 class PruningConfig:
-    min_opacity: float = 0.005  # Kerbl et al. 2023, sec. 5.2
-    max_relative_scale: float = 10.0  # longest axis, in means of its neighbourhood (paper, III.A)
-    neighbourhood_m: float = 0.25  # edge of the cubes that are neighbourhoods
-    # Once so many keyframes came after its own, and now and then later, a Gaussian must show in the
-    # image of its own keyframe or of the newest. Otherwise others have grown over it.
+    """Criteria of the pruning."""
+
+    min_opacity: float = 0.005  # Kerbl et al., 2023, sec. 5.2.
+    # Longest axis relative to the mean of its neighborhood (paper, III.A).
+    max_relative_scale: float = 10.0
+    neighbourhood_m: float = 0.25  # Edge of the cubes that are the neighborhoods.
+    # A Gaussian must be visible in the image of its own keyframe or of the newest one. This is
+    # checked once that many keyframes followed its own, and later at random. Hidden Gaussians are
+    # removed: others have grown over them.
     confirm_keyframes: int = 5
-    min_weight_px: float = 0.25  # sum of its weights over the image; 0: all are confirmed. Kitchen:
-    # 430 k Gaussians without, 165 k with it, held-out views 0.1 dB apart
+    # Least sum of its weights over the image; 0 confirms all. In the kitchen, 430 k Gaussians
+    # without and 165 k with it; the PSNR of held-out views differs by 0.1 dB.
+    min_weight_px: float = 0.25
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_opacity < 1:
-            raise ConfigError(f"min_opacity={self.min_opacity} must be in [0, 1).")
+            raise ConfigError(named(self, "min_opacity") + " must lie in [0, 1).")
         if self.confirm_keyframes < 1 or not self.min_weight_px >= 0:
             raise ConfigError(
                 named(self, "confirm_keyframes", "min_weight_px")
-                + ": confirm_keyframes at least 1, min_weight_px at least 0."
+                + ": confirm_keyframes must be at least 1, min_weight_px at least 0."
             )
         if not (self.max_relative_scale > 1 and self.neighbourhood_m > 0):
             raise ConfigError(
                 named(self, "max_relative_scale", "neighbourhood_m")
-                + ": max_relative_scale above 1, neighbourhood_m positive."
+                + ": max_relative_scale must exceed 1, neighbourhood_m must be positive."
             )
 
 
 def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.ndarray:
-    """Mask [N] bool of rows [N, 16] that are nearly transparent, far larger than those around
-    them, or not finite."""
+    """Return the mask of Gaussians to prune.
+
+    They are nearly transparent, far larger than those around them, or not finite.
+
+    Args:
+        rows: [N, 16].
+        config: Criteria.
+
+    Returns:
+        Mask [N] bool.
+    """
     config = config or PruningConfig()
     finite = np.isfinite(rows[:, :14]).all(axis=1)
     longest_m = np.exp(rows[:, 3:6].max(axis=1).astype(float))
@@ -50,7 +64,10 @@ def prunable_mask(rows: np.ndarray, config: PruningConfig | None = None) -> np.n
 
 
 def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.ndarray:
-    """Mean [N] of the values of the other Gaussians in the same cube; infinite for a lone one."""
+    """Return the mean [N] of the values of the other Gaussians in the same cube.
+
+    It is infinite if there is no other.
+    """
     cube = np.floor(np.nan_to_num(means.astype(float)) / edge_m).astype(np.int64)
     cube -= cube.min(axis=0, initial=0)
     sizes = cube.max(axis=0, initial=0) + 1
@@ -62,14 +79,16 @@ def _mean_around(means: np.ndarray, values: np.ndarray, edge_m: float) -> np.nda
 
 
 def weights(rows: np.ndarray) -> np.ndarray:
-    """How much of a picture each of the rows [N, 16] makes: opacity times its largest section, m^2,
-    the product of the two larger scales."""
+    """Return the approximate contribution of each of the rows [N, 16] to an image, [N].
+
+    It is the opacity times the largest section in m^2, the product of the two larger scales.
+    """
     log_scales = rows[:, 3:6]
     return _opacities(rows) * np.exp(log_scales.sum(axis=1) - log_scales.min(axis=1))
 
 
 def weightiest(rows: np.ndarray, most: int) -> np.ndarray:
-    """Mask [N] bool of the `most` rows that make most of the picture, or of all."""
+    """Return the mask [N] bool of the `most` rows with the largest weight, or of all rows."""
     mask = np.ones(len(rows), bool)
     if len(rows) > most:
         mask[np.argsort(weights(rows), kind="stable")[: len(rows) - most]] = False
@@ -82,38 +101,53 @@ def _opacities(rows: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class DeduplicationConfig:
-    keyframes_apart: int = 30  # nearer ones see the map that the others made, and add to it
-    off_m: float = 0.03  # along the normal: a closure is good to a centimetre or two, and the two
-    # sides of a door are 4 cm apart
-    reach_sigmas: float = 1.25  # in the plane: the corners of insertion's grid are at 1.18
-    min_cosine: float = 0.8  # between normals, 37 deg
-    max_color: float = 0.25  # 0..1, in any channel: exposure differs, a picture on a wall stays
-    neighbours: int = 4  # older ones that are looked at, the nearest
+    """Criteria of duplicate Gaussians."""
+
+    # Least difference of keyframe ids. Nearer keyframes were mapped with each other's Gaussians in
+    # view, so they made no duplicates.
+    keyframes_apart: int = 30
+    # Largest distance along the normal. A loop closure is accurate to one or two centimeters, and
+    # the two sides of a door are 4 cm apart.
+    off_m: float = 0.03
+    # Largest distance in the plane, in longest standard deviations; the corners of the grid of
+    # densification are at 1.18.
+    reach_sigmas: float = 1.25
+    min_cosine: float = 0.8  # Least |cos| of the angle between the normals: 37 deg.
+    # Largest difference in any channel, 0..1: exposures differ, but a picture on a wall is kept.
+    max_color: float = 0.25
+    neighbours: int = 4  # Number of nearest older Gaussians that are compared.
 
     def __post_init__(self) -> None:
         if self.keyframes_apart < 1 or self.neighbours < 1:
-            raise ConfigError(
-                named(self, "keyframes_apart", "neighbours")
-                + ": keyframes_apart and neighbours must be at least 1."
-            )
+            raise ConfigError(named(self, "keyframes_apart", "neighbours") + " must be at least 1.")
         if min(self.off_m, self.reach_sigmas, self.max_color) <= 0 or not 0 <= self.min_cosine <= 1:
             raise ConfigError(
                 named(self, "off_m", "reach_sigmas", "min_cosine", "max_color")
-                + ": off_m, reach_sigmas, max_color positive, a cosine 0..1."
+                + ": off_m, reach_sigmas and max_color must be positive, min_cosine must lie in "
+                "0..1."
             )
 
 
 def find_duplicates(
     rows: np.ndarray, anchors: np.ndarray, keyframe: int, config: DeduplicationConfig | None = None
 ) -> np.ndarray:
-    """Mask [N] bool of the Gaussians of `keyframe` that much older ones stand for.
+    """Return the mask of Gaussians of a keyframe that duplicate much older ones.
 
-    Such a one lies within `off_m` of an older one's plane and within `reach_sigmas` of it in that
-    plane, is turned alike and coloured alike. The older one stays: its neighbours were optimised
-    with it for longer, and the closure moved the newer ones.
+    A duplicate lies within `off_m` of an older Gaussian's plane and within `reach_sigmas` of it in
+    that plane, and has a similar normal and color. The older Gaussian is kept: it was optimized
+    longer together with its neighbors, and the loop closure moved the newer ones.
 
-    rows [N, 16], anchors [N]: see `GaussianMap`. Of the others only those around the keyframe's own
-    are looked at, so that it costs the same in a larger map but for one pass over the means.
+    Only the other Gaussians around those of the keyframe are compared. So the cost does not grow
+    with the map, except for one pass over the means.
+
+    Args:
+        rows: [N, 16], see `GaussianMap`.
+        anchors: [N].
+        keyframe: Id of the keyframe.
+        config: Criteria.
+
+    Returns:
+        Mask [N] bool.
     """
     config = config or DeduplicationConfig()
     mask = np.zeros(len(rows), bool)
@@ -131,7 +165,10 @@ def find_duplicates(
 
 
 def _within(rows: np.ndarray, among: np.ndarray, points: np.ndarray, reach_m: float) -> np.ndarray:
-    """Indices of those `among` [N] in the box around points [M, 3], and `reach_m` around that."""
+    """Return the indices of those `among` [N] near some points.
+
+    Near is in the bounding box of the points [M, 3], enlarged by `reach_m` on all sides.
+    """
     if not len(points):
         return np.zeros(0, np.intp)
     low, high = points.min(axis=0) - reach_m, points.max(axis=0) + reach_m
@@ -141,7 +178,7 @@ def _within(rows: np.ndarray, among: np.ndarray, points: np.ndarray, reach_m: fl
 
 
 def _is_duplicate(older: np.ndarray, newer: np.ndarray, config: DeduplicationConfig) -> np.ndarray:
-    """Mask [M] of pairs of rows [M, 16]."""
+    """Return the mask [M] of the pairs of rows [M, 16] that are duplicates."""
     normals, others = _normals(older), _normals(newer)
     apart = newer[:, :3] - older[:, :3]
     off_m = np.abs(np.sum(apart * normals, axis=1))
@@ -155,7 +192,7 @@ def _is_duplicate(older: np.ndarray, newer: np.ndarray, config: DeduplicationCon
 
 
 def _normals(rows: np.ndarray) -> np.ndarray:
-    """[M, 3] the shortest axis of each."""
+    """Return the shortest axis of each Gaussian, [M, 3]."""
     axes = se3.rotation(rows[:, 6:10])
     shortest = np.argmin(rows[:, 3:6], axis=1)
     return np.take_along_axis(axes, shortest[:, None, None], axis=2)[:, :, 0]

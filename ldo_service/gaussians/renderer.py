@@ -1,7 +1,8 @@
 """Rendering of the map and its derivatives: EWA splatting of 3D Gaussians, front to back.
 
 The kernels are `kernels/rasterize.cpp`, `kernels/blend_gradient.hpp` and
-`kernels/projection_gradient.hpp`; `tests/reference/render.py` implements them in plain NumPy.
+`kernels/projection_gradient.hpp`. Their NumPy reference implementation is
+`tests/reference/render.py`.
 """
 
 from dataclasses import dataclass
@@ -15,15 +16,23 @@ from ldo_service.kernels import _rasterize
 
 from .model import ROW, aligned_rows
 
-PLANES = 5  # red, green, blue, weighted depth, opacity
-WEIGHT = 14  # field of a row of gradients
+PLANES = 5  # Red, green, blue, weighted depth, opacity.
+WEIGHT = 14  # Field of the summed weight in a row of gradients.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class AdamStep:
-    """rows, mean, square  [N, 16] float32: parameters and moments, changed in place
-    steps               [N] int32, that each row has made, changed in place
-    rates               [16] float32, length of a step per field
+    """Parameters, moments and rates of a step of Adam, for `Rasterizer.descend`.
+
+    Attributes:
+        rows: Parameters, [N, 16] float32; changed in place.
+        mean: First moments, [N, 16] float32; changed in place.
+        square: Second moments, [N, 16] float32; changed in place.
+        steps: Number of steps of each row, [N] int32; changed in place.
+        rates: Step length per field, [16] float32.
+        beta1: Decay of the first moments.
+        beta2: Decay of the second moments.
+        epsilon: Added to the square root of the second moments.
     """
 
     rows: np.ndarray
@@ -38,12 +47,13 @@ class AdamStep:
 
 @dataclass(frozen=True, slots=True)
 class RowGradients:
-    """Derivatives of a scalar L by what was rendered. Views: valid until the next rendering.
+    """Derivatives of a scalar L at the last rendering; views, valid until the next rendering.
 
-    indices  [V] uint32, ascending: the rows that may touch the image
-    rows     [V, 16] float32, dL/drow; field 14 holds the Gaussian's weights summed over the
-             pixels (px), field 15 zero. A Gaussian that is hidden has zeros only.
-    xi       [6] float64, dL/dxi at xi = 0 of T_map_camera exp(xi): rotation rad, translation m
+    Attributes:
+        indices: Rows that may touch the image, [V] uint32, ascending.
+        rows: dL/drow, [V, 16] float32. Field 14 holds the Gaussian's weights summed over the
+            pixels (px), field 15 is zero. A hidden Gaussian has zeros only.
+        xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
     """
 
     indices: np.ndarray
@@ -53,11 +63,13 @@ class RowGradients:
 
 @dataclass(frozen=True, slots=True)
 class VisibleGaussians:
-    """What a step of the optimiser reached. Views: valid until the next rendering.
+    """Gaussians that a step of the optimizer reached; views, valid until the next rendering.
 
-    indices  [V] uint32, ascending: the rows that may touch the image
-    weights  [V] float32, of each Gaussian, summed over the pixels (px); 0: hidden, and not moved
-    xi       [6] float64, dL/dxi at xi = 0 of T_map_camera exp(xi): rotation rad, translation m
+    Attributes:
+        indices: Rows that may touch the image, [V] uint32, ascending.
+        weights: Weights of each Gaussian summed over the pixels (px), [V] float32. Hidden
+            Gaussians have 0 and are not moved.
+        xi: dL/dxi at xi = 0 of T_map_camera exp(xi), [6] float64: rotation rad, translation m.
     """
 
     indices: np.ndarray
@@ -66,9 +78,9 @@ class VisibleGaussians:
 
 
 class Rasterizer:
-    """Renders one view after the other for the optimiser, and keeps the memory for the next.
+    """Renderer of one view after the other for the optimizer, which reuses its memory.
 
-    Not for two threads at once. Its images have no median depth; otherwise they are `render`'s.
+    Its images have no median depth; otherwise they equal those of `render`. Not thread-safe.
     """
 
     def __init__(self, *, threads: int = 1) -> None:
@@ -90,14 +102,28 @@ class Rasterizer:
         bounds: _rasterize.Bounds | None = None,
         tiles: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity.
+        """Render the planes that the loss reads.
 
-        Arguments as those of `render`; the result is overwritten by the next rendering. Where
-        `tiles` [ceil(H / 16), ceil(W / 16)] uint8 is 0, the planes are zero and are not computed;
-        give `image_loss` the same, and the gradients are those of these tiles alone.
+        Args:
+            rows: See `render`.
+            camera: See `render`.
+            T_camera_map: See `render`.
+            bounds: See `render`.
+            tiles: [ceil(H / 16), ceil(W / 16)] uint8. Where it is 0, the planes are zero and are
+                not computed. Pass the same tiles to `image_loss`, and the gradients are those of
+                the other tiles alone.
+
+        Returns:
+            Planes [5, H, W] float32: red, green, blue, depth sum w_i z_i (m), opacity. The next
+            rendering overwrites them.
+
+        Raises:
+            DataError: The camera has lens distortion.
         """
         if camera.distortion:
-            raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
+            raise DataError(
+                "the rasterizer does not support lens distortion: pass camera.rectified()."
+            )
         size = (PLANES, camera.height, camera.width)
         if self._planes.shape != size:
             self._planes = _new_planes(camera.height, camera.width)
@@ -112,11 +138,16 @@ class Rasterizer:
     def gradients(
         self, by_planes: np.ndarray, *, needle_weight: float = 0.0, needle_ratio: float = 1.0
     ) -> RowGradients:
-        """Derivatives of L, given dL/dplanes [5, H, W], at the last rendering.
+        """Compute the derivatives of L at the last rendering.
 
-        To L is added needle_weight * mean over pixels of sum_i w_i max(0, log(longest / middle
-        axis of i) - log needle_ratio), with w_i held fixed. The rows must still be as they were
-        rendered. Bitwise equal for any number of threads.
+        L has an additional term needle_weight * mean over pixels of sum_i w_i max(0, log(longest /
+        middle axis of i) - log needle_ratio), with w_i held fixed. The rows must not have changed
+        since the rendering. The result is bitwise equal for any number of threads.
+
+        Args:
+            by_planes: dL/dplanes, [5, H, W].
+            needle_weight: Weight of the additional term.
+            needle_ratio: Ratio of axes from which the term counts.
         """
         indices = self._room_for_indices()
         if len(self._gradients) < self._visible:
@@ -144,12 +175,22 @@ class Rasterizer:
         needle_ratio: float = 1.0,
         max_sigma_px: float = inf,
     ) -> VisibleGaussians:
-        """The step of `step` against what `gradients` would give, to the same bits.
+        """Compute the gradients and take a step of Adam in one pass, bitwise equal to two passes.
 
-        Changes the rows that were rendered, in place, and the moments. Their gradients stay in
-        cache, which saves a sixth of an iteration. Of what moved, no standard deviation is longer
-        then than `max_sigma_px` in this view, at the depth of the mean. Raises ValueError where
-        `step` is for other rows than were rendered last, or they were stepped on since.
+        The rendered rows and the moments change in place. The gradients stay in cache, which saves
+        a sixth of an iteration.
+
+        Args:
+            by_planes: dL/dplanes, [5, H, W].
+            step: Parameters, moments and rates.
+            needle_weight: See `gradients`.
+            needle_ratio: See `gradients`.
+            max_sigma_px: Limit of the standard deviations of moved Gaussians in this view, at the
+                depth of the mean.
+
+        Raises:
+            ValueError: `step` is for other rows than the last rendering, or a step has changed them
+                since.
         """
         indices = self._room_for_indices()
         if len(self._weights) < self._visible:
@@ -183,22 +224,23 @@ class Rasterizer:
 
 
 def _new_planes(height: int, width: int) -> np.ndarray:
-    """Planes [5, H, W] on a cache line: where W is a multiple of 16, no two tiles share one."""
+    """Return planes [5, H, W] on a cache line; if 16 divides W, no two tiles share a line."""
     size = PLANES * height * width
     return aligned_rows(-(-size // ROW)).reshape(-1)[:size].reshape(PLANES, height, width)
 
 
-RenderMemory = _rasterize.Pass  # scratch that one rendering leaves to the next
+RenderMemory = _rasterize.Pass  # Scratch memory that one rendering leaves to the next.
 
 
 @dataclass(frozen=True, slots=True)
 class Contributions:
-    """Who made an image.
+    """Contributions of the Gaussians to an image.
 
-    indices  [V] uint32, ascending: the rows with any weight
-    weights  [V] float32, w_i summed over the pixels (px)
-    top      [H, W] int32, per pixel the row with the largest w_i, of equals the nearest; -1 where
-             no row has any: `np.where(top >= 0, labels[top], nothing)` is an image of labels
+    Attributes:
+        indices: Rows with a weight above 0, [V] uint32, ascending.
+        weights: w_i summed over the pixels (px), [V] float32.
+        top: Row with the largest w_i of each pixel, [H, W] int32; the nearest of equal ones, -1
+            without any. `np.where(top >= 0, labels[top], nothing)` is an image of labels.
     """
 
     indices: np.ndarray
@@ -208,14 +250,15 @@ class Contributions:
 
 @dataclass(frozen=True, slots=True)
 class Rendering:
-    """What a camera sees of the map. With w_i = alpha_i prod_{j<i} (1 - alpha_j), near to far:
+    """Rendering of the map, with w_i = alpha_i prod_{j<i} (1 - alpha_j), near to far.
 
-    color            [H, W, 3] float32, sum w_i c_i, background black
-    weighted_depth_m [H, W] float32, sum w_i z_i: not divided by the opacity
-    median_depth_m   [H, W] float32, z where the transmittance first falls below one half, or 0:
-                     a surface that was there, where the mean may lie between two
-    opacity          [H, W] float32, sum w_i = 1 - transmittance
-    contributions    if they were asked for
+    Attributes:
+        color: sum w_i c_i, [H, W, 3] float32; the background is black.
+        weighted_depth_m: sum w_i z_i, [H, W] float32; not divided by the opacity.
+        median_depth_m: z where the transmittance first falls below one half, else 0, [H, W]
+            float32. It lies on a surface, while the mean may lie between two.
+        opacity: sum w_i = 1 - transmittance, [H, W] float32.
+        contributions: Contributions of the Gaussians, if requested.
     """
 
     color: np.ndarray
@@ -226,7 +269,7 @@ class Rendering:
 
     @property
     def depth_m(self) -> np.ndarray:
-        """Mean depth [H, W] where the opacity exceeds one half, else 0 (computed on each call)."""
+        """Mean depth [H, W] where the opacity exceeds one half, else 0; computed on each access."""
         covered = self.opacity > 0.5
         return np.where(covered, self.weighted_depth_m / np.where(covered, self.opacity, 1), 0)
 
@@ -244,24 +287,34 @@ def render(
     """Render Gaussians into a pinhole camera.
 
     Each pixel blends, by increasing (z, index), alpha = min(0.99, o exp(-d' S^-1 d / 2)) with
-    S = J R Sigma R' J' + 0.3 px^2 I; Gaussians with z < 0.05 m and alpha < 1/255 are left out.
+    S = J R Sigma R' J' + 0.3 px^2 I. Gaussians with z < 0.05 m or alpha < 1/255 are skipped.
     A block of 4x4 pixels is finished when all its transmittances are below 1e-4.
 
-    rows          [N, 16] float32, contiguous: mean [3] in metres (map), log scale [3] in
-                  log metres, quaternion wxyz [4] of any length, opacity logit, rgb [3], 2 unused.
-                  Rows that hold NaN or infinity are not drawn.
-    camera        without distortion; raises DataError with it
-    T_camera_map  [4, 4]
-    bounds        of these rows (`GaussianMap.bounds`): those out of view are then not read, which
-                  changes no bit
-    memory        scratch for this call and the next, one call at a time: fresh pages cost time
-    contributions also say who made the image, for about half as much time again
-    Raises ValueError for arrays that do not fit. Bitwise equal for any number of threads; the
-    last bits differ between instruction sets (`ldo_service.kernels.isa`).
+    The result is bitwise equal for any number of threads; the last bits differ between
+    instruction sets (`ldo_service.kernels.isa`).
+
     Zwicker et al., EWA splatting, 2002; Kerbl et al., 3D Gaussian splatting, 2023.
+
+    Args:
+        rows: [N, 16] float32, contiguous: mean [3] in meters (map), log scale [3] in log meters,
+            quaternion wxyz [4] of any length, opacity logit, rgb [3], 2 unused. Rows that hold NaN
+            or infinity are not drawn.
+        camera: Intrinsics without distortion.
+        T_camera_map: [4, 4].
+        threads: Threads of the kernel.
+        bounds: Bounds of these rows (`GaussianMap.bounds`). Rows out of view are then not read,
+            which changes no bit of the result.
+        memory: Scratch memory for this call and the next, which saves the time of fresh pages. One
+            call may use it at a time.
+        contributions: Also compute the contributions of the Gaussians, which takes about half as
+            much time again.
+
+    Raises:
+        DataError: The camera has lens distortion.
+        ValueError: The shapes of the arrays do not match.
     """
     if camera.distortion:
-        raise DataError("the rasteriser knows no lens distortion: pass camera.rectified().")
+        raise DataError("the rasterizer does not support lens distortion: pass camera.rectified().")
     T = np.ascontiguousarray(np.asarray(T_camera_map)[:3], np.float32)
     intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     size = camera.width, camera.height

@@ -1,6 +1,6 @@
-"""Training views: frames to optimize the map against, and the choice of those of an iteration.
+"""Training views: keyframes to optimize the map against, and their choice for the iterations.
 
-The part of a view that never changes is kept as bytes.
+The images of a view, which never change, are stored as bytes.
 """
 
 from collections.abc import Sequence
@@ -15,20 +15,24 @@ from ldo_service.geometry import Camera, RgbdFrame, se3
 
 from .exposure import Exposure
 
-_LEVEL = 1  # of zstd
-_QUANTIZED = 0.25  # depth that shrinks to less is: sensors count in steps, so bytes repeat
+_LEVEL = 1  # Compression level of zstd.
+# Depth that compresses to less than this fraction is quantized: sensors measure in steps, so bytes
+# repeat.
+_QUANTIZED = 0.25
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrainingView:
     """A keyframe as the loss reads it.
 
-    keyframe      its id
-    camera        without distortion
-    color         [3, H, W] uint8
-    depth_m       [H, W] float32, 0 where not measured
-    T_map_camera  [4, 4]
-    mask          [H, W] uint8, 0 where the pixel does not count; None: all do
+    Attributes:
+        keyframe: Id of the keyframe.
+        camera: Intrinsics without distortion.
+        color: [3, H, W] uint8.
+        depth_m: [H, W] float32, meters; 0 where not measured.
+        T_map_camera: Pose, [4, 4].
+        exposure: Gain and bias of its image relative to the map.
+        mask: [H, W] uint8, 0 where the pixel is ignored; None to use all pixels.
     """
 
     keyframe: int
@@ -41,12 +45,13 @@ class TrainingView:
 
     @classmethod
     def of(cls, frame: RgbdFrame, T_map_camera: np.ndarray, keyframe: int) -> "TrainingView":
+        """Return the view of a frame, with neutral exposure and without a mask."""
         planes = np.ascontiguousarray(frame.color.transpose(2, 0, 1))
         return cls(keyframe, frame.camera, planes, frame.depth_m, T_map_camera)
 
 
 def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
-    """Points [M, 3] in the map that a view measured, of every `step_px`-th pixel."""
+    """Return the surface that a view measured: map points [M, 3] of every `step_px`-th pixel."""
     coarse = slice(step_px // 2, None, step_px)
     z = view.depth_m[coarse, coarse]
     points = view.camera.rays()[coarse, coarse][z > 0] * z[z > 0][:, None]
@@ -54,8 +59,15 @@ def sampled_surface(view: TrainingView, *, step_px: int = 32) -> np.ndarray:
 
 
 def covisibility_ratio(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray) -> float:
-    """Share of points [M, 3] that lie in the image of a camera, in front of it; 0 of none.
-    Occlusion is not looked at."""
+    """Return the fraction of points in the image of a camera and in front of it.
+
+    Occlusion is ignored. The result is 0 without points.
+
+    Args:
+        p_map: Points in the map frame, [M, 3].
+        camera: Intrinsics.
+        T_map_camera: Camera pose, [4, 4].
+    """
     points = se3.transform(se3.inverse(T_map_camera), p_map)
     points = points[points[:, 2] > 0.05]
     u, v = camera.project(points).T
@@ -66,8 +78,16 @@ def covisibility_ratio(p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarr
 def visible_in_mask(
     pixels: np.ndarray, p_map: np.ndarray, camera: Camera, T_map_camera: np.ndarray
 ) -> np.ndarray:
-    """Mask [M] of the points [M, 3] that a camera shows in `pixels`, [H, W] bool, or that something
-    before them hides there."""
+    """Return the mask [M] of the points that project into masked pixels.
+
+    Occlusion is ignored, so points behind the surface count too.
+
+    Args:
+        pixels: Mask, [H, W] bool.
+        p_map: Points in the map frame, [M, 3].
+        camera: Intrinsics.
+        T_map_camera: Camera pose, [4, 4].
+    """
     p_camera = se3.transform(se3.inverse(T_map_camera), p_map)
     out = p_camera[:, 2] > 0
     u, v = np.rint(camera.project(p_camera[out])).T
@@ -87,11 +107,19 @@ def sample_training_views(
     newest_share: float,
     covisible_share: float,
 ) -> list[int]:
-    """Which keyframe each iteration takes.
+    """Choose the keyframe of each iteration at random.
 
-    About `newest_share` of the iterations take the newest, the first among them, and
-    `covisible_share` one of `covisible`; the rest take one of `others`. The newest stands in where
-    a list is empty.
+    The newest keyframe replaces a choice from an empty list.
+
+    Args:
+        newest: The newest keyframe; the first iteration takes it unless `newest_share` is 0.
+        covisible: Keyframes covisible with it.
+        others: All other keyframes.
+        iterations: Number of iterations.
+        rng: Random generator.
+        newest_share: Fraction of the iterations that take the newest keyframe.
+        covisible_share: Fraction of the iterations that take one of `covisible`; the rest take
+            one of `others`.
     """
     out = []
     draws = rng.random(iterations)
@@ -109,14 +137,17 @@ def sample_training_views(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class KeyframeImages:
-    """The part of a view that never changes.
+    """The part of a training view that never changes.
 
-    keyframe  its id
-    camera    without distortion
-    color     [3, H, W] uint8
-    depth_m   [H, W] float32, 0 where not measured
-    mask      [H, W] uint8, 0 where the pixel does not count; None: all do
-    Raises DataError when the images do not fit the camera.
+    Attributes:
+        keyframe: Id of the keyframe.
+        camera: Intrinsics without distortion.
+        color: [3, H, W] uint8.
+        depth_m: [H, W] float32, meters; 0 where not measured.
+        mask: [H, W] uint8, 0 where the pixel is ignored; None to use all pixels.
+
+    Raises:
+        DataError: The images do not fit the camera.
     """
 
     keyframe: int
@@ -135,16 +166,17 @@ class KeyframeImages:
     def _require(self, name: str, image: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
         if image.dtype != dtype or image.shape != shape:
             raise DataError(
-                f"keyframe {self.keyframe}: {name} is {image.dtype}{image.shape}, its camera "
-                f"says {np.dtype(dtype)}{shape}."
+                f"keyframe {self.keyframe}: {name} is {image.dtype}{image.shape}, must be "
+                f"{np.dtype(dtype)}{shape} for its camera."
             )
 
     @classmethod
     def of(cls, view: TrainingView) -> "KeyframeImages":
+        """Return the images of a view."""
         return cls(view.keyframe, view.camera, view.color, view.depth_m, view.mask)
 
     def view(self, T_map_camera: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
-        """The keyframe as the loss reads it, at a pose [4, 4] and with an exposure."""
+        """Return the training view at a pose [4, 4] and with an exposure."""
         return TrainingView(
             self.keyframe,
             self.camera,
@@ -157,11 +189,12 @@ class KeyframeImages:
 
     @property
     def nbytes(self) -> int:
+        """Size of the images in bytes."""
         images = (self.color, self.depth_m, self.mask)
         return sum(image.nbytes for image in images if image is not None)
 
     def owned(self) -> "KeyframeImages":
-        """With read-only copies of the images, which keep no message alive."""
+        """Return read-only copies of the images, so that no received message stays in memory."""
         mask = None if self.mask is None else _own(self.mask)
         return replace(self, color=_own(self.color), depth_m=_own(self.depth_m), mask=mask)
 
@@ -176,14 +209,14 @@ def _own(image: np.ndarray) -> np.ndarray:
 class _Stored(msgspec.Struct, frozen=True):
     keyframe: int
     camera: Camera
-    color: bytes  # this and all other bytes: zstd
+    color: bytes  # Compressed with zstd, as all bytes here.
     depth: bytes
     is_depth_differences: bool
     mask: bytes | None
 
 
 def pack(images: KeyframeImages) -> bytes:
-    """The images without loss, about a quarter of their size (tests/bench/RESULTS.md)."""
+    """Compress images without loss to about a quarter of their size (tests/bench/RESULTS.md)."""
     depth, is_differences = _packed_depth(images.depth_m)
     stored = _Stored(
         images.keyframe,
@@ -197,7 +230,11 @@ def pack(images: KeyframeImages) -> bytes:
 
 
 def unpack(body: bytes | memoryview) -> KeyframeImages:
-    """The images of which `body` is the packed form. Raises DataError for other bytes."""
+    """Return the images from their packed form.
+
+    Raises:
+        DataError: The bytes are not packed images.
+    """
     try:
         stored = msgspec.msgpack.decode(body, type=_Stored)
         camera = stored.camera
@@ -214,7 +251,7 @@ def unpack(body: bytes | memoryview) -> KeyframeImages:
 
 
 def _color_differences(color: np.ndarray) -> np.ndarray:
-    """Red and blue beside green, each row beside the one above it; modulo 256."""
+    """Return red and blue minus green, then each row minus the one above it; modulo 256."""
     out = color.copy()
     out[0::2] -= color[1]
     out[:, 1:] = np.subtract(out[:, 1:], out[:, :-1])
@@ -222,7 +259,7 @@ def _color_differences(color: np.ndarray) -> np.ndarray:
 
 
 def _color_of(differences: np.ndarray) -> np.ndarray:
-    """In place: fresh memory would take longer than the sums."""
+    """Invert `_color_differences` in place: fresh memory would take longer than the sums."""
     for plane in differences:
         np.add.accumulate(plane, axis=0, dtype=np.uint8, out=plane)
     differences[0::2] += differences[1]
@@ -230,8 +267,14 @@ def _color_of(differences: np.ndarray) -> np.ndarray:
 
 
 def _packed_depth(depth_m: np.ndarray) -> tuple[bytes, bool]:
-    """Quantised depth as it is; other depth as differences of rows, byte by byte, which halves
-    it. Whether it is differences."""
+    """Compress depth [H, W].
+
+    Quantized depth is stored as it is. Other depth is stored as differences of rows, byte by
+    byte, which halves its size.
+
+    Returns:
+        The bytes, and whether they are differences.
+    """
     plain = _compressed(depth_m)
     if len(plain) < _QUANTIZED * depth_m.nbytes:
         return plain, False
@@ -259,5 +302,5 @@ def _expanded(data: bytes, dtype: type, shape: tuple[int, ...]) -> np.ndarray:
     with zstandard.ZstdDecompressor().stream_reader(data) as stream:
         filled = stream.readinto(out.reshape(-1).view(np.uint8).data)
         if filled < out.nbytes or stream.read(1):
-            raise ValueError(f"an image has not the size {shape}")
+            raise ValueError(f"the size of an image is not {shape}")
     return out

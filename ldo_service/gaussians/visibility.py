@@ -1,4 +1,4 @@
-"""Bounds on where Gaussians can be seen from, and the choice of those that leave memory."""
+"""Bounds on which cameras may see Gaussians, and the choice of Gaussians to offload."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,30 +11,35 @@ from ldo_service.geometry import Camera, se3
 
 from .densification import with_small_holes_filled
 
-BLOCKS = 12, 16  # of an image, down and to the right: 0.8 kB
-BEHIND = 0.1  # share of the depth: nearer to the surface than that is seen, as depth is noisy
-LOW_PASS_PX = 2.0  # 3.33 times the square root of the 0.3 px^2 that every splat is widened by
-_HOLE_PX = 4  # as insertion fills holes: shadows beside an object lie on what is behind it
+BLOCKS = 12, 16  # Blocks of an image, down and to the right: 0.8 kB.
+# Fraction of the depth. A point less than this behind the surface counts as visible, because depth
+# is noisy.
+BEHIND = 0.1
+LOW_PASS_PX = 2.0  # 3.33 times the square root of the 0.3 px^2 that the renderer adds to a splat.
+_HOLE_PX = 4  # Equals the hole_px of densification: the sensor's shadows lie on the surface behind.
 
-# What `render` draws of a Gaussian ends where alpha = 1/255: sqrt(2 ln 255) standard deviations.
-# At the rim of the image its affine splats are up to 1.3 times as wide as the ellipsoid there,
-# which is how far outside the image the Jacobian is still taken (kernels/projection.hpp).
+# `render` draws a Gaussian up to alpha = 1/255: sqrt(2 ln 255) standard deviations. At the rim of
+# the image its affine splats are up to 1.3 times as wide as the ellipsoid there. The Jacobian is
+# computed up to that far outside the image (kernels/projection.hpp).
 REACH_SIGMA = 1.3 * 3.33
-NEAR_M = 0.05  # the renderer draws nothing nearer
-_MAX_LOG_SCALE = 50.0  # as good as infinite, and no overflow
-_ROUNDING = 1.000_01  # of what the renderer adds up in float32
+NEAR_M = 0.05  # Near plane of the renderer.
+_MAX_LOG_SCALE = 50.0  # Effectively infinite, but without overflow.
+_ROUNDING = 1.000_01  # Margin for the float32 sums of the renderer.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MaxDepthGrid:
-    """farthest_m [12, 16] float32: the farthest depth in each block of an image; infinite where
-    not all of the block was measured."""
+    """The farthest depth in each block of an image.
+
+    Attributes:
+        farthest_m: [12, 16] float32; infinite where a block was not measured completely.
+    """
 
     farthest_m: np.ndarray
 
     @classmethod
     def of(cls, depth_m: np.ndarray) -> "MaxDepthGrid":
-        """depth_m [H, W] float32, 0 where not measured."""
+        """Return the grid of a depth image [H, W] float32, 0 where not measured."""
         filled_m = with_small_holes_filled(depth_m, _HOLE_PX)
         known_m = np.where(filled_m > 0, filled_m, np.float32(inf))
         for axis, edges in enumerate(_edges(depth_m.shape)):
@@ -44,11 +49,18 @@ class MaxDepthGrid:
     def occludes(
         self, camera: Camera, centers_camera: np.ndarray, radii_m: np.ndarray
     ) -> np.ndarray:
-        """Which spheres [K] bool lie wholly behind what `camera` saw in every block that they may
-        show in.
+        """Return which spheres lie wholly behind the measured surface.
 
-        centers_camera [K, 3], radii_m [K]. False for some that are hidden; true for none that is
-        not, nor for any that holds NaN.
+        A sphere is behind it in every block where it may be visible. The result is conservative:
+        never True for a visible sphere, but False for some hidden ones and for all that hold NaN.
+
+        Args:
+            camera: Intrinsics.
+            centers_camera: Centers in the camera frame, [K, 3].
+            radii_m: Radii, [K].
+
+        Returns:
+            Mask [K] bool.
         """
         downward, rightward = _edges((camera.height, camera.width))
         rows = _between(centers_camera[:, 1:], radii_m, downward, camera.fy, camera.cy)
@@ -59,7 +71,7 @@ class MaxDepthGrid:
 
 
 def _edges(shape: tuple[int, ...]) -> list[np.ndarray]:
-    """First pixel of each block, and one past the last, down and to the right."""
+    """Return the first pixel of each block and one past the last, downward and to the right."""
     return [
         np.linspace(0, pixels, blocks + 1).astype(int)
         for pixels, blocks in zip(shape, BLOCKS, strict=True)
@@ -69,8 +81,18 @@ def _edges(shape: tuple[int, ...]) -> list[np.ndarray]:
 def _between(
     centers: np.ndarray, radii_m: np.ndarray, edges: np.ndarray, focal_px: float, center_px: float
 ) -> np.ndarray:
-    """Whether each sphere [K] touches each wedge [B] between two neighbouring edges; centers
-    [K, 2] are across the edges and z."""
+    """Return whether each sphere touches each wedge between two neighboring edges.
+
+    Args:
+        centers: Coordinate across the edges and z, [K, 2].
+        radii_m: Radii, [K].
+        edges: Pixels of the edges, [B + 1].
+        focal_px: Focal length across the edges.
+        center_px: Principal point across the edges.
+
+    Returns:
+        Mask [K, B] bool.
+    """
     low = edges[:-1] - 0.5 - LOW_PASS_PX - center_px
     high = edges[1:] - 0.5 + LOW_PASS_PX - center_px
     beyond_low, before_high = (
@@ -82,24 +104,38 @@ def _between(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlacedCamera:
-    """A camera without distortion at T_map_camera [4, 4], and how far it saw there; None: who
-    knows."""
+    """A camera at a pose, with the farthest depth that it measured.
+
+    Attributes:
+        camera: Intrinsics without distortion.
+        T_map_camera: Pose, [4, 4].
+        horizon: Farthest depth in the blocks of its image; None if unknown.
+    """
 
     camera: Camera
     T_map_camera: np.ndarray
     horizon: MaxDepthGrid | None = None
 
     def distances_m(self, centers_map: np.ndarray, radii_m: np.ndarray) -> np.ndarray:
-        """To the nearest point of each sphere [K]; negative inside."""
+        """Return the distance to the nearest point of each sphere, [K]; negative inside."""
         return np.linalg.norm(centers_map - self.T_map_camera[:3, 3], axis=1) - radii_m
 
     def may_see(
         self, centers_map: np.ndarray, radii_m: np.ndarray, reach_m: float = inf
     ) -> np.ndarray:
-        """Which spheres [K] bool touch the view volume, up to `reach_m` away.
+        """Return which spheres the camera may see.
 
-        centers_map [K, 3], radii_m [K]. True for some that are just outside; false for none that
-        is inside and not hidden behind the horizon, nor for any that holds NaN.
+        They touch its view volume and are not hidden behind its horizon. The result is
+        conservative: never False for a visible sphere, but True for some just outside and for all
+        that hold NaN.
+
+        Args:
+            centers_map: Centers in the map frame, [K, 3].
+            radii_m: Radii, [K].
+            reach_m: Largest distance of a visible sphere.
+
+        Returns:
+            Mask [K] bool.
         """
         centers = se3.transform(se3.inverse(self.T_map_camera), centers_map)
         beside = np.any(centers @ self._sides().T < -radii_m[:, None], axis=1)
@@ -111,7 +147,7 @@ class PlacedCamera:
         return seen
 
     def _sides(self) -> np.ndarray:
-        """Inward normals [4, 3] of the planes through the camera and the rim of the image."""
+        """Return the inward normals [4, 3] of the planes through the camera and the image rim."""
         camera, rim = self.camera, 0.5 + LOW_PASS_PX
         left, right = -rim - camera.cx, camera.width - 1 + rim - camera.cx
         top, bottom = -rim - camera.cy, camera.height - 1 + rim - camera.cy
@@ -128,12 +164,13 @@ class PlacedCamera:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class BoundingSpheres:
-    """Spheres around all that is drawn of some Gaussians, each around Gaussians of one anchor.
+    """Bounding spheres of groups of Gaussians as drawn; each group has one anchor.
 
-    anchors  [K], of which one may have several
-    counts   [K] Gaussians
-    centers  [K, 3] in the map
-    radii_m  [K]
+    Attributes:
+        anchors: Anchor of each group, [K]; one anchor may have several groups.
+        counts: Number of Gaussians, [K].
+        centers: Centers in the map frame, [K, 3].
+        radii_m: Radii, [K].
     """
 
     anchors: np.ndarray
@@ -145,8 +182,13 @@ class BoundingSpheres:
     def around(
         cls, rows: np.ndarray, anchors: np.ndarray, clumps: np.ndarray | None = None
     ) -> "BoundingSpheres":
-        """Of Gaussians rows [N, 16] that hang on anchors [N], a sphere for each of the clumps [N],
-        in the order of their numbers (see `chunk_numbers`); without, one for each anchor."""
+        """Return a sphere for each chunk of Gaussians, in the order of the chunk numbers.
+
+        Args:
+            rows: [N, 16].
+            anchors: [N].
+            clumps: Chunk numbers [N], see `chunk_numbers`; None for one chunk per anchor.
+        """
         clumps = anchors if clumps is None else clumps
         order = np.argsort(clumps, kind="stable")
         rows, anchors, clumps = rows[order, :6], anchors[order], clumps[order]
@@ -159,9 +201,15 @@ class BoundingSpheres:
 
 
 def chunk_numbers(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.ndarray:
-    """Number [N] of the clump of each Gaussian: of those of one anchor in one cube of the map.
+    """Return the chunk number of each Gaussian, [N].
 
-    means [N, 3]; numbers ascend with the anchors. Cubes 1024 edges apart count as one.
+    A chunk holds the Gaussians of one anchor in one cube of the map. Numbers ascend with the
+    anchors. Cubes 1024 edges apart count as one.
+
+    Args:
+        means: [N, 3].
+        anchors: [N].
+        edge_m: Edge of the cubes.
     """
     cubes = np.floor(np.nan_to_num(means.astype(float)) / edge_m).astype(np.int64) & 1023
     keys = ((anchors.astype(np.int64) << 10 | cubes[:, 0]) << 10 | cubes[:, 1]) << 10 | cubes[:, 2]
@@ -171,8 +219,16 @@ def chunk_numbers(means: np.ndarray, anchors: np.ndarray, edge_m: float) -> np.n
 def _spheres(
     rows: np.ndarray, starts: np.ndarray, counts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Centers [K, 3] in the map and radii [K] in metres of what is drawn of the first fields of
-    rows [N, 6]: a sphere for `counts` rows from each of `starts`."""
+    """Return the bounding spheres of consecutive rows as drawn.
+
+    Args:
+        rows: Means and log scales, [N, 6].
+        starts: First row of each sphere, [K].
+        counts: Number of rows of each sphere, [K].
+
+    Returns:
+        Centers [K, 3] in the map frame and radii [K] in meters.
+    """
     if len(starts) == 0:
         return np.zeros((0, 3)), np.zeros(0)
     means = rows[:, :3].astype(float)
@@ -186,33 +242,39 @@ def _spheres(
 
 @dataclass(frozen=True, slots=True)
 class OffloadConfig:
-    max_active: int = 1_500_000  # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments.
-    # Between two looks at it, every mapper.publish.update_interval_keyframes, new and woken ones
-    # come on top
-    low_water: float = 0.9  # share of max_active that stays: a batch of 0.1 s now and then
-    reach_m: float = 20.0  # beyond, nothing counts as seen: depth cameras measure less far, so
-    # nothing is inserted a second time where Gaussians sleep. Nearer, what they measured hides
-    # what is behind
-    clump_m: float = 1.0  # edge of the cubes whose Gaussians of one keyframe sleep and wake
-    # together. In a flat of two rooms 36 % of the map may be seen by the last 8 keyframes, with 0.5
-    # 28 %, with 2.0 54 %; 67 % with whole keyframes and without a look at what hides them
+    """Limits of the Gaussians in memory."""
+
+    # Gaussians in memory (ALGORITHMS, The map): 300 MB with moments. The limit is checked every
+    # mapper.publish.update_interval_keyframes; new and loaded Gaussians exceed it until then.
+    max_active: int = 1_500_000
+    # Fraction of max_active that remains after offloading, so each batch takes about 0.1 s.
+    low_water: float = 0.9
+    # Largest distance at which Gaussians count as visible. Depth cameras measure less far, so
+    # nothing is inserted twice where Gaussians are offloaded. Within it, the measured surface
+    # hides the Gaussians behind it.
+    reach_m: float = 20.0
+    # Edge of the cubes; the Gaussians of one keyframe in one cube form a chunk. In an apartment of
+    # two rooms the last 8 keyframes may see 36 % of the map; with 0.5 m 28 %, with 2.0 m 54 %. It
+    # is 67 % with whole keyframes as chunks and without occlusion.
+    clump_m: float = 1.0
 
     def __post_init__(self) -> None:
         if not (self.max_active >= 1 and 0 < self.low_water <= 1):
             raise ConfigError(
                 named(self, "max_active", "low_water")
-                + ": max_active must be at least 1, low_water in (0, 1]."
+                + ": max_active must be at least 1, low_water must lie in (0, 1]."
             )
         if not (self.reach_m > 0 and self.clump_m > 0):
-            raise ConfigError(
-                named(self, "reach_m", "clump_m") + ": reach_m and clump_m must be positive."
-            )
+            raise ConfigError(named(self, "reach_m", "clump_m") + " must be positive.")
 
 
 @dataclass(frozen=True, slots=True)
 class OffloadPlan:
-    """clumps   numbers of the spheres whose Gaussians go to sleep, the farthest first
-    excess   Gaussians over max_active that stay, because they may be looked at
+    """Choice of the chunks to offload.
+
+    Attributes:
+        clumps: Chunk numbers to offload, the farthest first.
+        excess: Number of Gaussians over max_active that stay because a camera may see them.
     """
 
     clumps: list[int]
@@ -224,13 +286,16 @@ def plan_offload(
     recent: Sequence[PlacedCamera],
     config: OffloadConfig,
 ) -> OffloadPlan:
-    """Nobody up to `max_active` Gaussians; over it, clumps until `low_water` of that is left.
+    """Choose the chunks to offload if more than `max_active` Gaussians are in memory.
 
-    awake   of all Gaussians in memory, by clump
-    recent  cameras of the last keyframes, at least the current one, which is last
+    Chunks are offloaded until `low_water` of the limit is left. Only chunks that no recent camera
+    may see are chosen, the farthest from the current camera first. At the same distance, older
+    chunks are chosen first. Chunks of the newest anchor always stay. Deterministic.
 
-    Those that no recent camera may see go, the farthest from the current camera first, older ones
-    before newer ones at the same distance. Those of the newest anchor never go. Deterministic.
+    Args:
+        awake: Bounding spheres of all Gaussians in memory, by chunk.
+        recent: Cameras of the last keyframes; the current one is last, and required.
+        config: Limits.
     """
     active = int(awake.counts.sum())
     if active <= config.max_active:

@@ -249,7 +249,7 @@ def test_a_damaged_keyframe_is_dropped_with_one_line(
     with caplog.at_level(logging.WARNING):
         assert [store.get(1), store.get(1)] == [None, None]
     assert len(caplog.records) == 1
-    assert "keyframe 1 is dropped" in caplog.text
+    assert "images of keyframe 1 cannot be read" in caplog.text
     assert store.keyframes() == [2]
     assert not path.exists()
     assert store.metrics()["keyframes_damaged"] == 1

@@ -101,7 +101,7 @@ def test_only_absent_gaussians_of_this_map_come_back() -> None:
     gaussians = map_of(6)
     ids, rows, anchors, labels = gaussians.extract(np.array([0, 1, 1, 0, 0, 0], bool))
     before = gaussians.snapshot()
-    for wrong, reason in (([1, 3], "id 3 is in"), ([1, 6], "gave 0 to 5"), ([2, 2], "twice")):
+    for wrong, reason in (([1, 3], "id 3 is in"), ([1, 6], "this map, 0 to 5"), ([2, 2], "twice")):
         with pytest.raises(ValueError, match=reason):
             gaussians.reinsert(np.array(wrong), rows, anchors)
     with pytest.raises(ValueError, match="NaN"):

@@ -402,7 +402,7 @@ def test_a_damaged_chunk_is_lost_with_one_line_and_the_rest_goes_on(
         woken = sleeping.load_into(gaussians, [0, 1])
     assert woken.tolist() == list(range(5, 11))
     assert gaussians.ids.tolist() == list(range(5, 18))
-    assert "anchor 0: 5 of its sleeping Gaussians are lost" in caplog.text
+    assert "5 Gaussians of anchor keyframe 0 are lost" in caplog.text
     assert len(caplog.records) == 1
     assert sleeping.metrics()["gaussians_lost_on_disk"] == 5
     assert sleeping.pop_lost_ids(gaussians).tolist() == list(range(5))

@@ -102,7 +102,7 @@ def without(header: bytes, name: bytes) -> bytes:
     [
         (lambda b: b[:-1], "cut off"),
         (lambda b: b[: b.index(b"property")], "header has no end"),
-        (lambda b: b + b"\0", "do not belong together"),
+        (lambda b: b + b"\0", "do not match"),
         (lambda b: without(b, b"opacity"), "no property opacity"),
         (lambda b: without(b, b"nx"), "beyond the 200 Gaussians"),
         (lambda b: b.replace(b"vertex 200", b"vertex 201"), "cut off"),
