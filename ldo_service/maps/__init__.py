@@ -1,1 +1,1 @@
-"""The map as it is published, replicated and searched."""
+"""Publication, replication and search of the map."""

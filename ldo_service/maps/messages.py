@@ -1,4 +1,4 @@
-"""The mapper's map as messages of a bounded size; `replica` puts them together again."""
+"""Map messages of bounded size; `replica` assembles the map from them."""
 
 from collections.abc import Iterable, Iterator
 
@@ -15,7 +15,7 @@ NOTHING = GaussianBatch(
 
 
 def gaussians_message(piece: GaussianBatch) -> Gaussians:
-    """Without labels where nobody has seen any of them."""
+    """Return the message of a batch; its labels are empty if no Gaussian has observations."""
     labels = piece.labels if piece.labels.any() else new_labels(0)
     return Gaussians(
         ids=Array.of(piece.ids),
@@ -29,14 +29,17 @@ NO_GAUSSIANS = gaussians_message(NOTHING)
 
 
 def piece_of(message: Gaussians) -> GaussianBatch:
-    """Its arrays are read-only views, but for labels that did not travel."""
+    """Return the batch of a message.
+
+    Its arrays are read-only views, except for labels that were not sent.
+    """
     ids, labels = message.ids.numpy(), message.labels.numpy()
     labels = labels if len(labels) else new_labels(len(ids))
     return GaussianBatch(ids, message.params.numpy(), message.anchors.numpy(), labels)
 
 
 def rechunk(pieces: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[Gaussians]:
-    """Pieces as `parts` messages of `size` Gaussians, the last ones of what is left."""
+    """Yield batches as `parts` messages of `size` Gaussians; the last ones have the rest."""
     waiting, made = NOTHING, 0
     for piece in pieces:
         waiting = GaussianBatch(*map(np.concatenate, zip(waiting, piece, strict=True)))
@@ -50,8 +53,11 @@ def rechunk(pieces: Iterable[GaussianBatch], parts: int, size: int) -> Iterator[
 
 
 def split_changes(changes: Changes, size: int) -> Iterator[Changes]:
-    """The same in pieces of at most `size` Gaussians: first what goes, then what changed, then
-    what came. Nothing for no change."""
+    """Yield the changes in parts of at most `size` Gaussians.
+
+    Removed Gaussians come first, in one part, then changed ones, then added ones. There is no
+    part without changes.
+    """
     if len(changes.removed):
         yield Changes(changes.removed, NO_IDS, NO_IDS)
     for start in range(0, len(changes.changed), size):

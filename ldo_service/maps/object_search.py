@@ -1,4 +1,4 @@
-"""Where something is that somebody names: the objects of a map that answer to a text."""
+"""Search for objects of the map by text."""
 
 from dataclasses import dataclass
 
@@ -11,25 +11,33 @@ from ldo_service.semantics.text_search import Encode, TextComparisonError, searc
 
 @dataclass(frozen=True, slots=True)
 class ObjectMatch:
-    """An object, in the map frame; lengths in metres."""
+    """An object that matches a text, in the map frame; lengths in meters."""
 
     id: int
     name: str
-    score: float  # 0..1, see `semantics.search`
-    center: tuple[float, float, float]  # of its box
-    size: tuple[float, float, float]  # along the axes of the box
-    T_map_object: Pose  # these axes
-    distance: float | None  # from where the camera is, or was at the end of the run
+    score: float  # 0..1, see `semantics.text_search`.
+    center: tuple[float, float, float]  # Center of the object's box.
+    size: tuple[float, float, float]  # Size along the axes of the box.
+    T_map_object: Pose  # Axes of the box.
+    distance: float | None  # Distance to the camera or, after the run, to its last pose.
 
 
 def find_objects(
     text: str, found: MapObjects, eye: np.ndarray | None, encode: Encode | None = None
 ) -> list[ObjectMatch]:
-    """Objects that answer to `text`, the best and of equals the nearest to `eye` [3] first. Only
-    where none does by its name or another word for it, `encode` is asked which mean nearly the
-    same.
+    """Return the objects that match a text, the best first.
 
-    Raises DataError when there is none.
+    Of equally good ones, the nearest comes first. `encode` is used only if no object matches by
+    its name or a synonym. It then finds names of similar meaning.
+
+    Args:
+        text: The text.
+        found: The objects of the map.
+        eye: Camera position in the map frame, [3], or None if unknown.
+        encode: Text encoder, or None to compare words only.
+
+    Raises:
+        DataError: No object matches.
     """
     objects = found.objects
     named = [dict(one.distribution) for one in objects]

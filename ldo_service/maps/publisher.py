@@ -1,6 +1,6 @@
-"""Publication of the map and its objects, in messages of a bounded size.
+"""Publication of the map and its objects, in messages of bounded size.
 
-`replica` holds the receiving side. Objects that did not change are not encoded again.
+`replica` is the receiving side. Unchanged objects are not encoded again.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,14 +24,14 @@ from ldo_service.semantics.objects import Objects
 
 from .messages import NO_GAUSSIANS, NO_IDS, gaussians_message, rechunk, split_changes
 
-# A successor starts from a checkpoint and must not use a version again that followers may hold:
-# more than a mapper could use up between two checkpoints.
+# Added to the version of a checkpoint. A restored mapper must not reuse a version that replicas may
+# hold, and a mapper publishes fewer versions between two checkpoints.
 VERSIONS_IN_A_CHECKPOINT = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class PublishConfig:
-    """How much at once, and how often; see `MapperConfig`."""
+    """Size and rate of the map messages; see `MapperConfig`."""
 
     part_gaussians: int
     changed_keyframes: int
@@ -42,7 +42,13 @@ class PublishConfig:
 
 @dataclass(frozen=True, slots=True)
 class MessageContext:
-    """stamp_ns of the newest keyframe, version of the graph, all names of labels."""
+    """Context of a map message.
+
+    Attributes:
+        stamp_ns: Stamp of the newest keyframe.
+        graph_version: Version of the pose graph.
+        label_names: Names of all labels, by index.
+    """
 
     stamp_ns: int
     graph_version: int
@@ -50,25 +56,33 @@ class MessageContext:
 
 
 class MapPublisher:
-    """Counts the versions of a MapBuilder's map: one per delta. New Gaussians are told at once, how
-    old ones changed now and then, and the whole of it seldom."""
+    """Publisher of the map of a MapBuilder; every delta has its own version.
+
+    New Gaussians are published with each keyframe, changes of old ones less often, and snapshots
+    of the whole map rarely.
+    """
 
     def __init__(self, map_: MapBuilder, pace: PublishConfig) -> None:
         self.version = 0
         self._map, self._pace = map_, pace
         self._names_told = 0
-        self._since_snapshot = pace.snapshot_keyframes  # the first keyframe sends one
+        self._since_snapshot = pace.snapshot_keyframes  # The first keyframe publishes one.
         self._since_changed = 0
-        self._in_snapshot = 0  # Gaussians in the last one
+        self._in_snapshot = 0  # Number of Gaussians in the last snapshot.
 
     def on_keyframe(self, now: MessageContext) -> Iterator[MapDelta]:
-        """There is one more."""
+        """Yield the deltas to publish after a new keyframe."""
         self._since_changed += 1
         is_time = self._since_changed >= self._pace.changed_keyframes
         yield from self.deltas(now, with_changed=is_time)
 
     def deltas(self, now: MessageContext, *, with_changed: bool) -> Iterator[MapDelta]:
-        """What followers do not know."""
+        """Yield the deltas with all unpublished changes.
+
+        Args:
+            now: Context of the messages.
+            with_changed: Include changes of old Gaussians, and offload Gaussians afterwards.
+        """
         changes = self._map.changes(with_changed=with_changed)
         for part in split_changes(changes, self._pace.part_gaussians):
             yield self.delta(
@@ -80,7 +94,7 @@ class MapPublisher:
         if with_changed:
             self._since_changed = 0
             self._map.offload_excess()
-            trim_memory()  # copies as large as the map were made
+            trim_memory()  # The steps above made copies as large as the map.
 
     def delta(
         self,
@@ -90,6 +104,7 @@ class MapPublisher:
         changed: Gaussians = NO_GAUSSIANS,
         added: Gaussians = NO_GAUSSIANS,
     ) -> MapDelta:
+        """Return a delta with the next version."""
         self.version += 1
         return MapDelta(
             stamp_ns=now.stamp_ns,
@@ -104,16 +119,19 @@ class MapPublisher:
         )
 
     def _new_names(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """All, if there are some that followers do not know."""
+        """Return all names if some of them are unpublished, else none."""
         is_news, self._names_told = len(names) > self._names_told, len(names)
         return names if is_news else ()
 
     def _gaussians(self, chosen: np.ndarray) -> Gaussians:
         return gaussians_message(self._map.gaussians.all().at(chosen))
 
-    # --- the whole --------------------------------------------------------------------------------
+    # --- snapshots --------------------------------------------------------------------------------
     def snapshot_if_due(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
-        """To be asked once per keyframe."""
+        """Yield a snapshot if enough keyframes have passed since the last one.
+
+        The required number is smaller if the map has grown much. Call it once per keyframe.
+        """
         self._since_snapshot += 1
         pace, grown = self._pace, self._map.size() - self._in_snapshot
         has_grown = grown >= pace.snapshot_growth * self._in_snapshot
@@ -123,7 +141,10 @@ class MapPublisher:
             yield from self.publish_snapshot(now)
 
     def publish_snapshot(self, now: MessageContext) -> Iterator[MapDelta | MapSnapshot]:
-        """First all that is new, so that followers and late joiners hold the same."""
+        """Yield a snapshot of the whole map.
+
+        All unpublished changes are published first, so that existing and new replicas are equal.
+        """
         yield from self.deltas(now, with_changed=True)
         self._since_snapshot, self._in_snapshot = 0, self._map.size()
         parts = max(1, -(-self._map.size() // self._pace.part_gaussians))
@@ -163,11 +184,14 @@ class MapPublisher:
 
 
 class ObjectPublisher:
-    """Makes map/objects: a thousand objects take 50 ms to make, and few change at a time. `names`
-    of the vocabulary may get more."""
+    """Publisher of the topic map/objects.
+
+    It caches the message of each object: a thousand objects take 50 ms to encode, and few change
+    at a time.
+    """
 
     def __init__(self) -> None:
-        self._made: dict[int, tuple[bytes, MapObject]] = {}  # by id: the landmark, and its message
+        self._made: dict[int, tuple[bytes, MapObject]] = {}  # Landmark and message by id.
 
     def message(
         self,
@@ -177,6 +201,15 @@ class ObjectPublisher:
         graph_version: int,
         stamp_ns: int,
     ) -> MapObjects:
+        """Return the message of all objects.
+
+        Args:
+            objects: The objects.
+            names: Names of the vocabulary, which may grow between calls.
+            version: Version of the map.
+            graph_version: Version of the pose graph.
+            stamp_ns: Stamp of the newest keyframe.
+        """
         table = objects.landmarks
         rows, ids = [row.tobytes() for row in table], table["id"].tolist()
         known = [self._made.get(id_, (b"",))[0] == row for id_, row in zip(ids, rows, strict=True)]

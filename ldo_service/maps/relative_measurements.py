@@ -1,4 +1,4 @@
-"""What keyframes were measured against, and where the renderer wants them."""
+"""Relative-pose measurements of keyframes, recomputed after refinement."""
 
 from collections.abc import Iterator, KeysView, Mapping
 from typing import Any
@@ -17,20 +17,24 @@ LINK = np.dtype([("id", np.int64), ("reference", np.int64), ("information", np.f
 
 
 class RelativeMeasurements:
-    """Beside the poses of keyframes: which of them were measured against which.
+    """Table of the keyframe pairs with a relative-pose measurement.
 
-    Of the newest `recent` all; of older ones that against the reference, in 100 bytes: what else
-    they were measured against, the optimizer gave up when it condensed them.
+    The newest `recent` keyframes keep all their measurements. Older ones keep the measurement to
+    their reference keyframe, in 100 bytes. The pose-graph optimizer dropped their other
+    measurements when it condensed them.
     """
 
     def __init__(self, poses: KeyframePoses, recent: int) -> None:
         self._poses, self._most_recent = poses, recent
-        self._recent: dict[int, dict[int, Matrix6]] = {}  # by keyframe, then by what it is against
+        # Information by keyframe, then by reference.
+        self._recent: dict[int, dict[int, Matrix6]] = {}
         self._older = RecordTable(LINK)
-        self._refinements = 0  # sent
-        self._unacknowledged: dict[int, int] = {}  # the refinement that no correction knows yet
+        self._refinements = 0  # Number of published refinements.
+        # Last refinement by keyframe that no pose correction includes yet.
+        self._unacknowledged: dict[int, int] = {}
 
     def add(self, message: Keyframe) -> None:
+        """Add the measurements of a new keyframe."""
         links = {} if message.reference is None else {message.reference: message.information}
         links |= {pose.reference: pose.information for pose in message.window_measurements}
         if links:
@@ -43,9 +47,17 @@ class RelativeMeasurements:
         self._older.put(keyframe, reference, np.reshape(information, (6, 6))[UPPER])
 
     def refined(self, moved: Mapping[int, np.ndarray], stamp_ns: int) -> KeyframeRefinement | None:
-        """Keyframes that the optimiser moved to T_map_keyframe, measured anew against all that they
-        were measured against; and those that were measured against them, against where they are
-        now."""
+        """Recompute the measurements of keyframes that the Gaussian optimizer moved.
+
+        The result has all measurements with a moved keyframe at either end.
+
+        Args:
+            moved: New poses T_map_keyframe, by keyframe.
+            stamp_ns: Stamp of the message.
+
+        Returns:
+            The message, or None without measurements.
+        """
         for keyframe, T_map_keyframe in moved.items():
             self._poses.place(keyframe, T_map_keyframe)
         poses = tuple(
@@ -60,7 +72,10 @@ class RelativeMeasurements:
         return KeyframeRefinement(stamp_ns=stamp_ns, poses=poses, number=self._refinements)
 
     def _between(self, moved: Mapping[int, np.ndarray]) -> Iterator[tuple[int, int, Matrix6]]:
-        """Links at whose ends one of these is, oldest first: keyframe, reference, information."""
+        """Yield the measurements with a moved keyframe at either end, the oldest first.
+
+        Each is a keyframe, a reference and the information.
+        """
         older, keyframes = self._older.all, list(moved)
         at_an_end = np.isin(older["id"], keyframes) | np.isin(older["reference"], keyframes)
         for keyframe, reference, upper in older[at_an_end]:
@@ -71,7 +86,10 @@ class RelativeMeasurements:
                     yield keyframe, reference, information
 
     def _measured(self, keyframe: int, reference: int, information: Matrix6) -> MeasuredPose:
-        """The loss tells no information: the tracker's stands."""
+        """Return the measurement at the current poses, with the information of the tracker.
+
+        The image loss does not give an information matrix.
+        """
         T_reference_keyframe = se3.inverse(self._poses[reference]) @ self._poses[keyframe]
         return MeasuredPose(
             reference=reference,
@@ -81,7 +99,11 @@ class RelativeMeasurements:
         )
 
     def acknowledged(self, refinements: int) -> KeysView[int]:
-        """A correction knows so many: keyframes that it says nothing new of."""
+        """Return the keyframes with refinements that a pose correction does not include yet.
+
+        Args:
+            refinements: Number of refinements that the correction includes.
+        """
         self._unacknowledged = {
             k: number for k, number in self._unacknowledged.items() if number > refinements
         }

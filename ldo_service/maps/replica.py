@@ -9,20 +9,20 @@ from ldo_service.schemas import MapDelta, MapSnapshot
 
 from .messages import piece_of
 
-NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # gains and biases of a camera, [2, 3]
-SLACK = 1.25  # a bounded replica grows so far beyond its limit before it is cut back
+NEUTRAL = np.array([[1, 1, 1], [0, 0, 0]], np.float32)  # Gains and biases of a camera, [2, 3].
+SLACK = 1.25  # Size relative to the limit at which a bounded replica is cut to the limit.
 
 
 class MapReplica:
-    """The map of a mapper whose every map/delta and map/snapshot is given to `apply`.
+    """Replica of a map, updated by passing every map/delta and map/snapshot to `apply`.
 
     Without a limit the replica is exact: `map` equals the mapper's at `version`. After a missed
-    delta it waits, with `is_behind` set, for the next complete snapshot.
+    delta it sets `is_behind` and waits for the next complete snapshot.
 
-    With a limit the replica is bounded and goes on after a missed delta: what is wrong then stays
-    so until the next snapshot, each part of which is applied as it comes. Gaussians that no part
-    names between its first and its last id are gone. Of more than `max_gaussians` it keeps those
-    with the largest weight; it may exceed the limit by a quarter.
+    With a limit the replica is bounded. After a missed delta it continues with errors until the
+    next snapshot, and applies each part of it on arrival. A part removes all Gaussians between
+    its first and last id that it does not contain. If there are more than `max_gaussians`, the
+    replica keeps those with the largest weight. It may exceed the limit by a quarter.
 
     Args:
         max_gaussians: Limit of a bounded replica; None for an exact one.
@@ -37,18 +37,19 @@ class MapReplica:
         self.map = GaussianMap()
         self.version = 0
         self.is_behind = False
-        self.label_names: tuple[str, ...] = ()  # names of the labels, by index
+        self.label_names: tuple[str, ...] = ()  # Names of the labels, by index.
         self._exposures: dict[int, np.ndarray] = {}
-        self._next_id = 0  # above all ids that ever came
-        self._was_cut = False  # Gaussians were left out, and may weigh more by now
-        self._parts: dict[int, MapSnapshot] = {}  # of a snapshot that an exact replica awaits
-        self._last_ids: dict[int, int] = {}  # of the parts that a bounded replica applied
-        self._applied_version = 0  # of these parts
+        self._next_id = 0  # Greater than all ids received so far.
+        self._was_cut = False  # Removed Gaussians may have a larger weight by now.
+        # Parts of the incomplete snapshot of an exact replica.
+        self._parts: dict[int, MapSnapshot] = {}
+        self._last_ids: dict[int, int] = {}  # Last id of each part that a bounded replica applied.
+        self._applied_version = 0  # Version of these parts.
 
     def exposure(self, keyframe: int) -> np.ndarray:
-        """Return gains and biases [2, 3] of a keyframe's camera, as of the last snapshot.
+        """Return gains and biases [2, 3] of a keyframe's camera from the last snapshot.
 
-        They are 1 and 0 for a keyframe that it did not name.
+        They are 1 and 0 for a keyframe that the snapshot does not contain.
         """
         return self._exposures.get(keyframe, NEUTRAL)
 
@@ -66,7 +67,7 @@ class MapReplica:
     # --- changes ----------------------------------------------------------------------------------
     def _apply_delta(self, delta: MapDelta) -> bool:
         if delta.base_version == 0 and self.version:
-            self.reset()  # the mapper started again
+            self.reset()  # The mapper restarted with an empty map.
         if delta.version <= self.version:
             return False
         if delta.base_version != self.version:
@@ -86,7 +87,7 @@ class MapReplica:
         return True
 
     def _change(self, changed: GaussianBatch) -> None:
-        """Overwrite the Gaussians that are here: a bounded replica may lack some."""
+        """Overwrite the changed Gaussians; a bounded replica may lack some of them."""
         if not (len(self.map) and len(changed.ids)):
             return
         where = np.searchsorted(self.map.ids, changed.ids)
@@ -98,7 +99,7 @@ class MapReplica:
         self.map.touch(where.astype(np.uint32))
 
     def _add(self, added: GaussianBatch) -> None:
-        """Append the Gaussians that no snapshot brought already."""
+        """Append the Gaussians that no snapshot has added already."""
         new = added.at(added.ids >= self._next_id)
         self.map.append(*new)
         self._next_id = max(self._next_id, int(new.ids[-1]) + 1 if len(new.ids) else 0)
@@ -110,7 +111,7 @@ class MapReplica:
 
     # --- snapshots --------------------------------------------------------------------------------
     def _collect_part(self, part: MapSnapshot) -> bool:
-        """Keep a part until the snapshot is complete, then replace the map by it."""
+        """Keep a part until the snapshot is complete, then replace the map by the snapshot."""
         self._note_exposures(part)
         if part.version < self.version or (part.version == self.version and not self.is_behind):
             return False
@@ -128,7 +129,7 @@ class MapReplica:
         return True
 
     def _apply_part(self, part: MapSnapshot) -> bool:
-        """Replace the Gaussians that a part speaks of."""
+        """Replace the Gaussians in the id range of a part."""
         self._note_exposures(part)
         is_news = self.is_behind or self._was_cut or part.version > self.version
         if part.version < self.version or not is_news:
@@ -149,7 +150,7 @@ class MapReplica:
         return True
 
     def _span(self, part: MapSnapshot, ids: np.ndarray) -> tuple[float, float]:
-        """Return the first and the last id that a part speaks of."""
+        """Return the first and the last id of the range that a part replaces."""
         if not len(ids):
             return (0, np.inf) if part.parts == 1 else (0, -1)
         follows = part.part == 0 or part.part - 1 in self._last_ids
