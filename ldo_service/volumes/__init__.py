@@ -1,9 +1,9 @@
-"""What planners need of the map: a surface of triangles, and where there is room.
+"""Volumes for planners, computed from the map: a triangle mesh and an occupancy grid.
 
-viewpoints      what the map looks like from where it was seen
-tsdf            depth images, fused into distances to the surface
-marching_cubes  the surface, out of distances on a lattice, and the PLY file for it
-occupancy       voxels that are free, occupied or unknown; a slice of them for ROS' map_server
+viewpoints      renderings of the map at the poses of its keyframes
+tsdf            truncated signed distances, fused from depth images
+marching_cubes  the surface of distances on a lattice, and its PLY file
+occupancy       free, occupied and unknown voxels, and a floor plan for ROS' map_server
 """
 
 from .marching_cubes import Mesh, write_mesh

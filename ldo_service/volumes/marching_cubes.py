@@ -1,7 +1,7 @@
 """Marching cubes: the surface where a function on a lattice changes its sign.
 
-scikit-image computes it block by block. Its tables of Lorensen and Cline look at the corners of a
-face alone where that face is ambiguous, so cells and blocks on both sides of it agree.
+scikit-image computes it block by block. Its tables (Lorensen and Cline) resolve an ambiguous face
+by the corners of that face alone. So cells and blocks on both sides of the face agree.
 
 Lorensen and Cline, Marching cubes, 1987.
 """
@@ -15,18 +15,19 @@ from skimage import measure
 
 from ldo_service.errors import ConfigError
 
-STEPS = np.array([1 << 40, 1 << 20, 1])  # of a packed triple along each axis
+STEPS = np.array([1 << 40, 1 << 20, 1])  # Step of a packed triple along each axis.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LatticeBlock:
     """A cube of S^3 cells of a lattice, with the values at their corners.
 
-    origin      [3] integers, the lower corner
-    values      [S + 1, S + 1, S + 1] float32, finite, equal where blocks share a corner
-    attributes  [S + 1, S + 1, S + 1, C] there
-    is_used     [S, S, S] bool, the cells to look at; one of them at least is crossed: it has a
-                corner of value < 0 and one of value >= 0
+    Attributes:
+        origin: Lower corner, [3] integers.
+        values: [S + 1, S + 1, S + 1] float32, finite, equal where blocks share a corner.
+        attributes: Attributes of the corners, [S + 1, S + 1, S + 1, C].
+        is_used: Cells to process, [S, S, S] bool. At least one of them is crossed: it has a
+            corner of value < 0 and one of value >= 0.
     """
 
     origin: np.ndarray
@@ -37,8 +38,13 @@ class LatticeBlock:
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """points [V, 3] in lattice units; attributes [V, C] there; triangles [M, 3] indices of points,
-    counter-clockwise for who looks from where the function is positive."""
+    """Triangles of a surface, in lattice units.
+
+    Attributes:
+        points: [V, 3].
+        attributes: Attributes of the points, [V, C].
+        triangles: Indices of points, [M, 3]; counterclockwise when seen from the positive side.
+    """
 
     points: np.ndarray
     attributes: np.ndarray
@@ -49,14 +55,14 @@ def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
     """Return the surface value = 0 in blocks of a lattice, linear along the edges of its cells.
 
     Args:
-        blocks: Blocks that share faces, edges and corners, or nothing.
-        attributes: Count C of attributes; a surface without points has so many columns too.
+        blocks: Blocks, which may share faces, edges and corners.
+        attributes: Count C of attributes, also for a surface without points.
     """
     points, values, triangles = [np.zeros((0, 3))], [np.zeros((0, attributes))], []
     count = 0
     for block in blocks:
-        # scikit-image looks up at the upper corner of a cell whether to use it, and cuts corners
-        # above 0 off one by one: of negated values these are the ones within.
+        # scikit-image reads the mask of a cell at its upper corner. On an ambiguous face it
+        # separates the corners above 0. With negated values, these are the corners inside.
         mask = np.pad(block.is_used, ((1, 0),) * 3)
         here, faces, _, _ = measure.marching_cubes(
             -block.values, 0.0, mask=mask, method="lorensen", gradient_direction="ascent"
@@ -65,7 +71,7 @@ def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
         count += len(here)
         points.append(block.origin + here.astype(float))
         values.append(_interpolated(block.attributes, here))
-    # A point on a shared face has the same bits in all blocks: it depends on the edge alone.
+    # A point on a shared face is bitwise equal in all blocks, because it depends on its edge alone.
     merged, first, index = np.unique(
         np.concatenate(points), axis=0, return_index=True, return_inverse=True
     )
@@ -75,7 +81,7 @@ def marching_cubes(blocks: Iterable[LatticeBlock], attributes: int) -> Surface:
 
 
 def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Attributes [V, C] at points [V, 3] on edges of the lattice."""
+    """Return attributes [V, C] at points [V, 3] on edges of the lattice."""
     lower = np.floor(points).astype(int)
     upper = np.ceil(points).astype(int)
     share = (points - lower).sum(axis=1)[:, None]
@@ -83,22 +89,26 @@ def _interpolated(attributes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def pack(lattice: np.ndarray) -> np.ndarray:
-    """One int64 [...] for each integer triple [..., 3], in the same order; below 2^60.
+    """Return one int64 [...] for each integer triple [..., 3], in the same order; below 2^60.
 
-    Raises ConfigError for what lies 2^19 or more from the origin: 10 km of voxels of 2 cm.
+    Raises:
+        ConfigError: A coordinate is 2^19 or more from the origin: 10 km with voxels of 2 cm.
     """
     if len(lattice) and max(lattice.max(), -lattice.min()) >= 1 << 19:
-        raise ConfigError("the map reaches further than 524,288 voxels: choose larger voxels.")
+        raise ConfigError(
+            "the map extends more than 524,288 voxels from its origin: choose larger voxels."
+        )
     return lattice.astype(np.int64) @ STEPS + (1 << 19) * STEPS.sum()
 
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A surface in the map frame.
+    """Triangle mesh in the map frame.
 
-    vertices_m  [V, 3] float32
-    colors      [V, 3] uint8 RGB
-    triangles   [M, 3] int32, indices of vertices, counter-clockwise seen from the free side
+    Attributes:
+        vertices_m: [V, 3] float32.
+        colors: RGB of the vertices, [V, 3] uint8.
+        triangles: Indices of vertices, [M, 3] int32; counterclockwise when seen from the free side.
     """
 
     vertices_m: np.ndarray
@@ -107,6 +117,7 @@ class Mesh:
 
     @property
     def area_m2(self) -> float:
+        """Total area of the triangles."""
         a, b, c = np.moveaxis(self.vertices_m[self.triangles].astype(float), 1, 0)
         return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 

@@ -1,6 +1,6 @@
-"""Occupancy: voxels that are free, occupied or unknown, and a slice of them as a floor plan.
+"""Occupancy: free, occupied and unknown voxels, and a slice of them as a floor plan.
 
-The floor plan is a PGM picture and a YAML file, as ROS' map_server reads them.
+The floor plan is a PGM image and a YAML file in the format of ROS' map_server.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,10 +18,10 @@ from .marching_cubes import pack
 from .viewpoints import Viewpoint, surface_depth_m
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
-SLAB = 1 << 18  # voxels looked at at a time
+SLAB = 1 << 18  # Voxels processed at a time.
 
-# Axis of the map that is up: those that become x and y of the plan, to the right and ahead of who
-# looks down on it, and the sign of up.
+# Axes by the name of the map axis that is up: the two that become x (right) and y (ahead) of the
+# plan seen from above, the vertical one, and the sign of up.
 UP = {
     "x": (1, 2, 0, 1),
     "y": (2, 0, 1, 1),
@@ -30,22 +30,24 @@ UP = {
     "-y": (0, 2, 1, -1),
     "-z": (1, 0, 2, -1),
 }
-GRAY = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}  # as map_saver has them
+GRAY = {UNKNOWN: 205, FREE: 254, OCCUPIED: 0}  # Values of map_saver.
 
 
 @dataclass(frozen=True, slots=True)
 class OccupancyConfig:
+    """Settings of the occupancy grid."""
+
     voxel_m: float = 0.1
-    min_opacity: float = 0.5  # of a Gaussian that counts as matter
-    # Area of the Gaussians in an occupied voxel, as a share of a side of it: a wall through its
-    # middle has 1, single stray Gaussians have less than a hundredth.
+    min_opacity: float = 0.5  # Least opacity of a Gaussian that occupies voxels.
+    # Least area of the Gaussians in an occupied voxel, as a fraction of one side of the voxel. A
+    # wall through its middle has 1, single stray Gaussians have less than a hundredth.
     min_cover: float = 0.1
-    max_sigma_voxels: float = 10.0  # larger Gaussians are backdrop, not matter
-    max_voxels: int = 200_000_000  # a byte each
+    max_sigma_voxels: float = 10.0  # Larger Gaussians are background and occupy nothing.
+    max_voxels: int = 200_000_000  # One byte each.
 
     def __post_init__(self) -> None:
         if not 0.005 <= self.voxel_m <= 10:
-            raise ConfigError(f"a voxel of {self.voxel_m} m: choose one between 0.005 and 10 m.")
+            raise ConfigError(f"voxel_m={self.voxel_m} must lie between 0.005 and 10 m.")
         for name in ("min_opacity", "min_cover"):
             if not 0 < getattr(self, name) <= 1:
                 raise ConfigError(f"{name}={getattr(self, name)} must lie between 0 and 1.")
@@ -53,11 +55,12 @@ class OccupancyConfig:
 
 @dataclass(frozen=True, slots=True)
 class OccupancyGrid:
-    """Axes are those of the map.
+    """Occupancy grid with the axes of the map.
 
-    origin_m   [3] lower corner of voxel (0, 0, 0), in the map
-    voxel_m    side of a voxel
-    states     [X, Y, Z] uint8: 0 unknown, 1 free, 2 occupied
+    Attributes:
+        origin_m: Lower corner of voxel (0, 0, 0) in the map, [3].
+        voxel_m: Side of a voxel.
+        states: [X, Y, Z] uint8: 0 unknown, 1 free, 2 occupied.
     """
 
     origin_m: np.ndarray
@@ -66,7 +69,7 @@ class OccupancyGrid:
 
     def save(self, path: Path) -> None:
         """Write a compressed .npz with `origin_m`, `voxel_m` and `states`."""
-        with path.open("wb") as file:  # savez would add a suffix to a path
+        with path.open("wb") as file:  # Given a path, savez would add a suffix.
             np.savez_compressed(
                 file, origin_m=self.origin_m, voxel_m=self.voxel_m, states=self.states
             )
@@ -80,11 +83,22 @@ def occupancy(
     threads: int = 1,
     advance: Callable[[int], None] = lambda _done: None,
 ) -> OccupancyGrid:
-    """Occupied where opaque Gaussians of rows [N, 16] are; free where, from a viewpoint, something
-    is seen behind; unknown elsewhere. What is occupied stays so, whatever was seen through it.
+    """Compute the occupancy grid of Gaussians.
 
-    The grid holds all that is occupied, and every viewpoint. Raises DataError when nothing is
-    opaque, ConfigError when the grid would be too large.
+    A voxel is occupied if opaque Gaussians cover it. It is free if a viewpoint sees a surface
+    behind it. Otherwise it is unknown. An occupied voxel stays occupied even if a viewpoint sees
+    through it. The grid contains all occupied voxels and all viewpoints.
+
+    Args:
+        rows: Gaussians, [N, 16].
+        viewpoints: Viewpoints that free voxels.
+        config: Settings.
+        threads: Threads of the renderer.
+        advance: Called with the number of viewpoints done.
+
+    Raises:
+        DataError: No voxel is occupied.
+        ConfigError: The grid would be too large.
     """
     config = config or OccupancyConfig()
     occupied = occupied_voxels(rows, config)
@@ -101,7 +115,7 @@ def occupancy(
 
 
 def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
-    """Voxels [V, 3] (floor of the position over the side) that opaque Gaussians cover.
+    """Return the voxels that opaque Gaussians cover, [V, 3] (position over side, rounded down).
 
     A Gaussian covers its opacity times the integral of its two longer axes, 2 pi s1 s2.
     """
@@ -123,10 +137,20 @@ def occupied_voxels(rows: np.ndarray, config: OccupancyConfig) -> np.ndarray:
 def _split(
     means: np.ndarray, axes: np.ndarray, cover: np.ndarray, max_sigma_m: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Means and covers of pieces none of whose axes [N, axis, 3] is longer than `max_sigma_m`.
+    """Split Gaussians into parts until no axis is longer than `max_sigma_m`.
 
-    A Gaussian becomes two, half as long, at +- sqrt(3)/2 of that axis: together they have its
-    variance. The pieces of a large one are evenly spread, at most 2 sqrt(3) `max_sigma_m` apart.
+    A Gaussian becomes two of half the length, at +- sqrt(3)/2 of its longest axis; together they
+    have its variance. The parts of a large Gaussian are evenly spread, at most
+    2 sqrt(3) `max_sigma_m` apart.
+
+    Args:
+        means: [N, 3].
+        axes: Axes scaled by their standard deviations, [N, axis, 3].
+        cover: Covered areas, [N].
+        max_sigma_m: Limit of the length of an axis.
+
+    Returns:
+        Means and covered areas of the parts.
     """
     done = []
     while len(means):
@@ -144,7 +168,7 @@ def _split(
 
 
 def _grid(voxels: np.ndarray, config: OccupancyConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest voxel [3] and unknown states [X, Y, Z] around voxels [V, 3]."""
+    """Return the lowest voxel [3] and unknown states [X, Y, Z] of a grid around voxels [V, 3]."""
     lowest = voxels.min(axis=0) - 1
     size = voxels.max(axis=0) + 2 - lowest
     if size.astype(float).prod() > config.max_voxels:
@@ -163,8 +187,11 @@ def _carve(
     viewpoint: Viewpoint,
     voxel_m: float,
 ) -> None:
-    """Mark free the voxel where the camera stood, and all through whose middle it looks at
-    something at least a voxel further away."""
+    """Mark free the voxels that a viewpoint sees through.
+
+    These are the voxel of the camera and all voxels with a measured surface at least one voxel
+    behind their center.
+    """
     stood = np.floor(viewpoint.T_map_camera[:3, 3] / voxel_m).astype(int)
     states[tuple(stood - lowest)] = FREE
     T_camera_map = se3.inverse(viewpoint.T_map_camera)
@@ -176,13 +203,16 @@ def _carve(
 
 
 def _frustum_m(depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
-    """Corners [5, 3] in the map of what a camera sees: itself, and its image's at full depth."""
+    """Return the corners [5, 3] of a view frustum in the map: the camera and four at full depth."""
     ends = viewpoint.camera.rays()[[0, 0, -1, -1], [0, -1, 0, -1]] * depth_m.max(initial=0)
     return se3.transform(viewpoint.T_map_camera, np.vstack([np.zeros(3), ends]))
 
 
 def _slabs(shape: tuple[int, ...], corners: np.ndarray) -> Iterator[np.ndarray]:
-    """Indices [V, 3] of a grid within the box about some points [P, 3], a few layers at a time."""
+    """Yield the indices [V, 3] of a grid in the bounding box of points [P, 3], by slabs.
+
+    A slab has at most `SLAB` voxels, or one layer.
+    """
     start = np.maximum(np.floor(corners.min(axis=0)).astype(int), 0)
     stop = np.minimum(np.ceil(corners.max(axis=0)).astype(int), shape)
     x, y, z = zip(start, stop, strict=True)
@@ -194,8 +224,17 @@ def _slabs(shape: tuple[int, ...], corners: np.ndarray) -> Iterator[np.ndarray]:
 
 @dataclass(frozen=True, slots=True)
 class FloorPlan:
-    """states [X, Y] uint8 (0 unknown, 1 free, 2 occupied) over the axes `x` and `y` of the map;
-    origin_m [2] is the lower corner of cell (0, 0); `heights_m` along `up` are what it sums up."""
+    """Floor plan: a slice of an occupancy grid, seen from above.
+
+    Attributes:
+        states: [X, Y] uint8: 0 unknown, 1 free, 2 occupied.
+        origin_m: Lower corner of cell (0, 0) along the axes `x` and `y`.
+        cell_m: Side of a cell.
+        x: Axis of the map along the first dimension.
+        y: Axis of the map along the second dimension.
+        up: Axis of the map that is up, with its sign.
+        heights_m: Range of heights along `up` that the plan covers.
+    """
 
     states: np.ndarray
     origin_m: tuple[float, float]
@@ -209,12 +248,19 @@ class FloorPlan:
 def floor_plan(
     grid: OccupancyGrid, up: str = "-y", heights_m: tuple[float, float] = (-0.5, 0.5)
 ) -> FloorPlan:
-    """The voxels whose centre is at a height within `heights_m`, seen from above.
+    """Return the floor plan of the voxels with their center in a range of heights.
 
-    A cell is occupied where one of its voxels is, else free where one is free, else unknown.
-    Heights count from the origin of the map, where the first camera was, along `up`. The map has
-    the axes of the first camera, and -y is up when that was held level. Raises ConfigError when up
-    is no axis, or no voxel is in the band.
+    A cell is occupied if one of its voxels is, else free if one is free, else unknown.
+
+    Args:
+        grid: The occupancy grid.
+        up: Axis of the map that is up, a key of `UP`. The map has the axes of the first camera,
+            and -y is up if that camera was level.
+        heights_m: Range of heights along `up`, relative to the origin of the map, where the
+            first camera was.
+
+    Raises:
+        ConfigError: `up` is not an axis, or the range contains no voxel.
     """
     if up not in UP:
         raise ConfigError(f"up={up!r} is not one of {', '.join(UP)}.")
@@ -226,11 +272,11 @@ def floor_plan(
     if not band.any():
         found = sorted(sign * centers_m[[0, -1]])
         raise ConfigError(
-            f"no voxel is between {lowest_m} and {highest_m} m above the first camera: the map "
+            f"no voxel lies between {lowest_m} and {highest_m} m above the first camera: the map "
             f"reaches from {found[0]:.2f} to {found[1]:.2f} m along {up}. Choose other heights."
         )
     return FloorPlan(
-        states[:, :, band].max(axis=2),  # the codes ascend: unknown, free, occupied
+        states[:, :, band].max(axis=2),  # The codes ascend: unknown, free, occupied.
         (float(grid.origin_m[x]), float(grid.origin_m[y])),
         grid.voxel_m,
         "xyz"[x],
@@ -241,17 +287,17 @@ def floor_plan(
 
 
 def write_floor_plan(path: Path, plan: FloorPlan) -> None:
-    """Write `path` (.yaml) and the picture beside it (.pgm), y upwards."""
+    """Write the YAML file `path` and the image (.pgm) next to it, with y pointing up."""
     gray = np.array([GRAY[state] for state in (UNKNOWN, FREE, OCCUPIED)], np.uint8)
     picture = np.ascontiguousarray(gray[plan.states].T[::-1])
     path.with_suffix(".pgm").write_bytes(cv2.imencode(".pgm", picture)[1].tobytes())
     facts = {
         "image": path.with_suffix(".pgm").name,
         "resolution": plan.cell_m,
-        "origin": [*plan.origin_m, 0.0],  # of the lower left pixel; yaw
+        "origin": [*plan.origin_m, 0.0],  # Position of the lower left pixel, and yaw.
         "negate": 0,
         "occupied_thresh": 0.65,
-        "free_thresh": 0.196,  # 205 is 0.196 occupied, and unknown
+        "free_thresh": 0.196,  # 205 is an occupancy of 0.196, so it is unknown.
     }
     low_m, high_m = plan.heights_m
     axes = f"# x is the map's {plan.x}, y its {plan.y}; {low_m} to {high_m} m along {plan.up}\n"

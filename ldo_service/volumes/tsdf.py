@@ -1,4 +1,4 @@
-"""Depth images fused into a truncated signed distance: a running mean in sparse blocks of voxels.
+"""Truncated signed distances, fused from depth images as a running mean in sparse voxel blocks.
 
 Curless and Levoy, A volumetric method for building complex models from range images, 1996; blocks
 as in Niessner et al., Real-time 3D reconstruction at scale using voxel hashing, 2013.
@@ -15,27 +15,30 @@ from ldo_service.geometry import se3
 from .marching_cubes import LatticeBlock, Mesh, marching_cubes, pack
 from .viewpoints import Viewpoint, surface_color, surface_depth_m
 
-SIDE = 8  # voxels of a block
-BLOCK = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)  # [512, 3]
-GRID = np.stack(np.meshgrid(*[np.arange(SIDE + 1)] * 3, indexing="ij"), -1)  # [9, 9, 9, 3]
-CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # c = x + 2 y + 4 z
-VOXEL_BYTES = 4 + 4 + 3 * 4  # distance, weight, colour
-# Mean and median depth of one surface agree within this. In the synthetic room 2 voxels of 2 cm
-# leave 0.3 % of the vertices 4 cm off and 1 % of the surface out; 4 voxels: 1.1 %; 1 voxel: 0.06 %
-# and 3.5 % left out.
+SIDE = 8  # Voxels along the side of a block.
+BLOCK = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), -1).reshape(-1, 3)  # [512, 3].
+GRID = np.stack(np.meshgrid(*[np.arange(SIDE + 1)] * 3, indexing="ij"), -1)  # [9, 9, 9, 3].
+CORNERS = np.array([[c & 1, c >> 1 & 1, c >> 2 & 1] for c in range(8)])  # c = x + 2 y + 4 z.
+VOXEL_BYTES = 4 + 4 + 3 * 4  # Distance, weight, color.
+# Tolerance between the mean and the median depth of one surface. In the synthetic room, 2 voxels of
+# 2 cm put 0.3 % of the vertices off by 4 cm and omit 1 % of the surface. With 4 voxels 1.1 % are
+# off; with 1 voxel 0.06 % are off and 3.5 % is omitted.
 SURE_VOXELS = 2.0
-CHUNK = 512  # blocks worked on at a time: a quarter of a million voxels
+CHUNK = 512  # Blocks processed at a time: a quarter of a million voxels.
 
 
 @dataclass(frozen=True, slots=True)
 class TsdfConfig:
+    """Settings of the fusion."""
+
     voxel_m: float = 0.02
-    truncation_voxels: float = 4.0  # less tears noisy walls, more what is thin and seen twice
-    max_memory_mb: int = 1024  # of the voxels: 1000 m2 of surface at 2 cm
+    # Smaller values leave holes in noisy walls, larger ones in thin objects seen from both sides.
+    truncation_voxels: float = 4.0
+    max_memory_mb: int = 1024  # Memory of the voxels: 1000 m2 of surface at 2 cm.
 
     def __post_init__(self) -> None:
         if not 0.001 <= self.voxel_m <= 10:
-            raise ConfigError(f"a voxel of {self.voxel_m} m: choose one between 0.001 and 10 m.")
+            raise ConfigError(f"voxel_m={self.voxel_m} must lie between 0.001 and 10 m.")
         if not self.truncation_voxels >= 1:
             raise ConfigError(f"truncation_voxels={self.truncation_voxels} must be at least 1.")
         if self.max_memory_mb < 1:
@@ -43,10 +46,12 @@ class TsdfConfig:
 
     @property
     def truncation_m(self) -> float:
+        """Truncation distance in meters."""
         return self.truncation_voxels * self.voxel_m
 
     @property
     def max_blocks(self) -> int:
+        """Number of blocks that fit into `max_memory_mb`."""
         return self.max_memory_mb * 2**20 // (SIDE**3 * VOXEL_BYTES)
 
 
@@ -58,9 +63,17 @@ def fuse(
     threads: int = 1,
     advance: Callable[[int], None] = lambda _done: None,
 ) -> "Tsdf":
-    """Fuse what the Gaussians rows [N, 16] look like from each viewpoint.
+    """Fuse renderings of the map from viewpoints.
 
-    `advance` is called with how many are done. Raises ConfigError when memory does not suffice.
+    Args:
+        rows: Gaussians, [N, 16].
+        viewpoints: The viewpoints.
+        config: Settings.
+        threads: Threads of the renderer.
+        advance: Called with the number of viewpoints done.
+
+    Raises:
+        ConfigError: The voxels would exceed `max_memory_mb`.
     """
     tsdf = Tsdf(config)
     for done, viewpoint in enumerate(viewpoints, 1):
@@ -72,37 +85,45 @@ def fuse(
 
 
 class Tsdf:
-    """Distances to the nearest surface, in metres along the viewing axis, positive in front of it.
+    """Truncated signed distances to the surface, in meters along the viewing axis.
 
-    Voxel (i, j, k) has its centre at `voxel_m (i, j, k)` in the map. Only blocks of 8x8x8 voxels
-    that a surface came near hold memory.
+    They are positive in front of the surface. Voxel (i, j, k) has its center at
+    `voxel_m (i, j, k)` in the map. Only blocks of 8x8x8 voxels near a surface take memory.
     """
 
     def __init__(self, config: TsdfConfig | None = None) -> None:
         self.config = config or TsdfConfig()
-        self._blocks = np.zeros((0, 3), np.int64)  # coordinates, in blocks, in order of creation
-        self._keys = np.zeros(0, np.int64)  # of the blocks, sorted
-        self._slots = np.zeros(0, np.int64)  # where each key's block is
+        self._blocks = np.zeros((0, 3), np.int64)  # Coordinates in blocks, in order of creation.
+        self._keys = np.zeros(0, np.int64)  # Packed coordinates of the blocks, sorted.
+        self._slots = np.zeros(0, np.int64)  # Index of the block of each key.
         self._distance_m = np.zeros((0, SIDE**3), np.float32)
         self._weight = np.zeros((0, SIDE**3), np.float32)
         self._color = np.zeros((0, SIDE**3, 3), np.float32)
 
     @property
     def blocks(self) -> int:
+        """Number of blocks."""
         return len(self._blocks)
 
     @property
     def memory_mb(self) -> float:
-        """What the voxels hold."""
+        """Memory of the voxels in MB."""
         return (self._distance_m.nbytes + self._weight.nbytes + self._color.nbytes) / 2**20
 
-    # --- in ---------------------------------------------------------------------------------------
+    # --- fusion -----------------------------------------------------------------------------------
     def integrate(self, depth_m: np.ndarray, color: np.ndarray, viewpoint: Viewpoint) -> None:
-        """Take a depth image [H, W], 0 where unknown, and its colours [H, W, 3], 0..1.
+        """Fuse a depth image.
 
-        Each voxel near the surface takes the mean of what all images say of it, weighted by the
-        inverse square of depth, as the density of a camera's pixels is. Raises ConfigError when the
-        blocks would exceed `max_memory_mb`; what was fused before stays.
+        Each voxel near the surface has the mean over all images. Weights are the inverse square of
+        depth, as the density of a camera's pixels on the surface is.
+
+        Args:
+            depth_m: [H, W]; 0 where unknown.
+            color: [H, W, 3], 0..1.
+            viewpoint: Camera and pose of the image.
+
+        Raises:
+            ConfigError: The blocks would exceed `max_memory_mb`. The images fused before stay.
         """
         touched = self._touched(depth_m, viewpoint)
         self._allocate(touched)
@@ -111,7 +132,7 @@ class Tsdf:
             self._update(slots[start : start + CHUNK], depth_m, color, viewpoint)
 
     def _touched(self, depth_m: np.ndarray, viewpoint: Viewpoint) -> np.ndarray:
-        """Blocks [B, 3] within the truncation of the surface, along each ray."""
+        """Return the blocks [B, 3] within the truncation of the surface, along each ray."""
         seen, reach = depth_m > 0, self.config.truncation_m
         block_m, origin_m = SIDE * self.config.voxel_m, viewpoint.T_map_camera[:3, 3]
         rays_map = viewpoint.camera.rays()[seen] @ viewpoint.T_map_camera[:3, :3].T
@@ -126,8 +147,8 @@ class Tsdf:
         total = len(self._blocks) + len(new)
         if total > self.config.max_blocks:
             raise ConfigError(
-                f"voxels of {self.config.voxel_m} m need more than "
-                f"{self.config.max_memory_mb} MB for this map. Choose larger voxels or allow more."
+                f"voxels of {self.config.voxel_m} m need more than max_memory_mb="
+                f"{self.config.max_memory_mb} for this map. Choose larger voxels or allow more."
             )
         self._blocks = np.concatenate([self._blocks, new])
         keys = pack(self._blocks)
@@ -138,7 +159,7 @@ class Tsdf:
         self._color = _grown(self._color, total)
 
     def _find(self, blocks: np.ndarray) -> np.ndarray:
-        """Slots [B] of blocks [B, 3], -1 where there is none."""
+        """Return the slots [B] of blocks [B, 3]; -1 for a block that does not exist."""
         if not len(self._keys):
             return np.full(len(blocks), -1)
         keys = pack(blocks)
@@ -153,7 +174,7 @@ class Tsdf:
         offsets_camera = BLOCK * voxel_m @ T_camera_map[:3, :3].T
         at = viewpoint.look_up(corners_camera[:, None] + offsets_camera, depth_m)  # [B, 512]
         reach_m = self.config.truncation_m
-        told = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)  # what is far behind is hidden
+        told = (at.seen_m > 0) & (at.seen_m - at.z_m >= -reach_m)  # Voxels far behind are hidden.
         block, voxel = np.nonzero(told)
         slot, z_m, seen_m = slots[block], at.z_m[told], at.seen_m[told]
         weight = (1 / z_m**2).astype(np.float32)
@@ -165,12 +186,12 @@ class Tsdf:
         self._color[slot, voxel] += share[:, None] * (seen_color - self._color[slot, voxel])
         self._weight[slot, voxel] = total
 
-    # --- out --------------------------------------------------------------------------------------
+    # --- surface ----------------------------------------------------------------------------------
     def mesh(self) -> Mesh:
-        """The surface as triangles, where all corners of a cell have been seen.
+        """Return the surface as triangles, in cells with all corners observed.
 
-        Distances that jump by more than the truncation are no surface but the outline of one: in
-        front of what is behind it, and within itself, a voxel apart.
+        Cells with distances that jump by more than the truncation are skipped. They are no surface
+        but the outline of one, in front of the surface behind it.
         """
         surface = marching_cubes(self._crossed_blocks(), attributes=3)
         return Mesh(
@@ -180,7 +201,7 @@ class Tsdf:
         )
 
     def _crossed_blocks(self) -> Iterator[LatticeBlock]:
-        """Blocks with a surface; their attributes are colours."""
+        """Yield the blocks that a surface crosses; their attributes are colors."""
         for start in range(0, len(self._blocks), CHUNK):
             chunk = np.arange(start, min(start + CHUNK, len(self._blocks)))
             slots, voxels = self._corners(chunk)
@@ -195,8 +216,14 @@ class Tsdf:
                 yield LatticeBlock(origin, values[k], colors[k], is_used[k])
 
     def _corners(self, slots: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the corners of the cells of these blocks are: slots [B, 9, 9, 9], -1 for none, and
-        voxels [9, 9, 9] in them."""
+        """Return the location of the corners of the cells of some blocks.
+
+        Args:
+            slots: Slots of the blocks, [B].
+
+        Returns:
+            Slots [B, 9, 9, 9], -1 for a missing block, and voxels [9, 9, 9] in them.
+        """
         neighbors = np.stack([self._find(self._blocks[slots] + step) for step in CORNERS], -1)
         over = GRID // SIDE @ [1, 2, 4]
         inner = GRID % SIDE @ [SIDE * SIDE, SIDE, 1]
@@ -211,7 +238,7 @@ def _over_cells(reduce: np.ufunc, values: np.ndarray) -> np.ndarray:
 
 
 def _unique(lattice: np.ndarray) -> np.ndarray:
-    """The distinct integer triples of [..., 3], as [B, 3], in a fixed order."""
+    """Return the distinct integer triples of [..., 3], as [B, 3], in a fixed order."""
     flat = lattice.reshape(-1, 3).astype(np.int64)
     return flat[np.unique(pack(flat), return_index=True)[1]]
 

@@ -1,4 +1,4 @@
-"""What the map looks like from where it was seen."""
+"""Viewpoints: renderings of the map at the poses of its keyframes."""
 
 from dataclasses import dataclass
 
@@ -12,8 +12,14 @@ NEAR_M = 0.01
 
 @dataclass(frozen=True, slots=True)
 class Lookup:
-    """z_m [...] of points in the camera; seen_m [...] depth of the nearest pixel, 0 beside the
-    image and where unknown; row and column [...] of that pixel."""
+    """Values of a depth image at the pixels where points project.
+
+    Attributes:
+        z_m: Depth of the points in the camera, [...].
+        seen_m: Depth of the nearest pixel, [...]; 0 outside the image and where unknown.
+        row: Row of that pixel, [...].
+        column: Column of that pixel, [...].
+    """
 
     z_m: np.ndarray
     seen_m: np.ndarray
@@ -23,17 +29,17 @@ class Lookup:
 
 @dataclass(frozen=True, slots=True)
 class Viewpoint:
-    """A camera without distortion, and where it stood: T_map_camera [4, 4]."""
+    """A camera without distortion at the pose T_map_camera [4, 4]."""
 
     camera: Camera
     T_map_camera: np.ndarray
 
     def render(self, rows: np.ndarray, threads: int = 1) -> Rendering:
-        """The Gaussians rows [N, 16] seen from here."""
+        """Render Gaussians, rows [N, 16], at this viewpoint."""
         return render(rows, self.camera, se3.inverse(self.T_map_camera), threads=threads)
 
     def look_up(self, p_camera: np.ndarray, depth_m: np.ndarray) -> Lookup:
-        """What a depth image [H, W] from here says where points [..., 3] of the camera appear."""
+        """Read a depth image [H, W] of this viewpoint at points [..., 3] in the camera frame."""
         z_m = p_camera[..., 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = np.moveaxis(np.rint(self.camera.project(p_camera)), -1, 0)
@@ -44,15 +50,16 @@ class Viewpoint:
 
 
 def surface_depth_m(rendering: Rendering, tolerance_m: float) -> np.ndarray:
-    """Depth [H, W] of the surface, 0 where there is none or where it is not sure which.
+    """Return the depth [H, W] of the rendered surface; 0 where it is missing or ambiguous.
 
-    The mean depth is smoother than the median, and lies in the air between two surfaces at the
-    outline of the nearer one: it counts where it is within `tolerance_m` of the median.
+    The mean depth is smoother than the median. But at the outline of a surface it lies in the air
+    between that surface and the one behind. So the mean is used where it is within `tolerance_m`
+    of the median.
     """
     mean_m, median_m = rendering.depth_m, rendering.median_depth_m
     return np.where(np.abs(mean_m - median_m) <= tolerance_m, mean_m, 0).astype(np.float32)
 
 
 def surface_color(rendering: Rendering) -> np.ndarray:
-    """Colour [H, W, 3], 0..1, without the black background's share."""
+    """Return the color [H, W, 3], 0..1, without the contribution of the black background."""
     return rendering.color / np.maximum(rendering.opacity, 1e-6)[..., None]
