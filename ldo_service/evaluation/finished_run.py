@@ -1,4 +1,4 @@
-"""What is judged of a run. `ldo_service.runs.finished` reads it from a folder."""
+"""Data of a finished run for evaluation. `ldo_service.runs.finished` reads it from a folder."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -14,32 +14,42 @@ from ldo_service.semantics.semantics_file import SavedSemantics
 
 from .loops import FoundLoops
 
-STAMP_TOLERANCE_S = 1e-6  # the files print stamps to the nanosecond, as float64 seconds
+# The files hold stamps with nanoseconds, which float64 seconds cannot represent exactly.
+STAMP_TOLERANCE_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """A frame that was tracked."""
+    """A tracked frame of a run."""
 
-    index: int  # in the sequence
+    index: int  # Index in the sequence.
     stamp_ns: int
-    status: str  # OK, WEAK or LOST
-    is_held_out: bool  # tracked, never mapped
+    status: str  # Tracking status: OK, WEAK or LOST.
+    is_held_out: bool  # Tracked, but never mapped.
 
     @property
     def is_lost(self) -> bool:
+        """True for a frame without a pose."""
         return self.status == "LOST"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Exposures:
-    """Of the keyframes: stamps_ns [K] ascending, gains and biases [K, 2, 3]."""
+    """Exposures of the keyframes.
+
+    Attributes:
+        stamps_ns: [K], ascending.
+        matrices: Gains and biases, [K, 2, 3].
+    """
 
     stamps_ns: np.ndarray
     matrices: np.ndarray
 
     def at(self, stamp_ns: int) -> Exposure:
-        """Linear in time between the keyframes before and after; that of the map without any."""
+        """Return the exposure at a stamp, linear in time between the keyframes before and after.
+
+        Without keyframes it is the exposure of the map.
+        """
         if len(self.stamps_ns) == 0:
             return Exposure()
         after = int(np.searchsorted(self.stamps_ns, stamp_ns))
@@ -52,60 +62,76 @@ class Exposures:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PosedMap:
-    """A map [N, 16] (see `gaussians.model`), T_map_camera of the frames that are not LOST, the
-    exposures of its keyframes, and what its Gaussians are if a detector looked."""
+    """A map with the poses, exposures and labels that belong to it.
 
-    name: str  # online: as the run left it; refined: after further iterations
+    Attributes:
+        name: "online" as the run left it, "refined" after further iterations.
+        rows: Gaussians, [N, 16] (see `gaussians.model`).
+        trajectory: T_map_camera of the frames that are not LOST.
+        exposures: Exposures of the keyframes.
+        semantics: Labels of the Gaussians; None without a detector.
+    """
+
+    name: str
     rows: np.ndarray
     trajectory: Trajectory
     exposures: Exposures
     semantics: SavedSemantics | None = None
 
     def T_map_camera(self, frame: RunFrame) -> np.ndarray:
-        """[4, 4]. Raises DataError when there is none."""
+        """Return the pose of a frame, [4, 4].
+
+        Raises:
+            DataError: The trajectory has no pose for the frame.
+        """
         gaps_s = np.abs(self.trajectory.stamps_s - frame.stamp_ns * 1e-9)
         if len(gaps_s) == 0 or gaps_s.min() > STAMP_TOLERANCE_S:
             raise DataError(
-                f"the {self.name} trajectory has no pose for frame {frame.index}, which frames.csv "
-                f"calls {frame.status}: the folder is incomplete. Run again."
+                f"the {self.name} trajectory has no pose for frame {frame.index}, which has status "
+                f"{frame.status} in frames.csv: the folder is incomplete. Repeat the run."
             )
         return self.trajectory.T_world_camera[gaps_s.argmin()]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FinishedRun:
-    """`estimates` holds T_map_camera as published (online), after the last correction (final), and
-    after further iterations (refined), where there were any. Pictures are drawn into `folder`."""
+    """A finished run.
+
+    `estimates` holds T_map_camera as published (online) and after the last correction (final). If
+    there were further iterations, it also holds the poses after them (refined). Pictures are saved
+    to `folder`.
+    """
 
     folder: Path
-    frames: tuple[RunFrame, ...]  # every frame that was tracked
+    frames: tuple[RunFrame, ...]  # Tracked frames of the run.
     estimates: dict[str, Trajectory]
-    # one of the final poses, perhaps one of the refined; none of a run that localised
+    # Maps at the final and, if there are any, at the refined poses. A localization run has none.
     maps: tuple[PosedMap, ...]
-    vlm_calls: int | None = None  # of the labeller; None where the run does not say
-    loops: FoundLoops | None = None  # None: it looked for none
-    keyframes: Mapping[int, int] = field(default_factory=dict)  # id to index of the frame
+    vlm_calls: int | None = None  # Calls of the labeller; None if the run did not record them.
+    loops: FoundLoops | None = None  # Missing if loop closing was off.
+    keyframes: Mapping[int, int] = field(default_factory=dict)  # Frame index by keyframe id.
 
     def frame(self, index: int) -> RunFrame:
+        """Return the frame with an index in the sequence."""
         return next(frame for frame in self.frames if frame.index == index)
 
     def stamps_s(self, status: str) -> np.ndarray:
-        """Of the frames with a status [M], ascending."""
+        """Return the stamps of the frames with a tracking status, [M], ascending."""
         return np.array([f.stamp_ns * 1e-9 for f in self.frames if f.status == status])
 
     def require_source(self, sequence: Sequence) -> None:
-        """Raise DataError when the frames are not those of the sequence."""
+        """Raise DataError if the frames are not those of the sequence."""
         for frame in self.frames:
             is_there = 0 <= frame.index < len(sequence)
             if not is_there or sequence.stamps_ns[frame.index] != frame.stamp_ns:
                 raise DataError(
-                    f"the run had a frame {frame.index} at {frame.stamp_ns} ns, and "
-                    f"{sequence.name} has none: give the SOURCE that the run was made from."
+                    f"the run has a frame {frame.index} at {frame.stamp_ns} ns, but "
+                    f"{sequence.name} has none. Pass the SOURCE that the run was made from."
                 )
 
 
 def at_stamps(trajectory: Trajectory, stamps_s: np.ndarray) -> Trajectory:
-    """The poses whose stamp is among `stamps_s` [M], ascending."""
+    """Return the poses with a stamp among `stamps_s` [M], ascending."""
     if len(stamps_s) == 0:
         return Trajectory(trajectory.stamps_s[:0], trajectory.T_world_camera[:0])
     nearest = np.searchsorted(stamps_s, trajectory.stamps_s - STAMP_TOLERANCE_S)

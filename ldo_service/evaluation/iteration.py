@@ -1,4 +1,4 @@
-"""Time of one iteration of the optimiser, step by step, on a made-up scene."""
+"""Time of each step of an iteration of the Gaussian optimizer, on a synthetic scene."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -23,13 +23,16 @@ _WEIGHTS = LossWeights(l1=0.8, d_ssim=0.2, depth=1.0)
 
 
 def bench_camera(width: int, height: int) -> Camera:
-    """About 63 degrees wide, as RGB-D cameras are."""
+    """Return a camera with a field of view of about 63 degrees, as RGB-D cameras have."""
     return Camera(width, height, 0.82 * width, 0.82 * width, (width - 1) / 2, (height - 1) / 2)
 
 
 def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
-    """Rows [n, 16] of flat Gaussians on the walls of a room around the camera, line by line of its
-    image, each about as wide as its share of pixels; a tenth lies beyond the image's edges."""
+    """Return flat Gaussians, rows [n, 16], on the walls of a room around the camera.
+
+    They are ordered by image row. Each is about as wide as its fraction of the pixels. A tenth of
+    them lies beyond the image edges.
+    """
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(-0.65, 0.65, n), np.sort(rng.uniform(-0.5, 0.5, n))
     z = np.minimum(4, np.minimum(1.5 / np.abs(y).clip(0.01), 2.2 / np.abs(x).clip(0.01)))
@@ -45,7 +48,7 @@ def walls(n: int, camera: Camera, seed: int = 0) -> np.ndarray:
 
 
 def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """A frame: colour planes [3, H, W] uint8 and depth [H, W] in metres, with holes."""
+    """Return a frame of noise: color [3, H, W] uint8 and depth [H, W] in meters, with holes."""
     rng = np.random.default_rng(1)
     depth_m = rng.uniform(1, 4, (camera.height, camera.width)).astype(np.float32)
     depth_m[rng.uniform(size=depth_m.shape) < 0.2] = 0
@@ -53,10 +56,13 @@ def noise_frame(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Iteration:
-    """The steps of an iteration against one view, as `GaussianOptimizer.step` makes them.
+    """Steps of an iteration against one view, as `GaussianOptimizer.step` runs them.
 
-    n          Gaussians about the view
-    elsewhere  as many more in other directions, which no pixel shows
+    Args:
+        n: Gaussians around the view.
+        camera: Camera of the view.
+        threads: Threads of the kernels.
+        elsewhere: Additional Gaussians in other directions, invisible in all pixels.
     """
 
     def __init__(self, n: int, camera: Camera, *, threads: int = 1, elsewhere: int = 0) -> None:
@@ -73,34 +79,38 @@ class Iteration:
         self._by_planes = np.empty_like(self._planes)
 
     def forward(self) -> np.ndarray:
-        """Planes [5, H, W], as `Rasterizer.render`."""
+        """Render the planes [5, H, W] as `Rasterizer.render` does."""
         self._planes = self._rasterizer.render(
             self.gaussians.rows, self.camera, np.eye(4), bounds=self.gaussians.bounds
         )
         return self._planes
 
     def loss(self) -> np.ndarray:
-        """Derivatives by the planes [5, H, W]."""
+        """Compute the derivatives by the planes, [5, H, W]."""
         frame = self._color, self._depth_m, self._exposure
         image_loss(self._planes, *frame, _WEIGHTS, self._by_planes, threads=self.threads)
         return self._by_planes
 
     def backward(self) -> RowGradients:
-        """Derivatives by rows and pose, alone."""
+        """Compute the derivatives by rows and pose, without a step."""
         return self._rasterizer.gradients(self._by_planes)
 
     def descent(self) -> VisibleGaussians:
-        """Derivatives by rows and pose, and with them a step of Adam."""
+        """Compute the derivatives by rows and pose and take a step of Adam in the same pass."""
         return self._adam.step_fused(self.gaussians, self._rasterizer, self._by_planes, rate=0.1)
 
     def steps(self) -> Steps:
+        """Return the steps of an iteration by name."""
         return {"forward": self.forward, "loss": self.loss, "descent": self.descent}
 
 
 @dataclass(frozen=True, slots=True)
 class IterationTimes:
-    """Medians in milliseconds. Adam's is what a step of Adam adds to the backward pass, in which it
-    is made: the pass with it less the pass without."""
+    """Median times in milliseconds.
+
+    A step of Adam runs inside the backward pass, so `adam_ms` is the difference between the pass
+    with it and the pass without.
+    """
 
     forward_ms: float
     loss_ms: float
@@ -112,7 +122,7 @@ class IterationTimes:
 def iteration_times(
     iteration: Iteration, repeats: int, clock: Callable[[], float] = time.perf_counter
 ) -> IterationTimes:
-    """Median times of the steps of `iteration`, which is made `repeats` times."""
+    """Measure the median times of the steps of `iteration` over `repeats` repetitions."""
     unfused = {"again": iteration.forward, "backward": iteration.backward}
     (times,) = medians_ms([iteration.steps() | unfused], repeats, clock)
     backward_ms = min(times["backward"], times["descent"])
@@ -128,8 +138,11 @@ def iteration_times(
 def medians_ms(
     runs: Sequence[Steps], repeats: int, clock: Callable[[], float] = time.perf_counter
 ) -> list[dict[str, float]]:
-    """Median time of each step, run in turns after one turn to warm up, so that other work on the
-    machine slows all of them. Where there is a descent, also of the iteration that it ends."""
+    """Measure the median time of each step in milliseconds.
+
+    The runs take turns, after one turn of warm-up, so that other load on the machine slows all of
+    them. For a run with the step "descent", the result includes the time of the whole iteration.
+    """
     times: list[dict[str, list[float]]] = [{name: [] for name in steps} for steps in runs]
     for _ in range(repeats + 1):
         for steps, lists in zip(runs, times, strict=True):
@@ -153,7 +166,7 @@ def _shares(n: int, largest: int) -> list[int]:
 
 
 def _turned_away(keyframes: Sequence[int]) -> dict[int, np.ndarray]:
-    """About the vertical, by angles from a quarter to three quarters of a turn."""
+    """Return rotations about the vertical, by angles from a quarter to three quarters of a turn."""
     angles = np.linspace(0.5 * np.pi, 1.5 * np.pi, max(len(keyframes), 2))
     return {
         keyframe: se3.exp(np.array([0, angle, 0, 0, 0, 0]))

@@ -1,4 +1,4 @@
-"""Measures of labels against the truth: confusion, agreement of views, open-vocabulary names."""
+"""Measures of labels against ground truth: confusion, view agreement, open-vocabulary names."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,15 +11,20 @@ from ldo_service.geometry.sequence import FrameLabels
 
 from .label_lists import BACKGROUND, VOID, LabelSet, place_of_object
 
-NEAREST_M = 0.05  # in front of the second camera
-SAME_SURFACE = 0.02  # difference of depths, of the depth
+NEAREST_M = 0.05  # Least depth in the second camera.
+SAME_SURFACE = 0.02  # Largest relative depth difference on one surface.
 
-MIN_SHARE = 0.005  # of the pixels of a view: an object smaller than that need not be found
+MIN_SHARE = 0.005  # Least fraction of the pixels of a view; smaller objects are ignored.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Correspondences:
-    """Pixels [M] of two views that show the same place, as indices into their rows end to end."""
+    """Pixels of two views that show the same points.
+
+    Attributes:
+        first: Flat pixel indices of the first view, [M].
+        second: Flat pixel indices of the second view, [M].
+    """
 
     first: np.ndarray
     second: np.ndarray
@@ -27,29 +32,35 @@ class Correspondences:
 
 @dataclass(frozen=True, slots=True)
 class Agreement:
-    """Pixels of pairs of views."""
+    """Agreement of labels at corresponding pixels of view pairs."""
 
-    same: int = 0  # an object in either, and by the same name in both
-    objects: int = 0  # an object in either
+    same: int = 0  # Pixels with the same object in both views.
+    objects: int = 0  # Pixels with an object in at least one view.
 
     def __add__(self, other: "Agreement") -> "Agreement":
         return Agreement(self.same + other.same, self.objects + other.objects)
 
     @property
     def share(self) -> float:
-        """NaN where nothing is an object: background alone would always agree."""
+        """Fraction of agreeing pixels.
+
+        It is NaN without objects, because background alone would always agree.
+        """
         return self.same / self.objects if self.objects else float("nan")
 
 
 def correspondences(
     first: RgbdFrame, second: RgbdFrame, T_second_first: np.ndarray
 ) -> Correspondences:
-    """Where the pixels of one view are in another one.
+    """Return the corresponding pixels of two views.
 
-    T_second_first  [4, 4], from camera to camera
+    A pixel is projected by its measured depth and the poses to the nearest pixel of the second
+    view. The pair counts if the depth measured there is equal to 2 %, so both show one surface.
 
-    A pixel goes where its measured depth and the poses say, to the nearest pixel of the second
-    view, and counts if the depth measured there is its own to 2 %: the same surface.
+    Args:
+        first: The first view.
+        second: The second view.
+        T_second_first: Transform from the first to the second camera, [4, 4].
     """
     camera, measured = second.camera, np.flatnonzero(first.depth_m)
     points = first.camera.backproject(first.depth_m).reshape(-1, 3)[measured]
@@ -65,7 +76,7 @@ def correspondences(
 
 
 def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> Agreement:
-    """Of two images of labels [H, W]; 0 is background."""
+    """Compare two label images [H, W] at corresponding pixels; label 0 is background."""
     here, there = first.ravel()[pixels.first], second.ravel()[pixels.second]
     objects = (here > 0) | (there > 0)
     return Agreement(int(np.sum((here == there) & objects)), int(np.sum(objects)))
@@ -73,11 +84,11 @@ def agreement(first: np.ndarray, second: np.ndarray, pixels: Correspondences) ->
 
 @dataclass(frozen=True, slots=True)
 class DetectionCounts:
-    """right of `wanted` that there are, and of `named` that are said to be."""
+    """Recall and precision of names, over objects or over pixels."""
 
-    right: int = 0
-    wanted: int = 0
-    named: int = 0
+    right: int = 0  # Named correctly in the map.
+    wanted: int = 0  # Named in the ground truth.
+    named: int = 0  # Named in the map.
 
     def __add__(self, other: "DetectionCounts") -> "DetectionCounts":
         return DetectionCounts(
@@ -86,32 +97,45 @@ class DetectionCounts:
 
     @property
     def recall(self) -> float:
+        """Fraction of `wanted` that is right; NaN without any."""
         return self.right / self.wanted if self.wanted else float("nan")
 
     @property
     def precision(self) -> float:
+        """Fraction of `named` that is right; NaN without any."""
         return self.right / self.named if self.named else float("nan")
 
 
 class OpenNames:
-    """Counts pixels, and what the pixels of each true object are shown as, view by view.
+    """Scores of open-vocabulary names over pixels and over objects, accumulated view by view.
 
-    An object is called what most of its pixels are, over all views in which it has 0.5 % of the
-    pixels. What a data set has as an instance is an object here, be it a part of the building: a
-    wall can be called by a wrong name.
+    The name of an object is that of most of its pixels, over all views in which it has 0.5 % of
+    the pixels. Every instance of the data set is an object here, including parts of the building:
+    a wall can get a wrong name.
     """
 
     def __init__(self, labels: LabelSet, map_names: Sequence[str]) -> None:
-        """`labels` is the full list of a data set, `map_names` are by label of the map."""
+        """Start with no views.
+
+        Args:
+            labels: The full list of a data set.
+            map_names: Names by label of the map.
+        """
         self.pixels = DetectionCounts()
         self._of_map = labels.of_map(map_names)
         self._is_named = _table(map_names)
         self._is_wanted = _table(labels.names)
-        self._votes: dict[int, np.ndarray] = {}  # [256] pixels by label of the map, by instance
-        self._truth: dict[int, int] = {}  # index in the list, by instance
+        self._votes: dict[int, np.ndarray] = {}  # Pixels by label of the map [256], by instance.
+        self._truth: dict[int, int] = {}  # Index in the list, by instance.
 
     def add(self, frame: FrameLabels, truth: np.ndarray, shown: np.ndarray) -> None:
-        """truth [H, W] uint8, index in the list or VOID; shown [H, W] uint8, label of the map."""
+        """Add a view.
+
+        Args:
+            frame: Ground-truth labels of the view.
+            truth: Index in the list or VOID, [H, W] uint8.
+            shown: Label of the map, [H, W] uint8.
+        """
         self._add_pixels(truth, shown)
         sizes = np.bincount(frame.instance_ids.ravel())
         for instance in np.flatnonzero(sizes >= MIN_SHARE * truth.size).tolist():
@@ -132,6 +156,7 @@ class OpenNames:
 
     @property
     def objects(self) -> DetectionCounts:
+        """The scores of objects over all views."""
         called = {instance: int(votes.argmax()) for instance, votes in self._votes.items()}
         named = [instance for instance, label in called.items() if self._is_named[label]]
         right = [i for i in named if self._of_map[called[i]] == self._truth[i]]
@@ -140,12 +165,12 @@ class OpenNames:
 
 
 def is_beyond_coco(name: str) -> bool:
-    """Whether it is the name of an object that COCO has no class for."""
+    """Return whether a name is that of an object without a COCO class."""
     return place_of_object(name) not in (BACKGROUND, "other", *COCO)
 
 
 def _table(names: Sequence[str]) -> np.ndarray:
-    """[256] bool, by index."""
+    """Return which names are beyond COCO, [256] bool by index."""
     table = np.zeros(256, bool)
     table[: len(names)] = [is_beyond_coco(name) for name in names]
     return table
@@ -153,25 +178,31 @@ def _table(names: Sequence[str]) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class Segmentation:
-    """Figures 0..1; NaN where no pixel counts."""
+    """Segmentation metrics, 0..1; NaN without pixels that count."""
 
-    classes: int  # that are judged
-    pixel_accuracy: float  # of all pixels that count
+    classes: int  # Number of evaluated classes.
+    pixel_accuracy: float  # Accuracy over all pixels that count.
     mean_accuracy: float
     mean_iou: float
-    object_iou: float  # the mean without background
-    weighted_iou: float  # the mean weighted by frequency
+    object_iou: float  # Mean IoU without background.
+    weighted_iou: float  # Mean IoU weighted by frequency.
 
 
 def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
-    """Pixels of each class that are shown as each [C, C + 1] int64, in the last column as unknown.
+    """Count the pixels of each true class by the class shown.
 
-    truth, shown  [H, W] uint8, index into a list of C names; truth VOID does not count, shown
-                  beyond the list is unknown
-    Those of several images, added up, give the figures of all their pixels.
+    Confusions of several images may be added: the sum gives the metrics of all pixels together.
 
     >>> confusion(np.uint8([0, 0, 1, 255]), np.uint8([0, 1, 254, 1]), 2).tolist()
     [[1, 1, 0], [0, 0, 1]]
+
+    Args:
+        truth: Index in a list of C names, [H, W] uint8; VOID is ignored.
+        shown: Index in the list, [H, W] uint8; larger values are unknown.
+        classes: C.
+
+    Returns:
+        Pixels by true class and shown class, [C, C + 1] int64; the last column is unknown.
     """
     counted = truth != VOID
     columns = np.minimum(shown[counted], classes)
@@ -180,14 +211,15 @@ def confusion(truth: np.ndarray, shown: np.ndarray, classes: int) -> np.ndarray:
 
 
 def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
-    """Figures of a confusion [C, C + 1] over the classes with more than `gate` of the pixels.
+    """Return the metrics of a confusion [C, C + 1].
 
         accuracy = right / true,  IoU = right / (true + shown - right)
 
-    of each class. What is shown of it includes pixels of classes that are not judged; what is
-    unknown is wrong. Long et al., CVPR 2015, section 5, has the same four means.
+    for each class. The means are over the classes with more than the fraction `gate` of the
+    pixels. `shown` includes pixels of the other classes, and unknown pixels are wrong. Long et
+    al., CVPR 2015, section 5, define the same four means.
 
-    A cup of two pixels, one of them found, and one of the wall taken for it too:
+    A cup of two pixels, one of them found, and one pixel of the wall labelled as cup:
 
     >>> found = segmentation(np.array([[7, 1, 0], [1, 1, 0]]))
     >>> found.pixel_accuracy, round(found.mean_iou, 3), round(found.object_iou, 3)
@@ -209,7 +241,10 @@ def segmentation(counts: np.ndarray, gate: float = 0.0) -> Segmentation:
 
 
 def class_ious(counts: np.ndarray) -> np.ndarray:
-    """[C] of a confusion [C, C + 1]; NaN for a class that is neither there nor shown."""
+    """Return the IoU of each class of a confusion [C, C + 1], [C].
+
+    It is NaN for a class that is neither in the ground truth nor shown.
+    """
     right = np.diag(counts)
     union = counts.sum(axis=1) + counts.sum(axis=0)[:-1] - right
     return np.where(union > 0, right / np.maximum(union, 1), np.nan)

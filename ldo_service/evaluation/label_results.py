@@ -1,4 +1,4 @@
-"""Results of label evaluation: rows of figures, values for JSON, and a sheet of pictures."""
+"""Results of label evaluation: frames to show, values for JSON and a contact sheet."""
 
 import colorsys
 from collections import abc
@@ -19,9 +19,9 @@ from .semantics import GATES, LabelErrors, LabelView, ListErrors, labelled_maps
 from .sheet import VIEWS, shrunk
 
 CAPTIONS = ["camera", "truth", "map", "error"]
-PAINT = 0.65  # of a label's colour over the camera's image in grey
+PAINT = 0.65  # Opacity of a label's color over the gray camera image.
 GOLDEN_RATIO = 0.618033988749895
-SHADES = ((0.95, 1.0), (0.55, 1.0), (0.85, 0.65))  # saturation, value
+SHADES = ((0.95, 1.0), (0.55, 1.0), (0.85, 0.65))  # Saturation, value.
 VOID_COLOR, UNKNOWN_COLOR = (0, 0, 0), (255, 255, 255)
 RIGHT, MISSED, BEYOND = (46, 160, 67), (31, 111, 235), (178, 205, 245)
 INVENTED, CONFUSED = (207, 34, 46), (240, 190, 30)
@@ -33,13 +33,13 @@ ERRORS = {
     "another object": CONFUSED,
 }
 
-MIN_OBJECTS = 0.02  # of the pixels of a frame that is shown
+MIN_OBJECTS = 0.02  # Least fraction of object pixels in a frame of the sheet.
 FIGURES = ("mean_iou", "object_iou", "weighted_iou", "mean_accuracy", "pixel_accuracy")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelPicture:
-    """A view, and what stands above its row."""
+    """A view and the label above its row."""
 
     label: str
     view: LabelView
@@ -48,10 +48,13 @@ class LabelPicture:
 def label_sheet(
     pictures: list[LabelPicture], map_names: abc.Sequence[str], class_names: abc.Sequence[str]
 ) -> np.ndarray:
-    """Rows [camera, truth, map, error] as uint8 RGB, and a legend of the names that occur.
+    """Draw rows [camera, truth, map, error] as uint8 RGB, and a legend of the names that occur.
 
-    Names are those of the full list (`label_lists.full_list`); background is the camera's image in
-    grey. Raises ValueError without any row.
+    Names are those of the full list (`label_lists.full_list`). Background is the gray camera
+    image.
+
+    Raises:
+        ValueError: There is no picture.
     """
     labels = full_list(class_names)
     of_truth, of_map = labels.of_truth(class_names), labels.of_map(map_names)
@@ -81,7 +84,10 @@ def _pictures(
 
 
 def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
-    """[256, 3] uint8 for some indices: hues in steps of the golden ratio, three shades of them."""
+    """Return a color for each of some indices, [256, 3] uint8.
+
+    Hues advance by the golden ratio, in three shades.
+    """
     colors = np.zeros((256, 3), np.uint8)
     for place, index in enumerate(indices):
         hue, shade = place * GOLDEN_RATIO % 1.0, place % len(SHADES)
@@ -91,7 +97,7 @@ def label_colors(indices: abc.Sequence[int]) -> np.ndarray:
 
 
 def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """[H, W, 3] uint8, each object in its colour."""
+    """Draw each object in its color over the gray image, [H, W, 3] uint8."""
     gray = _gray(color)
     mixed = (1 - PAINT) * gray + PAINT * colors[labels]
     return np.where(labels[..., None] > 0, np.round(mixed), gray).astype(np.uint8)
@@ -100,7 +106,10 @@ def painted(color: np.ndarray, labels: np.ndarray, colors: np.ndarray) -> np.nda
 def error_colors(
     color: np.ndarray, truth: np.ndarray, shown: np.ndarray, labels: LabelSet
 ) -> np.ndarray:
-    """[H, W, 3] uint8, by `ERRORS`; grey where both are background or truth does not count."""
+    """Draw the errors in the colors of `ERRORS`, [H, W, 3] uint8.
+
+    Pixels are gray where both images show background, and black where ground truth is void.
+    """
     is_object, is_shown = truth > 0, shown > 0
     picture = _gray(color).astype(np.uint8)
     has_class = np.isin(truth, [k for k, name in enumerate(labels.names) if name in COCO])
@@ -114,7 +123,7 @@ def error_colors(
 
 
 def _gray(color: np.ndarray) -> np.ndarray:
-    """Bright, so that colours stand out."""
+    """Return the image in light gray, so that colors stand out."""
     gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[..., None].astype(np.float32)
     return np.repeat(np.round(96 + 0.5 * gray), 3, axis=2)
 
@@ -127,7 +136,7 @@ def _color(rgb: np.ndarray) -> Color:
 def sheet_of_labels(
     run: FinishedRun, sequence: Sequence, errors: LabelErrors, threads: int = 1
 ) -> np.ndarray | None:
-    """Of some frames, the best and the worst included; None where no frame has an object."""
+    """Draw some frames, including the best and the worst; None if no frame has an object."""
     truth = sequence.true_labels()
     chosen = frames_to_show(errors.lists[0])
     if truth is None or not chosen:
@@ -143,11 +152,21 @@ def sheet_of_labels(
 
 
 def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, str]]:
-    """Frames in their order, each with what stands above it: spread by how much of their objects is
-    right, from the worst to the best. In all of them some percent of the pixels are objects."""
+    """Choose frames with objects, spread from the worst to the best.
+
+    A frame is ranked by the fraction of its object pixels that is right. Frames with few object
+    pixels are not chosen.
+
+    Args:
+        errors: Errors of one list of names.
+        count: Number of frames.
+
+    Returns:
+        Frames in ascending order, each with the label above its row.
+    """
     shares = {}
     for frame, counts in zip(errors.frames, errors.confusions, strict=True):
-        objects = counts.sum() - counts[0, 0]  # that there are, or that are shown
+        objects = counts.sum() - counts[0, 0]  # Object pixels in the ground truth or the map.
         if objects > MIN_OBJECTS * counts.sum():
             shares[frame] = float(np.diag(counts)[1:].sum() / objects)
     ranked = sorted(shares, key=lambda frame: (shares[frame], frame))
@@ -158,7 +177,7 @@ def frames_to_show(errors: ListErrors, count: int = VIEWS) -> list[tuple[int, st
 
 
 def plain_labels(errors: LabelErrors) -> dict[str, Any]:
-    """For JSON; what is no finite number is null."""
+    """Return the errors as values for JSON; numbers that are not finite become null."""
     return {
         "map": errors.map,
         "frames": list(errors.lists[0].frames),
@@ -200,4 +219,5 @@ def _plain(found: DetectionCounts) -> dict[str, Any]:
 
 
 def finite(value: float | None) -> float | None:
+    """Return the value, or None if it is not finite."""
     return value if value is not None and np.isfinite(value) else None

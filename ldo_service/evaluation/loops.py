@@ -1,4 +1,4 @@
-"""Loops that were closed, and those that could have been. Conventions: `ldo_service.geometry`."""
+"""Evaluation of loop closing against ground truth. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,9 +12,10 @@ from .trajectory import ASSOCIATION_TOLERANCE_S
 
 APART_FRAMES = 100
 MIN_OVERLAP = 0.3
-KEPT_ACROSS, ASKED_ACROSS = 160, 40  # pixels in a row of depth, and those asked for a partner
-SAME_M, SAME_SHARE = 0.05, 0.03  # of depth: nearer to each other two depths are one surface
-LEFTOVER, LEAST = 5, 3  # keyframes of a subgraph that loops.json does not name
+KEPT_ACROSS, ASKED_ACROSS = 160, 40  # Pixels per row: of the stored depth, of those compared.
+# Two depths show one surface if they differ by less than SAME_M plus SAME_SHARE of the depth.
+SAME_M, SAME_SHARE = 0.05, 0.03
+LEFTOVER, LEAST = 5, 3  # Maximum and minimum keyframes of a subgraph missing in loops.json.
 
 PROTOCOL = """\
 Loops: a pair of subgraphs is true when a keyframe of one and a keyframe of the other each see more
@@ -27,17 +28,23 @@ against the true one. Time: of the whole search over its candidates, per candida
 
 @dataclass(frozen=True, slots=True)
 class ComparedPair:
-    """Two subgraphs, by the ids of their keyframes."""
+    """Two compared subgraphs, by the ids of their keyframes."""
 
     newer: tuple[int, ...]
     older: tuple[int, ...]
     is_closure: bool
-    ms: float | None  # None: not measured
+    ms: float | None  # Missing if not measured.
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LoopClosed:
-    """T_reference_keyframe [4, 4] between an old keyframe and a new one."""
+    """Loop closure between a new keyframe and an old one (`reference`).
+
+    Attributes:
+        keyframe: Id of the new keyframe.
+        reference: Id of the old keyframe.
+        T_reference_keyframe: Measured relative pose, [4, 4].
+    """
 
     keyframe: int
     reference: int
@@ -46,13 +53,23 @@ class LoopClosed:
 
 @dataclass(frozen=True, slots=True)
 class FoundLoops:
+    """Loop candidates and loop closures of a run."""
+
     candidates: tuple[ComparedPair, ...]
     closures: tuple[LoopClosed, ...]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SeenKeyframe:
-    """A keyframe with its true pose T_world_camera [4, 4] and depth [H, W] in m."""
+    """A keyframe with its true pose and its depth.
+
+    Attributes:
+        id: Id of the keyframe.
+        frame: Index of its frame in the sequence.
+        T_world_camera: True pose, [4, 4].
+        camera: Intrinsics of the subsampled depth.
+        depth_m: Subsampled depth, [H, W].
+    """
 
     id: int
     frame: int
@@ -63,31 +80,39 @@ class SeenKeyframe:
 
 @dataclass(frozen=True, slots=True)
 class LoopErrors:
-    """`PROTOCOL` says how each is computed; None where there is nothing to divide by."""
+    """Scores of loop closing, see `PROTOCOL`; None if the denominator is 0."""
 
     closures: int
     true_closures: int
-    queries: int  # subgraphs that have a true partner
+    queries: int  # Subgraphs with a true partner.
     closed_queries: int
     candidates: int
-    position_errors_m: tuple[float, ...]  # of the closures
-    rotation_errors_deg: tuple[float, ...]
-    ms: tuple[float, ...]  # of the candidates
-    retrieved_queries: int = 0  # of `queries`, with a true partner among their candidates
+    position_errors_m: tuple[float, ...]  # One per closure.
+    rotation_errors_deg: tuple[float, ...]  # One per closure.
+    ms: tuple[float, ...]  # One per measured candidate.
+    retrieved_queries: int = 0  # Queries with a true partner among their candidates.
 
     @property
     def precision(self) -> float | None:
+        """Fraction of the closures that connect true pairs."""
         return self.true_closures / self.closures if self.closures else None
 
     @property
     def recall(self) -> float | None:
+        """Fraction of the queries that closed a true pair."""
         return self.closed_queries / self.queries if self.queries else None
 
 
 def seen_keyframes(
     frames: Mapping[int, int], sequence: Frames, truth: Trajectory
 ) -> dict[int, SeenKeyframe]:
-    """By id: keyframes whose frame index `frames` gives, and that have a true pose within 20 ms."""
+    """Return keyframes with a true pose within 20 ms, by id.
+
+    Args:
+        frames: Frame index of each keyframe, by id.
+        sequence: The sequence.
+        truth: True poses.
+    """
     stamps_s = 1e-9 * sequence.stamps_ns[list(frames.values())]
     pairs = associate(stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
     ids = list(frames)
@@ -98,7 +123,7 @@ def seen_keyframes(
 
 
 def _seen(id: int, index: int, sequence: Frames, T_world_camera: np.ndarray) -> SeenKeyframe:
-    """With every n-th pixel of its depth, which tells what overlaps."""
+    """Return a keyframe with every n-th pixel of its depth, which is enough to measure overlap."""
     frame = sequence[index]
     step = max(1, frame.camera.width // KEPT_ACROSS)
     first, camera = step // 2, frame.camera
@@ -115,7 +140,12 @@ def _seen(id: int, index: int, sequence: Frames, T_world_camera: np.ndarray) -> 
 
 
 def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> LoopErrors:
-    """Judge by PROTOCOL; `keyframes` by id, those without a true pose left out."""
+    """Score loop closing by `PROTOCOL`.
+
+    Args:
+        found: Candidates and closures of a run.
+        keyframes: Keyframes with a true pose, by id; the others are ignored.
+    """
     subgraphs = _subgraphs(found, keyframes)
     index = {subgraph: number for number, subgraph in enumerate(subgraphs)}
     partners = _true_pairs(subgraphs, keyframes)
@@ -138,7 +168,10 @@ def evaluate_loops(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> 
 
 
 def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
-    """Share of the measured pixels of `new`, some 40 in a row, whose surface `old` measured."""
+    """Return the fraction of the measured pixels of `new` with a surface that `old` measured too.
+
+    About 40 pixels per row are compared.
+    """
     step = max(1, new.camera.width // ASKED_ACROSS)
     sampled = np.zeros(new.depth_m.shape, bool)
     sampled[step // 2 :: step, step // 2 :: step] = True
@@ -156,7 +189,7 @@ def overlap(new: SeenKeyframe, old: SeenKeyframe) -> float:
 
 
 def _subgraphs(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> list[tuple[int, ...]]:
-    """Those that were compared, and the keyframes between them."""
+    """Return the compared subgraphs, and subgraphs of the keyframes between them."""
     named = {subgraph for c in found.candidates for subgraph in (c.newer, c.older)}
     taken = {keyframe for subgraph in named for keyframe in subgraph}
     left = [keyframe for keyframe in sorted(keyframes) if keyframe not in taken]
@@ -171,7 +204,7 @@ def _subgraphs(found: FoundLoops, keyframes: Mapping[int, SeenKeyframe]) -> list
 def _true_pairs(
     subgraphs: Sequence[tuple[int, ...]], keyframes: Mapping[int, SeenKeyframe]
 ) -> set[tuple[int | None, int | None]]:
-    """(newer, older) indices of subgraphs."""
+    """Return the true pairs (newer, older) as indices of subgraphs."""
     members = [[keyframes[k] for k in subgraph if k in keyframes] for subgraph in subgraphs]
     return {
         (newer, older)
@@ -195,7 +228,7 @@ def _are_known(closure: LoopClosed, keyframes: Mapping[int, SeenKeyframe]) -> bo
 
 
 def _error(closure: LoopClosed, keyframes: Mapping[int, SeenKeyframe]) -> tuple[float, float]:
-    """m and degrees between a closure and the truth."""
+    """Return the position error in m and the rotation error in degrees of a closure."""
     old, new = keyframes[closure.reference], keyframes[closure.keyframe]
     T_true = se3.inverse(old.T_world_camera) @ new.T_world_camera
     T = se3.inverse(T_true) @ closure.T_reference_keyframe

@@ -1,4 +1,4 @@
-"""Perceptual distance by a network that the user brings (Zhang et al., CVPR 2018)."""
+"""LPIPS, a perceptual distance, by a network that the user provides (Zhang et al., CVPR 2018)."""
 
 from pathlib import Path
 
@@ -10,36 +10,39 @@ LAYOUT = (
     "two inputs float32 [1, 3, H, W], RGB in -1..1, and one output with a single number, as "
     "torch.onnx.export writes lpips.LPIPS(net='alex')"
 )
-OF_EQUAL_IMAGES = 1e-4  # a distance of an image to itself above this is none
+OF_EQUAL_IMAGES = 1e-4  # Largest distance of an image to itself.
 
 
 class Lpips:
-    """LPIPS of two images, by a network in ONNX in the `LAYOUT`; H and W may be dynamic.
+    """LPIPS of two images, by an ONNX network with the inputs and outputs of `LAYOUT`.
 
-    Raises ConfigError when the file does not fit, on opening or at the first images.
+    Height and width of the network may be dynamic.
+
+    Raises:
+        ConfigError: The file does not fit; raised on opening or at the first images.
     """
 
     def __init__(self, path: Path, *, threads: int = 1) -> None:
-        import onnxruntime  # here, because every start of `ldo` would pay for it
+        import onnxruntime  # Imported here, so that other commands of `ldo` start faster.
 
         self.path = path
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        options.log_severity_level = 4  # what is wrong is said in the error
+        options.log_severity_level = 4  # The exception has the message already.
         try:
             if not path.is_file():
                 raise FileNotFoundError("there is no such file")
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=["CPUExecutionProvider"]
             )
-        except Exception as error:  # onnxruntime has a class per cause, without a common base
+        except Exception as error:  # The exceptions of onnxruntime have no common base class.
             raise ConfigError(f"--lpips {path} cannot be opened: {_first_line(error)}.") from error
         self._names = [node.name for node in self._session.get_inputs()]
         self._require_layout()
         self._is_judged = False
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> float:
-        """The distance of images [H, W, 3] in 0..1."""
+        """Return the distance of two images [H, W, 3] in 0..1."""
         if not self._is_judged:
             self._require_distance(a)
             self._is_judged = True
@@ -71,14 +74,14 @@ class Lpips:
     def _require_distance(self, image: np.ndarray) -> None:
         itself = self._distance(image, image)
         if not abs(itself) <= OF_EQUAL_IMAGES:
-            raise self._misfit(f"it calls the distance of an image to itself {itself:.3g}")
+            raise self._misfit(f"its distance of an image to itself is {itself:.3g}, not 0")
 
     def _misfit(self, finding: str) -> ConfigError:
         return ConfigError(f"--lpips {self.path} is no LPIPS: {finding}. Expected: {LAYOUT}.")
 
 
 def _planes(image: np.ndarray) -> np.ndarray:
-    """[1, 3, H, W] float32 in -1..1."""
+    """Return the image as planes [1, 3, H, W] float32 in -1..1."""
     return np.ascontiguousarray(image.transpose(2, 0, 1)[None] * 2 - 1, np.float32)
 
 

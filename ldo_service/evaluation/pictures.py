@@ -1,4 +1,4 @@
-"""Pictures of results, as uint8 RGB images."""
+"""Pictures of results as uint8 RGB images."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +21,10 @@ NAMES = "xyz"
 
 
 def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.ndarray:
-    """Views from above and from the side [H, W, 3] of the estimate (blue) and the truth (grey).
+    """Draw the estimate (blue) and the truth (gray) from above and from the side, [H, W, 3].
 
-    The estimate is aligned to the truth if at least three poses have a partner. The world's axes
-    are sorted by how far the camera moved along them: the two longest make the view from above.
+    The estimate is aligned to the truth if at least three poses have a partner. The world axes are
+    sorted by the extent of the camera motion: the two longest span the view from above.
     """
     lines = [] if truth is None else [_Line(truth.T_world_camera[:, :3, 3], TRUTH, "truth")]
     lines.append(_Line(_aligned_positions(estimate, truth), ESTIMATE, "estimate"))
@@ -38,9 +38,11 @@ def trajectory_picture(estimate: Trajectory, truth: Trajectory | None) -> np.nda
 
 
 def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = None) -> np.ndarray:
-    """Depth [H, W] in Turbo colours [H, W, 3], near is red and far is blue; missing is black.
+    """Draw depth [H, W] in Turbo colors, [H, W, 3]: near is red, far is blue, missing is black.
 
-    From the nearest to the farthest of `range_m`, by default those of `depth_range`.
+    Args:
+        depth_m: [H, W].
+        range_m: Nearest and farthest depth; None for those of `depth_range`.
     """
     seen = np.isfinite(depth_m) & (depth_m > 0)
     if not seen.any():
@@ -54,7 +56,7 @@ def depth_picture(depth_m: np.ndarray, range_m: tuple[float, float] | None = Non
 
 
 def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
-    """Percentiles 2 and 98 of what was measured in depth [H, W]; zeros for nothing."""
+    """Return the 2nd and 98th percentile of the measured depth [H, W], or zeros without any."""
     seen = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
     if seen.size == 0:
         return 0.0, 0.0
@@ -63,21 +65,29 @@ def depth_range(depth_m: np.ndarray) -> tuple[float, float]:
 
 
 def error_picture(a: np.ndarray, b: np.ndarray, gain: float) -> np.ndarray:
-    """|a - b| of images [H, W, 3] in 0..1, amplified, as uint8."""
+    """Return gain * |a - b| as uint8, for images [H, W, 3] in 0..1."""
     return np.round(np.clip(gain * np.abs(a - b), 0, 1) * 255).astype(np.uint8)
 
 
 def contact_sheet(
     rows: list[list[np.ndarray]], captions: list[str], labels: list[str] | None = None
 ) -> np.ndarray:
-    """Images [H, W, 3] uint8 in rows, a caption above each column, a label above each row.
+    """Arrange images in rows, with a caption above each column and a label above each row.
 
-    All are scaled to the height of the first. Raises ValueError for an empty or ragged table.
+    All images are scaled to the height of the first.
+
+    Args:
+        rows: Images [H, W, 3] uint8.
+        captions: A caption for each column.
+        labels: A label for each row, or None.
+
+    Raises:
+        ValueError: The table is empty, or a row has another length.
     """
     if not rows or any(len(row) != len(captions) for row in rows) or not captions:
-        raise ValueError("a contact sheet needs rows with one image per caption")
+        raise ValueError("a contact sheet must have rows with one image per caption")
     if labels is not None and len(labels) != len(rows):
-        raise ValueError("a contact sheet needs a label for each row or none")
+        raise ValueError("a contact sheet must have a label for each row or none")
     height, width = rows[0][0].shape[:2]
     gap, label_px = 6, CAPTION_PX if labels else 0
     row_px = label_px + height + gap
@@ -95,7 +105,7 @@ def contact_sheet(
 
 
 def legend(entries: list[tuple[str, Color]], width_px: int) -> np.ndarray:
-    """Names beside their colours [H, width, 3] uint8, in as many lines as they take."""
+    """Draw names with their colors in as many lines as necessary, [H, width, 3] uint8."""
     places, x, line = [], MARGIN_PX // 2, 0
     for name, _ in entries:
         wide = 34 + 9 * len(name)
@@ -114,7 +124,7 @@ def legend(entries: list[tuple[str, Color]], width_px: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
-    points_m: np.ndarray  # [K, 3]
+    points_m: np.ndarray  # [K, 3].
     color: Color
     name: str
 
@@ -131,7 +141,7 @@ def _aligned_positions(estimate: Trajectory, truth: Trajectory | None) -> np.nda
 
 
 def _view(lines: list[_Line], points_m: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
-    """One square panel: grid, scale bar, axes and the lines seen along the third axis."""
+    """Draw one square panel: grid, scale bar, axes and the lines seen along the third axis."""
     panel = np.full((PANEL_PX, PANEL_PX, 3), BACKGROUND, np.uint8)
     across, up = axes
     low, high = points_m.min(axis=0), points_m.max(axis=0)
@@ -195,7 +205,7 @@ def _legend(picture: np.ndarray, lines: list[_Line]) -> None:
 
 
 def _round_step(length_m: float) -> float:
-    """The largest of 1, 2, 5 times a power of ten that is not above `length_m`."""
+    """Return the largest of 1, 2, 5 times a power of ten that does not exceed `length_m`."""
     power = 10.0 ** np.floor(np.log10(length_m))
     return float(
         max(factor for factor in (1, 2, 5) if factor * power <= length_m * 1.000001) * power
@@ -203,7 +213,7 @@ def _round_step(length_m: float) -> float:
 
 
 def _fitted(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """The image scaled into width x height, centred on white."""
+    """Scale an image into width x height, centered on white."""
     scale = min(width / image.shape[1], height / image.shape[0])
     size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
     scaled = image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -218,6 +228,10 @@ def _text(image: np.ndarray, text: str, at: tuple[int, int]) -> None:
 
 
 def save_picture(path: Path, image: np.ndarray) -> None:
-    """Write an RGB image [H, W, 3] uint8; the format follows the name. Raises OSError."""
+    """Write an RGB image [H, W, 3] uint8; the file suffix determines the format.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
         raise OSError(f"{path} cannot be written")

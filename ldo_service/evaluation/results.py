@@ -1,4 +1,4 @@
-"""Everything there is to say about a finished run."""
+"""Evaluation of a finished run: all scores, pictures and their JSON."""
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -27,14 +27,16 @@ NO_LABELS = "The map has no labels to judge: `ldo run --set detector.model=NAME`
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    trajectories: dict[str, TrajectoryErrors] | None  # None without ground truth
+    """Scores and pictures of a run."""
+
+    trajectories: dict[str, TrajectoryErrors] | None  # Missing without ground truth.
     judged: EvaluatedFrames
     renderings: list[RenderingErrors]
-    labels: list[LabelErrors]  # of maps that have some, where the source says what is true
-    unlabelled: str  # what is missing where only one of them has labels
-    vlm_calls_per_frame: float | None  # None where the run does not say
+    labels: list[LabelErrors]  # Errors of maps with labels, if the source has true labels.
+    unlabelled: str  # Reason why labels are not evaluated, or empty.
+    vlm_calls_per_frame: float | None  # Missing if the run did not record them.
     pictures: list[Path]
-    loops: LoopErrors | None = None  # None without ground truth, or where none were looked for
+    loops: LoopErrors | None = None  # Missing without ground truth or loop closing.
 
 
 def evaluate_run(
@@ -45,19 +47,25 @@ def evaluate_run(
     distance: Distance | None = None,
     threads: int = 1,
 ) -> Results:
-    """Judge the trajectories by the truth of the sequence, the maps by its frames, their labels by
-    its labels, and draw them.
+    """Evaluate trajectories, loops, maps and labels of a run, and save pictures of them.
 
-    `distance` and `advance` as for `views.evaluate_rendering`; `work` says how much there is to do.
-    Raises DataError when a file does not fit or nothing can be judged, ConfigError when a picture
-    cannot be written.
+    Args:
+        run: The run.
+        sequence: Its source, with ground truth and true labels if known.
+        advance: Called with the number of units done; `work` returns their total.
+        distance: LPIPS, see `views.evaluate_rendering`.
+        threads: Threads of the renderer.
+
+    Raises:
+        DataError: A file does not fit, or nothing can be evaluated.
+        ConfigError: A picture cannot be written.
     """
     judged, truth = EvaluatedFrames.of(run.frames), sequence.truth()
     if truth is None and not (judged.posed and run.maps):
         missing = "pose to render from" if run.maps else "map"
         raise DataError(
             f"{sequence.name} has no ground truth and {run.folder} no {missing}, so there is "
-            "nothing to judge."
+            "nothing to evaluate."
         )
     trajectories = None if truth is None else compare(run, truth)
     renderings = views.evaluate_rendering(
@@ -79,17 +87,22 @@ def evaluate_run(
 
 
 def work(run: FinishedRun, sequence: Sequence) -> int:
-    """Frames to render, those to label counted again."""
+    """Return the number of frames to render plus the number of frames to label."""
     labelled = has_labels(run) and sequence.true_labels() is not None
     return len(EvaluatedFrames.of(run.frames).posed) * (1 + labelled)
 
 
 def has_labels(run: FinishedRun) -> bool:
+    """Return whether a map of the run has labels."""
     return any(posed.semantics is not None for posed in run.maps)
 
 
 def missing_labels(run: FinishedRun, sequence: Sequence) -> str:
-    """Why labels are not judged; empty where they are, and where there is nothing to judge."""
+    """Return why labels are not evaluated.
+
+    The reason is empty if they are evaluated. It is also empty if the run has no map, or if
+    neither the map nor the source has labels.
+    """
     has_truth = sequence.true_labels() is not None
     if has_labels(run) and not has_truth:
         return NO_TRUTH
@@ -97,20 +110,21 @@ def missing_labels(run: FinishedRun, sequence: Sequence) -> str:
 
 
 def calls_per_frame(run: FinishedRun) -> float | None:
+    """Return the labeller calls per frame; None if the run did not record them."""
     if run.vlm_calls is None or not run.frames:
         return None
     return run.vlm_calls / len(run.frames)
 
 
 def judge_loops(run: FinishedRun, sequence: Sequence, truth: Trajectory) -> LoopErrors | None:
-    """None where the run looked for none."""
+    """Score the loops of a run; None if loop closing was off."""
     if run.loops is None:
         return None
     return evaluate_loops(run.loops, seen_keyframes(run.keyframes, sequence, truth))
 
 
 def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
-    """Each estimate; all frames that have a pose, and those whose pose was trusted."""
+    """Score each estimate: over all frames with a pose, and over those with status OK."""
     rows = {}
     for name, estimate in run.estimates.items():
         rows[name] = evaluate_trajectory(estimate, truth)
@@ -123,7 +137,10 @@ def compare(run: FinishedRun, truth: Trajectory) -> dict[str, TrajectoryErrors]:
 def sheet_of_newest(
     run: FinishedRun, sequence: Sequence, renderings: list[RenderingErrors], threads: int
 ) -> np.ndarray:
-    """Held-out frames beside the newest map; training frames where none was held out."""
+    """Draw renderings of the newest map and their frames.
+
+    The frames are held-out ones, or training frames if no frame was held out.
+    """
     newest = run.maps[-1]
 
     def view(index: int) -> RenderedView:
@@ -133,17 +150,20 @@ def sheet_of_newest(
 
 
 def draw(folder: Path, pictures: dict[str, np.ndarray]) -> list[Path]:
-    """Save pictures by their names, and return where."""
+    """Save pictures by name and return their paths."""
     try:
         for name, picture in pictures.items():
             save_picture(folder / name, picture)
     except OSError as error:
-        raise ConfigError(f"{error}: make room there, or make {folder} writable.") from error
+        raise ConfigError(f"{error}: free some disk space or make {folder} writable.") from error
     return [folder / name for name in pictures]
 
 
 def to_json(results: Results) -> dict[str, Any]:
-    """All of it for JSON, frame by frame; what is no finite number is null."""
+    """Return all results as values for JSON, with the scores of each frame.
+
+    Numbers that are not finite become null.
+    """
     trajectories = results.trajectories
     return {
         "protocol": {

@@ -1,4 +1,4 @@
-"""Labels of a run's map beside the truth, seen from where the run says the camera was."""
+"""Evaluation of map labels against the true labels, in views at the poses of the run."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,9 +28,9 @@ from .label_measures import (
 )
 from .views import EvaluatedFrames
 
-APART = 3  # frames, between views that ought to agree
-GATES = {"from 0.2 %": 0.002, "all": 0.0}  # share of the pixels that a class must have
-SAME_STAMP_S = 0.02  # of a true pose, as for trajectories
+APART = 3  # Frames between the two views of a pair.
+GATES = {"from 0.2 %": 0.002, "all": 0.0}  # Least fraction of the pixels of an evaluated class.
+SAME_STAMP_S = 0.02  # Largest stamp difference to a true pose, as for trajectories.
 
 PROTOCOL = """\
 Labels are rendered for the frames of A and B above, at the same poses: a pixel has the label s of
@@ -50,7 +50,13 @@ name, precision of those that are called by one; below that, the same of pixels.
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ListErrors:
-    """One list of names: confusions [C, C + 1] of each frame."""
+    """Errors for one list of names.
+
+    Attributes:
+        labels: The list, C names.
+        frames: Indices of the frames.
+        confusions: Confusion [C, C + 1] of each frame.
+    """
 
     labels: LabelSet
     frames: tuple[int, ...]
@@ -58,35 +64,42 @@ class ListErrors:
 
     @property
     def pooled(self) -> np.ndarray:
+        """Sum of the confusions of all frames."""
         return np.sum(self.confusions, axis=0)
 
     def figures(self, gate: float) -> Segmentation:
-        """Of all pixels."""
+        """Return the metrics of all pixels together."""
         return segmentation(self.pooled, gate)
 
     def per_image_iou(self) -> float:
-        """The mean over frames; NaN without any that counts."""
+        """Return the mean IoU per frame, averaged over frames; NaN without any."""
         ious = [segmentation(counts).mean_iou for counts in self.confusions]
         return float(np.nanmean(ious)) if np.any(np.isfinite(ious)) else float("nan")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelErrors:
-    """One map."""
+    """Errors of the labels of one map."""
 
     map: str
     lists: tuple[ListErrors, ...]
     consistency: Agreement
-    pairs: int  # of frames, that consistency is of
-    objects: DetectionCounts  # with names beyond COCO
+    pairs: int  # Number of frame pairs compared for consistency.
+    objects: DetectionCounts  # Objects with names beyond COCO.
     pixels: DetectionCounts
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class LabelView:
-    """frame, truth, and what the map shows [H, W] uint8 by its own labels.
+    """A view with its true labels and the labels that the map shows.
 
-    Raises DataError for truth of another size.
+    Attributes:
+        frame: The frame.
+        truth: Its true labels.
+        shown: Labels of the map, [H, W] uint8.
+
+    Raises:
+        DataError: The true labels have another size than the frame.
     """
 
     frame: RgbdFrame
@@ -96,14 +109,14 @@ class LabelView:
     def __post_init__(self) -> None:
         if not self.truth.class_ids.shape == self.truth.instance_ids.shape == self.shown.shape:
             raise DataError(
-                f"the true labels of frame {self.frame.index} are {self.truth.class_ids.shape} and "
-                f"{self.truth.instance_ids.shape} pixels, the frame {self.shown.shape}: export "
-                "them at the size of the frames."
+                f"the true labels of frame {self.frame.index} have {self.truth.class_ids.shape} "
+                f"and {self.truth.instance_ids.shape} pixels, the frame has {self.shown.shape}: "
+                "export them at the size of the frames."
             )
 
 
 class MapLabels:
-    """What a map says of frames."""
+    """Renderer of the labels of a map."""
 
     def __init__(
         self, sequence: datasets.Sequence, posed: PosedMap, saved: SavedSemantics, threads: int
@@ -113,7 +126,11 @@ class MapLabels:
         self._threads = threads
 
     def image(self, frame: RunFrame) -> np.ndarray:
-        """[H, W] uint8. Raises DataError for a frame without a pose."""
+        """Render the labels at the pose of a frame, [H, W] uint8.
+
+        Raises:
+            DataError: The frame has no pose.
+        """
         rows, camera, threads = self._posed.rows, self._sequence.camera, self._threads
         T_camera_map = se3.inverse(self._posed.T_map_camera(frame))
         made = render(rows, camera, T_camera_map, threads=threads, contributions=True)
@@ -121,7 +138,7 @@ class MapLabels:
 
 
 class LabelEvaluator:
-    """Takes view after view of one map."""
+    """Accumulator of the label errors of one map, view by view."""
 
     def __init__(self, map_names: Sequence[str], class_names: Sequence[str]) -> None:
         self._lists = (coco_list(class_names), full_list(class_names))
@@ -133,6 +150,7 @@ class LabelEvaluator:
         self._agreement, self._pairs = Agreement(), 0
 
     def see(self, view: LabelView) -> None:
+        """Add a view."""
         self._frames.append(view.frame.index)
         for labels, tables, seen in zip(self._lists, self._tables, self._confusions, strict=True):
             truth, shown = tables[0][view.truth.class_ids], tables[1][view.shown]
@@ -140,12 +158,19 @@ class LabelEvaluator:
         self._open.add(view.truth, self._tables[1][0][view.truth.class_ids], view.shown)
 
     def compare(self, first: np.ndarray, second: np.ndarray, pixels: Correspondences) -> None:
-        """Labels of the map [H, W] in two views."""
+        """Add a pair of views for consistency.
+
+        Args:
+            first: Labels of the map in the first view, [H, W].
+            second: Labels of the map in the second view, [H, W].
+            pixels: Corresponding pixels of the views.
+        """
         images = self._objects[first], self._objects[second]
         self._agreement += agreement(*images, pixels)
         self._pairs += 1
 
     def errors(self, name: str) -> LabelErrors:
+        """Return the errors over all views, for the map with a name."""
         lists = (
             ListErrors(labels, tuple(self._frames), tuple(confusions))
             for labels, confusions in zip(self._lists, self._confusions, strict=True)
@@ -162,10 +187,20 @@ def evaluate_labels(
     *,
     threads: int = 1,
 ) -> list[LabelErrors]:
-    """Each labelled map; none where the run has no labels or the source no truth for them.
+    """Evaluate the labels of each labelled map.
 
-    advance  called with the number of frames done
-    Raises DataError when a frame has no labels or no pose.
+    Args:
+        sequence: Source with the true labels.
+        run: The run.
+        judged: Frames to evaluate.
+        advance: Called with the number of frames done.
+        threads: Threads of the renderer.
+
+    Returns:
+        Errors of each map; empty if the run has no labels or the source no true labels.
+
+    Raises:
+        DataError: A frame has no true labels or no pose.
     """
     labels, maps = sequence.true_labels(), labelled_maps(sequence, run, threads)
     if labels is None or not maps:
@@ -187,6 +222,7 @@ def evaluate_labels(
 def labelled_maps(
     sequence: datasets.Sequence, run: FinishedRun, threads: int = 1
 ) -> list[MapLabels]:
+    """Return the maps of a run that have labels."""
     return [
         MapLabels(sequence, posed, posed.semantics, threads)
         for posed in run.maps
@@ -195,7 +231,7 @@ def labelled_maps(
 
 
 class Pairs:
-    """Frames of a run that are three apart, by index, and both have a pose."""
+    """Pairs of frames that are three apart and both have a pose."""
 
     def __init__(self, sequence: datasets.Sequence, run: FinishedRun) -> None:
         self._sequence = sequence
@@ -205,8 +241,15 @@ class Pairs:
     def of(
         self, frame: RunFrame, image: RgbdFrame
     ) -> tuple[RunFrame | None, Correspondences | None]:
-        """The later frame, and which pixels of it show what those of `image` do; None for both
-        where there is none."""
+        """Return the frame three after a frame, and the corresponding pixels of both.
+
+        Args:
+            frame: The frame.
+            image: Its color and depth.
+
+        Returns:
+            The later frame and the pixels; None for both if there is no such frame.
+        """
         other = self._by_index.get(frame.index + APART)
         T_first = _at(self._known, frame.stamp_ns)
         T_second = None if other is None else _at(self._known, other.stamp_ns)

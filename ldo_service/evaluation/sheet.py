@@ -1,4 +1,4 @@
-"""Rendered views beside what the camera saw, for the eye."""
+"""Contact sheet of rendered views and camera images."""
 
 from collections.abc import Callable
 
@@ -9,18 +9,26 @@ from .pictures import contact_sheet, depth_picture, depth_range, error_picture
 from .views import RenderedView, RenderingErrors, ViewErrors
 
 VIEWS = 6
-ERROR_GAIN = 4  # a quarter of the range is white
-WIDTH_PX = 320  # of an image
+ERROR_GAIN = 4  # An error of a quarter of the range is white.
+WIDTH_PX = 320  # Largest width of an image.
 CAPTIONS = ["camera", "map", f"error x {ERROR_GAIN}", "camera depth", "map depth"]
 
 
 def rendering_sheet(
     errors: RenderingErrors, view_of_frame: Callable[[int], RenderedView], count: int = VIEWS
 ) -> np.ndarray:
-    """Rows [camera, map, error, camera depth, map depth] of some frames, as uint8 RGB.
+    """Draw rows [camera, map, error, camera depth, map depth] of some frames, as uint8 RGB.
 
-    Above each are its frame number, its PSNR in `errors`, and the one scale of both depths. The
-    frames are the best, the worst, and others evenly between. Raises ValueError without any.
+    The label above a row has the frame number, its PSNR and the common scale of both depths. The
+    frames are the best, the worst, and others evenly spread.
+
+    Args:
+        errors: Errors of the frames.
+        view_of_frame: Renders the view of a frame index.
+        count: Number of frames.
+
+    Raises:
+        ValueError: There are no frames.
     """
     shown = some_of(errors.views, count)
     views = [view_of_frame(one.frame) for one in shown]
@@ -30,7 +38,7 @@ def rendering_sheet(
 
 
 def some_of(views: tuple[ViewErrors, ...], count: int = VIEWS) -> list[ViewErrors]:
-    """By frame number: the best and the worst by PSNR, and others evenly spread."""
+    """Choose the best and the worst view by PSNR and others evenly spread, in order of frames."""
     special = {_worst(views), _best(views)} if views else set()
     others = [view for view in views if view not in special]
     places = np.linspace(0, len(others), max(0, count - len(special)), endpoint=False)
@@ -71,13 +79,13 @@ def _scale(view: RenderedView) -> str:
 
 
 def _range_m(view: RenderedView) -> tuple[float, float]:
-    """Of the camera's depth, or of the map's where the camera has none."""
+    """Return the range of the camera's depth, or of the map's if the camera measured none."""
     measured_m = view.frame.depth_m
     return depth_range(measured_m if measured_m.any() else view.rendering.depth_m)
 
 
 def shrunk(image: np.ndarray) -> np.ndarray:
-    """At most WIDTH_PX wide."""
+    """Return the image, scaled down to at most WIDTH_PX in width."""
     height, width = image.shape[:2]
     if width <= WIDTH_PX:
         return image

@@ -10,7 +10,7 @@ from ldo_service.geometry.se3 import fit_rigid_transform
 
 ASSOCIATION_TOLERANCE_S = 0.020
 RPE_INTERVAL_S = 1.0
-MIN_POSES = 3  # fewer points do not fix a rotation
+MIN_POSES = 3  # Fewer points do not determine a rotation.
 
 PROTOCOL = """\
 Estimate and truth are paired by nearest stamp within 20 ms, each pose used once.
@@ -25,7 +25,7 @@ Some published systems print the mean as RMSE; both are given here."""
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Summary of one error over a trajectory, in the unit that its field is named after."""
+    """Statistics of one error over a trajectory, in the unit in the name of its field."""
 
     rmse: float
     mean: float
@@ -34,6 +34,7 @@ class ErrorStatistics:
 
     @staticmethod
     def of(errors: np.ndarray) -> "ErrorStatistics":
+        """Return the statistics of some errors."""
         return ErrorStatistics(
             float(np.sqrt(np.mean(errors**2))),
             float(np.mean(errors)),
@@ -44,20 +45,21 @@ class ErrorStatistics:
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryErrors:
-    """`PROTOCOL` says how each is computed; the relative errors are None below 1 s of poses."""
+    """Errors of a trajectory, see `PROTOCOL`; relative errors are None below 1 s of poses."""
 
-    poses: int  # associated
+    poses: int  # Number of associated poses.
     ate_m: ErrorStatistics
-    rpe_poses: int  # 1 s in poses
+    rpe_poses: int  # Number of poses in 1 s.
     rpe_translation_m: ErrorStatistics | None
     rpe_rotation_deg: ErrorStatistics | None
-    T_truth_estimate: np.ndarray  # [4, 4] the alignment
+    T_truth_estimate: np.ndarray  # Alignment, [4, 4].
 
 
 def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryErrors:
-    """Errors of an estimated trajectory, following `PROTOCOL`.
+    """Compute the errors of an estimated trajectory by `PROTOCOL`.
 
-    Raises DataError when fewer than 3 poses have a partner.
+    Raises:
+        DataError: Fewer than 3 poses have a partner.
     """
     pairs = associated(estimate, truth)
     T_estimate = estimate.T_world_camera[pairs[:, 0]]
@@ -77,19 +79,23 @@ def evaluate_trajectory(estimate: Trajectory, truth: Trajectory) -> TrajectoryEr
 
 
 def associated(estimate: Trajectory, truth: Trajectory) -> np.ndarray:
-    """Index pairs [M, 2] by nearest stamp within 20 ms. Raises DataError below 3 pairs."""
+    """Return index pairs [M, 2] by nearest stamp within 20 ms.
+
+    Raises:
+        DataError: There are fewer than 3 pairs.
+    """
     pairs = associate(estimate.stamps_s, truth.stamps_s, ASSOCIATION_TOLERANCE_S)
     if len(pairs) < MIN_POSES:
         raise DataError(
             f"{len(pairs)} of {len(estimate)} estimated poses have a true pose within 20 ms (the "
-            f"estimate spans {_span(estimate)}, the truth {_span(truth)}), and at least "
+            f"estimate spans {_span(estimate)}, the truth spans {_span(truth)}), but at least "
             f"{MIN_POSES} are needed. Check that both use the same clock."
         )
     return pairs
 
 
 def _relative_errors(T_estimate: np.ndarray, T_truth: np.ndarray, interval: int) -> np.ndarray:
-    """(Q_i^-1 Q_j)^-1 (P_i^-1 P_j) [M, 4, 4] for all j = i + interval."""
+    """Return (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), [M, 4, 4], for all j = i + interval."""
     motion_estimate = se3.inverse(T_estimate[:-interval]) @ T_estimate[interval:]
     motion_truth = se3.inverse(T_truth[:-interval]) @ T_truth[interval:]
     return se3.inverse(motion_truth) @ motion_estimate

@@ -1,4 +1,4 @@
-"""Frames of a run beside renderings of its map at their poses, and the errors of these images."""
+"""Comparison of the frames of a run with renderings of its map at their poses."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -14,11 +14,11 @@ from ldo_service.geometry.sequence import Sequence
 
 from .finished_run import PosedMap, RunFrame
 
-WINDOW_PX, SIGMA_PX = 11, 1.5  # Wang et al. 2004, section III.B
-C1, C2 = 0.01**2, 0.03**2  # the same, for images in 0..1
-COVERED = 0.5  # rendered opacity above which there is a surface to compare
+WINDOW_PX, SIGMA_PX = 11, 1.5  # Wang et al., 2004, section III.B.
+C1, C2 = 0.01**2, 0.03**2  # Constants of the same source, for images in 0..1.
+COVERED = 0.5  # Rendered opacity above which there is a surface to compare.
 
-TRAINING_STEP = 5  # of the literature's protocol (SplaTAM, Keetha et al. 2024)
+TRAINING_STEP = 5  # Step of the protocol of the literature (SplaTAM, Keetha et al., 2024).
 FIGURES = ("psnr_db", "ssim", "lpips", "depth_l1_m", "depth_share")
 
 PROTOCOL = """\
@@ -38,16 +38,25 @@ LOST frames have no pose and are only counted, WEAK frames are judged."""
 
 @dataclass(frozen=True, slots=True)
 class DepthError:
-    l1_m: float  # NaN where no pixel counts
-    share: float  # of the pixels with measured depth, those that count; NaN where none is measured
+    """Error of the rendered depth of one image."""
+
+    l1_m: float  # NaN if no pixel counts.
+    share: float  # Fraction of the measured pixels that count; NaN if none is measured.
 
 
 def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Peak signal-to-noise ratio in dB: 10 log10(peak^2 / mean (a - b)^2).
+    """Return the peak signal-to-noise ratio in dB: 10 log10(peak^2 / mean (a - b)^2).
 
-    a, b    [H, W, C] or [H, W]; both uint8 (peak 255) or both floating in 0..1 (peak 1)
-    mask    [H, W] bool, the pixels that count; all by default
-    Equal images give infinity, an empty mask gives NaN. Raises ValueError for unlike images.
+    Args:
+        a: [H, W, C] or [H, W]; uint8 (peak 255) or floating in 0..1 (peak 1).
+        b: Of the same shape and kind.
+        mask: Pixels that count, [H, W] bool; None for all.
+
+    Returns:
+        The ratio; infinity for equal images, NaN for an empty mask.
+
+    Raises:
+        ValueError: The images differ in shape or kind.
     """
     if a.shape != b.shape or (a.dtype == np.uint8) != (b.dtype == np.uint8):
         raise ValueError(f"images differ in kind: {a.dtype}{a.shape} and {b.dtype}{b.shape}")
@@ -61,16 +70,21 @@ def psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def ssim(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean structural similarity of images [H, W, 3], floating in 0..1.
+    """Return the mean structural similarity of images [H, W, 3], floating in 0..1.
 
         (2 m_a m_b + c1) (2 s_ab + c2) / ((m_a^2 + m_b^2 + c1) (s_a^2 + s_b^2 + c2))
 
-    per channel under an 11x11 Gaussian window of sigma 1.5 px, over the pixels whose window lies
-    in the image. One scale: MS-SSIM, which some print under this name, is often higher. Raises
-    ValueError for unlike images and for a side below 11 pixels. Wang et al., TIP 2004.
+    per channel under an 11x11 Gaussian window of sigma 1.5 px, over the pixels with their window in
+    the image. It has one scale; MS-SSIM, which some publish under this name, is often higher.
+    Wang et al., TIP 2004.
+
+    Raises:
+        ValueError: The images differ in shape, or a side is below 11 pixels.
     """
     if a.shape != b.shape or a.ndim != 3 or min(a.shape[:2]) < WINDOW_PX:
-        raise ValueError(f"SSIM of images {a.shape} and {b.shape}: they must be alike, from 11x11.")
+        raise ValueError(
+            f"SSIM of images {a.shape} and {b.shape}: their shapes must be alike, at least 11x11."
+        )
     a, b = a.astype(np.float64), b.astype(np.float64)
     mean_a, mean_b = _windowed(a), _windowed(b)
     variances = _windowed(a * a) - mean_a**2 + _windowed(b * b) - mean_b**2
@@ -80,10 +94,12 @@ def ssim(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def depth_error(rendered_m: np.ndarray, opacity: np.ndarray, measured_m: np.ndarray) -> DepthError:
-    """Mean |rendered - measured| over pixels with measured depth and opacity above one half.
+    """Return the mean |rendered - measured| over pixels with measured depth and a rendered surface.
 
-    rendered_m, measured_m  [H, W] metres, measured 0 where it was not
-    opacity                 [H, W] 0..1
+    Args:
+        rendered_m: Rendered depth, [H, W], meters.
+        opacity: Rendered opacity, [H, W], 0..1; there is a surface above one half.
+        measured_m: Measured depth, [H, W], meters; 0 where not measured.
     """
     measured = measured_m > 0
     counted = measured & (opacity > COVERED)
@@ -94,92 +110,101 @@ def depth_error(rendered_m: np.ndarray, opacity: np.ndarray, measured_m: np.ndar
 
 
 def _windowed(image: np.ndarray) -> np.ndarray:
-    """Gaussian means [H - 10, W - 10, C]."""
+    """Return the Gaussian means, [H - 10, W - 10, C]."""
     kernel = cv2.getGaussianKernel(WINDOW_PX, SIGMA_PX)
     margin = WINDOW_PX // 2
     return cv2.sepFilter2D(image, -1, kernel, kernel)[margin:-margin, margin:-margin]
 
 
-Images = tuple[np.ndarray, np.ndarray]  # seen and shown, [H, W, 3] in 0..1
+Images = tuple[np.ndarray, np.ndarray]  # Camera image and rendering, [H, W, 3] in 0..1.
 Distance = Callable[[np.ndarray, np.ndarray], float]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RenderedView:
+    """A frame with the rendering of the map at its pose."""
+
     frame: RgbdFrame
     rendering: Rendering
-    exposure: Exposure = field(default_factory=Exposure)  # expected of the camera, not fitted
+    # Interpolated between keyframes, not fitted to the frame.
+    exposure: Exposure = field(default_factory=Exposure)
 
     @property
     def seen(self) -> np.ndarray:
-        """What the camera saw [H, W, 3] float32, 0..1."""
+        """Camera image, [H, W, 3] float32, 0..1."""
         return self.frame.color.astype(np.float32) / 255
 
     @property
     def shown(self) -> np.ndarray:
-        """What the map shows to such a camera [H, W, 3] float32, 0..1."""
+        """Rendering at the exposure of the frame, [H, W, 3] float32, 0..1."""
         return self.exposure.applied(self.rendering.color)
 
     @property
     def picture(self) -> np.ndarray:
-        """`shown` [H, W, 3] uint8."""
+        """Rendering at the exposure of the frame, [H, W, 3] uint8."""
         return np.round(self.shown * 255).astype(np.uint8)
 
     @property
     def psnr_db(self) -> float:
-        """Of every pixel."""
+        """PSNR over every pixel."""
         return psnr(*every_pixel(self))
 
 
 @dataclass(frozen=True, slots=True)
 class ViewErrors:
-    """Errors of one frame; `views.PROTOCOL` says how each is computed."""
+    """Errors of one frame, see `PROTOCOL`."""
 
     frame: int
     psnr_db: float
     ssim: float
-    lpips: float | None  # None: nobody gave a network
+    lpips: float | None  # Missing without a network.
     depth_l1_m: float
     depth_share: float
 
 
 @dataclass(frozen=True, slots=True)
 class RenderingErrors:
-    """One map under one protocol, frame by frame."""
+    """Errors of one map under one protocol, frame by frame."""
 
     map: str
     protocol: str
     views: tuple[ViewErrors, ...]
 
     def mean(self, figure: str) -> float | None:
+        """Return the mean of a metric over frames; None without any."""
         values = self._values(figure)
         return float(np.mean(values)) if len(values) else None
 
     def median(self, figure: str) -> float | None:
+        """Return the median of a metric over frames; None without any."""
         values = self._values(figure)
         return float(np.median(values)) if len(values) else None
 
     def _values(self, figure: str) -> np.ndarray:
-        """Of the frames that have the figure."""
+        """Return the values of a metric without NaN."""
         values = np.array([getattr(view, figure) for view in self.views], float)
         return values[~np.isnan(values)]
 
 
 # --- protocols ------------------------------------------------------------------------------------
 def every_pixel(view: RenderedView) -> Images:
+    """Return the images with every pixel, at the exposure of the frame."""
     return view.seen, view.shown
 
 
 def exposure_fitted(view: RenderedView) -> Images:
+    """Return the images with the exposure fitted to the frame itself."""
     shown = view.rendering.color
     return view.seen, fit_exposure(shown, view.seen).applied(shown)
 
 
 def map_as_it_is(view: RenderedView) -> Images:
+    """Return the images with the brightness of the map."""
     return view.seen, view.rendering.color.clip(0, 1)
 
 
 def measured_pixels(view: RenderedView) -> Images:
+    """Return the images with pixels without measured depth black in both."""
     is_measured = (view.frame.depth_m > 0)[..., None]
     return view.seen * is_measured, view.shown * is_measured
 
@@ -194,13 +219,14 @@ TRAINING = {"B training": measured_pixels}
 
 @dataclass(frozen=True, slots=True)
 class EvaluatedFrames:
-    """The frames of a run that each protocol asks for; those that are LOST have no pose."""
+    """Frames of a run for each protocol, including LOST frames without a pose."""
 
     held_out: tuple[RunFrame, ...]
     training: tuple[RunFrame, ...]
 
     @staticmethod
     def of(frames: Iterable[RunFrame]) -> "EvaluatedFrames":
+        """Return the frames for each protocol, out of all frames of a run."""
         frames = tuple(frames)
         training = tuple(frame for frame in frames if not frame.is_held_out)
         return EvaluatedFrames(
@@ -209,10 +235,11 @@ class EvaluatedFrames:
 
     @property
     def posed(self) -> list[RunFrame]:
+        """Frames with a pose."""
         return [frame for frame in (*self.held_out, *self.training) if not frame.is_lost]
 
     def counts(self) -> str:
-        """How many, as a line below the protocol."""
+        """Return a sentence with the numbers of frames for each protocol."""
         if not self.held_out:
             a = "A: none, since all frames were mapped; `ldo run --hold-out-every 5` keeps some."
         else:
@@ -220,9 +247,19 @@ class EvaluatedFrames:
         return f"{a} B: {_counted(self.training)}."
 
 
-# --- judging --------------------------------------------------------------------------------------
+# --- evaluation -----------------------------------------------------------------------------------
 def view_of(image: RgbdFrame, posed: PosedMap, frame: RunFrame, threads: int = 1) -> RenderedView:
-    """A frame of a run, with its image as it was mapped. Raises DataError when it has no pose."""
+    """Render the map at the pose of a frame.
+
+    Args:
+        image: Color and depth of the frame, as it was mapped.
+        posed: The map.
+        frame: The frame of the run.
+        threads: Threads of the renderer.
+
+    Raises:
+        DataError: The frame has no pose.
+    """
     T_camera_map = se3.inverse(posed.T_map_camera(frame))
     rendering = render(posed.rows, image.camera, T_camera_map, threads=threads)
     return RenderedView(image, rendering, posed.exposures.at(frame.stamp_ns))
@@ -237,11 +274,18 @@ def evaluate_rendering(
     distance: Distance | None = None,
     threads: int = 1,
 ) -> list[RenderingErrors]:
-    """Errors of each map under each protocol that has frames.
+    """Compute the errors of each map under each protocol that has frames.
 
-    distance  LPIPS of two images [H, W, 3] in 0..1
-    advance   called with the number of frames done
-    Raises DataError when a frame cannot be read or has no pose.
+    Args:
+        sequence: Source of the frames.
+        judged: Frames to evaluate.
+        maps: The maps.
+        advance: Called with the number of frames done.
+        distance: LPIPS of two images [H, W, 3] in 0..1; None to omit it.
+        threads: Threads of the renderer.
+
+    Raises:
+        DataError: A frame cannot be read or has no pose.
     """
     views: dict[tuple[str, str], list[ViewErrors]] = defaultdict(list)
     for done, frame in enumerate(judged.posed, 1):
@@ -258,7 +302,7 @@ def evaluate_rendering(
 def evaluate_view(
     view: RenderedView, is_held_out: bool, distance: Distance | None = None
 ) -> Iterator[tuple[str, ViewErrors]]:
-    """Protocols that a frame belongs to, and its errors by each."""
+    """Yield the protocols that a frame belongs to, with its errors under each."""
     rendering = view.rendering
     depth = depth_error(rendering.depth_m, rendering.opacity, view.frame.depth_m)
     for protocol, images in (HELD_OUT if is_held_out else TRAINING).items():

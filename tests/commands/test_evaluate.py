@@ -75,7 +75,7 @@ def test_a_source_without_truth_says_nothing_about_a_run_without_a_map(
     ldo(capsys, "run", without_truth, "--out", again, "--localize", run, "--max-frames", "3")
     code, _, err = ldo(capsys, "eval", again, without_truth)
     assert code == 3
-    assert "no map, so there is nothing to judge" in " ".join(err.split())
+    assert "no map, so there is nothing to evaluate" in " ".join(err.split())
 
 
 def test_json_has_every_figure_of_every_frame(capsys, run: Path, room_folder: Path) -> None:
@@ -122,7 +122,7 @@ def test_nothing_to_judge_is_bad_data(capsys, run: Path, without_truth: Path) ->
     (run / "frames.csv").write_text(lines)
     code, _, err = ldo(capsys, "eval", run, without_truth)
     assert code == 3
-    assert "nothing to judge" in last_line(err)
+    assert "nothing to evaluate" in last_line(err)
 
 
 def test_a_refined_map_has_rows_of_its_own(capsys, run: Path, room_folder: Path) -> None:

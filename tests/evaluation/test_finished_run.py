@@ -16,7 +16,7 @@ def test_a_frame_that_should_have_a_pose_and_has_none_is_an_error(finished_run: 
     posed = run.maps[0]
     kept = np.arange(len(posed.trajectory)) != 7
     poses = Trajectory(posed.trajectory.stamps_s[kept], posed.trajectory.T_world_camera[kept])
-    with pytest.raises(DataError, match=r"no pose for frame 7.*calls OK"):
+    with pytest.raises(DataError, match=r"no pose for frame 7.*has status OK"):
         replace(posed, trajectory=poses).T_map_camera(run.frame(7))
 
 
