@@ -18,12 +18,12 @@ SAME_M, SAME_SHARE = 0.05, 0.03
 LEFTOVER, LEAST = 5, 3  # Maximum and minimum keyframes of a subgraph missing in loops.json.
 
 PROTOCOL = """\
-Loops: a pair of subgraphs is true when a keyframe of one and a keyframe of the other each see more
-than 30 % of the other's measured pixels, by the source's depth (within 5 cm + 3 %) and true poses,
-and are more than 100 frames apart. Precision: closures between true pairs, of all closures. Recall:
-newer subgraphs that closed a true pair, of those that have one; keyframes that loops.json puts into
-no subgraph are taken five at a time, fewer than three are none. Errors: of the pose of each closure
-against the true one. Time: of the whole search over its candidates, per candidate."""
+Loops: a pair of subgraphs is true if a keyframe of one and a keyframe of the other overlap and are
+more than 100 frames apart. They overlap if each sees more than 30 % of the other's measured pixels,
+by the source's depth (within 5 cm + 3 %) and true poses. Precision: true closures of all closures.
+Recall: newer subgraphs that closed a true pair, of those that have one. Keyframes that loops.json
+puts into no subgraph form subgraphs of five; fewer than three are ignored. Errors: pose of each
+closure against the true one. Time: of the whole search over its candidates, per candidate."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,8 @@ from .sheet import rendering_sheet
 from .trajectory import TrajectoryErrors, evaluate_trajectory
 from .views import FIGURES, Distance, EvaluatedFrames, RenderedView, RenderingErrors, view_of
 
-NO_TRUTH = "The source does not say what its pixels show, so the labels of the map are not judged."
-NO_LABELS = "The map has no labels to judge: `ldo run --set detector.model=NAME` makes some."
+NO_TRUTH = "The source has no true labels, so the labels of the map are not evaluated."
+NO_LABELS = "The map has no labels to evaluate. Run with a detector: --set detector.model=NAME."
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,18 +34,18 @@ SAME_STAMP_S = 0.02  # Largest stamp difference to a true pose, as for trajector
 
 PROTOCOL = """\
 Labels are rendered for the frames of A and B above, at the same poses: a pixel has the label s of
-the largest sum_i w_i p_i(s) over its Gaussians. Pixels of all frames are pooled. Those whose truth
-is void do not count; a name that is not in the list is wrong wherever it is shown.
+the largest sum_i w_i p_i(s) over its Gaussians. Pixels of all frames are pooled. Pixels without a
+true label are ignored; a name that is not in the list is wrong wherever it is shown.
 COCO: background and the classes of COCO among those of the source, by detection/synonyms.yaml; all
 other classes are background. All names: background (wall, floor, ceiling) and every object of the
-source by its own name, or by COCO's where COCO has one. mIoU, accuracy and IoU by frequency are
-means over classes: those with 0.2 % of the pixels, and all that occur. Pixel accuracy is of all
+source, by the name of its COCO class or else by its own. mIoU, accuracy and IoU by frequency are
+means over classes: those with 0.2 % of the pixels, and all that occur. Pixel accuracy is over all
 pixels. Per image: the mean over frames of mIoU over the classes that are in the frame.
-Consistency: of pixels labelled an object in either of two frames 3 apart, the share that has the
-same label in both, warped by measured depth and true poses (the run's own where none are known).
-Beyond COCO: objects whose name COCO has no class for, in frames where they have 0.5 % of the
-pixels. An object is called what most of its pixels are. Recall is of those that truly have such a
-name, precision of those that are called by one; below that, the same of pixels."""
+Consistency: fraction of equal labels among pixels with an object in at least one of two frames 3
+apart, warped by measured depth and true poses (by the run's own poses if no true ones are known).
+Beyond COCO: objects with a name that has no COCO class, in frames where they have 0.5 % of the
+pixels. The name of an object is that of most of its pixels. Recall is over the objects with such
+a true name, precision over those with such a name in the map; the next line counts pixels."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -19,7 +19,7 @@ ATE: positions after SE(3) alignment of the estimate to the truth over all pairs
 pairs j = i + n, where n is 1 s in poses at the median rate; its translation and rotation angle.
 `evo_ape tum TRUTH ESTIMATE --align --t_max_diff 0.02` and `evo_rpe tum TRUTH ESTIMATE --delta n
 --delta_unit f --all_pairs --t_max_diff 0.02 [--pose_relation angle_deg]` print the same, unless
-the clocks are half a frame apart and a nearest pose is nearest to two: evo then uses it twice.
+the clocks are half a frame apart and a pose is the nearest of two: evo then uses it twice.
 Some published systems print the mean as RMSE; both are given here."""
 
 

@@ -23,17 +23,18 @@ FIGURES = ("psnr_db", "ssim", "lpips", "depth_l1_m", "depth_share")
 
 PROTOCOL = """\
 Maps are rendered at the poses that the run ended with and compared with its rectified frames,
-colours in 0..1, renderings clipped. PSNR: pixels and channels pooled. SSIM: Wang et al. 2004, 11x11
+colors in 0..1, renderings clipped. PSNR: pixels and channels pooled. SSIM: Wang et al. 2004, 11x11
 Gaussian of 1.5 px, windows inside the image; some published systems print MS-SSIM, often higher.
 Depth L1: mean depth of the rendering, over pixels with measured depth and rendered opacity above
-0.5; "of measured" is the share of measured pixels that these are. Cells: mean / median of frames.
-online: the map at the end of the stream, fitted again where corrections had torn it; refined: after
-the further iterations of --refine-iterations.
-A: held-out frames, tracked and never mapped; every pixel. The map has one brightness, the camera's
-changes: its gain and bias per channel are interpolated between the keyframes before and after.
-Exposure fitted: to each judged frame itself, by least squares. No exposure: the map as it is.
+0.5; "of measured" is their fraction of the measured pixels. Cells: mean / median of frames.
+online: the map at the end of the stream, refitted after loop closures; refined: after the further
+iterations of --refine-iterations.
+A: held-out frames, tracked and never mapped; every pixel. The map has one brightness, that of the
+camera changes: its gain and bias per channel are interpolated between the keyframes before and
+after. Exposure fitted: to each evaluated frame itself, by least squares. No exposure: the map
+unchanged.
 B: the literature's: every 5th training frame, pixels without depth black in both images.
-LOST frames have no pose and are only counted, WEAK frames are judged."""
+LOST frames have no pose and are only counted, WEAK frames are evaluated."""
 
 
 @dataclass(frozen=True, slots=True)
