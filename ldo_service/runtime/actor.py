@@ -1,8 +1,8 @@
 """Actors and their ports.
 
 An actor has input and output ports, a handler, and state that can be saved and restored. The
-delivery policy belongs to the input: only a consumer knows whether a late message is still worth
-something.
+delivery policy belongs to the input: only the consumer knows whether a late message is still
+useful.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,13 +19,13 @@ UNLIMITED = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Lossless:
-    """Every message arrives, in order; the producer waits for room."""
+    """Policy of an input that receives every message, in order; the producer waits for credit."""
 
-    window: int = 8  # messages that may be under way; bounds memory at both ends
+    window: int = 8  # Maximum number of unhandled messages; bounds memory at both ends.
 
     def __post_init__(self) -> None:
         if self.window < 1:
-            raise ConfigError(f"Lossless(window={self.window}): must be at least 1.")
+            raise ConfigError(f"Lossless.window={self.window} must be at least 1.")
 
     def __str__(self) -> str:
         return f"Lossless({self.window})"
@@ -33,20 +33,16 @@ class Lossless:
 
 @dataclass(frozen=True, slots=True)
 class Latest:
-    """The newest `depth` messages wait; older ones are dropped and counted.
+    """Policy of an input that queues the newest messages; older ones are dropped and counted."""
 
-    With `per_key`, the newest `depth` for each value of the topic's key, at most `max_keys` values:
-    the oldest value makes room for a new one.
-    """
-
-    depth: int = 1
-    per_key: bool = False
-    max_keys: int = 32
+    depth: int = 1  # Maximum number of queued messages; with `per_key`, for each key.
+    per_key: bool = False  # Keep one queue for each value of the topic's key.
+    max_keys: int = 32  # Maximum number of keys; a new key displaces the oldest one.
 
     def __post_init__(self) -> None:
         if self.depth < 1 or self.max_keys < 1:
             raise ConfigError(
-                f"Latest(keep={self.depth}, max_keys={self.max_keys}): both must be at least 1."
+                f"Latest.depth={self.depth}, Latest.max_keys={self.max_keys} must be at least 1."
             )
 
     def __str__(self) -> str:
@@ -58,32 +54,38 @@ Policy = Lossless | Latest
 
 @dataclass(frozen=True, slots=True)
 class In:
-    """`has_priority`: what comes here is taken before all that waits at other inputs."""
+    """Input port of an actor."""
 
     topic: Topic
     policy: Policy
-    has_priority: bool = False
+    has_priority: bool = False  # Take its messages before those queued at other inputs.
 
     def __post_init__(self) -> None:
         if isinstance(self.policy, Latest) and self.policy.per_key and self.topic.key is None:
-            raise ConfigError(f"{self.topic.name} has no key: Latest(per_key=True) cannot be used.")
+            raise ConfigError(
+                f"Latest(per_key=True) needs a topic with a key, and {self.topic.name} has none. "
+                "Set Topic.key or per_key=False."
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Out:
-    """`is_nonblocking`: the actor looks at `credits` before it makes a message, and never waits for
-    it."""
+    """Output port of an actor."""
 
     topic: Topic
+    # The actor checks its credits before it produces a message; sending never waits.
     is_nonblocking: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class FlowStatus:
-    """What an actor sees of the traffic around it; with the message, all that a step depends on.
+    """State of an actor's links before a step.
 
-    room     for each output that never waits: how many messages may be sent now
-    waiting  for each lossless input: how many messages wait behind the one that is handled
+    A step depends on the actor's state, the message and this status, and on nothing else.
+
+    Attributes:
+        credits: Number of messages that may be sent now, for each nonblocking output.
+        backlog: Number of messages queued behind the current one, for each lossless input.
     """
 
     credits: Mapping[Topic, int] = field(default_factory=dict)
@@ -91,50 +93,66 @@ class FlowStatus:
 
 
 class Actor:
-    """One box of the design card. `situation` is set before each step."""
+    """Unit of computation that handles messages; the stage sets `situation` before each step."""
 
     name: ClassVar[str]
     inputs: ClassVar[tuple[In, ...]] = ()
     outputs: ClassVar[tuple[Out, ...]] = ()
-    lags = False  # its snapshots may be of an earlier step: what it took since is kept beside them
-    finishes_last = False  # its last words tell what came of the others'
-    # asks what no journal records: a replay leaves it out, and who takes what it makes is fed from
-    # what it took then
+    # Snapshots may be of an earlier step; the stage logs the inputs handled since.
+    lags = False
+    finishes_last = False  # The final messages depend on those of other actors.
+    # The actor queries a source that no journal records. A replay skips the actor and feeds its
+    # consumers from their own recorded inputs.
     talks_outside = False
-    is_prompt = False  # a robot waits for what it makes: its thread comes before those of others
+    # A robot waits for the outputs, so the thread has priority over those of other actors.
+    is_prompt = False
 
     def __init__(self) -> None:
         self.situation = FlowStatus()
 
     def has_credit(self, topic: Topic) -> bool:
+        """Return whether a message of the topic may be sent without waiting."""
         return self.situation.credits.get(topic, UNLIMITED) > 0
 
     def handle(self, message: Any) -> Iterator[Message]:
-        """What the actor makes of one message of its inputs."""
+        """Handle one input message and yield the output messages."""
         raise NotImplementedError
 
     def on_restored(self) -> Iterator[Message]:
-        """First words of a successor: what a predecessor may have left unsaid to those outside."""
+        """Yield the restored messages.
+
+        Called on an actor restored from a saved state. The previous process may have stopped before
+        it published them.
+        """
         return iter(())
 
     def on_stop(self) -> Iterator[Message]:
-        """Last words before a soft stop. `finishes_last`: after all others have said theirs."""
+        """Yield the final messages before a soft stop.
+
+        Actors with `finishes_last` publish theirs after all other actors.
+        """
         return iter(())
 
     def snapshot(self) -> State:
-        """What a successor needs to go on; called after every step, so it must be cheap."""
+        """Return the state that a restored actor needs to continue.
+
+        The stage calls it after every step, so it must be cheap.
+        """
         return {}
 
     def checkpoint(self) -> State:
-        """The same with nothing left for later, however long it takes; on request."""
+        """Return the complete state, including all that `snapshot` may defer.
+
+        It may take long; the stage calls it on request.
+        """
         return self.snapshot()
 
     def on_saved(self) -> None:
-        """The last snapshot or checkpoint is where a successor will find it."""
+        """Handle the notification that the last snapshot or checkpoint was written."""
 
     def restore(self, state: State) -> None:
-        """Go on from a predecessor's snapshot."""
+        """Continue from a snapshot of an earlier actor."""
 
     def metrics(self) -> dict[str, float]:
-        """What the actor counts itself, for its health message."""
+        """Return the actor's own metrics for its health message, by name."""
         return {}

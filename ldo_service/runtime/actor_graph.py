@@ -1,4 +1,4 @@
-"""A wired graph of actors: who makes what, who waits for whom."""
+"""Graph of actors: the producer of each topic, and cycles of lossless inputs."""
 
 from collections.abc import Iterable, Sequence
 from typing import Protocol
@@ -9,7 +9,7 @@ from .actor import In, Lossless, Out
 
 
 class HasPorts(Protocol):
-    """An actor's class, or its drawing."""
+    """Actor class, or another description of an actor's ports."""
 
     @property
     def name(self) -> str: ...
@@ -22,10 +22,13 @@ class HasPorts(Protocol):
 
 
 def check_graph(actors: Iterable[HasPorts]) -> None:
-    """Refuse two producers of one topic, and a cycle of lossless inputs.
+    """Reject two producers of one topic and a cycle of lossless inputs.
 
-    Around such a cycle each actor could wait for room at the next, for ever. Raises ConfigError or
-    LosslessCycle.
+    In such a cycle each actor could wait forever for credit from the next.
+
+    Raises:
+        ConfigError: A topic has two producers.
+        LosslessCycle: Lossless inputs form a cycle.
     """
     actors = list(actors)
     makers = producers(actors)
@@ -50,21 +53,25 @@ def check_graph(actors: Iterable[HasPorts]) -> None:
 
 
 def producers(actors: Iterable[HasPorts]) -> dict[str, str]:
-    """Topic name to the name of the actor that makes it."""
+    """Return the name of the producing actor for each topic name.
+
+    Raises:
+        ConfigError: A topic has two producers.
+    """
     makers: dict[str, str] = {}
     for actor in actors:
         for port in actor.outputs:
             if port.topic.name in makers:
                 raise ConfigError(
-                    f"{port.topic.name} is made by {makers[port.topic.name]} and by {actor.name}: "
-                    "a topic has one producer."
+                    f"topic {port.topic.name} has two producers, {makers[port.topic.name]} and "
+                    f"{actor.name}; it must have one. Remove it from the outputs of one actor."
                 )
             makers[port.topic.name] = actor.name
     return makers
 
 
 def lossless_consumers(actors: Iterable[HasPorts], topic_name: str) -> frozenset[str]:
-    """Names of the actors that must get every message of a topic."""
+    """Return the names of the actors that must receive every message of a topic."""
     return frozenset(
         actor.name
         for actor in actors
@@ -73,4 +80,5 @@ def lossless_consumers(actors: Iterable[HasPorts], topic_name: str) -> frozenset
 
 
 def lossless(actor: HasPorts) -> Sequence[In]:
+    """Return the lossless inputs of an actor."""
     return [port for port in actor.inputs if isinstance(port.policy, Lossless)]

@@ -1,4 +1,4 @@
-"""Saves what a successor needs, in one write, and counts when it cannot."""
+"""Checkpoints of a stage: the actor's state and the delivery state, saved in one write."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -13,31 +13,39 @@ log = logging.getLogger(__name__)
 
 
 class Checkpointer:
-    """Of one stage: `build_checkpoint` and `write` run in its actor's thread."""
+    """Writer and reader of the saved state of one stage.
+
+    The stage calls `build_checkpoint` and `write` in its actor's thread.
+    """
 
     def __init__(self, store: StateStore) -> None:
         self._store, self._ledger = store, DeliveryState()
         self.past = RestoredState()
-        self.is_unsaved = False  # the last step
+        self.is_unsaved = False  # The last step is not saved.
         self._failed = 0
 
     def restore_actor(self, make: Callable[[], Actor]) -> Actor:
-        """An actor that goes on from what was saved last."""
+        """Return an actor restored from the state that was saved last."""
         fresh = make()
         self.past = RestoredState.of(self._store.load(fresh.name))
         if self.past.of_actor:
-            log.info("%s goes on from its last state", fresh.name)
+            log.info("%s: restored from its last saved state.", fresh.name)
         return restore_actor(fresh, self.past, make)
 
     def forget(self, name: str) -> None:
-        """Begin anew."""
+        """Delete the saved state, so that the actor starts empty."""
         self._store.delete(name)
         self._ledger = DeliveryState()
 
     def links(
         self, inputs: Mapping[str, InletPosition], outputs: Mapping[str, OutletPosition | None]
     ) -> State:
-        """Where the stage stands; None: nobody is expected there."""
+        """Return the positions of the stage on its topics.
+
+        Args:
+            inputs: Position on each lossless input, by topic name.
+            outputs: Position on each output, by topic name; None where no consumer is required.
+        """
         return self._ledger.links(
             inputs, {topic: past for topic, past in outputs.items() if past is not None}
         )
@@ -45,32 +53,48 @@ class Checkpointer:
     def build_checkpoint(
         self, actor: Actor, links: State, taken: LoggedInput | None, whole: bool
     ) -> State:
-        """`taken`: what a lagging actor took last; `whole`: with nothing left for later."""
+        """Return the state to write after a step.
+
+        Args:
+            actor: The actor of the stage.
+            links: Positions on its topics, as `links` returns them.
+            taken: Input of the last step if the actor lags, for its write-ahead log.
+            whole: Write a checkpoint instead of a snapshot.
+        """
         is_whole = whole or self._ledger.is_long
         own = actor.checkpoint() if is_whole else actor.snapshot()
         return {**self._ledger.own(own, taken, is_whole), **links}
 
     def write(self, actor: Actor, state: State) -> None:
+        """Write the state and notify the actor.
+
+        Raises:
+            OSError: The state cannot be written, for example because the disk is full.
+        """
         self._store.save(actor.name, state)
         actor.on_saved()
         if self.is_unsaved:
             self.is_unsaved = False
-            log.info("%s is saved again", actor.name)
+            log.info("%s: its state is saved again; no action needed.", actor.name)
 
     def record_failure(self, name: str, error: OSError) -> bool:
-        """Count a save that failed; whether it is the first since one succeeded, which is said."""
+        """Count a failed save, and log the first one after a success.
+
+        Returns:
+            Whether it is the first failure since a save succeeded.
+        """
         self._failed += 1
         is_first, self.is_unsaved = not self.is_unsaved, True
         if is_first:
             log.error(
-                "%s: its last step cannot be saved: %r. It tries again, and nothing is mapped that "
-                "a kill would lose: free some disk space, or choose another folder with --state.",
+                "%s: saving the last step failed: %r. It retries, and maps nothing that a kill "
+                "would lose. Free some disk space, or choose another folder with --state.",
                 name, error,
             )  # fmt: skip
         return is_first
 
     def metrics(self) -> dict[str, float]:
-        """Nothing where every save succeeded."""
+        """Return counters of failed saves; empty if every save succeeded."""
         if not self._failed:
             return {}
         return {"checkpoint_failing": float(self.is_unsaved), "checkpoints_failed": self._failed}

@@ -1,11 +1,11 @@
-"""What a stage keeps beside its actor's state, and in one write with it.
+"""Delivery state of a stage, saved in one write with its actor's state.
 
-    stage.offsets      where it stands on each lossless topic: number of the next message
-    stage.outbox T N   message N of topic T, which some expected consumer has not handled
-    stage.wal N    what an actor took whose state lags behind, since that state
+- `stage.offsets`: Offset of the next message on each lossless topic.
+- `stage.outbox T N`: Message N of topic T, which a required consumer has not handled.
+- `stage.wal N`: Input N since the saved state of an actor that lags (write-ahead log).
 
-So a successor is where the last finished step was: what it took is not taken again, what it made is
-sent once more until it was handled, and nothing else was sent.
+A restored stage therefore continues after the last finished step. It does not take that input
+again, it sends the outputs of that step again until they are handled, and it sent nothing else.
 """
 
 import logging
@@ -24,12 +24,12 @@ from .step import produce
 log = logging.getLogger(__name__)
 
 OFFSETS, OUTBOX, WAL = "stage.offsets", "stage.outbox", "stage.wal"
-# messages that a lagging actor's successor handles again, some seconds of work
+# Maximum number of messages that a restored lagging actor handles again: some seconds of work.
 MAX_WAL_ENTRIES = 64
 
 
 class LoggedInput(NamedTuple):
-    """A message that was handled, and the situation it was handled in; counts by topic."""
+    """Handled message and the flow status of its step, with counts by topic name."""
 
     topic: str
     body: bytes
@@ -38,11 +38,13 @@ class LoggedInput(NamedTuple):
 
     @classmethod
     def of(cls, topic: str, body: bytes | memoryview, situation: FlowStatus) -> "LoggedInput":
+        """Create the log entry of a message."""
         credits = {topic.name: count for topic, count in situation.credits.items()}
         backlog = {topic.name: count for topic, count in situation.backlog.items()}
         return cls(topic, bytes(body), credits, backlog)
 
     def situation(self, actor: Actor) -> FlowStatus:
+        """Return the flow status of the step, with the topics of the actor's ports."""
         return FlowStatus(
             credits=counts_by_topic(self.credits, (out.topic for out in actor.outputs)),
             backlog=counts_by_topic(self.backlog, (port.topic for port in actor.inputs)),
@@ -51,19 +53,20 @@ class LoggedInput(NamedTuple):
 
 @dataclass(frozen=True)
 class RestoredState:
-    """A saved state, taken apart."""
+    """Saved state, split into the actor's state and the delivery state."""
 
-    own: State = field(default_factory=dict)  # the actor's
-    inputs: Mapping[str, InletPosition] = field(default_factory=dict)
-    outputs: Mapping[str, OutletPosition] = field(default_factory=dict)
-    taken: tuple[LoggedInput, ...] = ()
-    is_none: bool = False  # nothing was saved
+    own: State = field(default_factory=dict)  # State of the actor.
+    inputs: Mapping[str, InletPosition] = field(default_factory=dict)  # Position by topic name.
+    outputs: Mapping[str, OutletPosition] = field(default_factory=dict)  # Position by topic name.
+    taken: tuple[LoggedInput, ...] = ()  # Write-ahead log: inputs since the state.
+    is_none: bool = False  # The store had no state.
 
     @classmethod
     def of(cls, state: State | None) -> "RestoredState":
+        """Split a state as the store loaded it."""
         if not state:
             return cls(is_none=True)
-        links = state.get(OFFSETS, {"in": {}, "out": {}})  # none: no lossless neighbours
+        links = state.get(OFFSETS, {"in": {}, "out": {}})  # Absent without lossless neighbors.
         return cls(
             own={part: value for part, value in state.items() if not part.startswith("stage.")},
             inputs={topic: InletPosition(*past) for topic, past in links["in"].items()},
@@ -76,18 +79,18 @@ class RestoredState:
 
     @property
     def of_actor(self) -> State:
-        """All that decides what it does next."""
+        """State of the actor and its logged inputs, which together determine its next steps."""
         return {**self.own, **{f"{WAL} {n}": one for n, one in enumerate(self.taken)}}
 
     @property
     def has_passed(self) -> bool:
-        """Whether anything was taken or made on a lossless topic."""
+        """True if a message was handled or produced on a lossless topic."""
         handled = any(past.handled for past in self.inputs.values())
         return handled or any(past.seq for past in self.outputs.values())
 
 
 class DeliveryState:
-    """Makes the parts; those that did not change are the same objects as before."""
+    """Builder of the saved parts; unchanged parts stay the same objects."""
 
     def __init__(self) -> None:
         self._links: dict[str, Any] = {}
@@ -97,11 +100,20 @@ class DeliveryState:
 
     @property
     def is_long(self) -> bool:
+        """True if the write-ahead log has reached its maximum length."""
         return len(self._taken) >= MAX_WAL_ENTRIES
 
     def own(self, own: State, taken: LoggedInput | None, whole: bool) -> dict[str, Any]:
-        """The actor's state; with what it took since, if that is not `whole`, nor another one than
-        before."""
+        """Return the actor's state and the inputs that it handled since.
+
+        Args:
+            own: State of the actor, by part.
+            taken: Input of the last step if the actor lags.
+            whole: The state is a checkpoint, so no inputs are logged with it.
+
+        Returns:
+            Parts to save. A new state clears the write-ahead log.
+        """
         is_new = own.keys() != self._own.keys() or any(own[p] is not self._own[p] for p in own)
         if is_new or whole:
             self._own, self._taken = own, {}
@@ -113,7 +125,7 @@ class DeliveryState:
     def links(
         self, inputs: Mapping[str, InletPosition], outputs: Mapping[str, OutletPosition]
     ) -> dict[str, Any]:
-        """Nothing for an actor without lossless neighbours."""
+        """Return the offsets and the outbox; empty for an actor without lossless neighbors."""
         if not inputs and not outputs:
             return {}
         places = {
@@ -131,10 +143,16 @@ class DeliveryState:
 
 
 def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) -> Actor:
-    """An actor as its predecessor was after its last saved step, from one that was just made.
+    """Restore a new actor to the end of the last saved step.
 
-    What it took since its state it handles again, for the state alone: what it made then was kept.
-    A message that fails now is left out, and all the others go to another one made.
+    The actor handles the logged inputs again to rebuild its state. Their outputs are discarded,
+    because the outbox has them already. If an input fails now, it is skipped, and another new actor
+    handles the remaining ones.
+
+    Args:
+        actor: A new actor.
+        past: The saved state.
+        make: Function that creates another new actor.
     """
     taken = list(past.taken)
     while True:
@@ -148,7 +166,7 @@ def restore_actor(actor: Actor, past: RestoredState, make: Callable[[], Actor]) 
 
 
 def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
-    """Which of them fails first."""
+    """Handle logged inputs again; return the index of the first that fails, or None."""
     kinds = {port.topic.name: port.topic.message for port in actor.inputs}
     for number, one in enumerate(taken):
         kind = kinds[one.topic]
@@ -157,12 +175,17 @@ def _handled_again(actor: Actor, taken: Iterable[LoggedInput]) -> int | None:
         try:
             produce(actor, actor.handle(decode(one.body, kind)))
         except Exception:
-            log.exception("%s: %s fails now and is left out", actor.name, one.topic)
+            log.exception(
+                "%s: replaying a logged input of %s failed; the actor continues without this "
+                "message.",
+                actor.name, one.topic,
+            )  # fmt: skip
             return number
     return None
 
 
 def counts_by_topic(counts: Mapping[str, int], topics: Iterable[Topic]) -> dict[Topic, int]:
+    """Return counts by topic from counts by topic name."""
     return {topic: counts[topic.name] for topic in topics if topic.name in counts}
 
 
@@ -176,6 +199,6 @@ def _sent(state: State, topic: str) -> Iterator[UnackedMessage]:
 
 
 def _numbered(state: State, kind: str) -> list[str]:
-    """Parts `<kind> <number>`, by number."""
+    """Return the names of the parts `<kind> <number>`, sorted by number."""
     parts = [part for part in state if part.rpartition(" ")[0] == kind]
     return sorted(parts, key=lambda part: int(part.rpartition(" ")[2]))

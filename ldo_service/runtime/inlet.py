@@ -1,4 +1,4 @@
-"""One input of an actor: what waits, what is dropped, what is asked for again."""
+"""Inputs of an actor: queue, drop policy, and requests for retransmission."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ from .actor import In, Latest, Lossless
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Delivery:
-    """One message, as it arrived."""
+    """Message as it arrived, not decoded."""
 
     port: In
     header: Header
@@ -27,7 +27,7 @@ class Delivery:
 
 @dataclass
 class Inlet:
-    """An input of policy Latest."""
+    """Input with policy Latest; its counters are those of `InputCount`."""
 
     port: In
     waiting: deque[Delivery] = field(default_factory=deque)
@@ -35,21 +35,21 @@ class Inlet:
     dropped: int = 0
     rejected: int = 0
     gaps: int = 0
-    peak: int = 0
-    paused: int = 0
+    peak: int = 0  # Maximum length of the queue so far.
+    paused: int = 0  # Messages dropped while the stage was paused.
     numbers: SequenceTracker = field(default_factory=SequenceTracker)
 
     def number(self, header: Header) -> None:
-        """Count those that never came."""
+        """Count the messages that were lost before this one."""
         if header is not EXTERNAL_HEADER:
             self.numbers.observe(header)
 
     def accept(self, header: Header) -> bool:  # noqa: ARG002
-        """Whether to take the message in."""
+        """Return whether to queue the message."""
         return True
 
     def offer(self, delivery: Delivery) -> list[Delivery]:
-        """Take a delivery in; what had to make room for it."""
+        """Queue a delivery and return the deliveries that it displaced."""
         self.waiting.append(delivery)
         displaced = self._overflow(delivery)
         for old in displaced:
@@ -63,7 +63,7 @@ class Inlet:
         assert isinstance(policy, Latest)
         if not policy.per_key:
             return [self.waiting[0]] if len(self.waiting) > policy.depth else []
-        by_key: dict[str, list[Delivery]] = {}  # the key that has waited longest comes first
+        by_key: dict[str, list[Delivery]] = {}  # The key with the oldest message comes first.
         for delivery in self.waiting:
             by_key.setdefault(delivery.header.key, []).append(delivery)
         same = by_key[newest.header.key]
@@ -72,19 +72,21 @@ class Inlet:
         return next(iter(by_key.values())) if len(by_key) > policy.max_keys else []
 
     def done(self, delivery: Delivery, rejected: bool) -> None:  # noqa: ARG002
+        """Count a delivery that was handled or rejected."""
         self.delivered += not rejected
         self.rejected += rejected
 
     def discard_backlog(self) -> None:
-        """What waits is not taken any more: the stage is held."""
+        """Drop the queue, because the stage is paused, and count it as paused."""
         self.paused += len(self.waiting)
         self.waiting.clear()
 
     def reset(self) -> None:
-        """Forget what waits."""
+        """Clear the queue."""
         self.waiting.clear()
 
     def counts(self) -> InputCount:
+        """Return the counters for the health message."""
         return InputCount(
             topic=self.port.topic.name,
             delivered=self.delivered,
@@ -100,21 +102,30 @@ class Inlet:
 
 @dataclass
 class LosslessInlet(Inlet):
-    """The consumer's end of a link: order, gaps and grants."""
+    """Consumer end of a lossless link: message order, gaps and credits."""
 
-    epoch: int = 0  # of the producer that welcomed us; 0 before
-    handled: int = 0
-    arrived: int = 0
-    gap: bool = False
-    is_connected: bool = False  # by the producer that is there now
+    epoch: int = 0  # Epoch of the connected producer; 0 before the first hello.
+    handled: int = 0  # Offset of the first message that was not handled.
+    arrived: int = 0  # Offset of the first message that was not received.
+    gap: bool = False  # A message is missing; the producer should retransmit.
+    is_connected: bool = False  # The current producer has sent its hello.
 
     @property
     def window(self) -> int:
+        """Maximum number of messages in the queue."""
         assert isinstance(self.port.policy, Lossless)
         return self.port.policy.window
 
     def welcome(self, epoch: int, start: int) -> int:
-        """Numbering begins here, unless we know already; how many messages are lost by it."""
+        """Handle the hello of the producer.
+
+        Args:
+            epoch: Epoch of the producer. A new epoch restarts the numbering.
+            start: Offset of the first message that the producer can send.
+
+        Returns:
+            Number of messages that are lost: sent by this producer, but no longer in its outbox.
+        """
         known, joins = epoch == self.epoch, not self.is_connected
         self.is_connected = True
         if known and start <= self.arrived:
@@ -122,11 +133,14 @@ class LosslessInlet(Inlet):
             return 0
         lost = start - self.arrived if known else 0
         self.epoch, self.handled, self.arrived = epoch, start, start
-        self.gap = True  # ask for what was sent before we were known
+        self.gap = True  # Request the messages that were sent before the hello.
         return lost
 
     def accept(self, header: Header) -> bool:
-        """Take the next message, if there is room; what was skipped will be sent again."""
+        """Return whether the message is the next one and fits into the window.
+
+        The producer retransmits skipped messages.
+        """
         if header.epoch != self.epoch or header.seq < self.arrived:
             return False
         self.gap = header.seq > self.arrived or len(self.waiting) >= self.window
@@ -137,34 +151,40 @@ class LosslessInlet(Inlet):
         return True
 
     def discard_backlog(self) -> None:
-        """Nothing: it waits in its window."""
+        """Keep the queue: the producer waits while the window is full."""
 
     def reset(self) -> None:
-        """Forget what waits and who sent it: whoever sends has to welcome us again."""
+        """Clear the queue and the connection; the producer must send its hello again."""
         super().reset()
         self.epoch = self.handled = self.arrived = 0
         self.gap = self.is_connected = False
 
     def _overflow(self, newest: Delivery) -> list[Delivery]:  # noqa: ARG002
-        return []  # `accept` keeps to the window
+        return []  # `accept` enforces the window.
 
     def done(self, delivery: Delivery, rejected: bool) -> None:
+        """Count a delivery and advance the offset of handled messages."""
         super().done(delivery, rejected)
         if delivery.header.epoch == self.epoch:
             self.handled = max(self.handled, delivery.header.seq + 1)
 
     def resume_from(self, past: InletPosition) -> None:
-        """Where a predecessor stopped."""
+        """Continue at the saved position of the previous process."""
         self.epoch, self.handled, self.arrived = past.epoch, past.handled, past.handled
 
     def position(self, being_handled: Delivery | None) -> InletPosition:
-        """For a successor, as if that delivery had been handled."""
+        """Return the position to save.
+
+        Args:
+            being_handled: The delivery of the current step, which counts as handled.
+        """
         handled = self.handled
         if being_handled is not None and being_handled.header.epoch == self.epoch:
             handled = max(handled, being_handled.header.seq + 1)
         return InletPosition(self.epoch, handled)
 
     def grant(self, consumer: str, *, waits_for_disk: bool = False) -> ConsumerHello | Credit:
+        """Return the message to the producer: a hello until it is connected, then credit."""
         if not self.is_connected:
             return ConsumerHello(consumer)
         limit = self.handled + self.window

@@ -1,11 +1,13 @@
-"""What determined every step of an actor, and what came of it.
+"""Journal of an actor: everything that determined each step, and the result of the step.
 
-    journal/start   Started   an actor is in place: new, or restored from its predecessor's state
-    journal/step    Step      it handled the message taken last, in the situation it saw
-    journal/gap     Gap       from here on something is missing
+| channel         | entry        | meaning                                                         |
+|-----------------|--------------|-----------------------------------------------------------------|
+| `journal/start` | `Started`    | An actor is ready: new, or restored from a saved state.         |
+| `journal/step`  | `StepRecord` | The actor handled the last input under the given flow status.   |
+| `journal/gap`   | `Gap`        | Entries are missing from here on.                               |
 
-The messages taken lie between these, each on the channel of its topic, as they were decoded. Steps
-count from 0 in each file. What is not here cannot change what an actor makes: see `replay`.
+The inputs lie between these entries, each on the channel of its topic, as they were decoded. Steps
+count from 0 in each file. Nothing else can change the outputs of an actor; see `replay`.
 """
 
 import hashlib
@@ -24,43 +26,51 @@ from .step import Produced
 
 Kind: TypeAlias = Literal[
     "done",
-    "failed",  # the handler raised: its outputs are dropped, and a successor started
-    "dead_lettered",  # after failing twice
-    "resumed",  # first words of a successor: no message was taken
-    "finished",  # last words: none either
+    "failed",  # The handler raised: its outputs are dropped and the actor is restored.
+    "dead_lettered",  # The message failed twice.
+    "resumed",  # Restored messages were published; the step has no input.
+    "finished",  # Final messages were published; the step has no input.
 ]
 
 
 class Output(msgspec.Struct, frozen=True, array_like=True):
+    """Digest of one output of a step."""
+
     topic: str
     digest: str
 
 
 class Started(msgspec.Struct, frozen=True, kw_only=True):
-    step: int  # the one that follows
-    state: dict[str, bytes] | None  # parts as `state_store` encodes them; None: begins anew
+    """Start of a new or restored actor."""
+
+    step: int  # Number of the next step.
+    state: dict[str, bytes] | None  # Parts as `state_store` encodes them; None: a new actor.
 
 
 class StepRecord(msgspec.Struct, frozen=True, kw_only=True):
+    """Input, flow status and outputs of one step."""
+
     step: int
     kind: Kind
-    taken: int  # number of the message in this file; -1: none
-    topic: str = ""
-    source: str = ""  # header of the message
+    taken: int  # Number of the input in this file; -1: no input.
+    topic: str = ""  # Topic of the input.
+    source: str = ""  # Header fields of the input.
     epoch: int = 0
     seq: int = 0
-    checksum: str = ""  # of the message
-    credits: dict[str, int] = {}  # by topic: what the actor could send without waiting
+    checksum: str = ""  # Checksum of the input.
+    credits: dict[str, int] = {}  # Messages that could be sent without waiting, by topic.
     outputs: tuple[Output, ...] = ()
-    digest: str = ""  # of all outputs in order
-    error: str = ""  # of a step that failed
-    backlog: dict[str, int] = {}  # by topic: what waited behind the message
+    digest: str = ""  # Digest of all outputs in order.
+    error: str = ""  # Exception of a failed step.
+    backlog: dict[str, int] = {}  # Messages queued behind the input, by topic.
 
 
 class Gap(msgspec.Struct, frozen=True, kw_only=True):
-    step: int  # the one that would follow
-    reason: Literal["slow", "limit", "state"]  # disk too slow; size limit; state unwritable
-    lost: int = 0  # messages taken and not recorded; 0: unknown
+    """Missing entries of a journal."""
+
+    step: int  # Number of the first missing step.
+    reason: Literal["slow", "limit", "state"]  # Disk too slow; size limit; state not writable.
+    lost: int = 0  # Inputs that were not recorded; 0: unknown.
 
 
 Entry: TypeAlias = Started | StepRecord | Gap
@@ -72,7 +82,7 @@ CHANNELS: Mapping[type[Entry], str] = {
 
 
 def digest(*bodies: bytes | memoryview) -> str:
-    """BLAKE2b of 16 bytes, in hexadecimal, of bodies in order."""
+    """Compute the BLAKE2b digest (16 bytes, hexadecimal) of bodies in order."""
     state = hashlib.blake2b(digest_size=16)
     for body in bodies:
         state.update(len(body).to_bytes(8, "little"))
@@ -81,27 +91,28 @@ def digest(*bodies: bytes | memoryview) -> str:
 
 
 def checksum(body: bytes | memoryview) -> str:
-    """CRC-32 in hexadecimal: tells damage at a fifth of the digest's cost."""
+    """Compute the CRC-32 in hexadecimal: it detects damage at a fifth of the digest's cost."""
     return f"{zlib.crc32(body):08x}"
 
 
 def outputs_of(produced: Iterable[Produced]) -> tuple[Output, ...]:
+    """Return the digest of each produced message."""
     return tuple(Output(made.topic.name, digest(made.body)) for made in produced)
 
 
 def digest_of(outputs: Iterable[Output]) -> str:
-    """One digest for all outputs of a step."""
+    """Compute one digest for all outputs of a step."""
     return digest(*(f"{output.topic} {output.digest}".encode() for output in outputs))
 
 
 class Journal:
-    """What a stage tells about itself, in order. This one listens to nothing; `Recorder` writes."""
+    """Receiver of journal entries that discards them; `Recorder` writes them to a file."""
 
     def record_start(self, state: State | None) -> None:
-        """An actor is in place."""
+        """Record the start of an actor; None: a new actor without a saved state."""
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
-        """The message that the next steps speak of; the stamp is the message's own."""
+        """Record the input of the following steps and the stamp of the message, ns."""
 
     def record_step(
         self,
@@ -110,13 +121,14 @@ class Journal:
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
-        """A step is over, and nothing of it was sent yet."""
+        """Record a finished step; the stage calls it before it sends the outputs."""
 
     def close(self) -> "Future[None]":
-        """Take nothing more; the future is done when all that was told is kept."""
+        """Stop recording; the future is done when all recorded entries are written."""
         future: Future[None] = Future()
         future.set_result(None)
         return future
 
     def metrics(self) -> dict[str, float]:
+        """Return the journal's metrics for the health message, by name."""
         return {}

@@ -1,11 +1,12 @@
-"""The whole graph over a file, on a clock that ticks once per frame.
+"""Offline run of the whole actor graph, on a logical clock that ticks once per frame.
 
-What comes along with a frame, such as poses of another odometry, comes in the same tick, before it.
+Messages that belong to a frame, such as poses of another odometry, arrive in the same tick, before
+the frame.
 
-What an actor makes of a message becomes visible a declared number of ticks after it took the
-message, however long it really took. Actors compute side by side, each in its own thread; a thread
-is waited for when the clock reaches the tick at which its answer is due. So the result depends on
-the input and the latencies alone, not on the machine or its load, and nothing is dropped.
+The outputs of a step become visible a declared number of ticks after the actor took the input,
+independent of the real duration. Actors compute in parallel, each in its own thread. The clock
+waits for a thread only at the tick of its output. The result therefore depends only on the input
+and the latencies, not on the machine or its load, and no message is dropped.
 """
 
 import heapq
@@ -20,44 +21,52 @@ from ldo_service.schemas import Message
 from .actor import Actor
 from .actor_graph import check_graph
 
-Observer = Callable[[str, Message, float], None]  # actor, what it made, milliseconds of the step
+Observer = Callable[[str, Message, float], None]  # Actor, output, duration of the step in ms.
 
 
 @dataclass(frozen=True, slots=True)
 class StepOutput:
+    """Outputs of one step and its duration."""
+
     messages: list[Message]
-    step_ms: float  # wall time
+    step_ms: float  # Wall time, ms.
 
 
 @dataclass(order=True)
 class PendingOutput:
-    """An answer under way; equal ticks are settled in the order of the graph, then of starting."""
+    """Outputs of a step that is still running.
 
-    tick: int
-    rank: int
-    order: int
+    Outputs with equal ticks are delivered in the order of the graph, then of starting.
+    """
+
+    tick: int  # Tick at which the outputs become visible.
+    rank: int  # Position of the actor in the graph.
+    order: int  # Number of the step over all actors.
     answer: Future[StepOutput] = field(compare=False)
 
 
 @dataclass
 class ActorThread:
+    """Actor with its own thread."""
+
     actor: Actor
-    rank: int
+    rank: int  # Position of the actor in the graph.
     latency_ticks: int
     thread: ThreadPoolExecutor
-    step_ms: list[float] = field(
-        default_factory=list
-    )  # of each step, but those that took note only
+    # Wall time of each step, ms, except steps that only stored their input.
+    step_ms: list[float] = field(default_factory=list)
 
     def start(self, message: Message) -> Future[StepOutput]:
+        """Start a step in the thread."""
         return self.thread.submit(self._step, message)
 
     def finish(self) -> Future[StepOutput]:
+        """Start publishing the final messages in the thread."""
         return self.thread.submit(lambda: _timed(self.actor.on_stop()))
 
     def _step(self, message: Message) -> StepOutput:
         answer = _timed(self.actor.handle(message))
-        if answer.messages or not self.actor.outputs:  # notes would hide what a frame costs
+        if answer.messages or not self.actor.outputs:  # Steps without outputs bias the timing.
             self.step_ms.append(answer.step_ms)
         return answer
 
@@ -69,11 +78,12 @@ def _timed(messages: Iterator[Message]) -> StepOutput:
 
 
 class LogicalClock:
-    """Feeds a graph of actors from a source, or one after the other; see the module.
+    """Runner of an actor graph on a logical clock, for one source or several in sequence.
 
-    with LogicalClock(actors, latencies) as clock:
-        for tick in clock.run(source): ...
-        clock.finish()
+    Example:
+        with LogicalClock(actors, latencies) as clock:
+            for tick in clock.run(source): ...
+            clock.finish()
     """
 
     def __init__(
@@ -82,6 +92,13 @@ class LogicalClock:
         latency_ticks: Mapping[str, int],
         observe: Observer = lambda _actor, _message, _step_ms: None,
     ) -> None:
+        """Create one thread for each actor.
+
+        Args:
+            actors: The actors, producers first.
+            latency_ticks: Latency of each actor by name; 0 where absent.
+            observe: Called for each output when it becomes visible.
+        """
         check_graph(type(actor) for actor in actors)
         self._threads = [
             ActorThread(
@@ -97,7 +114,7 @@ class LogicalClock:
         self._due: list[PendingOutput] = []
         self._started = 0
         self._tick = -1
-        self.now = -1  # tick of what is being passed on, for an observer
+        self.now = -1  # Tick of the output that is being delivered, for an observer.
 
     def __enter__(self) -> "LogicalClock":
         return self
@@ -107,10 +124,13 @@ class LogicalClock:
             thread.thread.shutdown(cancel_futures=True)
 
     def run(self, source: Iterable[Message | tuple[Message, ...]]) -> Iterator[int]:
-        """Yield the tick after each item of the source; then everything under way is settled.
+        """Yield the tick after each item of the source, then wait for all running steps.
 
-        The messages of a tuple share a tick.
-        Raises StageError, naming the actor, when a handler raises.
+        Args:
+            source: Messages; the messages of a tuple share a tick.
+
+        Raises:
+            StageError: A handler raised; the error names the actor.
         """
         for item in source:
             self._tick += 1
@@ -121,14 +141,19 @@ class LogicalClock:
         self._settle_all()
 
     def finish(self) -> None:
-        """Let each actor say its last words, producers first, and those last that tell what came of
-        the others'. A run may still follow."""
+        """Deliver the final messages of each actor, producers first.
+
+        Actors with `finishes_last` come after all others. Another run may follow.
+        """
         for thread in sorted(self._threads, key=lambda thread: thread.actor.finishes_last):
             self._expect(thread, self._tick, thread.finish())
             self._settle_all()
 
     def step_ms(self) -> dict[str, list[float]]:
-        """Wall time of every step so far but those that took note only, by actor."""
+        """Return the wall times of the steps so far, ms, by actor.
+
+        Steps that only stored their input are excluded.
+        """
         return {thread.actor.name: thread.step_ms for thread in self._threads}
 
     def _deliver(self, message: Message, tick: int) -> None:
@@ -140,7 +165,7 @@ class LogicalClock:
         heapq.heappush(self._due, PendingOutput(tick, thread.rank, self._started, answer))
 
     def _settle(self, tick: int) -> None:
-        """Wait for every answer that is due by now and pass it on."""
+        """Wait for the outputs of all ticks up to this one and deliver them."""
         while self._due and self._due[0].tick <= tick:
             due = heapq.heappop(self._due)
             thread = self._threads[due.rank]
@@ -161,5 +186,5 @@ def _answer(due: PendingOutput, actor: str) -> StepOutput:
     except Exception as error:
         raise StageError(
             f"{actor} failed at tick {due.tick}: {type(error).__name__}: {error}. "
-            "Run with --debug to see where."
+            "Run with --debug to see the traceback."
         ) from error

@@ -1,5 +1,7 @@
-"""All inputs of one actor, merged in order of arrival but for those that go first, bounded, every
-drop counted."""
+"""Mailbox: all inputs of one actor, merged in order of arrival and bounded.
+
+Inputs with priority come first. Every drop is counted.
+"""
 
 import asyncio
 import logging
@@ -32,9 +34,10 @@ log = logging.getLogger(__name__)
 
 
 class Mailbox:
-    """Offered to on any thread, taken from on the event loop.
+    """Queue of all inputs of an actor; any thread may add, only the event loop takes.
 
-    A delivery counts as handled when `done` is called: a consumer that dies before gets it again.
+    A delivery counts as handled when `done` is called. A consumer that is killed before that
+    receives it again.
     """
 
     def __init__(
@@ -42,18 +45,28 @@ class Mailbox:
         consumer: str,
         ports: tuple[In, ...],
         transport: Transport,
-        max_bytes: int = 64_000_000,  # of a Latest input: lossless ones come from our own actors
-        past: Mapping[str, InletPosition]
-        | None = None,  # by lossless topic: where a predecessor was
+        max_bytes: int = 64_000_000,
+        past: Mapping[str, InletPosition] | None = None,
     ) -> None:
+        """Subscribe to the topics of all inputs.
+
+        Args:
+            consumer: Name of the actor.
+            ports: Its inputs.
+            transport: The network.
+            max_bytes: Largest message of a Latest input. Lossless inputs have no limit: their
+                messages come from actors of the service.
+            past: Position of the previous process on each lossless topic.
+        """
         self._consumer, self._max_bytes = consumer, max_bytes
         self._loop = asyncio.get_running_loop()
-        self._lock = Lock()  # of everything below that both sides use
+        self._lock = Lock()  # Guards all state below that both sides use.
         self._order: deque[Delivery] = deque()
         self._ready = asyncio.Event()
         self._wake_pending = self._grant_pending = False
         self._closed = self._held = False
-        self.waits_for_disk = False  # then it takes nothing, and that is no fault of this process
+        # The stage takes no messages because its state cannot be saved; it must not be evicted.
+        self.waits_for_disk = False
         self._orders: deque[StageCommand] = deque()
         self._grants: dict[str, Publisher] = {}
         self._inlets: dict[str, Inlet] = {}
@@ -91,19 +104,19 @@ class Mailbox:
             if self._held and not isinstance(inlet, LosslessInlet):
                 inlet.paused += 1
             elif header is None:
-                self._reject(inlet, "its header cannot be read")
+                self._reject(inlet, "malformed header")
             elif body.nbytes > self._max_bytes and not isinstance(inlet, LosslessInlet):
                 limit = "service.max_decoded_message_mb"
-                self._reject(inlet, f"{body.nbytes} bytes are more than {limit}")
+                self._reject(inlet, f"its {body.nbytes} bytes exceed {limit}")
             elif inlet.accept(header):
                 self._store(inlet, Delivery(inlet.port, header, body))
             else:
                 self._ask_for_grants()
 
     def _reject(self, inlet: Inlet, why: str) -> None:
-        """Before anything is decoded. Under the lock."""
+        """Count and log a message that is rejected before it is decoded; needs the lock."""
         if inlet.rejected == 0:
-            log.warning("%s: %s rejected: %s. Those that follow are counted.",
+            log.warning("%s: message of %s rejected: %s. Later rejections are only counted.",
                         self._consumer, inlet.port.topic.name, why)  # fmt: skip
         inlet.rejected += 1
 
@@ -111,7 +124,7 @@ class Mailbox:
         for displaced in inlet.offer(delivery):
             self._order.remove(displaced)
         self._order.append(delivery)
-        if not self._wake_pending:  # one wake-up is enough, however many messages come
+        if not self._wake_pending:  # One notification is enough for any number of messages.
             self._wake_pending = True
             call_soon(self._loop, self._ready.set)
 
@@ -119,26 +132,37 @@ class Mailbox:
         try:
             welcome = decode(body, ProducerHello)
         except msgspec.DecodeError as error:
-            log.warning("%s: unreadable welcome: %s", inlet.port.topic.name, error)
+            log.warning(
+                "%s: malformed handshake on %s ignored: %s. Do all programs on this network run "
+                "the same version?",
+                self._consumer, inlet.port.topic.name, error,
+            )  # fmt: skip
             return
         start = welcome.starts.get(self._consumer)
         with self._lock:
             lost = 0 if start is None else inlet.welcome(welcome.epoch, start)
             self._ask_for_grants()
         if lost:
-            log.error("%s: %d messages of %s were missed: it was evicted",
-                      self._consumer, lost, inlet.port.topic.name)  # fmt: skip
+            log.error(
+                "%s: lost %d messages of %s after its eviction as a slow consumer "
+                "(supervision.evict_after_s). The map has a gap here.",
+                self._consumer, lost, inlet.port.topic.name,
+            )  # fmt: skip
 
     def _ask_for_grants(self) -> None:
-        """Under the lock."""
+        """Schedule `send_credits` on the event loop; needs the lock."""
         if not self._grant_pending:
             self._grant_pending = True
             call_soon(self._loop, self.send_credits)
 
     # --- taking, on the event loop --------------------------------------------------------------
     async def take(self) -> Delivery | StageCommand | None:
-        """An order, else the oldest delivery, of an input that goes first if there is one; None
-        when the mailbox was closed and is empty."""
+        """Wait for the next command or delivery and take it.
+
+        Returns:
+            A command if there is one, else the oldest delivery of an input with priority, else the
+            oldest delivery. None if the mailbox is closed and empty.
+        """
         while True:
             with self._lock:
                 self._wake_pending = False
@@ -155,7 +179,7 @@ class Mailbox:
             await self._ready.wait()
 
     def done(self, delivery: Delivery, rejected: bool = False) -> None:
-        """The delivery was handled, or cannot be: either way it will not come again."""
+        """Mark a delivery as handled or rejected, so that it is not sent again."""
         inlet = self._inlets[delivery.port.topic.name]
         with self._lock:
             inlet.done(delivery, rejected)
@@ -163,7 +187,11 @@ class Mailbox:
             self._send_grant(inlet)
 
     def past(self, being_handled: Delivery | None = None) -> dict[str, InletPosition]:
-        """Where a successor goes on, by lossless topic, once that delivery was handled."""
+        """Return the position to save for each lossless topic.
+
+        Args:
+            being_handled: The delivery of the current step, which counts as handled.
+        """
         with self._lock:
             return {
                 topic: inlet.position(
@@ -174,12 +202,12 @@ class Mailbox:
             }
 
     def put_command(self, order: StageCommand) -> None:
-        """It is taken before any delivery."""
+        """Queue a command before all deliveries."""
         self._orders.append(order)
         self._ready.set()
 
     def pause(self) -> None:
-        """Give out no deliveries until `resume`; what has a policy of Latest is left out."""
+        """Hold back all deliveries until `resume`; Latest inputs drop their messages."""
         with self._lock:
             self._held = True
             for inlet in self._inlets.values():
@@ -187,16 +215,18 @@ class Mailbox:
             self._keep_only_waiting()
 
     def resume(self) -> None:
+        """Release deliveries again."""
         with self._lock:
             self._held = False
         self._ready.set()
 
     @property
     def is_held(self) -> bool:
+        """True between `pause` and `resume`."""
         return self._held
 
     def reset(self) -> None:
-        """Forget what waits, and join the producers again."""
+        """Clear all queues and connect to the producers again."""
         with self._lock:
             for inlet in self._inlets.values():
                 inlet.reset()
@@ -204,12 +234,15 @@ class Mailbox:
         self.send_credits()
 
     def _keep_only_waiting(self) -> None:
-        """Under the lock."""
+        """Remove deliveries from the order that their inlet has dropped; needs the lock."""
         waiting = {id(d) for inlet in self._inlets.values() for d in inlet.waiting}
         self._order = deque(d for d in self._order if id(d) in waiting)
 
     def send_credits(self) -> None:
-        """Repeat every grant: lost ones heal, new producers learn of us."""
+        """Send the credit of every lossless input again.
+
+        Repetition replaces lost credit messages and announces this consumer to new producers.
+        """
         with self._lock:
             self._grant_pending = False
         for inlet in self._inlets.values():
@@ -222,17 +255,18 @@ class Mailbox:
         self._grants[inlet.port.topic.name].post(b"", encode_link(grant))
 
     def close(self) -> None:
-        """Take nothing more in; what waits can still be taken."""
+        """Accept no more messages; queued ones can still be taken."""
         with self._lock:
             self._closed, self._held = True, False
         self._ready.set()
 
     def disconnect(self) -> None:
+        """Close the publishers of credit messages."""
         for publisher in self._grants.values():
             publisher.close()
 
     def waiting(self) -> dict[Topic, int]:
-        """Messages of each lossless input that were not taken yet."""
+        """Return the number of queued messages of each lossless input."""
         with self._lock:
             return {
                 inlet.port.topic: len(inlet.waiting)
@@ -241,12 +275,13 @@ class Mailbox:
             }
 
     def counts(self) -> tuple[InputCount, ...]:
+        """Return the counters of all inputs for the health message."""
         with self._lock:
             return tuple(inlet.counts() for inlet in self._inlets.values())
 
 
 def _read_header(raw: bytes) -> Header | None:
-    """None when it cannot be read."""
+    """Decode a header; return None if it is malformed."""
     try:
         return decode(raw, Header) if raw else EXTERNAL_HEADER
     except msgspec.DecodeError:

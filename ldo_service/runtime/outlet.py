@@ -1,4 +1,4 @@
-"""Outlets: the sending half of a topic, and all outlets of one actor."""
+"""Outlet (the sending half of a topic) and the set of all outlets of one actor."""
 
 import asyncio
 import logging
@@ -33,17 +33,17 @@ log = logging.getLogger(__name__)
 
 
 class Outlet:
-    """Numbers messages, waits for room at every lossless consumer, sends again what got lost.
+    """Sending half of a topic, with credit-based flow control for lossless consumers.
 
-    `expected` names consumers that must not miss a message: until each has joined, and again after
-    one died, there is no room. Others hold the producer back only while they live. A port that
-    never waits sends at once: its actor has looked at `room` before.
-
-    With a `past` it goes on with a predecessor's numbers, and what some expected consumer has not
-    handled is sent again.
+    The outlet numbers messages, waits for credit from every lossless consumer, and retransmits lost
+    messages. The consumers in `expected` are required: they must not miss a message. There is no
+    credit until each of them has connected, nor after one has stopped. Other consumers hold the
+    producer back only while they are alive. A nonblocking port sends at once, because its actor has
+    checked the credits before.
     """
 
-    REPEAT_AFTER_S = 0.25  # half a grant period: sooner would repeat what is still on its way
+    # Half a credit period; a shorter time would retransmit messages that are still on their way.
+    REPEAT_AFTER_S = 0.25
 
     def __init__(
         self,
@@ -56,6 +56,19 @@ class Outlet:
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         past: OutletPosition | None = None,
     ) -> None:
+        """Open the topic on the network.
+
+        Args:
+            port: The output of the actor.
+            source: Name of the actor.
+            epoch: Number of this run of the actor; a restored outlet continues the epoch of `past`.
+            transport: The network.
+            expected: Names of the required consumers.
+            evict_after_s: Time without progress after which a consumer is evicted.
+            on_evicted: Called with the name of an evicted consumer.
+            past: Position of the previous process. The outlet continues its numbering and sends
+                again all that a required consumer has not handled.
+        """
         self.port, self.topic = port, port.topic
         past = past or OutletPosition(epoch, 0)
         self._source, self._epoch = source, past.epoch
@@ -66,11 +79,11 @@ class Outlet:
         self._consumers = Consumers(expected, past.handled)
         self._unhandled = deque(past.unhandled)
         self._unsent = deque(past.unhandled)
-        self._changed = asyncio.Event()  # something about a consumer
-        self._ahead: set[str] = set()  # consumers that know messages we do not
+        self._changed = asyncio.Event()  # The state of a consumer changed.
+        self._ahead: set[str] = set()  # Consumers that received messages unknown to this outlet.
         self._repeating: asyncio.Task[None] | None = None
         self._closed = False
-        self._parts: list[tuple[bytes, bytes]] = []  # of a state that is not complete yet
+        self._parts: list[tuple[bytes, bytes]] = []  # Parts of an incomplete state.
         self._last_value: tuple[tuple[bytes, bytes], ...] = ()
         self.sent = self.waited = self.repeated = self.evicted = 0
         self._open(transport)
@@ -84,19 +97,20 @@ class Outlet:
         transport.watch_liveliness(self._presence)
         if self.topic.is_state:
             transport.serve_queries(data_key(topic), lambda: self._last_value)
-        self._post_welcomes()  # consumers that are there already join at once
+        self._post_welcomes()  # Running consumers connect at once.
 
     # --- sending ----------------------------------------------------------------------------
     def credits(self) -> int:
-        """How many messages may be sent now without waiting; none while one is held."""
+        """Return how many messages may be sent now without waiting; 0 while one is staged."""
         return 0 if self._unsent else self._consumers.room(self._seq)
 
     async def send(self, message: Message, body: bytes) -> None:
+        """Stage one message and commit it."""
         self.stage_message(message, body)
         await self.commit()
 
     def stage_message(self, message: Message, body: bytes) -> None:
-        """Number a message, to be sent with the next `release`."""
+        """Assign the next number to a message and stage it for the next `commit`."""
         key = str(getattr(message, self.topic.key)) if self.topic.key else ""
         header = encode_link(Header(self._source, self._epoch, self._seq, message.stamp_ns, key))
         held = UnackedMessage(self._seq, header, body)
@@ -107,7 +121,7 @@ class Outlet:
         self._seq += 1
 
     async def commit(self) -> None:
-        """Send what is held."""
+        """Send the staged messages in order, and wait for credit unless the port is nonblocking."""
         while self._unsent:
             if not self.port.is_nonblocking:
                 await self._wait_for_room()
@@ -117,14 +131,14 @@ class Outlet:
             await self._publisher.send(held.header, held.body)
 
     def rollback(self) -> None:
-        """What is held was never made: its numbers are given again."""
+        """Discard the staged messages and reuse their numbers."""
         self._seq = self._next
         self._unhandled = deque(sent for sent in self._unhandled if sent.seq < self._seq)
         self._unsent.clear()
 
     @property
     def _next(self) -> int:
-        """Number of the first message that was not sent."""
+        """Offset of the first message that was not sent."""
         return self._unsent[0].seq if self._unsent else self._seq
 
     async def _wait_for_room(self) -> None:
@@ -133,8 +147,8 @@ class Outlet:
             await self._change()
 
     async def flush(self) -> None:
-        """Wait until all that was sent has arrived at every lossless consumer."""
-        self._post_welcomes()  # each answers with a grant at once
+        """Wait until every lossless consumer has received all messages."""
+        self._post_welcomes()  # Each consumer replies with its credit at once.
         while not self._consumers.all_received(self._seq):
             await self._change()
 
@@ -151,18 +165,22 @@ class Outlet:
                 self._last_value = tuple(self._parts)
 
     def position(self) -> OutletPosition | None:
-        """What a successor needs to go on; None where nobody is expected."""
+        """Return the position to save; None if there is no required consumer."""
         if not self._consumers.expected:
             return None
         return OutletPosition(self._epoch, self._seq, tuple(self._unhandled))
 
     # --- consumers --------------------------------------------------------------------------
     def _requested(self, _header: bytes, body: memoryview) -> None:
-        """On any thread: grants are few, the loop does the rest."""
+        """Decode a hello or credit on any thread, and handle it on the event loop."""
         try:
             request = decode_request(body)
         except msgspec.DecodeError as error:
-            log.warning("%s: unreadable grant: %s", self.topic.name, error)
+            log.warning(
+                "%s: malformed credit message ignored: %s. Do all programs on this network run the "
+                "same version?",
+                self.topic.name, error,
+            )  # fmt: skip
             return
         call_soon(self._loop, self._take_request, request)
 
@@ -180,7 +198,7 @@ class Outlet:
         self._post_welcomes()
 
     def reset(self, epoch: int) -> None:
-        """Number from 0 again: what was sent is forgotten, and every consumer joins anew."""
+        """Restart numbering at 0 under a new epoch; all consumers must connect again."""
         if self._repeating is not None:
             self._repeating.cancel()
         self._epoch, self._seq = epoch, 0
@@ -206,12 +224,12 @@ class Outlet:
         self._changed.set()
 
     def _warn_stale_state(self, grant: Credit) -> None:
-        """It has had messages that were never sent."""
+        """Log once that a consumer has received messages that this outlet never sent."""
         if grant.consumer not in self._ahead:
             log.error(
-                "%s: %s has had %d messages, and %d were made: its state is newer than that of %s, "
-                "and nothing is sent to it. Bring both back from one copy, or begin anew with `ldo "
-                "control reset`.",
+                "%s: %s has received %d messages, but only %d were sent: its state is newer than "
+                "that of %s, so it receives no messages. Restore both states from one copy, or "
+                "start with an empty map by `ldo control reset`.",
                 self.topic.name, grant.consumer, grant.arrived, self._seq, self._source,
             )  # fmt: skip
         self._ahead.add(grant.consumer)
@@ -222,7 +240,7 @@ class Outlet:
             self._unhandled.popleft()
 
     def _retransmit(self, consumer: Consumer, gap: bool) -> None:
-        """Send again what did not arrive: after a gap at once, a lost tail after a while."""
+        """Retransmit lost messages: after a gap at once, at the end of the stream after a delay."""
         now = self._loop.time()
         recently = now - consumer.repeated_at_s < self.REPEAT_AFTER_S
         if gap:
@@ -245,25 +263,31 @@ class Outlet:
 
     def _presence(self, name: str, alive: bool) -> None:
         if not alive and not self._closed and name in self._consumers:
-            log.warning("%s: consumer %s is gone", self.topic.name, name)
+            log.warning("%s: consumer %s disconnected; waiting for its restart.",
+                        self.topic.name, name)  # fmt: skip
             self._consumers.leave(name)
             self._forget_handled()
             self._changed.set()
 
     def evict_stalled(self) -> None:
-        """Evict consumers that live and yet take nothing; called with every heartbeat."""
+        """Evict consumers that are alive but make no progress; called with every heartbeat."""
         overdue = self._consumers.stalled(self._loop.time(), self._evict_after_s, self._next)
         for name in overdue:
-            log.error("%s: consumer %s took nothing for %.0f s and is evicted",
-                      self.topic.name, name, self._evict_after_s)  # fmt: skip
+            log.error(
+                "%s: consumer %s evicted: it took no message for %.0f s "
+                "(supervision.evict_after_s). A child process of the service is restarted; any "
+                "other consumer is ignored until it makes progress.",
+                self.topic.name, name, self._evict_after_s,
+            )  # fmt: skip
             self.evicted += 1
             self._consumers.evict(name)
             self._forget_handled()
             self._changed.set()
             self._on_evicted(name)
 
-    # --- the rest ---------------------------------------------------------------------------
+    # --- counters and close ----------------------------------------------------------------
     def counts(self) -> OutputCount:
+        """Return the counters for the health message."""
         return OutputCount(
             topic=self.topic.name,
             sent=self.sent,
@@ -273,6 +297,7 @@ class Outlet:
         )
 
     def close(self) -> None:
+        """Cancel retransmission and close the publishers."""
         self._closed = True
         if self._repeating is not None:
             self._repeating.cancel()
@@ -281,7 +306,10 @@ class Outlet:
 
 
 class Outlets:
-    """What a step made is held by each, released when the step is saved, or taken back."""
+    """Set of all outlets of an actor.
+
+    They stage the outputs of a step, and send them when the step is saved or discard them.
+    """
 
     def __init__(self, outlets: Iterable[Outlet] = ()) -> None:
         self._all = {outlet.topic.message: outlet for outlet in outlets}
@@ -291,16 +319,16 @@ class Outlets:
 
     @property
     def is_nonblocking(self) -> bool:
-        """Whether one of them is of a port that never waits."""
+        """True if one of the ports is nonblocking."""
         return any(outlet.port.is_nonblocking for outlet in self._all.values())
 
     @property
     def has_required_consumers(self) -> bool:
-        """Whether some consumer must not miss a message."""
+        """True if some consumer must not miss a message."""
         return any(outlet.position() for outlet in self._all.values())
 
     def room(self) -> dict[Topic, int]:
-        """Of the ports that never wait, whose actor looks before it makes something."""
+        """Return the credits of the nonblocking ports; their actor checks them before a step."""
         return {
             outlet.topic: outlet.credits()
             for outlet in self._all.values()
@@ -308,37 +336,45 @@ class Outlets:
         }
 
     def past(self) -> dict[str, OutletPosition | None]:
+        """Return the position to save for each topic; None without required consumers."""
         return {outlet.topic.name: outlet.position() for outlet in self._all.values()}
 
     def hold(self, produced: Sequence[Produced]) -> None:
+        """Stage the outputs of a step."""
         for out in produced:
             self._all[type(out.message)].stage_message(out.message, out.body)
 
     async def release(self, *, is_saved: bool = True) -> None:
-        """Send what is held; of a step that is not saved what nobody has to get."""
+        """Send the staged outputs; those of an unsaved step only without required consumers."""
         for outlet in self._all.values():
             if is_saved or outlet.position() is None:
                 await outlet.commit()
 
     def take_back(self) -> None:
+        """Discard the staged outputs."""
         for outlet in self._all.values():
             outlet.rollback()
 
     async def flush(self) -> None:
+        """Wait until every lossless consumer has received all messages."""
         for outlet in self._all.values():
             await outlet.flush()
 
     def renew(self, epoch: int) -> None:
+        """Restart numbering of all topics under a new epoch."""
         for outlet in self._all.values():
             outlet.reset(epoch)
 
     def check_windows(self) -> None:
+        """Evict stalled consumers of all topics."""
         for outlet in self._all.values():
             outlet.evict_stalled()
 
     def counts(self) -> tuple[OutputCount, ...]:
+        """Return the counters of all outputs for the health message."""
         return tuple(outlet.counts() for outlet in self._all.values())
 
     def close(self) -> None:
+        """Close all outlets."""
         for outlet in self._all.values():
             outlet.close()

@@ -1,4 +1,4 @@
-"""An actor in a process of its own, seen from the process that started it."""
+"""Child processes: an actor in a process of its own, seen from the parent process."""
 
 import asyncio
 import ctypes
@@ -15,39 +15,46 @@ from .supervision_policy import RestartBudget
 
 log = logging.getLogger(__name__)
 
-PARENT_VARIABLE = "LDO_PARENT_PID"  # a child whose parent is gone has nobody to serve, and leaves
+PARENT_VARIABLE = "LDO_PARENT_PID"  # A child ends when its parent process has ended.
 
 
 def resident_mb() -> float:
-    """Memory of this process in RAM now, in MB."""
+    """Return the resident memory of this process, MB."""
     try:
         pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:  # not Linux: the peak is all that can be had
+    except OSError:  # Other systems than Linux report only the peak.
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return pages * resource.getpagesize() / 1e6
 
 
 def trim_memory() -> None:
-    """Hand the system what this process let go of. Without it glibc keeps what lies between what is
-    still used: 280 MB after three laps of a flat. Elsewhere than on Linux nothing is done."""
+    """Return freed memory to the operating system.
+
+    Without it, glibc keeps free memory between blocks in use: 280 MB after three laps of a flat. On
+    other systems than Linux this does nothing.
+    """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
     if trim is not None:
         trim(0)
 
 
 async def exit_with_parent(period_s: float = 0.5) -> None:
-    """Return when the process that started this one is gone; never, if no ChildProcess did."""
+    """Wait until the parent process has ended; wait forever if no `ChildProcess` started this one.
+
+    Args:
+        period_s: Time between two checks.
+    """
     parent = int(os.environ.get(PARENT_VARIABLE, "0"))
     while parent == 0 or os.getppid() == parent:
         await asyncio.sleep(period_s)
-    log.warning("the process that started this one is gone")
+    log.warning("The parent process has ended; this process stops too.")
 
 
 class ChildProcess:
-    """Starts an actor's process, and starts it again when it dies or is silent.
+    """Process of one actor, restarted when it ends or misses its heartbeat timeout.
 
-    `command` must run the stage `name` and end after SIGTERM. It gets a process group of its own:
-    Ctrl-C at a terminal reaches the parent alone, which ends its children in order.
+    The process has a process group of its own. Ctrl-C at a terminal therefore reaches only the
+    parent, which ends its children in order.
     """
 
     def __init__(
@@ -63,6 +70,19 @@ class ChildProcess:
         silent_after_s: float = 10.0,
         start_within_s: float = 60.0,
     ) -> None:
+        """Prepare the process; `run` starts it.
+
+        Args:
+            name: Name of the actor.
+            command: Command line that runs the stage `name` and ends after SIGTERM.
+            transport: The network, for heartbeats.
+            environment: Additional environment variables.
+            max_restarts: Maximum number of restarts within `restart_window_s`.
+            restart_window_s: Time window of the restart budget.
+            restart_delay_s: Delay before a restart, doubled with each failure in the window.
+            silent_after_s: Heartbeat timeout, after which the process is killed.
+            start_within_s: Heartbeat timeout of a new process.
+        """
         self.name = name
         self._command, self._transport = command, transport
         self._environment = {**os.environ, **(environment or {}), PARENT_VARIABLE: str(os.getpid())}
@@ -72,14 +92,20 @@ class ChildProcess:
         self._silent_after_s, self._start_within_s = silent_after_s, start_within_s
         self._process: asyncio.subprocess.Process | None = None
         self._draining = False
-        self._heard_until_s = float("inf")  # a heartbeat must come before
+        self._heard_until_s = float("inf")  # Deadline of the next heartbeat.
         self.restarts = 0
 
     @property
     def pid(self) -> int | None:
+        """Process id of the last started process."""
         return self._process.pid if self._process else None
 
     async def run(self) -> None:
+        """Start the process, and restart it until `drain`.
+
+        Raises:
+            RestartsExhausted: The restart budget is used up.
+        """
         self._loop = asyncio.get_running_loop()
         self._transport.subscribe(f"health/{self.name}", lambda _header, _body: self._heard())
         watch = asyncio.create_task(self._kill_when_silent(), name=f"{self.name} watch")
@@ -95,24 +121,24 @@ class ChildProcess:
                 await self._process.wait()
 
     async def _run_once(self) -> int:
-        """Exit code of one process; negative: the signal that killed it."""
+        """Run one process and return its exit code; negative: the signal that killed it."""
         self._process = await asyncio.create_subprocess_exec(
             *self._command, env=self._environment, process_group=0
         )
-        log.info("%s runs in process %d", self.name, self._process.pid)
+        log.info("%s: started process %d.", self.name, self._process.pid)
         self._heard_until_s = self._loop.time() + self._start_within_s
-        if self._draining:  # asked while it was being started
+        if self._draining:  # `drain` was called while the process started.
             self._process.terminate()
         return await self._process.wait()
 
     def drain(self) -> None:
-        """Soft stop."""
+        """Request a soft stop."""
         self._draining = True
         if self._process and self._process.returncode is None:
             self._process.terminate()
 
     def kill(self) -> None:
-        """End the process now; it is started again."""
+        """Kill the process now; `run` restarts it."""
         if self._process and self._process.returncode is None:
             self._process.kill()
 
@@ -120,21 +146,24 @@ class ChildProcess:
         self._heard_until_s = self._loop.time() + self._silent_after_s
 
     async def _kill_when_silent(self) -> None:
-        """A stopped process keeps its connection for seconds: only its silence tells."""
+        """Kill the process after its heartbeat timeout.
+
+        A stopped process keeps its connection for seconds, so the timeout alone detects it.
+        """
         while True:
             await asyncio.sleep(self._silent_after_s / 10)
             if self._loop.time() > self._heard_until_s:
-                log.error("%s is silent: its process %s is killed", self.name, self.pid)
+                log.error("%s: no heartbeat in time; killing its process %s.", self.name, self.pid)
                 self._heard_until_s = float("inf")
                 self.kill()
 
     async def _back_off(self, code: int) -> None:
         how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        log.error("%s: its process %s", self.name, how)
+        log.error("%s: its process %s; restarting it within its budget.", self.name, how)
         await asyncio.sleep(self._budget.record_failure(self._loop.time()))
         self.restarts += 1
 
 
 def python_command(*arguments: str) -> list[str]:
-    """The command line of this very installation."""
+    """Return the command line of this installation with the given arguments."""
     return [sys.executable, "-m", "ldo_service", *arguments]

@@ -1,4 +1,8 @@
-"""Runs one actor: take, handle in its own thread, save, send in order, acknowledge."""
+"""Stage: the runtime around one actor.
+
+For each message the stage runs the handler in the actor's own thread, saves the state, sends the
+outputs in order, and acknowledges the input.
+"""
 
 import asyncio
 import logging
@@ -28,24 +32,30 @@ log = logging.getLogger(__name__)
 
 
 class UnsavedStateError(Exception):
-    """A stage is to end, and the disk takes nothing: what it did last will be done again."""
+    """End of a stage with an unsaved state; the last step is repeated after a restart."""
 
 
 class Stage:
-    """`run` until `drain` or cancelled.
+    """Runtime around one actor; `run` lasts until `drain` or cancellation.
 
-    A failed step is tried once more by a successor that starts from the last state; a message that
-    fails twice is set aside and counted. `expected` names, for each output topic, the consumers
-    that must not miss a message. Everything that a step depends on is told to the `journal`.
+    Failures: The stage restores the actor from its last state and repeats a failed step once. A
+    message that fails twice becomes a dead letter and is counted. The `journal` receives everything
+    that a step depends on.
 
-    A step counts when it is saved: only then is what it made for such consumers sent, and what it
-    took acknowledged. While the disk takes nothing the stage tries again and does no more steps.
-    One whose outputs never wait goes on, makes nothing for them, and sends what it made once it is
-    saved; one without such neighbours goes on too. One that is to end does not wait for a disk.
+    Saving: A step is complete when it is saved. Only then does the stage send its outputs to
+    required consumers and acknowledge its input. While the disk is full, the stage retries and
+    takes no more messages, with two exceptions:
+
+    - A stage with nonblocking outputs continues. Its credit is 0 until the staged outputs are saved
+      and sent.
+    - A stage without lossless inputs and without required consumers continues too.
+
+    A stage that is about to end does not wait for the disk.
     """
 
-    JOURNAL_WITHIN_S = 5.0  # a stage that ends waits so long for its journal to be written
-    SAVE_AGAIN_S = 0.5  # after a failed save: soon enough for who frees a disk, and no load
+    JOURNAL_WITHIN_S = 5.0  # Maximum time to wait at the end for the journal to be written.
+    # Time between two attempts to save: short for a user who frees disk space, and cheap.
+    SAVE_AGAIN_S = 0.5
 
     def __init__(
         self,
@@ -58,6 +68,17 @@ class Stage:
         on_evicted: Callable[[str], None] = lambda _consumer: None,
         journal: Journal | None = None,
     ) -> None:
+        """Create the actor and restore its last saved state.
+
+        Args:
+            make: Function that creates a new actor.
+            transport: The network.
+            config: Limits of supervision.
+            store: Storage of the state; in memory by default.
+            expected: Names of the consumers that must not miss a message, by output topic.
+            on_evicted: Called with the name of an evicted consumer.
+            journal: Receiver of the journal entries.
+        """
         self._make, self._transport = make, transport
         self._config = config = config or SupervisionConfig()
         self._checkpointer = Checkpointer(store or MemoryStore())
@@ -82,7 +103,12 @@ class Stage:
 
     # --- life -----------------------------------------------------------------------------------
     async def run(self) -> None:
-        """Once. Raises RestartsExhausted or StageStalled when it gives up."""
+        """Run the stage; may be called once.
+
+        Raises:
+            RestartsExhausted: The actor failed more often than its restart budget allows.
+            StageStalled: A step took longer than `stall_after_s`.
+        """
         nice = 0 if self._actor.is_prompt else self._config.nice
         self._worker = Worker(self.name, nice=nice)
         self._open_outlets()
@@ -107,7 +133,7 @@ class Stage:
             await self._close_journal()
 
     def drain(self) -> None:
-        """Soft stop: handle what has arrived, say the last words, end."""
+        """Request a soft stop: handle queued messages, publish the final messages, end."""
         self._drain_requested = True
         self._metrics.state = "draining"
         if self._mailbox:
@@ -156,14 +182,17 @@ class Stage:
         done, _ = await asyncio.wait({written}, timeout=self.JOURNAL_WITHIN_S)
         if not done:
             written.cancel()
-            log.error("%s: the end of its recording is not written", self.name)
+            log.error(
+                "%s: the end of its recording was not written in time; a replay stops earlier.",
+                self.name,
+            )
 
     # --- work -----------------------------------------------------------------------------------
     async def _work(self, mailbox: Mailbox) -> None:
         try:
             if self._checkpointer.is_unsaved:
                 await self._save()
-            await self._outlets.release()  # what a predecessor made
+            await self._outlets.release()  # Outputs that the previous process staged.
             await self._publish_restored()
             while delivery := await self._next(mailbox):
                 await self._take(delivery, mailbox)
@@ -172,10 +201,14 @@ class Stage:
                 raise UnsavedStateError
             await self._outlets.flush()
         except UnsavedStateError:
-            log.error("%s ends and its last step is not saved: it will be done again", self.name)
+            log.error(
+                "%s: stopped with one unsaved step; it is repeated after the restart, nothing is "
+                "lost. Free some disk space.",
+                self.name,
+            )
 
     async def _next(self, mailbox: Mailbox) -> Delivery | StageCommand | None:
-        """While something is not saved, it is tried again meanwhile."""
+        """Take the next delivery or command, and retry to save an unsaved state meanwhile."""
         while self._checkpointer.is_unsaved:
             try:
                 return await asyncio.wait_for(mailbox.take(), self.SAVE_AGAIN_S)
@@ -201,12 +234,17 @@ class Stage:
         self._journal.record_step("dead_lettered", FlowStatus())
         await self._save(delivery)
         log.error(
-            "%s: %s of stamp %d failed twice and is set aside",
+            "%s: message %s (stamp %d ns) failed twice and becomes a dead letter. Its traceback is "
+            "above; please report it with the recording.",
             self.name, type(message).__name__, message.stamp_ns,
         )  # fmt: skip
 
     async def _try(self, message: Message, delivery: Delivery) -> bool:
-        """Handle, save, send; False when it failed and a successor is in place."""
+        """Handle a message, save the state and send the outputs.
+
+        Returns:
+            False if the handler failed; the actor is then restored.
+        """
         self._update_flow_status()
         try:
             with self._metrics.step():
@@ -216,7 +254,8 @@ class Stage:
         except UnsavedStateError:
             raise
         except Exception as error:
-            log.exception("%s failed on %s", self.name, type(message).__name__)
+            log.exception("%s: handling %s failed; restoring the actor.",
+                          self.name, type(message).__name__)  # fmt: skip
             self._journal.record_step("failed", self._actor.situation, error=repr(error))
             await self._restart()
             return False
@@ -226,7 +265,7 @@ class Stage:
         return True
 
     def _taken(self, delivery: Delivery) -> LoggedInput | None:
-        """For an actor whose state lags."""
+        """Return the log entry of the input for an actor that lags, else None."""
         if not self._actor.lags:
             return None
         return LoggedInput.of(delivery.port.topic.name, delivery.body, self._actor.situation)
@@ -254,23 +293,35 @@ class Stage:
             produced = await self._worker.run(lambda: produce(self._actor, words()))
         except Exception:
             self._metrics.failures += 1
-            log.exception("%s: what it says when it has %s failed", self.name, kind)
+            log.exception(
+                "%s: producing the messages of %r failed; subscribers may miss the last state.",
+                self.name, kind,
+            )  # fmt: skip
             return
         if produced or kind == "finished":
             self._journal.record_step(kind, self._actor.situation, produced)
         await self._tell(produced, whole=True)
 
-    # --- keeping --------------------------------------------------------------------------------
+    # --- saving ---------------------------------------------------------------------------------
     async def _save(
         self,
         delivery: Delivery | None = None,
         taken: LoggedInput | None = None,
         whole: bool = False,
     ) -> bool:
-        """Save all as of now, that delivery handled. False: not yet, and nobody waits for it.
+        """Save the current state, and retry while the disk is full.
 
-        Raises what the actor raises when it is asked for its state, and LeftUnsaved when the stage
-        is to end and the disk takes nothing.
+        Args:
+            delivery: The delivery of the current step, which counts as handled.
+            taken: Its log entry if the actor lags.
+            whole: Write a checkpoint instead of a snapshot.
+
+        Returns:
+            False if the state is not saved and the stage need not wait for the disk.
+
+        Raises:
+            UnsavedStateError: The stage is about to end and the state cannot be written.
+            Exception: Any exception of the actor's `snapshot` or `checkpoint`.
         """
         state = await self._worker.run(
             self._checkpointer.build_checkpoint, self._actor, self._links(delivery), taken, whole
@@ -298,8 +349,11 @@ class Stage:
         return not self._outlets.is_nonblocking and (takes or self._outlets.has_required_consumers)
 
     def _begin(self) -> None:
-        """Save what there is before anyone counts on this stage: at once, as it is little. What the
-        disk does not take is tried again before the first step."""
+        """Save the initial state before other actors connect.
+
+        The state is small, so the event loop saves it itself. If that fails, the stage retries
+        before the first step.
+        """
         try:
             self._write(
                 self._checkpointer.build_checkpoint(self._actor, self._links(), None, False)
@@ -315,7 +369,7 @@ class Stage:
         self._metrics.failures += self._checkpointer.record_failure(self.name, error)
         self._metrics.facts = {**self._metrics.facts, **self._checkpointer.metrics()}
 
-    # --- orders ---------------------------------------------------------------------------------
+    # --- commands -------------------------------------------------------------------------------
     async def _execute(self, order: StageCommand, mailbox: Mailbox) -> None:
         try:
             match order.what:
@@ -328,13 +382,16 @@ class Stage:
                 case "save":
                     await self._worker.run(self._save_whole, self._links())
         except Exception as error:
-            log.exception("%s could not %s", self.name, order.what)
+            log.exception(
+                "%s: command %s failed. Repeat `ldo control %s` or restart the service.",
+                self.name, order.what, order.what,
+            )  # fmt: skip
             self._orders.report(order, f"{type(error).__name__}: {error}")
         else:
             self._orders.report(order, "")
 
     async def _renew(self, mailbox: Mailbox) -> None:
-        """Begin anew; to everyone else it looks like a process that was started again."""
+        """Reset to an empty state; other actors observe it like a restarted process."""
         self._checkpointer.forget(self.name)
         self._actor = await self._worker.run(self._restored_actor)
         self._epoch = new_epoch()
@@ -364,14 +421,18 @@ class Stage:
         self._write(self._checkpointer.build_checkpoint(self._actor, links, None, True))
 
     async def _restart(self) -> None:
-        """Wait, longer with each failure, and put a successor in place."""
+        """Wait, longer with each failure, and restore the actor from its last state."""
         while True:
             self._metrics.failures += 1
             await asyncio.sleep(self._budget.record_failure(asyncio.get_running_loop().time()))
             try:
                 self._actor = await self._worker.run(self._restored_actor)
             except Exception:
-                log.exception("%s cannot go on from its last state", self.name)
+                log.exception(
+                    "%s: restoring its last state failed; retrying within the restart budget. If "
+                    "it ends the service, start with an empty map by another --state folder.",
+                    self.name,
+                )
                 continue
             self._metrics.restarts += 1
             self._outlets.take_back()
@@ -390,7 +451,7 @@ class Stage:
             await asyncio.sleep(self._config.heartbeat_s)
 
     def health(self) -> Health:
-        """How it is now; also sent with every heartbeat."""
+        """Return the current health message, as sent with every heartbeat."""
         return self._metrics.health(
             actor=self.name,
             epoch=self._epoch,

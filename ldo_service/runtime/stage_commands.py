@@ -2,17 +2,21 @@
 
 The service sends commands to its stages over a network that may lose messages:
 
-Order    service -> stage   "do this", between two steps; repeated until reported
-Report   stage -> service   "order n is done", or why not; repeated for each repetition
+- `StageCommand` (service to stage): A command to execute between two steps. It is repeated until
+  the reply arrives.
+- `StageReply` (stage to service): Success, or the reason of the failure. It is repeated for each
+  repetition of the command.
 
-pause     take nothing; messages that arrive at a Latest input are dropped and counted as paused
-resume    take again
-reset     start with an empty state and a new epoch
-save      write the whole state now
+Commands:
 
-`Control` gives one answer for the whole service when all its actors have reported. `reset` first
-holds every actor, producers first, so that nothing of the old run is under way when they start
-again: a late correction of 50 keyframes would outdate the first one of the new run.
+- `pause`: Take no messages. Latest inputs drop arriving messages and count them as paused.
+- `resume`: Take messages again.
+- `reset`: Start with an empty state and a new epoch.
+- `save`: Write the whole state now.
+
+`Control` replies once for the whole service, when all its actors have replied. `reset` first pauses
+every actor, producers first, so that no message of the old run is in flight when they restart. A
+late correction of 50 keyframes would otherwise supersede the first correction of the new run.
 """
 
 import asyncio
@@ -32,28 +36,34 @@ from ldo_service.transport.interface import Transport, call_soon
 log = logging.getLogger(__name__)
 
 COMMAND_KEY, REPLY_KEY = "link/command", "link/reply"
-REPEAT_AFTER_S = 0.25  # an order or its report got lost; a stage at work is asked again in vain
+# A command without a reply after this time may be lost and is sent again. A stage that is still
+# executing it ignores the repetition.
+REPEAT_AFTER_S = 0.25
 
-MIN_S = 2.0  # 3x the slowest step measured
+MIN_S = 2.0  # Minimum time for each actor: 3x the slowest step measured.
 
 
 What = Literal["pause", "resume", "reset", "save"]
 
 
 class StageCommand(msgspec.Struct, frozen=True, array_like=True):
-    number: int  # no other order has it
+    """Command to one stage."""
+
+    number: int  # Unique number of the command.
     what: What
     stage: str
 
 
 class StageReply(msgspec.Struct, frozen=True, array_like=True):
-    number: int
+    """Reply of a stage to a command."""
+
+    number: int  # Number of the command.
     stage: str
-    error: str = ""  # empty: done
+    error: str = ""  # Empty on success.
 
 
 class CommandReceiver:
-    """The stage's end: hands over each order once, and repeats its report when asked again."""
+    """Stage end of the protocol: passes each command on once and repeats lost replies."""
 
     def __init__(
         self, stage: str, transport: Transport, take: Callable[[StageCommand], None]
@@ -66,14 +76,16 @@ class CommandReceiver:
         transport.subscribe(COMMAND_KEY, self._arrived)
 
     def report(self, order: StageCommand, error: str) -> None:
+        """Send the reply to a command; an empty error means success."""
         self._done = StageReply(order.number, self._stage, error)
         self._reports.post(b"", encode_link(self._done))
 
     def close(self) -> None:
+        """Close the publisher of replies."""
         self._reports.close()
 
     def _arrived(self, _header: bytes, body: memoryview) -> None:
-        """On any thread."""
+        """Decode a command on any thread, and handle it on the event loop."""
         with suppress(msgspec.DecodeError):
             order = decode(body, StageCommand)
             if order.stage == self._stage:
@@ -88,7 +100,7 @@ class CommandReceiver:
 
 
 class CommandSender:
-    """The service's end."""
+    """Service end of the protocol."""
 
     def __init__(self, transport: Transport) -> None:
         self._loop = asyncio.get_running_loop()
@@ -97,7 +109,11 @@ class CommandSender:
         transport.subscribe(REPLY_KEY, self._arrived)
 
     async def order(self, what: What, stage: str, timeout_s: float) -> str:
-        """Empty when it is done, else why it is not; does not raise for what a stage does."""
+        """Send a command to a stage and wait for its reply.
+
+        Returns:
+            Empty on success, else the error of the stage or of the timeout.
+        """
         order = StageCommand(1 + secrets.randbits(62), what, stage)
         report = self._reports[order.number] = self._loop.create_future()
         try:
@@ -112,10 +128,11 @@ class CommandSender:
             del self._reports[order.number]
 
     def close(self) -> None:
+        """Close the publisher of commands."""
         self._orders.close()
 
     def _arrived(self, _header: bytes, body: memoryview) -> None:
-        """On any thread."""
+        """Decode a reply on any thread, and handle it on the event loop."""
         with suppress(msgspec.DecodeError):
             call_soon(self._loop, self._reported, decode(body, StageReply))
 
@@ -126,11 +143,11 @@ class CommandSender:
 
 
 class ControlError(Exception):
-    """Some actor did not obey; the text names it."""
+    """Command that some actors did not execute; the text names them."""
 
 
 class Control:
-    """`actors` in the order of the data, producers first; `sources` are those fed from outside."""
+    """Control interface of the whole service: pause, resume, save and reset."""
 
     def __init__(
         self,
@@ -140,6 +157,15 @@ class Control:
         saved_where: str,
         timeout_s: float,
     ) -> None:
+        """Connect to the stages.
+
+        Args:
+            transport: The network.
+            actors: Names of all actors, producers first.
+            sources: Names of the actors with inputs from outside the service.
+            saved_where: Description of the state folder, for replies.
+            timeout_s: Time limit of a command for all actors together.
+        """
         self._commander = CommandSender(transport)
         self._actors, self._sources = tuple(actors), tuple(sources)
         self._saved_where, self._timeout_s = saved_where, timeout_s
@@ -155,15 +181,15 @@ class Control:
         transport.watch_liveliness(self._presence)
 
     async def answer(self, body: bytes) -> bytes:
-        """The reply to a query's payload, whatever the bytes are."""
+        """Execute the request of a query and return the encoded reply; accepts any bytes."""
         try:
             request = decode(body, ControlRequest)
         except msgspec.DecodeError as error:
-            return encode(_answer(0, False, f"this is no ControlRequest: {error}."))
+            return encode(_answer(0, False, f"malformed ControlRequest: {error}."))
         verb = self._verbs.get(request.command)
         if verb is None:
             known = ", ".join(self._verbs)
-            text = f"there is no {request.command[:40]!r} in this version. There are {known}."
+            text = f"unknown command {request.command[:40]!r}; this version has {known}."
             return encode(_answer(request.stamp_ns, False, text))
         async with self._one_at_a_time:
             try:
@@ -174,18 +200,19 @@ class Control:
         return encode(_answer(request.stamp_ns, ok, text))
 
     def close(self) -> None:
+        """Close the publisher of commands."""
         self._commander.close()
 
     # --- verbs ------------------------------------------------------------------------------------
     async def _pause(self) -> str:
         self._is_paused = True
         await self._each("pause", self._sources)
-        return "frames are left out and counted until `resume`."
+        return "frames are dropped and counted until `resume`."
 
     async def _resume(self) -> str:
         self._is_paused = False
         await self._each("resume", self._sources)
-        return "frames are taken again."
+        return "frames are processed again."
 
     async def _save(self) -> str:
         await self._each("save", self._actors)
@@ -199,13 +226,17 @@ class Control:
             held = self._sources if self._is_paused else ()
             await self._each("resume", [actor for actor in self._actors if actor not in held])
         still = " Frames stay paused." if self._is_paused else ""
-        return f"{', '.join(self._actors)} began anew.{still}"
+        return f"{', '.join(self._actors)} restarted with an empty state.{still}"
 
     async def _each(self, what: What, actors: Sequence[str]) -> None:
-        """One after the other: a producer may have to wait for a consumer that is not held yet. All
-        have `timeout_s` together, and who comes after one that hangs a moment at least.
+        """Send a command to the actors in sequence.
 
-        Raises ControlFailed, after all have been told, naming those that did not obey.
+        A producer may have to wait for a consumer that is not paused yet. The actors share
+        `timeout_s`; each has at least `MIN_S`, also after an actor that does not reply.
+
+        Raises:
+            ControlError: Some actors did not execute the command. It is raised after all actors
+                have received the command, and names these actors.
         """
         failures, until_s = [], time.monotonic() + self._timeout_s
         for actor in actors:
@@ -213,12 +244,12 @@ class Control:
             error = await self._commander.order(what, actor, within_s)
             failures += [f"{actor} {error}"] if error else []
         if failures:
-            advice = "`ldo doctor` shows how the actors are; then ask again."
+            advice = "`ldo doctor` shows the state of the actors; then repeat the command."
             raise ControlError(f"could not {what} all actors: {'; '.join(failures)}. {advice}")
 
     # --- actors that were restarted ---------------------------------------------------------------
     def _presence(self, name: str, alive: bool) -> None:
-        """A process that comes back does not know of the pause."""
+        """Pause a restarted source again, because the pause is not part of its saved state."""
         if alive and self._is_paused and name in self._sources:
             task = asyncio.ensure_future(self._commander.order("pause", name, self._timeout_s))
             self._tasks.add(task)

@@ -1,4 +1,4 @@
-"""What a stage counts about itself, for its health message."""
+"""Counters and step times of a stage, for its health message."""
 
 import os
 import time
@@ -17,25 +17,26 @@ from .process import resident_mb
 
 @dataclass
 class StageMetrics:
-    """Times are of the monotonic clock."""
+    """Counters and step times of a stage; times are of the monotonic clock."""
 
     state: Literal["starting", "ready", "draining"] = "starting"
     steps: int = 0
     failures: int = 0
     restarts: int = 0
     dead_lettered: int = 0
-    step_ms: deque[float] = field(
-        default_factory=lambda: deque(maxlen=200)
-    )  # as `record_step` has it
+    # Durations of the last 200 timed steps, ms; see `record_step`.
+    step_ms: deque[float] = field(default_factory=lambda: deque(maxlen=200))
     last_step_ms: float = 0.0
     last_stamp_ns: int = 0
     finished_at_s: float = field(default_factory=time.monotonic)
-    started_at_s: float | None = None  # of the step under way
-    facts: dict[str, float] = field(default_factory=dict)  # the actor's own, after its last step
+    started_at_s: float | None = None  # Start of the current step; None between steps.
+    facts: dict[str, float] = field(
+        default_factory=dict
+    )  # The actor's metrics after its last step.
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Around the handler; only a step that does not raise is timed."""
+        """Measure the duration of a handler; only a step that does not raise is timed."""
         started_s = self.started_at_s = time.monotonic()
         try:
             yield
@@ -44,7 +45,13 @@ class StageMetrics:
             self.started_at_s = None
 
     def record_step(self, message: Message, is_timed: bool) -> None:
-        """`is_timed`: not for a step that took note only, or such would hide what a frame costs."""
+        """Count a finished step.
+
+        Args:
+            message: Input of the step.
+            is_timed: Whether its duration enters `step_ms`. Steps that only store their input are
+                excluded, because they would bias the duration of a frame.
+        """
         self.steps += 1
         if is_timed:
             self.step_ms.append(self.last_step_ms)
@@ -53,11 +60,12 @@ class StageMetrics:
 
     @property
     def busy_s(self) -> float:
-        """Age of the step under way, 0 when there is none."""
+        """Seconds since the start of the current step; 0 between steps."""
         started_s = self.started_at_s
         return 0.0 if started_s is None else time.monotonic() - started_s
 
     def health(self, **of_the_stage: Any) -> Health:
+        """Return the health message; the stage passes the remaining fields."""
         step_ms = np.array(self.step_ms or [0.0])
         is_busy = self.started_at_s is not None and self.state == "ready"
         return Health(

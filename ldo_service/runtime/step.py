@@ -1,4 +1,4 @@
-"""One step of an actor: its messages decoded, its outputs encoded and checked.
+"""Step of an actor: decoding of its input, encoding and checks of its outputs.
 
 The service and the replay share this code.
 """
@@ -20,44 +20,60 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Produced:
+    """Output of a step with its encoded body."""
+
     topic: Topic
     message: Message
     body: bytes
 
 
 def produce(actor: Actor, messages: Iterable[Message]) -> list[Produced]:
-    """Raises when a message is none of the outputs, or has no room where none may wait."""
+    """Encode the outputs of a step.
+
+    Args:
+        actor: The actor, with the flow status of the step.
+        messages: The outputs, as its handler yields them.
+
+    Raises:
+        TypeError: A message belongs to none of the actor's outputs.
+        RuntimeError: The actor produced more messages than its credit on a nonblocking output.
+    """
     topics = {out.topic.message: out.topic for out in actor.outputs}
     room = dict(actor.situation.credits)
     produced: list[Produced] = []
     for message in messages:
         topic = topics.get(type(message))
         if topic is None:
-            raise TypeError(f"{type(message).__name__} is none of {actor.name}'s outputs")
+            raise TypeError(
+                f"{actor.name} produced a {type(message).__name__}, which is not in its outputs."
+            )
         if topic in room:
             room[topic] -= 1
             if room[topic] < 0:
-                raise RuntimeError(f"{actor.name} made {topic.name} without room for it")
+                raise RuntimeError(
+                    f"{actor.name} produced a message of {topic.name} without credit; it must "
+                    "check has_credit first."
+                )
         produced.append(Produced(topic, message, encode(message)))
     return produced
 
 
 class MessageDecoder:
-    """Says once an episode that messages of a topic cannot be decoded."""
+    """Decoder of inputs that logs a series of malformed messages of a topic once."""
 
     def __init__(self, actor: str) -> None:
         self._actor = actor
-        self._rejecting: set[Topic] = set()  # topics whose last message could not be decoded
+        self._rejecting: set[Topic] = set()  # Topics with a malformed last message.
 
     def message_of(self, delivery: Delivery) -> Message | None:
-        """None for one that cannot be decoded."""
+        """Decode a delivery; return None if it is malformed."""
         topic, header = delivery.port.topic, delivery.header
         try:
             message = decode(delivery.body, topic.message)
         except msgspec.DecodeError as error:
             if topic not in self._rejecting:
                 log.warning(
-                    "%s: %s #%d from %s rejected: %s. Those that follow are counted.",
+                    "%s: message of %s (#%d from %s) rejected: %s. Later ones are only counted.",
                     self._actor, topic.name, header.seq, header.source, error,
                 )  # fmt: skip
             self._rejecting.add(topic)

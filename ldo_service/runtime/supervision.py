@@ -1,8 +1,8 @@
-"""All stages of a process in one task group, and the watchdog of systemd.
+"""Supervision of all stages of a process in one task group, and the watchdog of systemd.
 
-An error that a stage gives up on ends them all. The protocol of the watchdog is that of
-sd_notify(3): a word in a datagram to the socket that the environment names. A unit with
-`WatchdogSec=` restarts a service whose event loop stood still for so long.
+An error that a stage cannot recover from ends all stages. The watchdog uses the protocol of
+sd_notify(3). It sends a datagram with one word to the socket that the environment names. The
+systemd manager restarts a unit with `WatchdogSec=` if the event loop is blocked for that time.
 """
 
 import asyncio
@@ -15,11 +15,12 @@ from typing import Protocol
 
 log = logging.getLogger(__name__)
 
-PINGS_PER_PERIOD = 3  # sd_watchdog_enabled(3) asks for two; one may come late on a busy machine
+# sd_watchdog_enabled(3) recommends two; one may be late on a busy machine.
+PINGS_PER_PERIOD = 3
 
 
 class Runner(Protocol):
-    """A stage in this process, or the process of one."""
+    """Stage in this process, or the child process of a stage."""
 
     name: str
 
@@ -29,29 +30,43 @@ class Runner(Protocol):
 
 
 class StopRequest:
-    """Asked once: soft, each stage finishes what it has. Asked twice: hard, at once."""
+    """Stop request: soft after the first call, hard after the second.
+
+    On a soft stop each stage handles its queued messages. A hard stop cancels the stages.
+    """
 
     def __init__(self) -> None:
         self._soft, self._hard = asyncio.Event(), asyncio.Event()
 
     def request(self) -> None:
+        """Request a soft stop, or a hard stop if a soft one is requested already."""
         (self._hard if self._soft.is_set() else self._soft).set()
 
     @property
     def is_asked(self) -> bool:
+        """True after the first request."""
         return self._soft.is_set()
 
     async def wait_soft(self) -> None:
+        """Wait for the first request."""
         await self._soft.wait()
 
     async def wait_hard(self) -> None:
+        """Wait for the second request."""
         await self._hard.wait()
 
 
 async def supervise(runners: Sequence[Runner], stop: StopRequest, drain_s: float = 10.0) -> None:
-    """Run until asked to stop; then end them in the given order, producers first.
+    """Run the stages until a stop request, then end them in the given order.
 
-    Raises what a runner gave up on (RestartsExhausted, StageStalled).
+    Args:
+        runners: Stages and child processes, producers first.
+        stop: The stop request.
+        drain_s: Time that each runner has for a soft stop before it is cancelled.
+
+    Raises:
+        RestartsExhausted: A restart budget is used up.
+        StageStalled: A step took too long.
     """
     try:
         async with asyncio.TaskGroup() as group:
@@ -74,12 +89,12 @@ async def _end(
         runner.drain()
         await asyncio.wait({task, hard}, timeout=drain_s, return_when=asyncio.FIRST_COMPLETED)
     if not task.done():
-        log.warning("%s did not end in time: cancelled", runner.name)
+        log.warning("%s: did not stop in time and is cancelled.", runner.name)
         task.cancel()
 
 
 def _first(errors: BaseExceptionGroup) -> BaseException:
-    """The error that ended the group; the others followed from it."""
+    """Return the error that ended the group; the others are its consequences."""
     error: BaseException = errors
     while isinstance(error, BaseExceptionGroup):
         error = error.exceptions[0]
@@ -87,16 +102,17 @@ def _first(errors: BaseExceptionGroup) -> BaseException:
 
 
 class Watchdog:
-    """Says nothing where nobody listens."""
+    """Client of the systemd watchdog; it does nothing without systemd."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address
         watched = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         period = environment.get("WATCHDOG_USEC", "") if watched else ""
-        self.period_s = int(period) * 1e-6 if period.isdecimal() else 0.0  # 0: not watched
+        self.period_s = int(period) * 1e-6 if period.isdecimal() else 0.0  # 0: no watchdog.
 
     def notify(self, word: str) -> None:
+        """Send a word of sd_notify(3), for example "READY=1"."""
         if not self._address:
             return
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify, suppress(OSError):
@@ -104,7 +120,7 @@ class Watchdog:
             notify.sendto(word.encode(), self._address)
 
     async def ping(self) -> None:
-        """For ever, on the event loop that is watched; returns at once when nobody does."""
+        """Notify the watchdog periodically on the event loop; return at once without one."""
         while self.period_s > 0:
             self.notify("WATCHDOG=1")
             await asyncio.sleep(self.period_s / PINGS_PER_PERIOD)

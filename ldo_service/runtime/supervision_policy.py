@@ -7,7 +7,10 @@ from ldo_service.errors import ConfigError, RestartsExhausted, named
 
 
 class RestartBudget:
-    """At most `max_restarts` within `window_s`; each restart in the window waits twice as long."""
+    """Restart budget of an actor: at most `max_restarts` within `window_s`.
+
+    The delay before a restart doubles with each failure in the window.
+    """
 
     def __init__(
         self, name: str, max_restarts: int, window_s: float, delay_s: float, delay_max_s: float
@@ -17,7 +20,11 @@ class RestartBudget:
         self._failed_at_s: deque[float] = deque()
 
     def record_failure(self, now_s: float) -> float:
-        """Count a failure; the delay before the restart. Raises RestartsExhausted."""
+        """Count a failure and return the delay before the restart, in seconds.
+
+        Raises:
+            RestartsExhausted: The budget is used up.
+        """
         self._failed_at_s.append(now_s)
         while self._failed_at_s[0] < now_s - self._window_s:
             self._failed_at_s.popleft()
@@ -29,16 +36,23 @@ class RestartBudget:
 
 @dataclass(frozen=True, slots=True)
 class SupervisionConfig:
-    max_restarts: int = 5  # within restart_window_s; more is a fault that a restart does not cure
+    """Limits of supervision for all stages and child processes."""
+
+    # Maximum restarts within `restart_window_s`; a restart does not cure a more frequent fault.
+    max_restarts: int = 5
     restart_window_s: float = 60.0
-    restart_delay_s: float = 0.05  # doubled with each failure in the window
+    restart_delay_s: float = 0.05  # Doubled with each failure in the window.
     restart_delay_max_s: float = 5.0
-    heartbeat_s: float = 0.5  # a stopped process shows within two of these
-    stall_after_s: float = 60.0  # 100x the slowest step measured (mapper, 1.5 M Gaussians)
-    evict_after_s: float = 30.0  # a consumer that takes nothing for so long holds up the robot
-    nice: int = 10  # of threads whose work may be late: a tenth of the weight of those that a robot
-    # waits for, where both want the same core (Linux)
-    max_message_mb: float = 64.0  # larger ones are not decoded: raw colour and depth of 8 MP are 58
+    heartbeat_s: float = 0.5  # Heartbeat period; a stopped process shows within two periods.
+    # Maximum duration of a step: 100x the slowest step measured (mapper, 1.5 M Gaussians).
+    stall_after_s: float = 60.0
+    # Time without progress after which a consumer is evicted, because it holds up the robot.
+    evict_after_s: float = 30.0
+    # Nice value of threads with work that may be late. On a shared core (Linux) they have a tenth
+    # of the weight of threads that a robot waits for.
+    nice: int = 10
+    # Larger messages are not decoded; raw color and depth of 8 MP have 58 MB.
+    max_message_mb: float = 64.0
 
     def __post_init__(self) -> None:
         times = (self.restart_window_s, self.heartbeat_s, self.stall_after_s, self.evict_after_s)
@@ -58,7 +72,7 @@ class SupervisionConfig:
                     "evict_after_s",
                     "max_message_mb",
                 )
-                + ": counts and times must be positive."
+                + " must be positive; max_restarts and the delays may be 0."
             )
         if not 0 <= self.nice <= 19:
-            raise ConfigError(f"supervision.background_nice={self.nice}: must be within 0..19.")
+            raise ConfigError(f"supervision.background_nice={self.nice} must be within 0..19.")

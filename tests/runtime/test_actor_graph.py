@@ -43,7 +43,7 @@ def test_a_diamond_is_no_cycle() -> None:
 
 
 def test_two_producers_of_one_topic_are_refused() -> None:
-    with pytest.raises(ConfigError, match="a is made by one and by two"):
+    with pytest.raises(ConfigError, match="topic a has two producers, one and two"):
         check_graph([actor("one", [], [A]), actor("two", [], [A])])
 
 

@@ -131,7 +131,7 @@ async def test_bytes_that_are_no_request_are_answered_all_the_same() -> None:
         for body in (b"", b"\xc1", encode(number(1))):
             answer = decode(await scene.control.answer(body), ControlAnswer)
             assert not answer.ok
-            assert "no ControlRequest" in answer.message
+            assert "malformed ControlRequest" in answer.message
 
 
 async def test_a_source_that_was_restarted_is_told_of_the_pause() -> None:

@@ -62,7 +62,7 @@ def test_pause_resume_save_and_reset_a_live_service(tmp_path: Path, room: Sequen
                 10,
                 "corrections of the new run",
             )
-        assert service.client.control("dance").message.startswith("there is no 'dance'")
+        assert service.client.control("dance").message.startswith("unknown command 'dance'")
         assert service.stop() == 0
         assert "Traceback" not in service.log
 

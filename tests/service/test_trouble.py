@@ -77,7 +77,7 @@ def test_a_message_that_always_fails_is_set_aside_and_the_stream_goes_on(
         assert (tracker.failures, tracker.restarts) == (2, 2)
         poses = tracked(service, room, range(21, 30))
         assert [(pose.frame, pose.status) for pose in poses] == [(i, "OK") for i in range(21, 30)]
-        assert "failed twice and is set aside" in service.log
+        assert "failed twice and becomes a dead letter" in service.log
         assert service.stop() == 0
 
 
