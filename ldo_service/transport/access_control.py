@@ -1,11 +1,16 @@
-"""Who may do what on the network: Zenoh's access control, made from the topics.
+"""Access control of Zenoh, derived from the topics and the role of each certificate.
 
-    service    everything of its robot
-    camera     puts frames                      odometry   puts priors
-    viewer     reads every topic                operator   reads, controls, refines, adds labels
+| role       | permissions                                            |
+|------------|--------------------------------------------------------|
+| `service`  | Everything of its robot.                               |
+| `camera`   | Publishes frames.                                      |
+| `odometry` | Publishes odometry priors.                             |
+| `viewer`   | Reads every topic.                                     |
+| `operator` | Reads every topic, controls, refines and adds labels.  |
 
-Whoever is not named may connect and do nothing. What a rule does not cover whole is denied too: a
-viewer that subscribes to `ldo/robot/**` hears nothing, it has to name topics.
+Clients without an entry may connect, but every message is denied. A request that the rules cover
+only in part is denied too: a viewer that subscribes to `ldo/robot/**` receives nothing. It must
+subscribe to topics by name.
 
 `access.yaml` has an entry for each certificate, by its common name:
 
@@ -52,16 +57,22 @@ EVERYTHING = (
 
 
 class AccessEntry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Role of one certificate."""
+
     role: Role
-    robot: str  # whose topics; EVERY_ROBOT: of each
-    until: date | None = None  # the certificate's last day
+    robot: str  # Name of the robot; EVERY_ROBOT for all robots.
+    until: date | None = None  # Last day of the certificate.
 
 
-Access = Mapping[str, AccessEntry]  # by common name of the certificate
+Access = Mapping[str, AccessEntry]  # Entry by common name of the certificate.
 
 
 def read_access(path: Path) -> dict[str, AccessEntry]:
-    """Raises ConfigError for a file that cannot be read or says something else."""
+    """Read `access.yaml`.
+
+    Raises:
+        ConfigError: The file cannot be read or is malformed.
+    """
     try:
         return msgspec.convert(load_yaml(path.read_bytes()), dict[str, AccessEntry])
     except OSError as error:
@@ -70,12 +81,12 @@ def read_access(path: Path) -> dict[str, AccessEntry]:
         ) from error
     except (ValueError, yaml.YAMLError) as error:
         raise ConfigError(
-            f"{path} does not say who may do what: {error}. `ldo keys` writes such a file."
+            f"{path} is no valid access list: {error}. `ldo keys` writes such a file."
         ) from error
 
 
 def access_control(access: Access) -> dict[str, Any]:
-    """Zenoh's section `access_control`, for a router."""
+    """Return the section `access_control` of a router's Zenoh configuration."""
     parts: dict[tuple[Role, str], list[str]] = {}
     for name, grantee in sorted(access.items()):
         parts.setdefault((grantee.role, grantee.robot), []).append(name)
@@ -92,14 +103,15 @@ def access_control(access: Access) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """Messages that may pass: "ingress" from who has the role to the router, "egress" back."""
+    """Rule that allows messages: "ingress" from the client to the router, "egress" back."""
 
-    says: str
+    says: str  # Name of the rule, part of its id.
     flows: tuple[str, ...]
     messages: tuple[str, ...]
     keys: tuple[str, ...]
 
     def for_robot(self, robot: str, part: str) -> dict[str, Any]:
+        """Return the rule in Zenoh's format; `part` is the prefix of its id."""
         return {
             "id": f"{part}: {self.says}",
             "permission": "allow",
@@ -110,6 +122,7 @@ class Rule:
 
 
 def rules_of(role: Role) -> Iterator[Rule]:
+    """Yield the rules of a role."""
     if role == "service":
         yield Rule("do all", ("ingress", "egress"), EVERYTHING, ("**",))
     if role in PUTS:

@@ -1,11 +1,11 @@
-"""The small authority of a network's keys: `ldo keys`.
+"""Certificate authority of a network of robots: `ldo keys`.
 
-    DIR/ca.crt, ca.key    the authority; its secret stays in this folder and is needed on no robot
-    DIR/access.yaml       who may do what; each service's folder has a copy
-    DIR/<name>/           what goes to that machine: ca.crt, tls.crt, tls.key
+- `DIR/ca.crt`, `DIR/ca.key`: The authority. Its private key stays here; no robot needs it.
+- `DIR/access.yaml`: Role of each certificate. The folder of each service has a copy.
+- `DIR/<name>/`: Files for one machine: ca.crt, tls.crt, tls.key.
 
-A certificate's common name is its name and a number of its own: keys that were lost and made again
-under the same name are two, and routers that know the new list let the old ones do nothing.
+The common name of a certificate is its name and a random number. New keys under an old name
+therefore have another common name, and routers with the new access list deny the old keys.
 """
 
 import os
@@ -38,14 +38,14 @@ from .endpoint import require_robot
 from .keys import ACCESS, CA, CERTIFICATE, KEY
 
 CA_KEY = "ca.key"
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")  # with its number 64, a common name's most
-HERE = ("localhost", "127.0.0.1", "::1")  # where a service's actors reach it
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,54}")  # 64 with its number, the limit of X.509.
+HERE = ("localhost", "127.0.0.1", "::1")  # Addresses that the actors of a service connect to.
 HEAD = "# Who may do what. `ldo keys` writes this; routers read it when they start.\n"
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """Keys that were given out."""
+    """Issued keys."""
 
     name: str
     common_name: str
@@ -53,10 +53,14 @@ class Entry:
 
 
 class CertificateAuthority:
-    """Opened in a folder that `CertificateAuthority.new` made. Raises ConfigError for another
-    one."""
+    """Certificate authority in a folder that `CertificateAuthority.new` created."""
 
     def __init__(self, folder: Path) -> None:
+        """Open the folder.
+
+        Raises:
+            ConfigError: The folder holds no authority.
+        """
         self.folder = folder
         try:
             self._certificate = read_certificate((folder / CA).read_bytes())
@@ -64,16 +68,25 @@ class CertificateAuthority:
         except (OSError, ValueError) as error:
             why = error.strerror if isinstance(error, OSError) else error
             raise ConfigError(
-                f"{folder} holds no authority ({why}): `ldo keys init` makes one, in a new folder."
+                f"{folder} holds no certificate authority ({why}). Create one in a new folder by "
+                "`ldo keys init`."
             ) from error
         self._access = read_access(folder / ACCESS)
 
     @classmethod
     def new(cls, folder: Path, days: int) -> "CertificateAuthority":
-        """Raises ConfigError when something is there already, which is left as it is."""
+        """Create an authority in a new folder.
+
+        Args:
+            folder: The folder to create.
+            days: Validity of its certificate.
+
+        Raises:
+            ConfigError: The folder exists already, which stays unchanged, or cannot be written.
+        """
         if folder.exists():
             raise ConfigError(
-                f"{folder} is there already, and keys are never overwritten: name a new folder."
+                f"{folder} exists already, and keys are never overwritten. Choose a new folder."
             )
         key = new_key()
         certificate = of_authority(key, days, datetime.now(UTC))
@@ -88,6 +101,7 @@ class CertificateAuthority:
 
     @property
     def entries(self) -> list[Entry]:
+        """Issued keys, sorted by common name."""
         rows = (Entry(cn.rpartition("-")[0], cn, who) for cn, who in self._access.items())
         return sorted(rows, key=lambda entry: entry.common_name)
 
@@ -100,18 +114,29 @@ class CertificateAuthority:
         hosts: Sequence[str] = (),
         now: datetime | None = None,
     ) -> Path:
-        """The folder with new keys, to be copied to its machine.
+        """Issue new keys and add them to the access list.
 
-        hosts  names and addresses where others reach it, of a service
-        now    when the days begin; default: now
+        Args:
+            name: Name of the keys, for example of the machine.
+            role: Role of the certificate.
+            robot: Name of the robot, or EVERY_ROBOT.
+            days: Validity of the certificate.
+            hosts: Host names and addresses of a service.
+            now: Start of the validity; the current time by default.
 
-        Raises ConfigError for names that are none or taken; then nothing changes.
+        Returns:
+            Folder with the keys, to copy to the machine.
+
+        Raises:
+            ConfigError: A name is invalid or taken; nothing changes then.
         """
         _require_name(name)
         if robot != EVERY_ROBOT:
             require_robot(robot)
         if hosts and role != "service":
-            raise ConfigError(f"--host is of a service, and a {role} is reached by nobody.")
+            raise ConfigError(
+                f"--host needs the role service; a {role} accepts no connections. Omit --host."
+            )
         _require_absent(self.folder / name)
         common_name = f"{name}-{secrets.token_hex(4)}"
         reached = (*HERE, *hosts) if role == "service" else ()
@@ -121,21 +146,22 @@ class CertificateAuthority:
         return self.folder / name
 
     def remove(self, name: str) -> None:
-        """Routers that get the new list let these keys do nothing.
+        """Remove keys from the access list; routers with the new list deny them.
 
-        Raises ConfigError when there are none of this name.
+        Raises:
+            ConfigError: No keys have this name.
         """
         kept = {entry.common_name: entry.grantee for entry in self.entries if entry.name != name}
         if len(kept) == len(self._access):
             known = ", ".join(entry.name for entry in self.entries) or "none"
-            raise ConfigError(f"{self.folder} gave no keys to {name!r}; there are: {known}.")
+            raise ConfigError(f"{self.folder} has no keys named {name!r}; it has: {known}.")
         self._grant(kept)
-        shutil.rmtree(self.folder / name, ignore_errors=True)  # it may have been moved away
+        shutil.rmtree(self.folder / name, ignore_errors=True)  # The user may have moved it.
 
     def _make(
         self, name: str, common_name: str, days: int, hosts: Sequence[str], now: datetime
     ) -> Certificate:
-        """Key, certificate and their folder, whole or not at all."""
+        """Create key, certificate and their folder atomically; return the certificate."""
         key = new_key()
         certificate = of_member(
             self._certificate, self._key, common_name, key.public_key(), days, now, hosts
@@ -151,33 +177,33 @@ class CertificateAuthority:
         return certificate
 
     def _grant(self, access: dict[str, AccessEntry]) -> None:
-        """Write the list, here and for every service."""
+        """Write the access list to this folder and to the folder of every service."""
         self._access = access
         text = HEAD + dump_yaml(msgspec.to_builtins(access))
         services = {entry.name for entry in self.entries if entry.grantee.role == "service"}
         for folder in (self.folder, *(self.folder / name for name in sorted(services))):
-            if folder.is_dir():  # a service's may have been moved away
+            if folder.is_dir():  # The user may have moved the folder of a service.
                 write_atomically(folder / ACCESS, text.encode())
 
 
 def _require_name(name: str) -> None:
     if not NAME.fullmatch(name):
         raise ConfigError(
-            f"{name!r} is no name for keys: use letters, digits, '.', '-' and '_', at most 55, "
-            "beginning with a letter or digit."
+            f"{name!r} is no valid name of keys. Use at most 55 letters, digits, '.', '-' and '_', "
+            "and begin with a letter or digit."
         )
 
 
 def _require_absent(path: Path) -> None:
     if path.exists():
         raise ConfigError(
-            f"{path} is there already, and keys are never overwritten: choose another name, or "
-            "`ldo keys remove` it, after which those who have a copy can do nothing."
+            f"{path} exists already, and keys are never overwritten. Choose another name, or "
+            "remove the old keys by `ldo keys remove`; routers then deny all copies of them."
         )
 
 
 def _write_secret(path: Path, body: bytes) -> None:
-    """A new file that its owner alone may read, from the first byte on."""
+    """Write a new file that only its owner may read, from the first byte on."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(descriptor, "wb") as file:
         file.write(body)

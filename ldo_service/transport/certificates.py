@@ -1,4 +1,4 @@
-"""X.509 certificates of a network's authority, and of those whom it knows."""
+"""X.509 certificates of a network's authority and its members."""
 
 import ipaddress
 import secrets
@@ -14,23 +14,35 @@ try:
     from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 except ImportError as error:
     raise ConfigError(
-        "making keys needs the extra `keys`: `pip install 'ldo-slam[keys]'` brings it."
+        "creating keys needs the extra `keys`. Install it by `pip install 'ldo-slam[keys]'`."
     ) from error
 
 MAX_DAYS = 36500
-CLOCKS_DIFFER = timedelta(hours=1)  # of machines: a certificate is valid so long before it is made
+# Maximum difference between the clocks of machines. The validity of a certificate begins this long
+# before its creation.
+CLOCKS_DIFFER = timedelta(hours=1)
 
 PrivateKey = ec.EllipticCurvePrivateKey
 Certificate = x509.Certificate
 
 
 def new_key() -> PrivateKey:
+    """Generate a private key on the curve P-256."""
     return ec.generate_private_key(ec.SECP256R1())
 
 
 def of_authority(key: PrivateKey, days: int, now: datetime) -> Certificate:
-    """Signed by itself. Raises ConfigError for a number of days that is none."""
-    name = _named(f"ldo-slam {secrets.token_hex(4)}")  # two authorities are told apart
+    """Create the self-signed certificate of an authority.
+
+    Args:
+        key: Private key of the authority.
+        days: Validity.
+        now: Current time.
+
+    Raises:
+        ConfigError: The number of days is out of range.
+    """
+    name = _named(f"ldo-slam {secrets.token_hex(4)}")  # Distinguishes two authorities.
     public = key.public_key()
     return (
         _valid(name, name, public, days, now)
@@ -50,9 +62,19 @@ def of_member(
     now: datetime,
     hosts: Sequence[str] = (),
 ) -> Certificate:
-    """For a client; with `hosts`, where others reach it, for a server too.
+    """Create the certificate of a client, or of a client and server if it has hosts.
 
-    Raises ConfigError for a host or a number of days that is none.
+    Args:
+        authority: Certificate of the authority.
+        signing: Private key of the authority.
+        common_name: Common name of the member.
+        public: Public key of the member.
+        days: Validity.
+        now: Current time.
+        hosts: Host names and addresses of a server.
+
+    Raises:
+        ConfigError: A host or the number of days is invalid.
     """
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signing.public_key())
@@ -71,10 +93,12 @@ def of_member(
 
 
 def certificate_pem(certificate: Certificate) -> bytes:
+    """Encode a certificate as PEM."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def key_pem(key: PrivateKey) -> bytes:
+    """Encode a private key as PEM, without encryption."""
     return key.private_bytes(
         serialization.Encoding.PEM,
         serialization.PrivateFormat.PKCS8,
@@ -83,15 +107,23 @@ def key_pem(key: PrivateKey) -> bytes:
 
 
 def read_certificate(body: bytes) -> Certificate:
-    """Raises ValueError."""
+    """Read a certificate from PEM.
+
+    Raises:
+        ValueError: The bytes are no certificate.
+    """
     return x509.load_pem_x509_certificate(body)
 
 
 def read_key(body: bytes) -> PrivateKey:
-    """Raises ValueError."""
+    """Read a private key from PEM.
+
+    Raises:
+        ValueError: The bytes are no private key of an elliptic curve.
+    """
     key = serialization.load_pem_private_key(body, None)
     if not isinstance(key, PrivateKey):
-        raise ValueError("it is no key of an elliptic curve")
+        raise ValueError("not a private key of an elliptic curve")
     return key
 
 
@@ -103,7 +135,7 @@ def _valid(
     now: datetime,
 ) -> x509.CertificateBuilder:
     if not 1 <= days <= MAX_DAYS:
-        raise ConfigError(f"--days {days}: keys are valid for 1 to {MAX_DAYS} days.")
+        raise ConfigError(f"--days {days} must be within 1..{MAX_DAYS}.")
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -141,4 +173,6 @@ def _host(host: str) -> x509.GeneralName:
     try:
         return x509.DNSName(host)
     except ValueError as error:
-        raise ConfigError(f"--host {host}: write a name in ASCII, or an address.") from error
+        raise ConfigError(
+            f"--host {host} must be a host name in ASCII or an IP address."
+        ) from error

@@ -1,4 +1,4 @@
-"""Where a robot's topics are, and by which keys one gets there."""
+"""Endpoint of a robot: address of its router, key prefix of its topics, and TLS keys."""
 
 import ipaddress
 from dataclasses import dataclass
@@ -8,41 +8,44 @@ from ldo_service.schemas.topics import ROBOT_PREFIX
 
 from .keys import TlsKeys
 
-LOOPBACK = "127.0.0.1"  # anyone who may read them may also see where the robot is at work
+# Default address of HTTP servers without keys: their clients can see where the robot works.
+LOOPBACK = "127.0.0.1"
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-MAX_MESSAGE_MB = 128  # a 4K frame with depth in floats has 58 MB, Zenoh's default is 1074
-CLOSED = {  # what Zenoh opens by default, by the paths of its settings
+MAX_MESSAGE_MB = 128  # A 4K frame with depth in floats has 58 MB; Zenoh's default is 1074.
+CLOSED = {  # Zenoh settings, by path, that would open the network by default.
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "adminspace/enabled": False,
     "transport/shared_memory/enabled": False,
 }
-NOT_IN_NAMES = "/*$?#@ "  # Zenoh's own, and what separates parts of a topic
+NOT_IN_NAMES = "/*$?#@ "  # Characters with a meaning in Zenoh, and separators of topic parts.
 
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A robot, and the address of its router."""
+    """Name of a robot and address of its router."""
 
     robot: str = "robot"
     endpoint: str = DEFAULT_ENDPOINT
     keys: TlsKeys | None = None
-    max_message_mb: int = MAX_MESSAGE_MB  # larger ones are dropped where they arrive
+    max_message_mb: int = MAX_MESSAGE_MB  # Receivers drop larger messages.
 
     def __post_init__(self) -> None:
         require_robot(self.robot)
         is_tls = self.endpoint.startswith("tls/")
         if is_tls and self.keys is None:
             raise ConfigError(
-                f"{self.endpoint} needs keys: `ldo keys` makes them, and --keys names their folder."
+                f"endpoint {self.endpoint} needs keys. Create them by `ldo keys` and name their "
+                "folder by --keys."
             )
         if self.keys is not None and not is_tls:
             raise ConfigError(
-                f"keys are for TLS, and {self.endpoint} is not: write tls/ADDRESS:PORT."
+                f"keys need a TLS endpoint, and {self.endpoint} is none: write tls/ADDRESS:PORT."
             )
 
     def expression(self, key: str) -> str:
+        """Return the Zenoh key expression of a key of this robot."""
         return f"{ROBOT_PREFIX}/{self.robot}/{key}"
 
     @property
@@ -53,28 +56,36 @@ class Endpoint:
 
     @property
     def local_endpoint(self) -> str:
-        """Where a process on the same machine reaches who listens here."""
+        """Address that processes on the same machine connect to."""
         reached = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.address[0])
         if reached is None:
             return self.endpoint
         return f"{self.endpoint.partition('/')[0]}/{reached}:{self.address[1]}"
 
     def require_safe(self) -> None:
-        """Raises ConfigError where everybody on the network could listen, feed and control."""
+        """Check that the endpoint is on loopback or protected by TLS.
+
+        Raises:
+            ConfigError: Every machine on the network could read topics, publish and control.
+        """
         if self.keys is None and not _is_loopback(self.address[0]):
             raise ConfigError(
-                f"on {self.endpoint} everybody on the network could read the map and control the "
-                "robot. Use tls/ADDRESS:PORT with --keys (`ldo keys` makes them), or say "
-                "--insecure where the network is yours alone."
+                f"endpoint {self.endpoint} would let everybody on the network read the map and "
+                "control the robot. Use tls/ADDRESS:PORT with --keys (created by `ldo keys`), or "
+                "--insecure on a private network."
             )
 
 
 def require_robot(name: str) -> None:
-    """Raises ConfigError for a name that is none."""
+    """Check the name of a robot.
+
+    Raises:
+        ConfigError: The name is empty or contains a reserved character.
+    """
     if not name or any(c in name for c in NOT_IN_NAMES):
         raise ConfigError(
-            f"robot name {name!r}: it becomes a part of every topic, so it must not be empty nor "
-            "hold any of / * $ ? # @ or a space."
+            f"robot name {name!r} is part of every topic: it must not be empty and must not "
+            "contain any of / * $ ? # @ or a space."
         )
 
 

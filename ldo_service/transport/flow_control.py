@@ -1,18 +1,19 @@
 """Flow control between a producer and its lossless consumers, over a lossy network.
 
-    Join      consumer -> producer   "I am here"; repeated until welcomed
-    Welcome   producer -> consumers  "in my epoch e, your messages begin at n", as far as it knows;
-                                     each answers at once, with a Join or a Grant
-    Grant     consumer -> producer   "I have handled all before h, all before a has arrived, and I
-                                     take up to n"; after each step and twice a second
+- `ConsumerHello` (consumer to producer): Announces the consumer. It is repeated until the producer
+  sends its hello.
+- `ProducerHello` (producer to consumers): Epoch of the producer and offset of the first message for
+  each known consumer. Each consumer replies at once with a hello or its credit.
+- `Credit` (consumer to producer): Offsets of the first message that is not handled, that has not
+  arrived, and that may not be sent yet. It is sent after each step and twice a second.
 
-All three state what is, not what changed: they may be lost, repeated or replaced by newer ones.
+All three carry a state, not a change. They may be lost, repeated or replaced by newer ones.
 
-The producer keeps the messages that were not handled, at most one window, and sends them again from
-`arrived` when a grant shows a gap. A consumer that died and joined again gets what it had not
-handled. Both ends keep their position beside the actor's state (`runtime.delivery_state`), in one
-write with it: so each message takes effect once, whichever process is killed, and when.
-`SequenceTracker` follows the sequence numbers that a producer gave to the messages of a topic.
+The producer keeps the unhandled messages, at most one window. It retransmits them from `arrived`
+when a credit message reports a gap. A restarted consumer receives the messages that it had not
+handled. Both ends save their position in one write with the actor's state
+(`runtime.delivery_state`). Each message therefore takes effect once, no matter which process is
+killed and when. `SequenceTracker` counts lost messages by their sequence numbers.
 """
 
 import secrets
@@ -23,54 +24,70 @@ import msgspec
 from ldo_service.schemas import decode
 
 MAX_SEQ = 1 << 62
-ALIVE = "link/alive"  # tokens of the actors that are there
+ALIVE = "link/alive"  # Key of the liveliness tokens of running actors.
 
-MAX_MISSING = 1024  # numbers that may come late yet: half a minute of a camera
+# Maximum number of missing messages that may still arrive late: half a minute of a camera.
+MAX_MISSING = 1024
 
 
 class Header(msgspec.Struct, frozen=True, array_like=True):
-    """Rides beside each body, so that foreign programs can decode the body directly."""
+    """Header of a message, sent as an attachment.
 
-    source: str
-    epoch: int  # changes when the producer starts anew, and with it the numbering
-    seq: int
+    Other programs can therefore decode the body directly.
+    """
+
+    source: str  # Name of the producer.
+    epoch: int  # Changes when the producer restarts its numbering.
+    seq: int  # Offset of the message in this epoch.
     stamp_ns: int
-    key: str = ""
+    key: str = ""  # Value of the topic's key, for `Latest(per_key=True)`.
 
     def __post_init__(self) -> None:
         if not (0 <= self.seq < MAX_SEQ and self.epoch > 0):
-            raise ValueError(f"header with epoch {self.epoch}, seq {self.seq}")
+            raise ValueError(
+                f"header epoch={self.epoch} must be positive, seq={self.seq} within 0..2^62-1"
+            )
 
 
-# of a message that a foreign program sends without one
+# Header of messages that other programs send without one.
 EXTERNAL_HEADER = Header("outside", 1, 0, 0)
 
 
 class ConsumerHello(msgspec.Struct, frozen=True, tag="join", array_like=True):
+    """Handshake of a consumer."""
+
     consumer: str
 
 
 class Credit(msgspec.Struct, frozen=True, tag="grant", array_like=True):
+    """Position and credit of a consumer."""
+
     consumer: str
-    epoch: int
-    handled: int  # every seq below is done with
-    arrived: int  # every seq below has arrived
-    limit: int  # the first seq that may not be sent yet
-    gap: bool = False  # `arrived` was sent and did not arrive
-    waits_for_disk: bool = False  # it takes nothing until its disk does, and is not to be evicted
+    epoch: int  # Epoch of the producer.
+    handled: int  # Offset of the first message that is not handled.
+    arrived: int  # Offset of the first message that has not arrived.
+    limit: int  # Offset of the first message that may not be sent yet.
+    gap: bool = False  # Message `arrived` was sent and lost.
+    # The consumer takes no messages while its disk is full, and must not be evicted.
+    waits_for_disk: bool = False
 
     def __post_init__(self) -> None:
         if not 0 <= self.handled <= self.arrived < MAX_SEQ or self.limit < self.handled:
-            raise ValueError(f"impossible grant {self.handled}, {self.arrived}, {self.limit}")
+            raise ValueError(
+                f"credit handled={self.handled}, arrived={self.arrived}, limit={self.limit} must "
+                "satisfy 0 <= handled <= arrived and handled <= limit"
+            )
 
 
 class ProducerHello(msgspec.Struct, frozen=True, array_like=True):
+    """Handshake of a producer."""
+
     epoch: int
-    starts: dict[str, int]  # by consumer: the first seq to come
+    starts: dict[str, int]  # Offset of the first message to come, by consumer.
 
 
 class UnackedMessage(NamedTuple):
-    """A message that was numbered."""
+    """Numbered message that some consumer has not handled."""
 
     seq: int
     header: bytes
@@ -78,23 +95,23 @@ class UnackedMessage(NamedTuple):
 
 
 class OutletPosition(NamedTuple):
-    """Where a producer stood, and what some consumer had not handled."""
+    """Saved position of a producer, with the messages that some consumer has not handled."""
 
     epoch: int
-    seq: int  # of the next message
+    seq: int  # Offset of the next message.
     unhandled: tuple[UnackedMessage, ...] = ()
 
     @property
     def handled(self) -> int:
-        """Every message before has been handled."""
+        """Offset before which every message has been handled."""
         return self.unhandled[0].seq if self.unhandled else self.seq
 
 
 class InletPosition(NamedTuple):
-    """Where a consumer stood."""
+    """Saved position of a consumer."""
 
-    epoch: int  # of its producer; 0: none was known
-    handled: int
+    epoch: int  # Epoch of the producer; 0: no producer was connected.
+    handled: int  # Offset of the first message that is not handled.
 
 
 def new_epoch() -> int:
@@ -106,38 +123,48 @@ encode_link = msgspec.msgpack.Encoder().encode
 
 
 def decode_request(body: memoryview) -> ConsumerHello | Credit:
+    """Decode a message of a consumer."""
     return decode(body, ConsumerHello | Credit)  # type: ignore[arg-type]
 
 
 def data_key(topic: str) -> str:
+    """Return the key on which the messages of a topic are published."""
     return topic
 
 
 def retransmit_key(topic: str) -> str:
-    """Repetitions go to lossless consumers only: others see each message once."""
+    """Return the key of retransmitted messages.
+
+    Only lossless consumers subscribe to it; other consumers receive each message once.
+    """
     return f"link/again/{topic}"
 
 
 def credit_key(topic: str) -> str:
+    """Return the key of the messages from consumers to the producer."""
     return f"link/grant/{topic}"
 
 
 def producer_hello_key(topic: str) -> str:
+    """Return the key of the producer's hello."""
     return f"link/welcome/{topic}"
 
 
 class SequenceTracker:
-    """How many never came. One that comes late after all is none of them, one that comes again
-    neither: a producer that was started again repeats what some consumer may not have had."""
+    """Counter of lost messages of a topic.
+
+    A message that arrives late is not lost. A message that arrives twice counts once, because a
+    restarted producer repeats messages that some consumer may not have received.
+    """
 
     def __init__(self) -> None:
         self.lost = 0
-        self._producer: tuple[str, int] = ("", 0)  # name and epoch of who sent the last one
-        self._next = 0  # number of that producer
-        self._missing: dict[int, None] = {}  # in order
+        self._producer: tuple[str, int] = ("", 0)  # Name and epoch of the last message.
+        self._next = 0  # Offset of the next message of that producer.
+        self._missing: dict[int, None] = {}  # Offsets of missing messages, in order.
 
     def observe(self, header: Header) -> bool:
-        """Take note of a message; False: it came before."""
+        """Count the messages lost before this one; return False for a repeated message."""
         if (header.source, header.epoch) != self._producer:
             self._producer, self._next = (header.source, header.epoch), header.seq
             self._missing.clear()

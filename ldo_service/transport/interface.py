@@ -1,68 +1,82 @@
-"""What the runtime needs of a network, and the network within one process."""
+"""Interface of the network that the runtime uses, and its implementation in memory."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
-OnMessage = Callable[[bytes, memoryview], None]  # header, body; may be called on any thread
-OnPresence = Callable[[str, bool], None]  # name, alive; called on the event loop
-LastValues = Callable[[], Sequence[tuple[bytes, bytes]]]  # on any thread; header, body of each part
+OnMessage = Callable[[bytes, memoryview], None]  # Header, body; may be called on any thread.
+OnPresence = Callable[[str, bool], None]  # Name, alive; called on the event loop.
+# Header and body of each part; may be called on any thread.
+LastValues = Callable[[], Sequence[tuple[bytes, bytes]]]
 
 
 class Publisher(Protocol):
-    """Sends on one key. Nothing here blocks the event loop; after `close` nothing is sent."""
+    """Publisher on one key; its methods do not block the event loop."""
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
-        """Send; done when the message has left, or was given up to congestion."""
+        """Send a message; done when it has left or was dropped because of congestion."""
         ...
 
     def post(self, header: bytes, body: bytes) -> None:
-        """Send soon; a newer post replaces one that has not left yet."""
+        """Send a message soon; a newer post replaces one that has not left yet."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Stop sending."""
+        ...
 
 
 class Transport(Protocol):
-    """Keys are relative to the robot: `data/...` of topics, and the runtime's own.
+    """Network between actors; keys are relative to the robot.
 
-    Messages may be lost, and those of one publisher stay in order: what must arrive is numbered,
-    acknowledged and sent again by `ldo_service.transport.flow_control`.
+    Messages may be lost, and those of one publisher stay in order. Lossless delivery is provided by
+    `ldo_service.transport.flow_control`, which numbers, acknowledges and retransmits messages.
     """
 
-    def publisher(self, key: str) -> Publisher: ...
+    def publisher(self, key: str) -> Publisher:
+        """Create a publisher on a key."""
+        ...
 
-    def subscribe(self, key: str, on_message: OnMessage) -> None: ...
+    def subscribe(self, key: str, on_message: OnMessage) -> None:
+        """Subscribe to a key."""
+        ...
 
     def declare_liveliness(self, name: str) -> None:
-        """Be seen as alive until this process ends."""
+        """Declare an actor alive until this process ends."""
         ...
 
     def watch_liveliness(self, on_presence: OnPresence) -> None:
-        """Be told who is alive, who joins and who is gone."""
+        """Subscribe to the liveliness of all actors, including those that are alive already."""
         ...
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
-        """Answer queries on a key with its last values.
+        """Reply to queries on a key with its last values.
 
-        The parts of a value share the key: over Zenoh, ask with consolidation NONE to get all.
+        The parts of a value share the key. A Zenoh query needs consolidation NONE to get all parts.
         """
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """End all subscriptions and publishers."""
+        ...
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, callback: Callable[..., None], *args: Any) -> None:
-    """On any thread, even one that outlives the loop: then there is nobody left to tell."""
+    """Schedule a callback on the event loop from any thread; ignored if the loop is closed."""
     with suppress(RuntimeError):
         loop.call_soon_threadsafe(callback, *args)
 
 
 class MemoryTransport:
-    """All stages in one event loop; delivery is immediate. `lose` drops messages, for tests."""
+    """Transport in memory, for stages in one event loop; delivery is immediate."""
 
     def __init__(self, lose: Callable[[str], bool] = lambda _key: False) -> None:
+        """Initialize without subscribers.
+
+        Args:
+            lose: Function of the key that decides whether a message is lost, for tests.
+        """
         self._subscribers: dict[str, list[OnMessage]] = {}
         self._watchers: list[OnPresence] = []
         self._alive: list[str] = []
@@ -70,53 +84,66 @@ class MemoryTransport:
         self._lose = lose
 
     def publisher(self, key: str) -> "MemoryPublisher":
+        """Create a publisher on a key."""
         return MemoryPublisher(self, key)
 
     def deliver(self, key: str, header: bytes, body: bytes) -> None:
+        """Call the subscribers of a key, unless the message is lost."""
         if not self._lose(key):
             for on_message in list(self._subscribers.get(key, ())):
                 on_message(header, memoryview(body))
 
     def subscribe(self, key: str, on_message: OnMessage) -> None:
+        """Subscribe to a key."""
         self._subscribers.setdefault(key, []).append(on_message)
 
     def declare_liveliness(self, name: str) -> None:
+        """Declare an actor alive until `leave`."""
         self._alive.append(name)
         for on_presence in self._watchers:
             on_presence(name, True)
 
     def leave(self, name: str) -> None:
-        """What a killed process looks like to the others."""
+        """Report an actor as gone, as after its process was killed."""
         self._alive.remove(name)
         for on_presence in self._watchers:
             on_presence(name, False)
 
     def watch_liveliness(self, on_presence: OnPresence) -> None:
+        """Subscribe to the liveliness of all actors."""
         self._watchers.append(on_presence)
         for name in self._alive:
             on_presence(name, True)
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
+        """Reply to queries on a key with its last values."""
         self._answers[key] = last_values
 
     def query(self, key: str) -> Sequence[tuple[bytes, bytes]]:
+        """Return the last values of a key; empty without a queryable."""
         return self._answers[key]() if key in self._answers else ()
 
     def close(self) -> None:
+        """End all subscriptions."""
         self._subscribers.clear()
 
 
 class MemoryPublisher:
+    """Publisher of a `MemoryTransport`."""
+
     def __init__(self, transport: MemoryTransport, key: str) -> None:
         self._transport, self._key = transport, key
         self._closed = False
 
     async def send(self, header: bytes, body: bytes) -> None:
+        """Deliver a message at once."""
         self.post(header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
+        """Deliver a message at once."""
         if not self._closed:
             self._transport.deliver(self._key, header, body)
 
     def close(self) -> None:
+        """Stop sending."""
         self._closed = True

@@ -1,11 +1,11 @@
-"""Keys of one name on the network, in a folder that `ldo keys` made.
+"""TLS keys of one machine, in a folder that `ldo keys` created.
 
-    ca.crt        the authority that all of the network trust
-    tls.crt       who this is; `access.yaml` of the router says what it may do
-    tls.key       its secret, not readable by others
-    access.yaml   of a service or a router: who may do what
+- `ca.crt`: Certificate of the authority that the whole network trusts.
+- `tls.crt`: Certificate of this machine. `access.yaml` of the router lists its role.
+- `tls.key`: Private key, not readable by other users.
+- `access.yaml`: Role of each certificate; only in the folder of a service or router.
 
-The first three are named as in a secret of Kubernetes, so that such a folder will do as well.
+The first three have the names of a Kubernetes TLS secret, so the folder of such a secret works too.
 """
 
 import socket
@@ -19,12 +19,12 @@ from ldo_service.errors import ConfigError
 from .access_control import Access, access_control, read_access
 
 CA, CERTIFICATE, KEY, ACCESS = "ca.crt", "tls.crt", "tls.key", "access.yaml"
-OTHERS = 0o007  # bits of a mode that let everybody on the machine in
-ALERT_WITHIN_S = 1.0  # a refusal comes with the handshake, or one journey later
+OTHERS = 0o007  # Bits of a file mode that give access to all users of the machine.
+ALERT_WITHIN_S = 1.0  # TLS rejects a client in the handshake or one round trip later.
 
 
 def router_settings(folder: Path, access: Access) -> dict[str, Any]:
-    """Zenoh's settings by their paths, for a router with its keys in `folder`."""
+    """Return the Zenoh settings, by path, of a router with its keys in `folder`."""
     tls = {"transport/link/tls": _tls(folder, "listen")}
     return {**tls, "access_control": access_control(access)}
 
@@ -41,48 +41,59 @@ def _tls(folder: Path, side: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class TlsKeys:
+    """Folder with TLS keys, checked when it is created."""
+
     folder: Path
 
     @classmethod
     def of(cls, folder: str | Path | None) -> "TlsKeys | None":
+        """Return the keys in a folder; None without a folder."""
         return None if folder is None else cls(Path(folder).expanduser().resolve())
 
     def __post_init__(self) -> None:
-        """Raises ConfigError for a folder that cannot be used."""
+        """Check that the keys are readable, private and match.
+
+        Raises:
+            ConfigError: The folder cannot be used.
+        """
         for name in (CA, CERTIFICATE, KEY):
             self._require_readable(self.folder / name)
         mode = (self.folder / KEY).stat().st_mode
         if mode & OTHERS:
             raise ConfigError(
-                f"{self.folder / KEY} may be read by everybody on this machine: "
-                f"`chmod 600 {self.folder / KEY}`, and make new keys if somebody did."
+                f"{self.folder / KEY} is readable by all users of this machine. Run "
+                f"`chmod 600 {self.folder / KEY}`, and create new keys if another user read it."
             )
         self.context()
 
     def settings(self, router: bool) -> dict[str, Any]:
-        """Zenoh's settings, for a router with an `access.yaml` or for a client."""
+        """Return the Zenoh settings, by path, of a router with `access.yaml` or of a client."""
         if router:
             return router_settings(self.folder, read_access(self.folder / ACCESS))
         return {"transport/link/tls": _tls(self.folder, "connect")}
 
     def context(self) -> ssl.SSLContext:
-        """A client with these keys. Raises ConfigError when they are none, or do not fit."""
+        """Create the TLS context of a client with these keys.
+
+        Raises:
+            ConfigError: A file is malformed, or certificate and key do not match.
+        """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         try:
             context.load_verify_locations(self.folder / CA)
         except ssl.SSLError as error:
-            raise ConfigError(f"{self.folder / CA} holds no certificate: copy it anew.") from error
+            raise ConfigError(f"{self.folder / CA} holds no certificate. Copy it again.") from error
         try:
             context.load_cert_chain(self.folder / CERTIFICATE, self.folder / KEY)
         except ssl.SSLError as error:
             raise ConfigError(
                 f"{CERTIFICATE} and {KEY} in {self.folder} do not belong together "
-                f"({error.reason or error}): copy the whole folder anew."
+                f"({error.reason or error}). Copy the whole folder again."
             ) from error
         return context
 
     def tls_error(self, host: str, port: int) -> str:
-        """What TLS says of a server that Zenoh got no connection to; empty: nothing is wrong."""
+        """Return the TLS error of a server that Zenoh cannot connect to, or an empty string."""
         try:
             with (
                 socket.create_connection((host, port), ALERT_WITHIN_S) as plain,
@@ -92,7 +103,7 @@ class TlsKeys:
         except ssl.SSLError as error:
             return getattr(error, "verify_message", "") or error.reason or str(error)
         except OSError:
-            pass  # nobody there, or nothing to say against us
+            pass  # The server is absent, or reports no TLS error within the time limit.
         return ""
 
     def _require_readable(self, path: Path) -> None:
@@ -101,6 +112,6 @@ class TlsKeys:
                 pass
         except OSError as error:
             raise ConfigError(
-                f"{path} cannot be read: {error.strerror}. --keys names a folder that `ldo keys` "
-                f"made, with {CA}, {CERTIFICATE} and {KEY}."
+                f"{path} cannot be read: {error.strerror}. --keys must name a folder that "
+                f"`ldo keys` created, with {CA}, {CERTIFICATE} and {KEY}."
             ) from error

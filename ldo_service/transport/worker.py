@@ -1,4 +1,4 @@
-"""A thread that works off what it is given, in order."""
+"""Worker thread that runs jobs in order."""
 
 import asyncio
 import logging
@@ -19,17 +19,22 @@ R = TypeVar("R")
 
 
 class Worker:
-    """One daemon thread.
+    """Daemon thread that runs jobs in order.
 
-    An executor's thread keeps the interpreter from exiting while a job runs, for ever if the job
-    never ends; this one does not. How much may wait is up to who submits. `nice` of 0..19: so much
-    it steps back behind other threads where there are too few cores; on Linux, where each thread
-    may, and those that it starts do as it does.
+    The thread of an executor keeps the interpreter from exiting while a job runs; this thread does
+    not. The queue has no limit, so callers must bound the number of jobs.
     """
 
     _all: "WeakSet[Worker]" = WeakSet()
 
     def __init__(self, name: str, *, nice: int = 0) -> None:
+        """Start the thread.
+
+        Args:
+            name: Name of the thread.
+            nice: Increase of its nice value, 0..19, on Linux. Threads that it starts inherit it. A
+                higher value yields to other threads when there are too few cores.
+        """
         self.name, self._nice = name, nice
         self._jobs: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
         self._lock = Lock()
@@ -39,7 +44,7 @@ class Worker:
         Worker._all.add(self)
 
     def submit(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> "Future[R]":
-        """Run soon, in the thread. After `close` the future is cancelled at once."""
+        """Queue a job for the thread. After `close` the future is cancelled at once."""
         future: Future[R] = Future()
         with self._lock:
             if self._closed:
@@ -49,24 +54,30 @@ class Worker:
         return future
 
     async def run(self, job: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
+        """Run a job in the thread and wait for its result."""
         return await asyncio.wrap_future(self.submit(job, *args, **kwargs))
 
     def close(self) -> None:
-        """End after what was submitted so far; nobody waits for it."""
+        """End the thread after the jobs submitted so far, without waiting for it."""
         with self._lock:
             if not self._closed:
                 self._closed = True
                 self._jobs.put(None)
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the thread after `close`: one that is inside a library while the interpreter
-        ends would be killed there, which some libraries answer with an abort."""
+        """Wait for the thread after `close`.
+
+        Otherwise the end of the interpreter kills a thread inside a library, and some libraries
+        then abort the process.
+        """
         self._thread.join(timeout_s)
 
     @classmethod
     def busy_workers(cls, within_s: float) -> list[str]:
-        """Names of closed ones that are still at work after so long: the interpreter must not end
-        around them."""
+        """Return the names of closed workers that are still busy after `within_s`.
+
+        The interpreter must not end while they run; see `join`.
+        """
         until_s = time.monotonic() + within_s
         closed = [worker for worker in cls._all if worker._closed]
         for worker in closed:
@@ -79,25 +90,29 @@ class Worker:
             future, job = entry
             if future.set_running_or_notify_cancel():
                 _settle(future, job)
-            del entry, future, job  # a waiting thread holds on to nothing
+            del entry, future, job  # An idle thread keeps no references.
 
 
 def _lower_priority(name: str, nice: int) -> None:
-    """Of the thread that calls it, from where its process is; not where a sandbox forbids it."""
+    """Increase the nice value of the calling thread; log a warning if a sandbox forbids it."""
     if not nice or sys.platform != "linux":
         return
     thread = get_native_id()
     try:
         os.setpriority(os.PRIO_PROCESS, thread, os.getpriority(os.PRIO_PROCESS, thread) + nice)
     except OSError as error:
-        log.warning("%s does not step back behind poses: %s", name, error.strerror)
+        log.warning(
+            "%s: cannot lower the thread priority (%s); it may delay tracking on a busy machine. "
+            "Set supervision.background_nice=0 to silence this.",
+            name, error.strerror,
+        )  # fmt: skip
 
 
 def _settle(future: Future[Any], job: Callable[[], Any]) -> None:
     try:
         result = job()
     except (StopIteration, GeneratorExit, KeyboardInterrupt, SystemExit) as error:
-        # asyncio cannot hand these on: the job failed, and that is all there is to know
+        # asyncio cannot pass these on, so the future gets a RuntimeError.
         failure = RuntimeError(f"{type(error).__name__} was raised")
         failure.__cause__ = error
         future.set_exception(failure)

@@ -1,13 +1,15 @@
-"""The runtime's network in production: Zenoh.
+"""Transport over Zenoh, the network of the service.
 
-Facts of zenoh-python 1.x that shape this file:
-- Callbacks with `indirect=False` run on Zenoh's own thread; they store and wake, nothing else. A
-  plain `callback=` hides a queue of 256 messages and a thread that keeps the interpreter alive.
-- `put` and `reply` may block, so they run in threads of ours. Everything is sent with congestion
-  control DROP: with BLOCK one stalled subscriber stalls the sender for seconds and then loses
-  messages all the same. What must arrive is sent again by the links above.
-- The default configuration listens on every interface: scouting, gossip and shared memory are
-  switched off here, and the service listens on loopback, or over TLS to those whom it knows.
+Properties of zenoh-python 1.x that shape this module:
+
+- Callbacks with `indirect=False` run on Zenoh's own thread, so they only store the message and
+  notify the event loop. A plain `callback=` adds a hidden queue of 256 messages. It also adds a
+  thread that keeps the interpreter alive.
+- `put` and `reply` may block, so they run in threads of this module.
+- Everything is sent with congestion control DROP. With BLOCK, one stalled subscriber stalls the
+  sender for seconds and then loses messages anyway. Flow control retransmits lost messages.
+- The default configuration listens on every interface. Scouting, gossip and shared memory are
+  therefore disabled. The service listens on loopback, or over TLS for known certificates.
 """
 
 import asyncio
@@ -30,21 +32,22 @@ from .worker import Worker
 
 log = logging.getLogger(__name__)
 
-MAX_QUERIES = 16  # that may wait for their answer; who asks more often gets an error
+MAX_QUERIES = 16  # Maximum number of pending queries; further ones get an error.
 CONNECT_WITHIN_MS = 3000
-LEAVE_WITHIN_S = 2.0  # for what is still being sent when a transport closes
+LEAVE_WITHIN_S = 2.0  # Time to send pending messages when a transport closes.
 
 
 def open_session(network: Endpoint, router: bool = False) -> zenoh.Session:
-    """Open the service's router, or a client of it. Use it in a `with` block.
+    """Open the router of the service or a client of it, for use in a `with` block.
 
-    Raises ConfigError when the port is taken, nobody answers there, or the keys are refused.
+    Raises:
+        ConfigError: The port is taken, no service replies there, or the keys are rejected.
     """
     try:
         config = _session_config(network, router)
     except zenoh.ZError as error:
         raise ConfigError(
-            f"endpoint {network.endpoint!r}: write it like {DEFAULT_ENDPOINT}."
+            f"endpoint {network.endpoint!r} is malformed: write it like {DEFAULT_ENDPOINT}."
         ) from error
     try:
         return zenoh.open(config)
@@ -80,18 +83,24 @@ def _why_not_connected(network: Endpoint) -> str:
     if network.keys and port.isdecimal() and (why := network.keys.tls_error(host, int(port))):
         return (
             f"{network.endpoint} and the keys in {network.keys.folder} do not accept each other: "
-            f"{why}. `ldo keys list` tells what is valid; keys of one network have one authority."
+            f"{why}. `ldo keys list` shows the valid keys; all of them need one authority."
         )
     return (
-        f"nobody answers on {network.endpoint}: start `ldo serve`, "
+        f"no service replies on {network.endpoint}: start `ldo serve`, "
         "or name its address with --endpoint."
     )
 
 
 class ZenohTransport:
-    """Made inside a running event loop, on an open session that outlives it."""
+    """Transport over a Zenoh session."""
 
     def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
+        """Initialize inside a running event loop.
+
+        Args:
+            session: Open session, which must stay open until `close`.
+            network: Endpoint of the robot.
+        """
         self._session, self._network = session, network
         self._loop = asyncio.get_running_loop()
         self._declared: list[Any] = []
@@ -101,11 +110,14 @@ class ZenohTransport:
         self._query_slots = BoundedSemaphore(MAX_QUERIES)
 
     def publisher(self, key: str) -> "ZenohPublisher":
+        """Create a publisher on a key."""
         publisher = ZenohPublisher(self._session, self._network.expression(key))
         self._publishers.append(publisher)
         return publisher
 
     def subscribe(self, key: str, on_message: OnMessage) -> None:
+        """Subscribe to a key; `on_message` runs on Zenoh's thread."""
+
         def store(sample: zenoh.Sample) -> None:
             attachment = sample.attachment
             header = attachment.to_bytes() if attachment is not None else b""
@@ -116,10 +128,13 @@ class ZenohTransport:
         self._declared.append(self._session.declare_subscriber(expression, handler))
 
     def declare_liveliness(self, name: str) -> None:
+        """Declare an actor alive until this process ends."""
         expression = self._network.expression(f"{ALIVE}/{name}")
         self._declared.append(self._session.liveliness().declare_token(expression))
 
     def watch_liveliness(self, on_presence: OnPresence) -> None:
+        """Subscribe to the liveliness of all actors."""
+
         def changed(sample: zenoh.Sample) -> None:
             name = str(sample.key_expr).rsplit("/", 1)[1]
             alive = sample.kind == zenoh.SampleKind.PUT
@@ -131,11 +146,12 @@ class ZenohTransport:
         self._declared.append(liveliness.declare_subscriber(expression, handler, history=True))
 
     def serve_queries(self, key: str, last_values: LastValues) -> None:
+        """Reply to queries on a key with its last values."""
         expression = self._network.expression(key)
 
         def reply(query: zenoh.Query) -> None:
             try:
-                with query, suppress(zenoh.ZError):  # the asker may be gone
+                with query, suppress(zenoh.ZError):  # The client may have disconnected.
                     for header, body in last_values():
                         query.reply(expression, body, attachment=header)
             finally:
@@ -152,16 +168,19 @@ class ZenohTransport:
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def respond(self, key: str, respond: Callable[[bytes], Awaitable[bytes]]) -> None:
-        """Answer each query on a key with what `respond`, on the event loop, makes of its payload.
+        """Reply to each query on a key with the result of a coroutine on the event loop.
 
-        For requests that are done before they are answered; `serve_queries` is for values that are
-        there.
+        This is for requests that take time; `serve_queries` is for values that exist already.
+
+        Args:
+            key: Key of the queries.
+            respond: Coroutine function from the payload of a query to the payload of the reply.
         """
         expression = self._network.expression(key)
 
         async def reply(query: zenoh.Query, request: bytes) -> None:
             try:
-                with query, suppress(zenoh.ZError):  # the asker may be gone
+                with query, suppress(zenoh.ZError):  # The client may have disconnected.
                     body = await respond(request)
                     await self._answering.run(query.reply, expression, body)
             finally:
@@ -185,10 +204,11 @@ class ZenohTransport:
         self._declared.append(self._session.declare_queryable(expression, handler))
 
     def close(self) -> None:
+        """End all declarations, and send pending messages within `LEAVE_WITHIN_S`."""
         for task in self._responding:
             task.cancel()
         for declared in self._declared:
-            with suppress(zenoh.ZError):  # the session may be closed already
+            with suppress(zenoh.ZError):  # The session may be closed already.
                 declared.undeclare()
         self._declared.clear()
         self._answering.close()
@@ -199,7 +219,10 @@ class ZenohTransport:
 
 
 class ZenohPublisher:
-    """One key, one thread: messages of a key stay in order, and no key waits for another."""
+    """Publisher on one key with its own thread.
+
+    Messages of a key stay in order, and no key waits for another.
+    """
 
     def __init__(self, session: zenoh.Session, expression: str) -> None:
         self._publisher = session.declare_publisher(
@@ -210,9 +233,11 @@ class ZenohPublisher:
         self._posted: tuple[bytes, bytes] | None = None
 
     def send(self, header: bytes, body: bytes) -> Awaitable[None]:
+        """Send a message; done when it has left or was dropped because of congestion."""
         return self._thread.run(self._put, header, body)
 
     def post(self, header: bytes, body: bytes) -> None:
+        """Send a message soon; a newer post replaces one that has not left yet."""
         with self._lock:
             is_under_way, self._posted = self._posted is not None, (header, body)
         if not is_under_way:
@@ -228,14 +253,16 @@ class ZenohPublisher:
         try:
             self._publisher.put(body, attachment=header)
         except zenoh.ZError as error:
-            log.warning("%s: put failed: %s", self._publisher.key_expr, error)
+            log.warning("%s: put failed: %s; this message is lost.",
+                        self._publisher.key_expr, error)  # fmt: skip
 
     def close(self) -> None:
-        """What was sent or posted so far still leaves."""
+        """Stop sending; messages sent or posted so far still leave."""
         self._thread.submit(self._undeclare)
         self._thread.close()
 
     def join(self, timeout_s: float) -> None:
+        """Wait for the thread after `close`."""
         self._thread.join(timeout_s)
 
     def _undeclare(self) -> None:

@@ -78,7 +78,7 @@ def test_nothing_is_overwritten(authority: CertificateAuthority) -> None:
         ({"days": 0}, "--days 0"),
         ({"days": 10**9}, "--days 1000000000"),
         ({"robot": "a/b"}, "robot name"),
-        ({"hosts": ["mule"], "role": "camera"}, "--host is of a service"),
+        ({"hosts": ["mule"], "role": "camera"}, "--host needs the role service"),
         ({"hosts": ["mülé"], "role": "service"}, "--host mülé"),
     ],
 )

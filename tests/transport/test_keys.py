@@ -72,11 +72,11 @@ def test_damaged_keys_are_refused(
     ("text", "says"),
     [
         (None, "cannot be read"),
-        ("[", "does not say"),
+        ("[", "is no valid access list"),
         ("x: {role: king, robot: mule}", "king"),
         ("x: {role: camera}", "robot"),
         ("x: {role: camera, robot: mule, may: all}", "may"),
-        ("x: !!python/object/apply:os.system ['true']", "does not say"),
+        ("x: !!python/object/apply:os.system ['true']", "is no valid access list"),
     ],
 )
 def test_a_list_that_does_not_say_who_may_do_what_is_refused(

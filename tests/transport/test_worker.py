@@ -94,5 +94,5 @@ async def test_a_worker_that_may_not_step_back_works(
     monkeypatch.setattr("os.setpriority", forbidden)
     worker = Worker("mapper", nice=3)
     assert await worker.run(int) == 0
-    assert "mapper does not step back behind poses: Operation not permitted" in caplog.text
+    assert "mapper: cannot lower the thread priority (Operation not permitted)" in caplog.text
     worker.close()

@@ -274,7 +274,7 @@ def test_a_taken_port_and_an_absent_service_are_said_plainly(network: Endpoint) 
     with pytest.raises(ConfigError, match=r"is another `ldo serve` running there\?"):
         open_session(network, router=True)
     nobody = Endpoint("test", f"tcp/127.0.0.1:{free_port()}")
-    with pytest.raises(ConfigError, match="nobody answers on"):
+    with pytest.raises(ConfigError, match="no service replies on"):
         open_session(nobody)
 
 
