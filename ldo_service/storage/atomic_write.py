@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-UNFINISHED = ".new"  # added to the name while a file is written
+UNFINISHED = ".new"  # Suffix of a file that is being written.
 
 
 def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: bool = False) -> int:
@@ -19,7 +19,7 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
 
     Args:
         path: The file; its folder must exist.
-        parts: The content, one after the other.
+        parts: The content, concatenated in order.
         syncs: Wait until the content and the name are on the disk, so a power cut loses nothing.
         unique: Use a temporary name of its own, for a file that several processes may write at
             the same time.
@@ -50,10 +50,10 @@ def write_atomically(path: Path, *parts: bytes, syncs: bool = False, unique: boo
 
 @contextmanager
 def folder_made_atomically(path: Path) -> Iterator[Path]:
-    """Give a temporary path at which the block makes the folder; it becomes `path` at the end.
+    """Yield a temporary path for a new folder, which is renamed to `path` at the end of the block.
 
     Raises:
-        OSError: The folder cannot be made; nothing of it is left.
+        OSError: The folder cannot be created; no part of it remains.
     """
     with tempfile.TemporaryDirectory(prefix=f"{UNFINISHED}-", dir=path.parent) as temporary:
         made = Path(temporary) / path.name
@@ -62,7 +62,7 @@ def folder_made_atomically(path: Path) -> Iterator[Path]:
 
 
 def sync(path: Path) -> None:
-    """Return when a file, or the names in a folder, are on the disk."""
+    """Wait until a file, or the names in a folder, are on the disk."""
     number = os.open(path, os.O_RDONLY)
     try:
         os.fsync(number)

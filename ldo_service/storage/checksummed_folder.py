@@ -1,8 +1,8 @@
-"""A folder of numbered files that are read whole or not at all.
+"""Folder of numbered files with checksums.
 
-A file begins with a checksum of the rest, and gets its name when all of it is written: a reader
-sees what was meant or is told that it is damaged. Not synced to the disk, so a power cut may damage
-the last ones.
+A file begins with a checksum of its content, and gets its name when it is completely written. A
+reader gets the written content or an error. Files are not synced to the disk, so a power cut may
+damage the last ones.
 """
 
 import errno
@@ -20,21 +20,30 @@ from .atomic_write import UNFINISHED, write_atomically
 
 log = logging.getLogger(__name__)
 
-_HEADER = struct.Struct("<4sI")  # magic, CRC-32 of the rest
+_HEADER = struct.Struct("<4sI")  # Magic, CRC-32 of the content.
 _MAGIC = b"LDO1"
-_OF_PROCESS = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # limits that say nothing of a file
+_OF_PROCESS = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)  # Limits of the process, not of a file.
 
 
 class ChecksummedFolder:
-    """Files `<number>.<suffix>` in `folder`, which is made; others there are left alone.
+    """Files `<number>.<suffix>` in a folder; other files there stay unchanged.
 
-    folder       None: a temporary one, which goes with this object
-    consequence  what a full disk means, for the log
-
-    Raises ConfigError for a folder that cannot be used.
+    Attributes:
+        is_temporary: Whether the folder is deleted with this object.
+        not_written: Number of failed writes.
     """
 
     def __init__(self, folder: Path | None, suffix: str, consequence: str) -> None:
+        """Create or open the folder.
+
+        Args:
+            folder: The folder; None for a temporary one that is deleted with this object.
+            suffix: Suffix of the files.
+            consequence: Sentence for the log about the consequence of a full disk.
+
+        Raises:
+            ConfigError: The folder cannot be used.
+        """
         self.is_temporary = folder is None
         self._folder = folder or _temporary_folder(self, suffix)
         self._suffix, self._consequence = suffix, consequence
@@ -47,32 +56,41 @@ class ChecksummedFolder:
             self._sizes = self._found()
         except OSError as error:
             raise ConfigError(
-                f"{self._folder} cannot be used: {error}. Choose a folder that can be written."
+                f"{self._folder} cannot be used: {error}. Choose a folder that is writable."
             ) from error
 
     @property
     def sizes(self) -> dict[int, int]:
-        """Bytes of each file by number; not to be changed."""
+        """Size of each file in bytes, by number; read-only."""
         return self._sizes
 
     def write(self, number: int, body: bytes) -> bool:
-        """Write or replace a file. False when the disk does not take it, which is counted, and
-        logged once until it takes one again."""
+        """Write or replace a file.
+
+        Returns:
+            False if the write failed. Failures are counted, and a series of them is logged once.
+        """
         try:
             header = _HEADER.pack(_MAGIC, zlib.crc32(body))
             self._sizes[number] = write_atomically(self._path(number), header, body)
         except OSError as error:
             self.not_written += 1
             if not self._is_refusing:
-                log.error("%s takes no files: %s. %s", self._folder, error, self._consequence)
+                log.error(
+                    "%s: writing a file failed: %s. %s", self._folder, error, self._consequence
+                )
             self._is_refusing = True
             return False
         self._is_refusing = False
         return True
 
     def read(self, number: int) -> memoryview:
-        """What was written. Raises DataError for a file that is not what was written, and OSError
-        where this process can open no more."""
+        """Read the content of a file.
+
+        Raises:
+            DataError: The file is missing or damaged.
+            OSError: This process has reached a limit of memory or open files.
+        """
         path = self._path(number)
         try:
             data = memoryview(path.read_bytes())
@@ -82,16 +100,19 @@ class ChecksummedFolder:
             raise DataError(f"{path} cannot be read: {error}") from error
         body = data[_HEADER.size :]
         if bytes(data[: _HEADER.size]) != _HEADER.pack(_MAGIC, zlib.crc32(body)):
-            raise DataError(f"{path} is damaged: {len(data)} bytes do not match their checksum")
+            raise DataError(f"{path} is damaged: its {len(data)} bytes do not match their checksum")
         return body
 
     def remove(self, number: int) -> None:
-        """A file that cannot be removed costs disk space only."""
+        """Remove a file; a failure only costs disk space and is logged."""
         self._sizes.pop(number, None)
         try:
             self._path(number).unlink(missing_ok=True)
         except OSError as error:
-            log.warning("%s cannot be removed: %s", self._path(number), error)
+            log.warning(
+                "%s cannot be removed: %s. It only takes disk space; no action needed.",
+                self._path(number), error,
+            )  # fmt: skip
 
     def _path(self, number: int) -> Path:
         return self._folder / f"{number:08d}.{self._suffix}"

@@ -5,20 +5,24 @@ from typing import Any
 import msgspec
 import numpy as np
 
-ARRAY_CODE = 1  # MessagePack extension type of a NumPy array
+ARRAY_CODE = 1  # MessagePack extension type of a NumPy array.
 UNREADABLE = (
     *(ValueError, RecursionError),
-    *(TypeError, SyntaxError, OverflowError, MemoryError),  # what NumPy thinks of a dtype and shape
+    *(TypeError, SyntaxError, OverflowError, MemoryError),  # NumPy on an invalid dtype or shape.
 )
 
 
 def encode_state(value: object) -> bytes:
-    """Plain values, bytes and NumPy arrays as MessagePack."""
+    """Encode plain values, bytes and NumPy arrays as MessagePack."""
     return msgspec.msgpack.encode(value, enc_hook=_array_to_ext)
 
 
 def decode_state(body: bytes) -> Any:
-    """The inverse. Raises msgspec.DecodeError, whatever the bytes are."""
+    """Decode the result of `encode_state`.
+
+    Raises:
+        msgspec.DecodeError: The bytes cannot be decoded; no other exception occurs.
+    """
     try:
         return msgspec.msgpack.decode(body, ext_hook=_array_from_ext)
     except UNREADABLE as error:
@@ -29,16 +33,21 @@ def _array_to_ext(value: object) -> msgspec.msgpack.Ext:
     if isinstance(value, np.generic):
         value = np.asarray(value)
     if not isinstance(value, np.ndarray):
-        raise NotImplementedError(f"{type(value).__name__} in an actor's state")
+        raise NotImplementedError(
+            f"an actor's state contains a {type(value).__name__}; it must contain plain values, "
+            "bytes and NumPy arrays"
+        )
     if value.dtype.hasobject:
-        raise NotImplementedError("an array of Python objects in an actor's state")
+        raise NotImplementedError(
+            "an actor's state contains an array of Python objects; arrays must have a plain dtype"
+        )
     packed = (value.dtype.str, value.shape, value.tobytes())
     return msgspec.msgpack.Ext(ARRAY_CODE, msgspec.msgpack.encode(packed))
 
 
 def _array_from_ext(code: int, data: memoryview) -> Any:
     if code != ARRAY_CODE:
-        raise ValueError(f"unknown extension {code} in a saved state")
+        raise ValueError(f"MessagePack extension {code} must be {ARRAY_CODE} in a saved state")
     dtype, shape, raw = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...], bytes])
     array = np.frombuffer(raw, dtype).reshape(shape).copy()
     return array if shape else array[()]

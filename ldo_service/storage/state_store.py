@@ -1,7 +1,7 @@
-"""Where the last state of each actor is kept, so that a successor goes on.
+"""Stores of the last state of each actor, from which a restored actor continues.
 
-A state is a few named parts. Only a part that is a new object is written, so the parts given must
-not be changed afterwards.
+A state consists of a few named parts. A store writes only the parts that are new objects, so
+callers must not modify parts after saving them.
 """
 
 import logging
@@ -25,59 +25,79 @@ log = logging.getLogger(__name__)
 # change since the last step is the same object: only new objects are written.
 State = Mapping[str, Any]
 CONTENTS = "contents.msgpack"
-# Version of what the parts hold. A change of any actor's state that an older state does not fit
-# increments it. Version 1 had no number.
+# Version of the content of the parts. A change of any actor's state that makes older states
+# incompatible increments it. Version 1 had no number.
 STATE_VERSION = 2
 
 
 class _Contents(msgspec.Struct, frozen=True):
-    """The files of an actor's state, by part, and the version of what they hold."""
+    """File of each part of an actor's state, and the version of their content."""
 
     files: dict[str, str]
     version: int = STATE_VERSION
 
 
 class StateStore(Protocol):
-    def save(self, actor: str, state: State) -> None: ...
+    """Store of the last state of each actor."""
 
-    def load(self, actor: str) -> State | None: ...
+    def save(self, actor: str, state: State) -> None:
+        """Replace the state of an actor; an empty state is ignored."""
+        ...
+
+    def load(self, actor: str) -> State | None:
+        """Load the last state of an actor; None if there is none."""
+        ...
 
     def delete(self, actor: str) -> None:
-        """As if nothing had been saved."""
+        """Delete the state of an actor."""
         ...
 
 
 class MemoryStore:
-    """Outlives an actor that failed, not its process."""
+    """Store in memory: it survives a failed actor, but not its process."""
 
     def __init__(self) -> None:
         self._states: dict[str, State] = {}
 
     def save(self, actor: str, state: State) -> None:
+        """Replace the state of an actor; an empty state is ignored."""
         if state:
             self._states[actor] = dict(state)
 
     def load(self, actor: str) -> State | None:
+        """Return the last state of an actor; None if there is none."""
         return self._states.get(actor)
 
     def delete(self, actor: str) -> None:
+        """Delete the state of an actor."""
         self._states.pop(actor, None)
 
 
 class FolderStore:
-    """`<folder>/<actor>/`: outlives a killed process.
+    """Store in a folder `<folder>/<actor>/` that survives a killed process.
 
-    Each part has a file, and `contents.msgpack` names the files that belong together. A new part
-    goes to a new file and the contents change last, in one rename: a reader finds the whole old
-    state or the whole new one. `syncs`: after a power cut too; otherwise that may cost it.
+    Each part has a file, and `contents.msgpack` lists the files of one state. A new part is written
+    to a new file, and the list changes last, by one rename. A reader therefore finds the whole old
+    state or the whole new state.
     """
 
     def __init__(self, folder: Path, *, syncs: bool = False) -> None:
+        """Initialize without reading.
+
+        Args:
+            folder: Folder of all states.
+            syncs: Sync every file to the disk, so that the state survives a power cut too.
+        """
         self._folder, self._syncs = folder, syncs
         self._saved: dict[str, State] = {}
-        self._files: dict[str, dict[str, str]] = {}  # by actor: part to file
+        self._files: dict[str, dict[str, str]] = {}  # File of each part, by actor.
 
     def save(self, actor: str, state: State) -> None:
+        """Replace the state of an actor; an empty state is ignored.
+
+        Raises:
+            OSError: The state cannot be written; the old state stays unchanged.
+        """
         if not state:
             return
         folder = self._folder / actor
@@ -95,7 +115,7 @@ class FolderStore:
                 self._write(folder / new[part], encode_state(value))
         new = {part: new[part] for part in state}
         if new != old:
-            self._saved.pop(actor, None)  # these files may be named from now on, whatever fails
+            self._saved.pop(actor, None)  # The list may refer to the new files from here on.
             body = msgspec.msgpack.encode(_Contents(new))
             write_atomically(folder / CONTENTS, body, syncs=self._syncs)
         for file in set(old.values()) - set(new.values()):
@@ -108,11 +128,17 @@ class FolderStore:
             sync(path)
 
     def load(self, actor: str) -> State | None:
-        """None when nothing was saved, or what was saved makes no sense: said in the log, and
-        kept beside it, the last time it happened, for whoever can make something of it.
+        """Load the last state of an actor.
 
-        Raises DataError where there is something and the disk, or a limit, does not let it be read,
-        or where another version of the service wrote it.
+        A damaged state is logged and moved to `<actor>.unreadable`, where it replaces an earlier
+        one.
+
+        Returns:
+            The state; None if there is none or it is damaged.
+
+        Raises:
+            DataError: The state exists but cannot be read because of the disk or a limit, or
+                another version of the service wrote it.
         """
         folder = self._folder / actor
         try:
@@ -120,21 +146,26 @@ class FolderStore:
             parts = {
                 part: decode_state((folder / file).read_bytes()) for part, file in files.items()
             }
-        except (FileNotFoundError, ValueError) as error:  # a name may hold a null byte
-            log.error("%s: its saved state cannot be read and is left out: %s", actor, error)
+        except (FileNotFoundError, ValueError) as error:  # A file name may contain a null byte.
+            log.error(
+                "%s: its saved state cannot be read: %s. The actor starts with an empty state; the "
+                "damaged one is kept as %s.unreadable.",
+                actor, error, folder,
+            )  # fmt: skip
             _set_aside(folder)
             return None
         except OSError as error:
             raise DataError(
-                f"the state of {actor} in {folder} cannot be read: {error.strerror}. It is as it "
-                "was: mend the disk, or raise the limit that was met, and start again."
+                f"the state of {actor} in {folder} cannot be read: {error.strerror}. It is "
+                "unchanged: repair the disk, or raise the limit of the process, and start again."
             ) from error
         return parts or None
 
     def delete(self, actor: str) -> None:
+        """Delete the state of an actor."""
         folder = self._folder / actor
         self._saved.pop(actor, None)
-        (folder / CONTENTS).unlink(missing_ok=True)  # first: what it does not name is not read
+        (folder / CONTENTS).unlink(missing_ok=True)  # First, because unlisted files are not read.
         for file in folder.glob("*"):
             _remove(file)
 
@@ -145,24 +176,28 @@ def _set_aside(folder: Path) -> None:
         shutil.rmtree(aside, ignore_errors=True)
         folder.rename(aside)
     except OSError as error:
-        log.error("%s cannot be kept as %s: %s", folder, aside.name, error.strerror)
+        log.error(
+            "cannot move the unreadable state %s to %s (%s); the next checkpoint overwrites it. "
+            "Copy it now if you need it.",
+            folder, aside.name, error.strerror,
+        )  # fmt: skip
 
 
 def _remove_unreferenced(folder: Path, files: Mapping[str, str]) -> None:
-    """Remove what a killed process wrote and did not name, or no longer named."""
+    """Remove files that a killed process wrote and the list does not contain."""
     for file in folder.glob("*"):
         if file.name not in (CONTENTS, *files.values()):
             _remove(file)
 
 
 def _remove(file: Path) -> None:
-    """One that nothing names: if it stays, it costs space until the next process sweeps."""
+    """Remove an unlisted file; if that fails, the next process removes it."""
     with suppress(OSError):
         file.unlink()
 
 
 def _read_contents(folder: Path) -> dict[str, str]:
-    """Return the files of a state, by part; none where nothing was saved.
+    """Return the files of a state, by part; empty if no state was saved.
 
     Raises:
         DataError: Another version of the service wrote the state.
@@ -175,13 +210,15 @@ def _read_contents(folder: Path) -> dict[str, str]:
     try:
         contents = msgspec.msgpack.decode(body, type=_Contents)
     except msgspec.ValidationError:
-        msgspec.msgpack.decode(body, type=dict[str, str])  # As version 1 wrote it, or damaged.
+        msgspec.msgpack.decode(
+            body, type=dict[str, str]
+        )  # Format of version 1; an error if damaged.
         contents = _Contents({}, version=1)
     if contents.version != STATE_VERSION:
         raise DataError(
             f"{folder / CONTENTS} has version={contents.version}, and this service reads "
             f"{STATE_VERSION}: another version of the service wrote this state. Choose another "
-            "folder with --state, or go on with the version that wrote it."
+            "folder with --state, or use the version that wrote it."
         )
     return contents.files
 

@@ -1,7 +1,7 @@
-"""Plain values out of YAML that somebody wrote, and back.
+"""Plain values from YAML that a user wrote, and back.
 
-Numbers with an exponent are those of YAML 1.2: in 1.1, which PyYAML reads, `2e-4` is text for want
-of a point.
+Numbers with an exponent follow YAML 1.2. PyYAML reads YAML 1.1, where `2e-4` is text because it has
+no decimal point.
 """
 
 import re
@@ -25,16 +25,19 @@ for _one in (_Loader, _Dumper):
 
 
 def load_yaml(text: str | bytes) -> Any:
-    """Numbers, text, dates, lists and dictionaries. Raises yaml.YAMLError in one line, whatever the
-    text is.
+    """Parse YAML into numbers, text, dates, lists and dictionaries.
 
-    Parsed in Python: libyaml, in C, overflows its stack where brackets are nested deeply.
+    The parser is the one in Python, because libyaml (C) overflows its stack on deeply nested
+    brackets.
+
+    Raises:
+        yaml.YAMLError: The text is malformed; the message has one line. No other exception occurs.
     """
     try:
         return _loaded(text)
     except RecursionError:
         raise yaml.YAMLError("it is nested too deeply") from None
-    except (yaml.YAMLError, ValueError) as error:  # ValueError: a date such as 2027-13-01
+    except (yaml.YAMLError, ValueError) as error:  # A date such as 2027-13-01 is a ValueError.
         raise yaml.YAMLError(" ".join(str(error).split())) from error
 
 
@@ -47,9 +50,12 @@ def _loaded(text: str | bytes) -> Any:
 
 
 def dump_yaml(values: Any, *, flow: bool | None = False, width: float = 80) -> str:
-    """YAML that `load_yaml` reads as the same.
+    """Write values as YAML that `load_yaml` reads back unchanged.
 
-    flow  all on one line; None: only what is innermost
+    Args:
+        values: Plain values.
+        flow: Write all values on one line; None: only the innermost lists and dictionaries.
+        width: Maximum line width in columns.
     """
     form = {"default_flow_style": flow, "width": width, "sort_keys": False}
     return yaml.dump(values, Dumper=_Dumper, **form)

@@ -197,7 +197,7 @@ def test_a_disk_that_does_not_answer_is_no_reason_to_begin_anew(
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(Path, "read_bytes", fail)
-    with pytest.raises(DataError, match=r"Too many open files\. It is as it was"):
+    with pytest.raises(DataError, match=r"Too many open files\. It is unchanged"):
         FolderStore(tmp_path).load("mapper")
     monkeypatch.undo()
     assert FolderStore(tmp_path).load("mapper") == {"step": [1]}
