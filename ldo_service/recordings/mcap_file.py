@@ -1,8 +1,8 @@
 """MCAP files of a recording: written message by message, and indexed for reading.
 
-Records are not chunked: writing costs a fifth, and a file that was cut off by a kill or a full disk
-is good up to its last whole record. Unlike the readers of the library, the index takes such a file,
-needs no summary, and leaves bodies on the disk until they are asked for.
+Records are not chunked, so writing has a fifth of the cost. A file that was cut off by a kill or a
+full disk is readable up to its last whole record. Unlike the readers of the library, the index
+accepts such a file. It needs no summary, and it reads bodies from the disk only on request.
 Format: https://mcap.dev/spec
 """
 
@@ -31,46 +31,53 @@ from ldo_service.runtime.journal import CHANNELS, Entry
 
 log = logging.getLogger(__name__)
 
-RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the body
+RECORD = struct.Struct("<BQ")  # Opcode, length of the content.
+MESSAGE = struct.Struct("<HIQQ")  # Channel, sequence, log time, publish time; the body follows.
 
-MAX_CHUNK_BYTES = 1 << 28  # ours have none; other tools fill them to 1 or 4 MB
+# Maximum size of a chunk. This service writes no chunks; other tools use 1 or 4 MB.
+MAX_CHUNK_BYTES = 1 << 28
 UNREADABLE = (
     *(OSError, struct.error, McapError, ZstdError, ValueError, LookupError),
-    *(MemoryError, OverflowError),  # a damaged length asks for too much
+    *(MemoryError, OverflowError),  # A damaged length is too large.
 )
 
-ABOUT = "ldo/recording"  # name of the metadata record
-# Version of the messages, states and journal entries in a recording, a field of that record. A
+ABOUT = "ldo/recording"  # Name of the metadata record.
+# Version of the messages, states and journal entries in a recording, a field of its metadata. A
 # change after which an older recording no longer replays increments it. Version 1 had no number.
 RECORDING_VERSION = 2
-CHECK_EVERY_BYTES = 64_000_000  # limits are looked at so often: 10 ms of a fast disk
+# Bytes between two checks of the limits: 10 ms of a fast disk.
+CHECK_EVERY_BYTES = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class MessageLocation:
-    """A message: the file's bytes [start, start + size), or those of a chunk in it."""
+    """Location of a message body: bytes [start, start + size) of the file or of a chunk in it."""
 
     topic: str
     number: int
     stamp_ns: int
     start: int
     size: int
-    chunk: int | None  # where the chunk's record starts
+    chunk: int | None  # Offset of the chunk in the file; None: not in a chunk.
 
 
 @dataclass
 class McapIndex:
-    """Raises DataError for a file that is no MCAP."""
+    """Index of the messages in an MCAP file."""
 
     path: Path
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
-    places: list[MessageLocation] = field(default_factory=list)  # in the order of the file
-    is_whole: bool = False  # it was finished: neither killed nor cut off
+    places: list[MessageLocation] = field(default_factory=list)  # Sorted by position in the file.
+    is_whole: bool = False  # The file was closed; it was not cut off.
 
     def __post_init__(self) -> None:
+        """Read the index.
+
+        Raises:
+            DataError: The file is not a readable MCAP file.
+        """
         self._topics: dict[int, str] = {}
-        self._chunk: tuple[int, bytes] = (-1, b"")  # the one read last
+        self._chunk: tuple[int, bytes] = (-1, b"")  # Offset and data of the last chunk read.
         try:
             with self.path.open("rb") as file:
                 self._read_index(file, self.path.stat().st_size)
@@ -78,6 +85,7 @@ class McapIndex:
             raise DataError(f"{self.path} cannot be read as a recording: {error}.") from error
 
     def body(self, place: MessageLocation) -> bytes:
+        """Read the body of a message."""
         with self.path.open("rb") as file:
             if place.chunk is None:
                 file.seek(place.start)
@@ -89,7 +97,7 @@ class McapIndex:
 
     def _read_index(self, file: BinaryIO, size: int) -> None:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise ValueError("it is no MCAP file")
+            raise ValueError("it is not an MCAP file")
         for opcode, start, length in _records(file, size):
             if opcode == Opcode.CHUNK:
                 data = _read_chunk(file)
@@ -130,7 +138,7 @@ def require_version(index: McapIndex) -> None:
 
 
 def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
-    """Opcode, place and length of every whole record; the stream is at its content."""
+    """Yield opcode, offset and length of each whole record, with the stream at its content."""
     while size - stream.tell() >= RECORD.size:
         opcode, length = RECORD.unpack(stream.read(RECORD.size))
         start = stream.tell()
@@ -141,35 +149,46 @@ def _records(stream: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
 
 
 def _read_chunk(file: BinaryIO) -> bytes:
-    """The uncompressed data of the chunk whose content begins here."""
+    """Read and decompress the chunk at the current position of the file."""
     chunk = Chunk.read(ReadDataStream(file))
     announced = frame_content_size(chunk.data) if chunk.compression == "zstd" else 0
     if max(announced, chunk.uncompressed_size) > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk says that it unpacks to over {MAX_CHUNK_BYTES} bytes")
+        raise ValueError(f"a chunk has more than the maximum of {MAX_CHUNK_BYTES} bytes")
     data, length = get_chunk_data_stream(chunk)
     return data.read(length)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordConfig:
-    """What a recording may cost. 640x480 at 30 Hz makes 100 MB a second."""
+    """Limits of a recording. A camera with 640x480 at 30 Hz needs 100 MB/s."""
 
-    max_gb: float = 50.0  # of the whole folder; more is not recorded
-    min_free_gb: float = 1.0  # left on the disk for everything else, such as the actors' states
-    queue_mb: float = 256.0  # per actor, in memory: 2 s of frames when the disk is busy elsewhere
+    max_gb: float = 50.0  # Maximum size of the folder; recording stops there.
+    min_free_gb: float = 1.0  # Disk space left for other files, such as the actors' states.
+    # Queue of each actor in memory: 2 s of frames while the disk is busy.
+    queue_mb: float = 256.0
 
     def __post_init__(self) -> None:
         if self.max_gb <= 0 or self.queue_mb <= 0 or self.min_free_gb < 0:
             raise ConfigError(
-                named(self, "max_gb", "min_free_gb", "queue_mb") + ": sizes must be positive."
+                named(self, "max_gb", "min_free_gb", "queue_mb")
+                + " must be positive; min_free_gb may be 0."
             )
 
 
 class RecordingFile:
-    """Opened new, written by one thread. After an error, or at a limit, it takes nothing more."""
+    """New MCAP file, written by one thread; it ignores messages after an error or a limit."""
 
     def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
-        """Raises OSError when the file exists or cannot be written."""
+        """Create the file.
+
+        Args:
+            path: The new file.
+            about: Fields of the metadata record.
+            config: Limits of the recording.
+
+        Raises:
+            OSError: The file exists or cannot be written.
+        """
         self.path, self._config = path, config
         self._file: BinaryIO = path.open("xb")
         self._writer = Writer(self._file, compression=CompressionType.NONE, use_chunking=False)
@@ -177,11 +196,12 @@ class RecordingFile:
         self._writer.add_metadata(ABOUT, {**about, "version": str(RECORDING_VERSION)})
         self._file.flush()
         self._channels: dict[str, int] = {}
-        self._log_ns = 0  # of the last record
+        self._log_ns = 0  # Log time of the last record.
         self._unchecked = 0
         self.is_open = True
 
     def add_entry(self, entry: Entry) -> None:
+        """Append a journal entry."""
         body = msgspec.msgpack.encode(entry)
         self.add(CHANNELS[type(entry)], type(entry), body, entry.step, time.time_ns())
 
@@ -191,9 +211,9 @@ class RecordingFile:
         """Append a message of type `kind`; its publish time is `stamp_ns`."""
         if not self.is_open:
             return
-        data = cast(bytes, body)  # a view is written without a copy
+        data = cast(bytes, body)  # A view is written without a copy.
         try:
-            self._log_ns = max(time.time_ns(), self._log_ns + 1)  # tools sort by it
+            self._log_ns = max(time.time_ns(), self._log_ns + 1)  # Tools sort by it.
             self._writer.add_message(
                 self._channel(topic, kind), self._log_ns, data, stamp_ns, number
             )
@@ -210,7 +230,7 @@ class RecordingFile:
         return self._channels[topic]
 
     def is_over_limit(self) -> bool:
-        """Whether the folder has grown too large, or the disk too full."""
+        """Return whether the folder is too large or the disk too full."""
         if self._unchecked < CHECK_EVERY_BYTES:
             return False
         self._unchecked = 0
@@ -231,12 +251,13 @@ class RecordingFile:
         self.is_open = False
 
     def _give_up(self, error: OSError) -> None:
-        """What was written before stays readable. The robot goes on."""
-        log.error("%s: %s: this recording ends here", self.path, error.strerror)
+        """End the recording after an error; the records before it stay readable."""
+        log.error("%s: %s: this recording ends here; the robot continues.",
+                  self.path, error.strerror)  # fmt: skip
         self.abandon()
 
     def abandon(self) -> None:
-        """Take nothing more, and leave the end as it is."""
+        """Close the file without a summary and ignore further messages."""
         self.is_open = False
-        with suppress(OSError):  # what it could not flush
+        with suppress(OSError):  # A failed flush.
             self._file.close()

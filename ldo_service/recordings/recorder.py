@@ -1,4 +1,4 @@
-"""A journal in a file. Writing happens in a thread of its own: no step waits for a disk."""
+"""Journal that is written to a file, in a thread of its own so that no step waits for the disk."""
 
 import logging
 from collections.abc import Callable, Iterable, Mapping
@@ -31,48 +31,62 @@ from .mcap_file import RecordConfig, RecordingFile
 
 log = logging.getLogger(__name__)
 
-ENTRY_BYTES = 1000  # of memory that an entry takes beside its body
+ENTRY_BYTES = 1000  # Memory of an entry in addition to its body.
 
 
 @dataclass(frozen=True, slots=True)
 class Taken:
+    """Recorded input of the following steps."""
+
     number: int
     stamp_ns: int
     delivery: Delivery
 
 
 class Recorder(Journal):
-    """One actor's journal in a file.
+    """Journal of one actor that is written to a file.
 
-    At most `queue_mb` wait to be written. A message that finds no place is left out, steps and
-    all, and the gap is marked and said once: the recording suffers, not the robot.
+    The queue to the writer is limited to `queue_mb`. If it is full, an input and its steps are
+    dropped. The gap is recorded and logged once; the robot is not affected.
     """
 
     def __init__(self, path: Path, about: Mapping[str, str], config: RecordConfig) -> None:
-        """Raises OSError when the file exists or cannot be written."""
+        """Create the file.
+
+        Args:
+            path: The new file.
+            about: Fields of its metadata record.
+            config: Limits of the recording.
+
+        Raises:
+            OSError: The file exists or cannot be written.
+        """
         self._file = RecordingFile(path, about, config)
         self._max_waiting = int(config.queue_mb * 1e6)
         self._writer = Worker(f"journal {path.stem}")
-        self._lock = Lock()  # of the bytes that wait
-        self._waiting = 0
+        self._lock = Lock()  # Guards `_waiting`.
+        self._waiting = 0  # Bytes in the queue to the writer.
         self._steps = self._numbers = 0
-        self._taken: Taken | None = None  # None: not recorded
-        self._lost = 0  # messages of the gap under way
+        self._taken: Taken | None = None  # The last input; None if it was not recorded.
+        self._lost = 0  # Messages dropped in the current gap.
         self._lost_before = 0
         self._closed: Future[None] | None = None
 
-    # --- told by the stage ------------------------------------------------------------------------
+    # --- called by the stage ----------------------------------------------------------------------
     def record_start(self, state: State | None) -> None:
+        """Record the start of an actor with its state."""
         try:
             parts = None if state is None else {k: encode_state(v) for k, v in state.items()}
         except (NotImplementedError, TypeError) as error:
-            log.error("%s: a state cannot be recorded: %s", self._file.path, error)
+            log.error("%s: a state cannot be recorded: %s. A replay stops here.",
+                      self._file.path, error)  # fmt: skip
             self._submit(0, self._file.add_entry, Gap(step=self._steps, reason="state"))
             return
         size = sum(map(len, (parts or {}).values()))
         self._submit(size, self._file.add_entry, Started(step=self._steps, state=parts))
 
     def record_input(self, delivery: Delivery, stamp_ns: int) -> None:
+        """Record the input of the following steps, or drop it if the queue is full."""
         size = len(delivery.body)
         with self._lock:
             has_place = self._waiting + size <= self._max_waiting
@@ -91,10 +105,11 @@ class Recorder(Journal):
         produced: Iterable[Produced] = (),
         error: str = "",
     ) -> None:
+        """Record a finished step, unless its input was dropped."""
         takes_none = kind in ("resumed", "finished")
         taken = None if takes_none else self._taken
         if taken is None and (not takes_none or self._lost):
-            return  # its message is not recorded
+            return  # The input was not recorded.
         made = tuple(produced)
         step = StepRecord(
             step=self._steps,
@@ -108,6 +123,7 @@ class Recorder(Journal):
         self._submit(sum(len(out.body) for out in made), self._write_step, step, taken, made)
 
     def close(self) -> "Future[None]":
+        """Stop recording; the future is done when the file is closed."""
         if self._closed is None:
             self._mark_gap()
             self._closed = self._writer.submit(self._file.close)
@@ -115,6 +131,7 @@ class Recorder(Journal):
         return self._closed
 
     def metrics(self) -> dict[str, float]:
+        """Return the metrics of the recording, by name."""
         return {
             "journal_is_open": float(self._file.is_open),
             "journal_steps": self._steps,
@@ -122,12 +139,13 @@ class Recorder(Journal):
             "journal_waiting_mb": self._waiting / 1e6,
         }
 
-    # --- what finds no place ----------------------------------------------------------------------
+    # --- gaps -------------------------------------------------------------------------------------
     def _lose(self, delivery: Delivery) -> None:
         if self._lost == 0:
             log.error(
-                "%s: the disk is too slow, %.0f MB wait: %s #%d and what follows is not recorded. "
-                "A replay ends here; the robot goes on",
+                "%s: the disk is too slow, %.0f MB are queued: %s #%d and later messages are not "
+                "recorded. A replay stops here; the robot continues. Record to a faster disk or "
+                "lower the frame rate.",
                 *(self._file.path, self._waiting / 1e6),
                 *(delivery.port.topic.name, delivery.header.seq),
             )
@@ -138,7 +156,8 @@ class Recorder(Journal):
         if self._lost:
             gap = Gap(step=self._steps, reason="slow", lost=self._lost)
             self._submit(0, self._file.add_entry, gap)
-            log.error("%s: %d messages were not recorded", self._file.path, self._lost)
+            log.error("%s: %d messages were not recorded; a replay stops before them.",
+                      self._file.path, self._lost)  # fmt: skip
             self._lost, self._lost_before = 0, self._lost_before + self._lost
 
     # --- in the writer's thread -------------------------------------------------------------------
@@ -152,7 +171,7 @@ class Recorder(Journal):
         try:
             job(*args)
         except Exception:
-            log.exception("%s: this recording ends here", self._file.path)
+            log.exception("%s: this recording ends here; the robot continues.", self._file.path)
             self._file.abandon()
         finally:
             with self._lock:
@@ -187,8 +206,8 @@ class Recorder(Journal):
         self._file.add_entry(Gap(step=step, reason="limit"))
         self._file.close()
         log.error(
-            "%s: the recording has reached recording.max_gb, or the disk recording.min_free_gb: it "
-            "ends here; the robot goes on",
+            "%s: the recording has reached recording.max_gb, or the disk recording.min_free_gb. It "
+            "ends here; the robot continues.",
             self._file.path,
         )
 

@@ -1,4 +1,4 @@
-"""A recording as it is read: a folder with a file for each process that an actor lived in."""
+"""Reader of a recording: a folder with one file for each process of each actor."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -18,9 +18,14 @@ ENTRIES: Mapping[str, Any] = {channel: kind for kind, channel in CHANNELS.items(
 
 
 class JournalFile:
-    """What an actor lived in one process. Raises DataError when it cannot be read."""
+    """Recorded journal of an actor in one process."""
 
     def __init__(self, path: Path) -> None:
+        """Read the index of a file.
+
+        Raises:
+            DataError: The file cannot be read.
+        """
         self.path = path
         self._index = McapIndex(path)
         self._entries = [place for place in self._index.places if place.topic in ENTRIES]
@@ -29,52 +34,69 @@ class JournalFile:
 
     @property
     def about(self) -> Mapping[str, str]:
-        """Actor, robot, configuration, instruction set, versions."""
+        """Metadata: actor, robot, configuration, instruction set, versions."""
         return self._index.metadata.get(ABOUT, {})
 
     def require_version(self) -> None:
-        """Raise DataError if another version recorded what this service cannot replay."""
+        """Check that this service can replay the file.
+
+        Raises:
+            DataError: Another version of the service recorded the file.
+        """
         require_version(self._index)
 
     @property
     def is_whole(self) -> bool:
-        """It was closed in peace."""
+        """True if the file was closed and not cut off."""
         return self._index.is_whole
 
     @property
     def steps(self) -> int:
+        """Number of recorded steps."""
         return sum(place.topic == CHANNELS[StepRecord] for place in self._entries)
 
     def entries(self) -> Iterator[Entry]:
+        """Yield the journal entries in order.
+
+        Raises:
+            DataError: An entry is damaged.
+        """
         for place in self._entries:
             try:
                 yield decode(self._index.body(place), ENTRIES[place.topic])
             except msgspec.DecodeError as error:
-                raise DataError(f"{self.path}, {place.topic} {place.number}: {error}.") from error
+                raise DataError(
+                    f"{self.path}: entry {place.number} of {place.topic} is damaged: {error}."
+                ) from error
 
     def body(self, message: MessageLocation) -> bytes:
+        """Read the body of a message."""
         return self._index.body(message)
 
     def taken(self, step: StepRecord) -> bytes:
-        """The message of a step."""
+        """Read the input of a step.
+
+        Raises:
+            DataError: The message is missing.
+        """
         if step.taken not in self._by_number:
             raise DataError(f"{self.path}: the message of step {step.step} is missing.")
         return self.body(self._by_number[step.taken])
 
 
 def recorded_actors(folder: Path) -> dict[str, list[Path]]:
-    """By actor: its files, in the order of its lives."""
+    """Return the files of each actor, in the order of its processes."""
     return {actor: list(lives.values()) for actor, lives in sorted(_lives(folder).items())}
 
 
 def new_path(folder: Path, actor: str) -> Path:
-    """For the next life of an actor."""
+    """Return the path of the file for the next process of an actor."""
     last = max(_lives(folder).get(actor, ()), default=0)
     return folder / (f"{actor}.{last + 1}.mcap" if last else f"{actor}.mcap")
 
 
 def _lives(folder: Path) -> dict[str, dict[int, Path]]:
-    """By actor, then by number from 1, ascending."""
+    """Return the files by actor and then by process number, which starts at 1, ascending."""
     matches = [(NAME.fullmatch(path.name), path) for path in folder.glob("*.mcap")]
     numbered = sorted((int(m["number"] or 1), m["actor"], path) for m, path in matches if m)
     lives: dict[str, dict[int, Path]] = {}
@@ -84,7 +106,11 @@ def _lives(folder: Path) -> dict[str, dict[int, Path]]:
 
 
 def prepare_recording(folder: Path) -> None:
-    """A folder that holds nothing yet. Raises ConfigError."""
+    """Create the folder of a new recording.
+
+    Raises:
+        ConfigError: The folder is not empty or cannot be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):

@@ -1,7 +1,7 @@
-"""An actor lives its recorded life again: the same messages, situations and restarts.
+"""Replay of a recorded actor with the same inputs, flow status and restarts.
 
-What it makes must have the digests of the recording. A step that failed leaves nothing behind, so
-whether it fails again is counted and not judged.
+The outputs must have the digests of the recording. A failed step has no effect on the state, so the
+replay counts whether it fails again but accepts either result.
 """
 
 from collections import Counter
@@ -28,34 +28,39 @@ from ldo_service.storage.state_codec import decode_state
 
 from .recording import JournalFile
 
-Make = Callable[[Mapping[str, str]], Actor]  # from what a file says about itself
+Make = Callable[[Mapping[str, str]], Actor]  # Creates an actor from the metadata of a file.
 
 
 @dataclass
 class ReplayReport:
-    """What came of a replay; it ends at the first difference."""
+    """Result of a replay, which ends at the first difference."""
 
     actor: str
-    starts: int = 0
-    restored: int = 0  # starts that took up a state
+    starts: int = 0  # Starts of the actor, new or restored.
+    restored: int = 0  # Starts with a saved state.
     steps: int = 0
-    failures: int = 0
-    failures_repeated: int = 0
+    failures: int = 0  # Steps that failed when recorded.
+    failures_repeated: int = 0  # Steps that failed again.
     dead_lettered: int = 0
-    taken: Counter[str] = field(default_factory=Counter)  # messages by topic
-    made: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)
-    is_complete: bool = True  # False: something was not recorded
+    taken: Counter[str] = field(default_factory=Counter)  # Number of inputs by topic.
+    made: Counter[str] = field(default_factory=Counter)  # Number of outputs by topic.
+    notes: list[str] = field(default_factory=list)  # Sentences for the user.
+    is_complete: bool = True  # The recording has no gap.
     difference: ReplayDiverged | None = None
 
     def verify(self) -> None:
-        """Raises ReplayDiverged, or DataError when the recording has a gap."""
+        """Check that all steps were replayed without a difference.
+
+        Raises:
+            ReplayDiverged: A step differs.
+            DataError: The recording has a gap.
+        """
         if self.difference is not None:
             raise self.difference
         if not self.is_complete:
             raise DataError(
-                f"{self.actor}: its {self.steps} steps replay, and more cannot be said: "
-                + " ".join(self.notes)
+                f"{self.actor}: {self.steps} recorded steps verified, but the recording is "
+                "incomplete: " + " ".join(self.notes)
             )
 
 
@@ -65,7 +70,17 @@ def replay(
     make: Make,
     advance: Callable[[], None] = lambda: None,
 ) -> ReplayReport:
-    """Replay every life of an actor; `advance` is called after each step."""
+    """Replay all recorded processes of an actor.
+
+    Args:
+        actor: Name of the actor.
+        files: Its files in order.
+        make: Function that creates a new actor.
+        advance: Called after each step.
+
+    Returns:
+        The counters and the first difference, if there is one.
+    """
     replayed = ReplayReport(actor)
     try:
         for file in files:
@@ -77,14 +92,20 @@ def replay(
 
 
 class ReplaySession:
-    """One file, step by step."""
+    """Replay of one file, step by step."""
 
     def __init__(self, file: JournalFile, make: Make, replayed: ReplayReport) -> None:
         self._file, self._make, self._replayed = file, make, replayed
-        self._actor: Actor | None = None  # None: nothing is known until the next start
+        self._actor: Actor | None = None  # Steps are skipped while it is None.
         self._last: StepRecord | None = None
 
     def steps(self) -> Iterator[StepRecord]:
+        """Replay the steps one by one and yield the record of each.
+
+        Raises:
+            ReplayDiverged: A step differs.
+            DataError: The file is damaged.
+        """
         for entry in self._file.entries():
             match entry:
                 case Started():
@@ -97,14 +118,14 @@ class ReplaySession:
                     self._last = entry
                     yield entry
         if not self._file.is_whole:
-            self._note(f"was cut off{self._under_way()}; it is replayed up to there.")
+            self._note(f"was cut off{self._under_way()}; it is replayed up to that point.")
 
     def _under_way(self) -> str:
-        """What was taken last and not finished: perhaps what killed it."""
+        """Describe the input without a finished step, which may have killed the process."""
         taken = self._file.messages
         if not taken or (self._last and self._last.taken == taken[-1].number):
             return ""
-        return f" while it handled {taken[-1].topic} of stamp {taken[-1].stamp_ns}"
+        return f" while it handled {taken[-1].topic} (stamp {taken[-1].stamp_ns} ns)"
 
     def _start(self, start: Started) -> None:
         self._replayed.starts += 1
@@ -121,9 +142,9 @@ class ReplaySession:
             return restore_actor(self._make(about), past, lambda: self._make(about))
         except Exception as error:
             where = f"the start before step {start.step} ({self._file.path.name})"
-            what = "the state it began from"
+            what = "the saved state"
             raise ReplayDiverged(
-                self._replayed.actor, where, what, "taken up", f"refused, {error!r},"
+                self._replayed.actor, where, what, "restored", f"rejected, {error!r},"
             ) from error
 
     def _skip(self, gap: Gap) -> None:
@@ -135,7 +156,7 @@ class ReplaySession:
         why = "a state could not be recorded"
         if gap.reason == "slow":
             why = f"the disk was too slow and {gap.lost} messages were not recorded"
-        self._note(f"has a gap before step {gap.step}: {why}; the replay stops there.")
+        self._note(f"has a gap before step {gap.step}: {why}; the replay skips to the next start.")
 
     def _note(self, text: str) -> None:
         self._replayed.notes.append(f"{self._file.path.name} {text}")
@@ -152,7 +173,7 @@ class ReplaySession:
             case "done":
                 message = self._message(actor, step)
                 self._compare(step, self._produce(step, actor, actor.handle(message)))
-                actor.snapshot()  # as the stage does: it may keep what it gave away
+                actor.snapshot()  # The stage does so too, and it may change the actor's caches.
                 actor.on_saved()
             case "failed":
                 self._fail(step, actor, self._message(actor, step))
@@ -169,7 +190,7 @@ class ReplaySession:
         self._replayed.taken[step.topic] += 1
         body = self._file.taken(step)
         if checksum(body) != step.checksum:
-            what = f"the checksum of {step.topic}, which it took,"
+            what = f"the checksum of its input {step.topic}"
             raise self._diverged(step, what, step.checksum, checksum(body))
         kinds = {port.topic.name: port.topic.message for port in actor.inputs}
         kind = kinds.get(step.topic)
@@ -178,7 +199,7 @@ class ReplaySession:
         try:
             return decode(body, kind)
         except msgspec.DecodeError as error:
-            raise self._diverged(step, step.topic, "readable", f"not: {error}") from error
+            raise self._diverged(step, step.topic, "decoded", f"malformed, {error},") from error
 
     def _produce(
         self, step: StepRecord, actor: Actor, messages: Iterable[Message]
@@ -189,20 +210,20 @@ class ReplaySession:
             raise self._diverged(step, "the step", "done", f"a failure, {error!r},") from error
 
     def _fail(self, step: StepRecord, actor: Actor, message: Message) -> None:
-        self._actor = None  # a start follows
+        self._actor = None  # The next entry is a start.
         self._replayed.failures += 1
         try:
             produce(actor, actor.handle(message))
         except Exception:
             self._replayed.failures_repeated += 1
         else:
-            self._note(f"step {step.step} failed when recorded ({step.error}) and does not now.")
+            self._note(f"step {step.step} failed when recorded ({step.error}), but succeeds now.")
 
     def _compare(self, step: StepRecord, produced: list[Produced]) -> None:
         self._replayed.made.update(made.topic.name for made in produced)
         outputs = outputs_of(produced)
         if outputs != step.outputs:
-            what = f"the digest of what it made ({first_difference(step.outputs, outputs)})"
+            what = f"the digest of its outputs ({first_difference(step.outputs, outputs)})"
             raise self._diverged(step, what, step.digest, digest_of(outputs))
 
     def _diverged(
@@ -214,7 +235,7 @@ class ReplaySession:
 
 
 def first_difference(recorded: tuple[Output, ...], replayed: tuple[Output, ...]) -> str:
-    """In words."""
+    """Describe the first difference between recorded and replayed outputs."""
     for place, (old, new) in enumerate(zip(recorded, replayed, strict=False), 1):
         if old != new:
             topics = old.topic if old.topic == new.topic else f"{old.topic}, now {new.topic}"

@@ -73,7 +73,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("serve --state junk", 2, "junk is a recording"),
         ("serve --set tracker.nothing=1", 2, "no setting tracker.nothing"),
         ("serve --keys empty --endpoint tls/127.0.0.1:1", 2, "ca.crt cannot be read"),
-        ("replay junk --verify", 3, "no MCAP file"),
+        ("replay junk --verify", 3, "not an MCAP file"),
     ],
 )
 def test_it_is_said_in_one_paragraph(capsys, here: Path, words: str, code: int, says: str) -> None:
