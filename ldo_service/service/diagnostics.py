@@ -1,7 +1,8 @@
-"""What is wrong with an actor, from what can be seen from outside, and what to do about it.
+"""Diagnosis of an actor from its messages: problems, consequences and what to do.
 
-Three levels: its liveliness token (there while its process is), its heartbeat (twice a second while
-its event loop turns), and the age of its last step (young while it works).
+Three signals are checked. The liveliness token is present while the process exists. Heartbeats
+arrive twice a second while the event loop runs. The age of the last step is small while the actor
+handles messages.
 """
 
 from collections.abc import Iterator
@@ -10,36 +11,45 @@ from dataclasses import dataclass
 from ldo_service.schemas import Health
 from ldo_service.schemas.map import MAX_ITERATIONS
 
-SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians)
-IDLE_S = 5.0  # a mailbox with messages is emptied within a step; a camera sends many a second
+SLOW_STEP_S = 5.0  # 8x the slowest step measured (mapper, 1.5 M Gaussians).
+# Maximum idle time with queued messages or a running camera. An actor takes a queued message after
+# each step, and a camera sends many frames a second.
+IDLE_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class ActorStatus:
-    """What was seen of an actor while somebody listened for `listened_s`."""
+    """Observations of an actor."""
 
     actor: str
-    has_token: bool
-    health: Health | None  # its last heartbeat
-    listened_s: float
+    has_token: bool  # The liveliness token is present.
+    health: Health | None  # The last heartbeat; None: no heartbeat was received.
+    listened_s: float  # Duration of the observation.
     heartbeat_age_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    what: str
-    advice: str
+    """Problem of an actor that needs an action."""
+
+    what: str  # The problem and its consequence; the subject is the actor.
+    advice: str  # Action of the user.
 
     def __str__(self) -> str:
         return f"{self.what}: {self.advice}"
 
 
 def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
-    """What must be mended; nothing when the actor is well."""
+    """Yield the problems of an actor; none if it is healthy.
+
+    Args:
+        seen: Observations of the actor.
+        heartbeat_s: Heartbeat period of the service.
+    """
     if not seen.has_token and seen.health is None:
         yield Problem(
             "is not running",
-            "the log of `ldo serve` says how it ended, and when it is started again",
+            "the service restarts it within its restart budget; see the log of `ldo serve`",
         )
     elif seen.health is None:
         yield _silent(f"for {seen.listened_s:.1f} s")
@@ -48,8 +58,8 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
     else:
         if not seen.has_token:
             yield Problem(
-                "reports, and its liveliness token is absent",
-                "it is ending, or the router's access control hides it: look again in 10 s",
+                "sends heartbeats, but its liveliness token is absent",
+                "it is stopping, or the router's access control hides it; repeat in 10 s",
             )
         yield from _of_steps(seen.health)
         yield from _of_failures(seen.health)
@@ -59,9 +69,9 @@ def diagnose(seen: ActorStatus, heartbeat_s: float = 0.5) -> Iterator[Problem]:
 
 def _silent(how_long: str) -> Problem:
     return Problem(
-        f"has a process, and no heartbeat {how_long}",
-        "the process is stopped or its machine overloaded; the service kills and restarts one "
-        "that stays so for service.heartbeat_timeout_s",
+        f"has a process, but no heartbeat {how_long}",
+        "its process is stopped or the machine overloaded; reduce the load. After "
+        "service.heartbeat_timeout_s the service kills and restarts it",
     )
 
 
@@ -72,12 +82,12 @@ def _of_steps(health: Health) -> Iterator[Problem]:
             return
         yield Problem(
             f"has been busy with one message for {health.current_step_s:.0f} s",
-            "give it less work per message; beyond supervision.step_timeout_s it is given up",
+            "reduce its work per message; after supervision.step_timeout_s the service stops it",
         )
     elif waiting and not health.current_step_s and health.step_age_s > IDLE_S and not health.paused:
         yield Problem(
-            f"took none of {waiting} waiting messages for {health.step_age_s:.0f} s",
-            "it waits for room at a consumer: look at the actors that take what it makes",
+            f"took none of {waiting} queued messages for {health.step_age_s:.0f} s",
+            "it waits for credit of a consumer; check the actors that consume its outputs",
         )
 
 
@@ -86,71 +96,78 @@ def _waiting(health: Health) -> int:
 
 
 def _waits_for_server(health: Health) -> bool:
-    """A labeller's server may take its time: patience_s bounds that, and the map goes on."""
+    """Return whether the actor is a labeller with a server.
+
+    A slow server is no problem: its timeout bounds the step, and mapping continues.
+    """
     return "attempts" in health.metrics
 
 
 def _of_failures(health: Health) -> Iterator[Problem]:
     if health.dead_lettered or health.restarts:
         yield Problem(
-            f"failed {health.failures} times, was restarted {health.restarts} times and set "
-            f"{health.dead_lettered} messages aside",
-            "the log of `ldo serve` has each failure",
+            f"failed {health.failures} times, was restarted {health.restarts} times and discarded "
+            f"{health.dead_lettered} messages as dead letters",
+            "the log of `ldo serve` has the traceback of each failure; report it",
         )
 
 
 def _of_disk(health: Health) -> Iterator[Problem]:
     if health.metrics.get("checkpoint_failing"):
         yield Problem(
-            "cannot save its last step, and takes no more keyframes until it can",
+            "cannot save its last step and takes no more keyframes until it can",
             "free some disk space, or start the service with another folder for --state",
         )
 
 
 def _of_models(health: Health) -> Iterator[Problem]:
-    """Networks and labellers that an actor was told to use."""
+    """Yield problems of the configured networks and labellers."""
     facts = health.metrics
     for what in ("network", "labeller"):
         if facts.get(f"{what}s_missing"):
             yield Problem(
-                f"goes on without the {what} that it was told to use",
-                "the log of `ldo serve` says why; `ldo models list` shows those there are",
+                f"runs without the configured {what} and produces no results",
+                "the log of `ldo serve` has the reason; `ldo models list` shows what is installed",
             )
     if failed := facts.get("inferences_failed"):
         yield Problem(
-            f"had {failed:.0f} inferences fail, and these keyframes have no labels",
-            "the log of `ldo serve` has the first of them; try inference.providers=[cpu]",
+            f"had {failed:.0f} failed inferences; these keyframes have no detections",
+            "the log of `ldo serve` has the first failure; try inference.providers=[cpu]",
         )
     if facts.get("labeller_failing"):
         yield Problem(
-            f"gets no answer from its labeller, {facts.get('labellings_failed', 0):.0f} regions so "
-            "far stay unnamed",
-            "the log of `ldo serve` has the first failure; is the server at vlm_labeller.url up?",
+            "gets no results from its labeller; "
+            f"{facts.get('labellings_failed', 0):.0f} regions so far have no label",
+            "check the server at vlm_labeller.url; the log of `ldo serve` has the first failure",
         )
 
 
 def notes(seen: ActorStatus) -> Iterator[str]:
-    """What a person wants to know and nobody has to mend."""
+    """Yield remarks on an actor that need no repair."""
     health = seen.health
     if health is None:
         return
     from_camera = [count for count in health.inputs if count.topic.startswith("camera/")]
     if health.paused:
-        yield "is paused: `ldo control resume` ends it"
+        yield "is paused and takes no messages: run `ldo control resume` to continue"
     elif from_camera and sum(count.delivered for count in from_camera) == 0:
         topics = ", ".join(count.topic for count in from_camera)
         yield (
-            f"has had no frame yet on {topics}: start a camera, or `ldo publish SOURCE`; a camera "
-            "that runs may be denied by the router's access control, which tells it nothing"
+            f"has received no frame yet on {topics}: start a camera or `ldo publish SOURCE`. If a "
+            "camera runs, check the router's access control, which denies messages silently"
         )
     elif from_camera and health.step_age_s > IDLE_S:
-        yield f"had its last frame {health.step_age_s:.0f} s ago"
+        yield (
+            f"received its last frame {health.step_age_s:.0f} s ago: check the camera if it should "
+            "be running"
+        )
     if health.metrics.get("networks") == 0 and not health.metrics.get("networks_missing"):
-        yield "has no model: nothing is detected until detector.model names one of `ldo models`"
+        yield "has no model and detects nothing: set detector.model to one of `ldo models`"
     if due := health.metrics.get("iterations_pending"):
         yield (
-            f"is due {due:.0f} iterations since a correction tore the map: keyframes bring some, "
-            f"`ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` at once"
+            f"has {due:.0f} refit iterations pending after a loop closure: new keyframes run some; "
+            f"run `ldo control refine --iterations {min(int(due), MAX_ITERATIONS)}` while the "
+            "robot stands still"
         )
     yield from _of_answers(health)
 
@@ -158,16 +175,19 @@ def notes(seen: ActorStatus) -> Iterator[str]:
 def _of_answers(health: Health) -> Iterator[str]:
     if _waits_for_server(health) and health.current_step_s > SLOW_STEP_S:
         yield (
-            f"has asked its server about one region for {health.current_step_s:.0f} s, and "
-            f"{_waiting(health)} wait: names come late, and the map goes on without"
+            f"has waited for its server for {health.current_step_s:.0f} s, with "
+            f"{_waiting(health)} more regions queued: labels are late, and mapping continues"
         )
     if refused := health.metrics.get("answers_refused"):
         questions = health.metrics.get("questions", 0)
-        yield f"refused {refused:.0f} of {questions:.0f} answers: no name, or not one asked for"
+        yield (
+            f"rejected {refused:.0f} of {questions:.0f} label results, which had no label or none "
+            "of the vocabulary; these regions have no label"
+        )
     if untold := health.metrics.get("answers_without_logprobs"):
         yield (
-            f"had {untold:.0f} answers without log-probabilities, which count as "
-            "vlm_labeller.http.default_confidence sure"
+            f"received {untold:.0f} label results without log-probabilities; their confidence is "
+            "vlm_labeller.http.default_confidence"
         )
     if refused := health.metrics.get("names_refused"):
-        yield f"refused {refused:.0f} names that were to be added: the log says why"
+        yield f"rejected {refused:.0f} added names: the log of `ldo serve` has the reasons"

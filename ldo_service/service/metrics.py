@@ -1,10 +1,12 @@
-"""`ldo serve --metrics-port PORT`: the actors' health for those who watch over them, by default on
-loopback.
+"""HTTP endpoint with the health of all actors: `ldo serve --metrics-port PORT`.
 
-/metrics  what health messages say, for Prometheus. Counters restart from 0 with their actor's
-          process, as Prometheus expects of counters; of an actor that is silent for too long they
-          are all that is told, beside the age of its last heartbeat
-/healthz  200 while every actor reports, else 503 and who does not: what was is forgotten
+It listens on loopback by default.
+
+- `/metrics`: Metrics of the health messages for Prometheus. Counters restart from 0 with the
+  process of their actor, as Prometheus expects. A silent actor keeps only its counters and the age
+  of its last heartbeat.
+- `/healthz`: 200 while every actor sends heartbeats, else 503 with the names of the silent actors.
+  It shows the current state only.
 """
 
 import socket
@@ -25,67 +27,79 @@ from ldo_service.errors import ConfigError
 from ldo_service.schemas import Health, InputCount, OutputCount, decode
 from ldo_service.transport.endpoint import LOOPBACK
 
-MAX_ACTORS = 64  # that are kept; a name is what a message says
-COMES_BACK_S = 5.0  # an actor, once it was killed for its silence
+MAX_ACTORS = 64  # Maximum number of actors, because messages may contain any name.
+COMES_BACK_S = 5.0  # Time for an actor to restart after it was killed at its heartbeat timeout.
 
 Row = tuple[type[CounterMetricFamily] | type[GaugeMetricFamily], str, str]
 
 OF_ACTOR: dict[Row, Callable[[Health], float]] = {
-    (CounterMetricFamily, "steps", "messages handled"): lambda h: h.steps,
+    (CounterMetricFamily, "steps", "Messages handled by the actor."): lambda h: h.steps,
     (
         CounterMetricFamily,
         "failures",
-        "handlers, successors or last words that raised, and first of saves that failed",
+        "Exceptions of handlers, restores and final messages, and series of failed saves.",
     ): lambda h: h.failures,
-    (CounterMetricFamily, "restarts", "times the actor was rebuilt within its process"): lambda h: (
+    (CounterMetricFamily, "restarts", "Restarts of the actor within its process."): lambda h: (
         h.restarts
     ),
-    (CounterMetricFamily, "dead_letters", "messages that failed twice"): lambda h: h.dead_lettered,
-    (GaugeMetricFamily, "step_age_seconds", "since the last step ended"): lambda h: h.step_age_s,
-    (GaugeMetricFamily, "current_step_seconds", "age of the step under way"): lambda h: (
+    (CounterMetricFamily, "dead_letters", "Messages that failed twice."): lambda h: h.dead_lettered,
+    (GaugeMetricFamily, "step_age_seconds", "Time since the last step ended."): lambda h: (
+        h.step_age_s
+    ),
+    (GaugeMetricFamily, "current_step_seconds", "Time since the current step began."): lambda h: (
         h.current_step_s
     ),
-    (GaugeMetricFamily, "resident_bytes", "memory of its process"): lambda h: h.rss_mb * 1e6,
-    (GaugeMetricFamily, "paused", "1 while the actor is paused"): lambda h: h.paused,
+    (GaugeMetricFamily, "resident_bytes", "Resident memory of the process."): lambda h: (
+        h.rss_mb * 1e6
+    ),
+    (GaugeMetricFamily, "paused", "1 while the actor is paused."): lambda h: h.paused,
 }
 OF_INPUT: dict[Row, Callable[[InputCount], float]] = {
-    (CounterMetricFamily, "input_messages", "handled by the actor"): lambda i: i.delivered,
-    (CounterMetricFamily, "input_dropped", "displaced by newer ones"): lambda i: i.dropped,
-    (CounterMetricFamily, "input_rejected", "no valid message"): lambda i: i.rejected,
-    (CounterMetricFamily, "input_dropped_paused", "left out while paused"): lambda i: (
+    (CounterMetricFamily, "input_messages", "Messages of the topic handled."): lambda i: (
+        i.delivered
+    ),
+    (CounterMetricFamily, "input_dropped", "Messages dropped for newer ones."): lambda i: i.dropped,
+    (CounterMetricFamily, "input_rejected", "Malformed messages rejected."): lambda i: i.rejected,
+    (CounterMetricFamily, "input_dropped_paused", "Messages dropped while paused."): lambda i: (
         i.dropped_paused
     ),
-    (CounterMetricFamily, "input_lost", "never came, by number"): lambda i: i.lost,
-    (CounterMetricFamily, "input_gaps", "came out of order"): lambda i: i.gaps,
-    (GaugeMetricFamily, "input_queued", "in the mailbox now"): lambda i: i.queued,
+    (CounterMetricFamily, "input_lost", "Messages lost, by sequence number."): lambda i: i.lost,
+    (CounterMetricFamily, "input_gaps", "Messages that arrived out of order."): lambda i: i.gaps,
+    (GaugeMetricFamily, "input_queued", "Messages in the mailbox now."): lambda i: i.queued,
 }
 OF_OUTPUT: dict[Row, Callable[[OutputCount], float]] = {
-    (CounterMetricFamily, "output_messages", "messages sent"): lambda o: o.sent,
-    (CounterMetricFamily, "output_backpressure_waits", "times it waited for room"): lambda o: (
+    (CounterMetricFamily, "output_messages", "Messages of the topic sent."): lambda o: o.sent,
+    (CounterMetricFamily, "output_backpressure_waits", "Waits for credit."): lambda o: (
         o.backpressure_waits
     ),
-    (CounterMetricFamily, "output_evicted", "consumers given up"): lambda o: o.evicted_consumers,
-    (CounterMetricFamily, "output_retransmitted", "sent again after a loss"): lambda o: (
+    (CounterMetricFamily, "output_evicted", "Consumers evicted."): lambda o: o.evicted_consumers,
+    (CounterMetricFamily, "output_retransmitted", "Messages retransmitted."): lambda o: (
         o.retransmitted
     ),
 }
 
 
 class HealthCollector(Collector):
-    """Keeps the last heartbeat of each actor of a robot."""
+    """Prometheus collector of the last heartbeat of each actor of a robot."""
 
     def __init__(
         self, robot: str, actors: Iterable[str] = (), silent_after_s: float = 10.0
     ) -> None:
-        """`silent_after_s`: until then an actor may say nothing, see `service`."""
+        """Initialize without heartbeats.
+
+        Args:
+            robot: Name of the robot, a label of every metric.
+            actors: Names of the actors that must send heartbeats.
+            silent_after_s: Heartbeat timeout of the service.
+        """
         self._robot, self._actors = robot, tuple(actors)
         self._silent_after_s = silent_after_s + COMES_BACK_S
         self._lock = Lock()
-        self._last: dict[str, tuple[float, Health]] = {}  # by actor: when it was heard
-        self._begun_anew: dict[str, int] = {}  # by actor: how often it came in another process
+        self._last: dict[str, tuple[float, Health]] = {}  # Arrival and heartbeat, by actor.
+        self._begun_anew: dict[str, int] = {}  # Number of process restarts, by actor.
 
     def on_health(self, _header: bytes, body: memoryview) -> None:
-        """On any thread; bytes that are no health message are left alone."""
+        """Store a heartbeat, on any thread; malformed messages are ignored."""
         try:
             health = decode(body, Health)
         except msgspec.DecodeError:
@@ -99,6 +113,7 @@ class HealthCollector(Collector):
             self._last[health.actor] = (time.monotonic(), health)
 
     def collect(self) -> Iterator[Metric]:
+        """Yield all metrics, as Prometheus requires."""
         with self._lock:
             last, anew = dict(sorted(self._last.items())), dict(sorted(self._begun_anew.items()))
         since_s = time.monotonic() - self._silent_after_s
@@ -124,7 +139,7 @@ class HealthCollector(Collector):
             yield metric
 
     def silent_actors(self) -> list[str]:
-        """Those of the actors that do not report; all of them before the first heartbeat."""
+        """Return the actors without a recent heartbeat; all of them before the first one."""
         since_s = time.monotonic() - self._silent_after_s
         with self._lock:
             heard = {actor for actor, (at_s, _) in self._last.items() if at_s > since_s}
@@ -133,7 +148,7 @@ class HealthCollector(Collector):
     @staticmethod
     def _ages(last: dict[str, tuple[float, Health]]) -> Metric:
         ages = GaugeMetricFamily(
-            "ldo_heartbeat_age_seconds", "since it was heard", labels=["actor"]
+            "ldo_heartbeat_age_seconds", "Time since the last heartbeat.", labels=["actor"]
         )
         for actor, (heard_at_s, _) in last.items():
             ages.add_metric([actor], time.monotonic() - heard_at_s)
@@ -147,7 +162,15 @@ def _table(
     now: list[Health],
     items_of: Callable[[Health], list[tuple[list[str], Any]]],
 ) -> Iterator[Metric]:
-    """Counters of all that are known, gauges of those that report now."""
+    """Yield the metrics of a table.
+
+    Args:
+        rows: Type, name and help text of each metric, with the function that reads its value.
+        labels: Names of the labels.
+        known: Health of all known actors, for counters.
+        now: Health of the actors with a recent heartbeat, for gauges.
+        items_of: Function from a health message to label values and items.
+    """
     for (family, name, says), value in rows.items():
         metric = family(f"ldo_{name}", says, labels=labels)
         for health in known if family is CounterMetricFamily else now:
@@ -157,7 +180,7 @@ def _table(
 
 
 def _processes(begun_anew: dict[str, int]) -> Metric:
-    says = "times that it came back in another process, since this exporter began"
+    says = "Restarts of the actor's process since this exporter started."
     metric = CounterMetricFamily("ldo_process_restarts", says, labels=["actor"])
     for actor, count in begun_anew.items():
         metric.add_metric([actor], count)
@@ -166,7 +189,7 @@ def _processes(begun_anew: dict[str, int]) -> Metric:
 
 def _step_seconds(actors: list[Health]) -> Metric:
     metric = GaugeMetricFamily(
-        "ldo_step_seconds", "time of the last 200 steps", labels=["actor", "quantile"]
+        "ldo_step_seconds", "Duration of the last 200 steps.", labels=["actor", "quantile"]
     )
     for health in actors:
         metric.add_metric([health.actor, "0.5"], health.step_ms_p50 * 1e-3)
@@ -176,7 +199,7 @@ def _step_seconds(actors: list[Health]) -> Metric:
 
 def _facts(actors: list[Health]) -> Metric:
     metric = GaugeMetricFamily(
-        "ldo_actor_metric", "metric of the actor", labels=["actor", "metric"]
+        "ldo_actor_metric", "Metric of the actor itself.", labels=["actor", "metric"]
     )
     for health in actors:
         for name, value in health.metrics.items():
@@ -190,17 +213,18 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 class _Quiet(WSGIRequestHandler):
     def log_message(self, format: str, *args: Any) -> None:
-        """Nobody wants a line for each scrape."""
+        """Suppress the log line of each request."""
 
 
 @contextmanager
 def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK) -> Iterator[None]:
     """Serve http://ADDRESS:PORT/metrics and /healthz inside the block.
 
-    Raises ConfigError when the port or the address cannot be had.
+    Raises:
+        ConfigError: The server cannot listen on the address and port.
     """
     if not 0 < port < 65536:
-        raise ConfigError(f"--metrics-port {port}: a port is a number in 1..65535.")
+        raise ConfigError(f"--metrics-port {port} must be within 1..65535.")
     registry = CollectorRegistry()
     registry.register(collector)
     metrics = make_wsgi_app(registry)
@@ -217,7 +241,7 @@ def serve_metrics(collector: HealthCollector, port: int, address: str = LOOPBACK
     except OSError as error:
         raise ConfigError(
             f"--metrics-port {port}: cannot listen on {address}:{port} ({error.strerror}). Is "
-            "another service exporting there? Choose another port, or service.metrics_address."
+            "another service listening there? Choose another port, or service.metrics_address."
         ) from error
     thread = Thread(target=server.serve_forever, name="metrics", daemon=True)
     thread.start()

@@ -1,8 +1,7 @@
-"""The live service: every actor as a stage in this process, or in one of its own.
+"""Live service: every actor as a stage in this process or in a child process.
 
-The main process opens the router that all others connect to. An actor in a process of its own is
-`ldo serve --actor ACTOR`, started and watched by the main process with the same configuration and
-the same folder for its state.
+The main process opens the router that all other processes connect to. It starts a child process as
+`ldo serve --actor ACTOR`, with the same configuration and state folder, and supervises it.
 """
 
 import asyncio
@@ -50,11 +49,15 @@ from .state_folder import claim_state
 
 log = logging.getLogger(__name__)
 
-LEAVE_WITHIN_S = 1.0  # for a step under way when everything else has ended
+LEAVE_WITHIN_S = 1.0  # Time for a running step after everything else has ended.
 
 
 def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recorder:
-    """A new file for the actor's life in this process. Raises ConfigError."""
+    """Open a new recording file for an actor in this process.
+
+    Raises:
+        ConfigError: The folder cannot be written.
+    """
     about = {
         "actor": actor,
         "robot": robot,
@@ -66,26 +69,31 @@ def open_recorder(folder: Path, actor: str, robot: str, config: Config) -> Recor
         folder.mkdir(parents=True, exist_ok=True)
         return Recorder(new_path(folder, actor), about, recording_parameters(config))
     except OSError as error:
-        raise ConfigError(f"{folder} cannot be recorded to: {error.strerror}.") from error
+        raise ConfigError(
+            f"{folder} cannot be recorded to: {error.strerror}. Choose another folder with "
+            "--record."
+        ) from error
 
 
 @dataclass(frozen=True, slots=True)
 class Service:
-    """What to serve, and where. `only` names the actors of this process; empty: all of them."""
+    """Live service, or a child process of it."""
 
     config: Config
     network: Endpoint
-    state: Path
-    only: tuple[str, ...] = ()
-    is_router: bool = True  # False: there is one on the network already
-    is_state_kept: bool = True  # the folder outlives the service
-    metrics_port: int | None = None  # for Prometheus
-    recording: Path | None = None  # what every actor takes is recorded there
+    state: Path  # State folder.
+    only: tuple[str, ...] = ()  # Actors of this process; empty: all actors.
+    is_router: bool = True  # Open a router; False: the network has one.
+    is_state_kept: bool = True  # The state folder remains after the service ends.
+    metrics_port: int | None = None  # Port for Prometheus.
+    recording: Path | None = None  # Folder of the recording.
 
     def run(self) -> None:
-        """Serve until SIGINT or SIGTERM; a second one stops at once.
+        """Serve until SIGINT or SIGTERM; a second signal stops at once.
 
-        Raises ConfigError when the port cannot be had, StageError when an actor was given up.
+        Raises:
+            ConfigError: The configuration is invalid or the port is taken.
+            StageError: An actor cannot be restarted any more.
         """
         check_graph(GRAPH)
         self.config.check_timeouts()
@@ -122,7 +130,8 @@ class Service:
         pings = asyncio.create_task(watchdog.ping())
         runners = self._runners(transport)
         control = None if self.only else self._open_control(transport)
-        log.info("serving %s on %s", ", ".join(r.name for r in runners), self.network.endpoint)
+        log.info("service: serving %s on %s", ", ".join(r.name for r in runners),
+                 self.network.endpoint)  # fmt: skip
         watchdog.notify("READY=1")
         try:
             await supervise(runners, stop, self.config.service.shutdown_timeout_s)
@@ -148,11 +157,11 @@ class Service:
     def _saved_where(self) -> str:
         if self.is_state_kept:
             return str(self.state)
-        return f"{self.state}, which goes with the service (--state DIR keeps it)"
+        return f"{self.state}, which is deleted with the service (--state DIR keeps it)"
 
-    # --- who runs where ---------------------------------------------------------------------------
+    # --- stages and child processes ---------------------------------------------------------------
     def _runners(self, transport: ZenohTransport) -> list[Runner]:
-        """Stages and child processes, producers first."""
+        """Create the stages and child processes, producers first."""
         children: dict[str, ChildProcess] = {}
         runners: list[Runner] = []
         for box in GRAPH:
@@ -190,7 +199,8 @@ class Service:
         except (KeyError, ValueError, TypeError, IndexError) as error:
             raise ConfigError(
                 f"the state of {box.name} in {self.state} does not fit this version ({error!r}). "
-                "Choose another folder with --state, or delete this one to start anew."
+                "Choose another folder with --state, or delete this one to start with an empty "
+                "map."
             ) from error
 
     def _journal(self, actor: str) -> Journal:
@@ -235,8 +245,10 @@ def _is_fed_from_outside(box: ActorSpec) -> bool:
 
 
 def _leave_if_busy(exit_code: int, why: str) -> None:
-    """A thread in the middle of a step cannot be stopped, and aborts the process that ends around
-    it: then leave without ending."""
+    """Exit at once if a step is still running.
+
+    Its thread cannot be stopped, and a normal end of the interpreter would abort the process.
+    """
     if busy := Worker.busy_workers(LEAVE_WITHIN_S):
         log.error("%s (left in the middle of a step: %s)", why, ", ".join(busy))
         logging.shutdown()

@@ -26,7 +26,7 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
 
         def is_well() -> bool:
             code, out = doctor()
-            assert "had no frame yet on camera/rgbd, camera/color, camera/depth" in out
+            assert "received no frame yet on camera/rgbd, camera/color, camera/depth" in out
             return code == 0 and "bad " not in out
 
         wait_until(is_well, 20, "every heartbeat comes")
@@ -40,7 +40,7 @@ def test_the_doctor_names_a_stopped_process_and_a_service_without_frames(
                 os.kill(stopped, signal.SIGCONT)
             assert code == 1
             # After some seconds the router forgets a stopped process, and it "is not running".
-            return "optimizer has a process, and no heartbeat" in out
+            return "optimizer has a process, but no heartbeat" in out
 
         wait_until(is_stopped_process_named, 60, "the stopped process is named")
 

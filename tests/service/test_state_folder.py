@@ -41,7 +41,7 @@ def test_so_is_one_that_was_killed_while_it_started(tmp_path: Path, actors: tupl
 @pytest.mark.parametrize("missing", ["mapper", "optimizer"])
 def test_one_that_lost_a_part_of_a_journey_is_refused(tmp_path: Path, missing: str) -> None:
     saved(tmp_path, 5, *(name for name in ACTORS if name != missing))
-    with pytest.raises(ConfigError, match=f"no readable state of {missing} beside"):
+    with pytest.raises(ConfigError, match=f"no readable state of {missing}, but"):
         claim(tmp_path)
 
 
