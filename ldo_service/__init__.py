@@ -7,14 +7,17 @@ LIBRARIES = ("numpy", "gtsam", "onnxruntime", "opencv-python-headless", "msgspec
 
 try:
     __version__ = version("ldo-slam")
-except PackageNotFoundError:  # read from a source tree that was never installed
+except PackageNotFoundError:  # A source tree that is not installed.
     __version__ = "0+unknown"
 
 __all__ = ["__version__"]
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what computes results; every run and recording keeps them."""
+    """Return the versions of all software that computes results.
+
+    Every run and recording stores them.
+    """
     return {
         "ldo-slam": __version__,
         "python": platform.python_version(),

@@ -1,4 +1,4 @@
-"""`python -m ldo_service` is `ldo`."""
+"""Entry point of `python -m ldo_service`, the same as `ldo`."""
 
 from ldo_service.commands.cli import main
 

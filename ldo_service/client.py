@@ -1,4 +1,4 @@
-"""What other programs import: publish camera frames, follow poses and the map.
+"""Python client of the service: publishes camera frames, receives poses and the map.
 
     from ldo_service.client import connect
 
@@ -6,8 +6,8 @@
         for pose in service.poses():
             print(pose.status, pose.T_odom_camera.translation)
 
-Imports no numerics. A subscriber never slows the robot: it gets the newest messages, and what it
-does not take in time is dropped on its side.
+The module imports no numerical code of the service. A slow subscriber does not slow the robot: the
+client buffers the newest messages and drops older ones.
 """
 
 import logging
@@ -65,14 +65,14 @@ log = logging.getLogger(__name__)
 
 
 class Client:
-    """A connection to one robot's topics; made by `connect`."""
+    """Connection to the topics of one robot, created by `connect`."""
 
     def __init__(self, session: zenoh.Session, network: Endpoint) -> None:
         self._session, self._network = session, network
         self._sent = self._asked = self._priors = 0
-        self._numbers: Counter[type[Message]] = Counter()  # of frames and halves sent
+        self._numbers: Counter[type[Message]] = Counter()  # Messages sent, by type.
         self._epoch = time.time_ns()
-        self._publishers: dict[type[Message], Any] = {}  # by message
+        self._publishers: dict[type[Message], Any] = {}  # Publisher by message type.
 
     def publish(
         self,
@@ -82,13 +82,18 @@ class Client:
         depth_scale: float,
         stamp_ns: int | None = None,
     ) -> None:
-        """Send one exposure.
+        """Send one RGB-D frame.
 
-        color        [H, W, 3] uint8 RGB
-        depth        [H, W] uint16 or float32, registered to colour; 0 or NaN: not measured
-        depth_scale  units of `depth` per metre
-        stamp_ns     of the exposure; default: now
-        Raises ValueError for arrays that do not fit the camera.
+        Args:
+            color: RGB image, [H, W, 3], uint8.
+            depth: Depth registered to the color image, [H, W], uint16 or float32; 0 or NaN where
+                unknown.
+            camera: Intrinsics.
+            depth_scale: Units of `depth` per meter.
+            stamp_ns: Time of the exposure, ns; the current time by default.
+
+        Raises:
+            ValueError: The arrays do not fit the camera.
         """
         message = CameraRgbd(
             stamp_ns=_stamp(stamp_ns),
@@ -103,7 +108,10 @@ class Client:
     def publish_color(
         self, color: np.ndarray, camera: CameraModel, stamp_ns: int | None = None
     ) -> None:
-        """Send colour alone; `publish_depth` sends the other half. Arguments as in `publish`."""
+        """Send a color image without depth; `publish_depth` sends the depth.
+
+        The arguments are those of `publish`.
+        """
         image = Image.raw("rgb8", color)
         self.send(
             CameraColor(stamp_ns=_stamp(stamp_ns), frame=self._sent, camera=camera, image=image)
@@ -117,10 +125,16 @@ class Client:
         T_color_depth: Pose = IDENTITY,
         stamp_ns: int | None = None,
     ) -> None:
-        """Send depth alone, of a camera of its own. It is paired with the colour of nearest stamp.
+        """Send a depth image of a separate depth camera.
 
-        T_color_depth  from coordinates of the depth camera to the colour camera's
-        Other arguments as in `publish`.
+        The service pairs it with the color image of the nearest stamp.
+
+        Args:
+            depth: Depth image, [H, W], uint16 or float32; 0 or NaN where unknown.
+            camera: Intrinsics of the depth camera.
+            depth_scale: Units of `depth` per meter.
+            T_color_depth: Transform from the depth camera to the color camera.
+            stamp_ns: Time of the exposure, ns; the current time by default.
         """
         message = CameraDepth(
             stamp_ns=_stamp(stamp_ns),
@@ -133,9 +147,12 @@ class Client:
         self.send(message)
 
     def publish_prior(self, T_prior_base: Pose, stamp_ns: int | None = None) -> None:
-        """Send where another odometry of the robot has its base, in a frame of its own.
+        """Send an odometry prior: a pose from another odometry of the robot.
 
-        stamp_ns  of the measurement, by the clock that stamps frames; default: now
+        Args:
+            T_prior_base: Pose of the robot's base in the frame of that odometry.
+            stamp_ns: Time of the measurement, ns, by the clock of the frames; the current time by
+                default.
         """
         message = OdometryPrior(stamp_ns=_stamp(stamp_ns), T_prior_base=T_prior_base)
         header = Header("odometry", self._epoch, self._priors, message.stamp_ns)
@@ -144,8 +161,10 @@ class Client:
         self._priors += 1
 
     def send(self, frame: CameraRgbd | CameraColor | CameraDepth) -> None:
-        """Send a frame or half of one, which may be compressed. May block for some milliseconds,
-        and is dropped when the network is congested."""
+        """Send an RGB-D frame, color image or depth image, which may be compressed.
+
+        The call may block for some milliseconds. A congested network drops the message.
+        """
         kind = type(frame)
         header = Header("camera", self._epoch, self._numbers[kind], frame.stamp_ns)
         self._publisher(kind).put(msgspec.msgpack.encode(frame), attachment=encode_link(header))
@@ -164,26 +183,44 @@ class Client:
 
     @property
     def has_subscriber(self) -> bool:
-        """Whether anybody subscribes to this client's camera/rgbd."""
+        """True if a subscriber of camera/rgbd exists."""
         return self._publisher(CameraRgbd).matching_status.matching
 
     def wait_for_subscriber(self, timeout_s: float = 3.0) -> bool:
-        """Who has just connected hears of subscribers a moment later. False: of none in time."""
+        """Wait for a subscriber of camera/rgbd.
+
+        A new connection learns of subscribers after a short delay.
+
+        Returns:
+            False if none was found within `timeout_s`.
+        """
         until_s = time.monotonic() + timeout_s
         while not self.has_subscriber and time.monotonic() < until_s:
             time.sleep(0.02)
         return self.has_subscriber
 
     def poses(self, keep: int = 1) -> Iterator[TrackedPose]:
-        """Every tracked pose as it comes, for ever; of those not taken in time the newest stay."""
+        """Yield tracked poses as they arrive, without end.
+
+        Args:
+            keep: Number of buffered poses; older ones are dropped.
+        """
         for _, message in self.messages(POSE_TRACKED, keep):
             assert isinstance(message, TrackedPose)
             yield message
 
     def messages(self, topic: Topic | str, keep: int = 1) -> Iterator[tuple[Header, Message]]:
-        """Header and message of each sample on a topic, or one of that name, for ever; what a
-        producer repeats that was started again is left out. Of those not taken in time the newest
-        `keep` stay. Raises ConfigError for a name that no topic has."""
+        """Yield header and message of each sample on a topic, without end.
+
+        Messages that a restarted producer repeats are skipped.
+
+        Args:
+            topic: The topic or its name.
+            keep: Number of buffered messages; older ones are dropped.
+
+        Raises:
+            ConfigError: No topic has this name.
+        """
         topic, numbers = _topic(topic), SequenceTracker()
         with self._subscriber(topic.subscription_key, keep) as subscriber:
             for sample in subscriber:
@@ -193,9 +230,12 @@ class Client:
 
     @contextmanager
     def poller(self, name: str, of: type[M], keep: int = 256) -> Iterator[Callable[[], list[M]]]:
-        """A function that returns what has come since it was last called; never waits.
+        """Yield a function that returns the messages since its last call, without waiting.
 
-        `name` may hold `*`, such as `health/*`.
+        Args:
+            name: Key of the messages; it may contain `*`, as in `health/*`.
+            of: Type of the messages; malformed ones are logged and skipped.
+            keep: Number of buffered messages; older ones are dropped.
         """
         with self._subscriber(name, keep) as subscriber:
 
@@ -205,46 +245,66 @@ class Client:
             yield inbox
 
     def latest(self, topic: Topic | str, timeout_s: float = 3.0) -> list[Message]:
-        """The last value of a state topic, or the one of that name, all its parts; empty when there
-        is none yet. Raises ConfigError for a topic that keeps none, and for a name that none has.
+        """Request the last value of a state topic.
+
+        Args:
+            topic: The topic or its name.
+            timeout_s: Maximum time to wait.
+
+        Returns:
+            All parts of the value; empty if there is no value yet.
+
+        Raises:
+            ConfigError: No topic has this name, or the topic keeps no last value.
         """
         topic = _topic(topic)
         if not topic.is_state:
             keeping = ", ".join(other.name for other in TOPICS if other.is_state)
-            raise ConfigError(f"{topic.name} keeps no last value. Those that do: {keeping}.")
+            raise ConfigError(f"{topic.name} keeps no last value. Topics that do: {keeping}.")
         replies = self._session.get(
             self._network.expression(topic.name),
             timeout=timeout_s,
-            consolidation=zenoh.ConsolidationMode.NONE,  # or one part of several would be kept
+            consolidation=zenoh.ConsolidationMode.NONE,  # Other modes return only one part.
         )
         return list(_readable((r.ok for r in replies if r.ok is not None), topic.message))
 
     def objects(self, timeout_s: float = 3.0) -> MapObjects:
-        """The objects of the map as of now. Raises ConfigError when nobody answers: a map without
-        a detector has none."""
+        """Request the current objects of the map.
+
+        Raises:
+            ConfigError: The service does not reply or has no objects, for example without a
+                detector.
+        """
         for message in self.latest(MAP_OBJECTS, timeout_s):
             assert isinstance(message, MapObjects)
             return message
         if "mapper" in self.live_actors():
             raise ConfigError(
-                "the map has no objects yet, which takes a keyframe, also after a restart, and a "
-                "detector that looked at it: `ldo serve --set detector.model=...`; `ldo models` "
-                "tells how. A service that localises takes none: those of its map are in the map's "
-                "folder."
+                "the map has no objects yet. They need a keyframe, also after a restart, and a "
+                "detector: `ldo serve --set detector.model=...`; `ldo models` shows how. A service "
+                "that only localizes adds no objects; the folder of its map has them."
             )
-        raise self._nobody("answers", MAP_OBJECTS)
+        raise self._nobody("replies", MAP_OBJECTS)
 
     def live_actors(self, timeout_s: float = 1.0) -> set[str]:
-        """Names of the actors whose process is there."""
+        """Return the names of the actors with a running process."""
         expression = self._network.expression(f"{ALIVE}/*")
         replies = self._session.liveliness().get(expression, timeout=timeout_s)
         return {str(r.ok.key_expr).rsplit("/", 1)[1] for r in replies if r.ok is not None}
 
     def control(self, verb: str, timeout_s: float = 120.0) -> ControlAnswer:
-        """Ask the service to pause, resume, save or reset; returns when all actors have done it.
+        """Request the service to pause, resume, save or reset, and wait for all actors.
 
-        `ok` of the answer is false when one has not, or when there is no such verb; `text` says.
-        Raises ConfigError when nobody answers.
+        Args:
+            verb: The command.
+            timeout_s: Maximum time to wait.
+
+        Returns:
+            The reply. `ok` is False if an actor failed or the command is unknown; `message` has the
+            reason.
+
+        Raises:
+            ConfigError: The service does not reply.
         """
         replies = self._session.get(
             self._network.expression(CONTROL.name),
@@ -254,7 +314,7 @@ class Client:
         for reply in replies:
             if reply.ok is not None:
                 return _message(reply.ok, ControlAnswer)
-        raise self._nobody("answers", CONTROL)
+        raise self._nobody("replies", CONTROL)
 
     def refine(
         self,
@@ -263,11 +323,19 @@ class Client:
         last_rate: float = 1.0,
         timeout_s: float = 3.0,
     ) -> None:
-        """Ask the mapper to fit the map further to the keyframes it has, with steps that shrink
-        from one rate to the other. Returns at once; `map/delta` will tell what changed.
+        """Request further optimization of the Gaussians with the existing keyframes.
 
-        Raises ValueError for more than 500 iterations or rates outside (0, 1], ConfigError when
-        nobody listens.
+        The call returns at once; the changes are published on `map/delta`.
+
+        Args:
+            iterations: Number of iterations, at most 500.
+            first_rate: Factor of the step size in the first iteration, in (0, 1].
+            last_rate: Factor of the step size in the last iteration, in (0, 1].
+            timeout_s: Maximum time to wait for a subscriber.
+
+        Raises:
+            ValueError: An argument is out of range.
+            ConfigError: No mapper subscribes to the request.
         """
         message = RefineMap(
             stamp_ns=time.time_ns(),
@@ -279,10 +347,19 @@ class Client:
         self._ask(MAP_REFINE, message, timeout_s)
 
     def add_label(self, name: str, timeout_s: float = 60.0) -> tuple[str, ...]:
-        """Ask the labeller to choose from one more name when it names regions; returns all of them
-        when it has. It may be busy with a region for some seconds.
+        """Add a name to the vocabulary of the labeller.
 
-        Raises ConfigError when it refuses, or nobody answers.
+        The call waits for the labeller, which may be busy with a region for some seconds.
+
+        Args:
+            name: The new name.
+            timeout_s: Maximum time to wait.
+
+        Returns:
+            All names of the vocabulary.
+
+        Raises:
+            ConfigError: The name is invalid, or the labeller rejects it or does not reply.
         """
         try:
             message = AddLabel(stamp_ns=time.time_ns(), name=name)
@@ -296,10 +373,14 @@ class Client:
                     if answer.stamp_ns == message.stamp_ns:
                         return _names_or_why(name, answer)
                 time.sleep(0.02)
-        raise self._nobody("answers", LABEL_ADD)
+        raise self._nobody("replies", LABEL_ADD)
 
     def _ask(self, topic: Topic, message: RefineMap | AddLabel, timeout_s: float) -> None:
-        """Send, when somebody listens. Raises ConfigError when nobody does."""
+        """Publish a request once it has a subscriber.
+
+        Raises:
+            ConfigError: There is no subscriber within `timeout_s`.
+        """
         publisher, until_s = self._publisher(type(message)), time.monotonic() + timeout_s
         while not publisher.matching_status.matching:
             if time.monotonic() > until_s:
@@ -311,8 +392,8 @@ class Client:
 
     def _nobody(self, does: str, topic: Topic) -> ConfigError:
         return ConfigError(
-            f"nobody {does} on {self._network.expression(topic.name)}: is this the name of the "
-            "robot, and is its service up? `ldo doctor` tells."
+            f"no service {does} on {self._network.expression(topic.name)}. Check the name of the "
+            "robot and whether its service is running: `ldo doctor`."
         )
 
     def _subscriber(self, name: str, keep: int) -> Any:
@@ -324,14 +405,14 @@ def _topic(topic: Topic | str) -> Topic:
     if isinstance(topic, Topic):
         return topic
     if topic not in BY_NAME:
-        hint = did_you_mean(topic, BY_NAME, "`ldo topics` lists all.")
+        hint = did_you_mean(topic, BY_NAME, "`ldo topics` lists all topics.")
         raise ConfigError(f"there is no topic {topic!r}. {hint}")
     return BY_NAME[topic]
 
 
 def _names_or_why(name: str, answer: LabelNames) -> tuple[str, ...]:
     if answer.error:
-        raise ConfigError(f"{name!r} is not added: {answer.error}")
+        raise ConfigError(f"{name!r} was not added: {answer.error}")
     return answer.names
 
 
@@ -352,21 +433,30 @@ def _message(sample: Any, of: type[M]) -> M:
 
 
 def _readable(samples: Iterable[Any], of: type[M]) -> Iterator[M]:
-    """Their messages; what cannot be decoded, as of another version, is left out and said."""
+    """Yield the messages of samples; malformed ones are logged and skipped."""
     for sample in samples:
         try:
             yield _message(sample, of)
         except msgspec.DecodeError as error:
-            log.warning("a %s cannot be read and is left out: %s", of.__name__, error)
+            log.warning(
+                "client: malformed %s skipped: %s. Does the service run the same version?",
+                of.__name__, error,
+            )  # fmt: skip
 
 
 @contextmanager
 def connect(
     robot: str = "robot", endpoint: str = DEFAULT_ENDPOINT, keys: str | Path | None = None
 ) -> Iterator[Client]:
-    """Connect to a running service; with `keys`, a folder that `ldo keys` made, over TLS.
+    """Connect to a running service.
 
-    Raises ConfigError when nobody answers, or refuses the keys.
+    Args:
+        robot: Name of the robot.
+        endpoint: Address of its router.
+        keys: Folder with TLS keys, created by `ldo keys`; needed for a `tls/` endpoint.
+
+    Raises:
+        ConfigError: No service replies, or the keys are rejected.
     """
     network = Endpoint(robot, endpoint, TlsKeys.of(keys))
     with open_session(network) as session:

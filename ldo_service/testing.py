@@ -1,12 +1,12 @@
-"""A recording as a test, in three lines:
+"""Pytest fixtures that replay a recording as a test.
 
     from ldo_service.testing import recorded
 
-    actor = recorded("recordings/desk")             # a fixture: one case for each recorded actor
+    actor = recorded("recordings/desk")             # A fixture with one case per recorded actor.
 
     def test_the_recording_replays(actor): actor.verify()
 
-Needs pytest, which is not installed with this package.
+The module needs pytest, which is not installed with this package.
 """
 
 from collections.abc import Callable
@@ -23,16 +23,27 @@ __all__ = ["RecordedActor", "ReplayReport", "recorded", "replay_recording"]
 
 
 def replay_recording(folder: Path | str, *actors: str) -> dict[str, ReplayReport]:
-    """Replay the recorded actors, or some, and count what they did.
+    """Replay recorded actors and verify their outputs.
 
-    Raises ReplayDiverged at the first difference, DataError for a recording with a gap.
+    Args:
+        folder: Folder of the recording.
+        actors: Names of the actors; all recorded actors by default.
+
+    Returns:
+        The counters of each replay, by actor.
+
+    Raises:
+        ReplayDiverged: A step differs from the recording.
+        DataError: The recording has a gap.
     """
     return {actor.name: actor.verify() for actor in open_recording(Path(folder), actors)}
 
 
 def recorded(folder: Path | str) -> Callable[..., Any]:
-    """A fixture whose cases are the recorded actors; skipped where there is no recording."""
-    absent = pytest.param(None, marks=pytest.mark.skip(f"no recording in {folder}: `ldo record`"))
+    """Create a fixture with one case per recorded actor; skipped without a recording."""
+    absent = pytest.param(
+        None, marks=pytest.mark.skip(f"no recording in {folder}: create it by `ldo record`")
+    )
 
     @pytest.fixture(params=list(recorded_actors(Path(folder))) or [absent])
     def recorded_actor(request: pytest.FixtureRequest) -> RecordedActor:

@@ -100,4 +100,4 @@ def test_a_robot_that_is_not_there_is_said(tmp_path: Path) -> None:
             text=True,
         )
         assert done.returncode == 2
-        assert "is this the name of the robot" in done.stderr
+        assert "Check the name of the robot" in done.stderr

@@ -39,7 +39,7 @@ def test_frames_go_in_and_poses_come_out_over_tls(tmp_path: Path) -> None:
         assert subprocess.run([*control, str(keys / "operator")]).returncode == 0
         refused = subprocess.run([*control, str(keys / "viewer")], capture_output=True, text=True)
         assert refused.returncode == 2
-        assert "nobody answers on ldo/robot/control" in refused.stderr
+        assert "no service replies on ldo/robot/control" in refused.stderr
     finally:
         service.terminate()
         assert service.wait(60) == 0

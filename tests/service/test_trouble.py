@@ -95,7 +95,7 @@ def test_an_actor_that_always_fails_is_given_up_with_exit_code_4(
             service.client.send(message(room, next(frames)))
             time.sleep(0.2)
         assert service.process.returncode == 4
-        assert "tracker failed 6 times within 60 s and was given up" in service.log
+        assert "tracker failed 6 times within 60 s, so the service stops" in service.log
 
 
 # --- bytes that are no frames ---------------------------------------------------------------------

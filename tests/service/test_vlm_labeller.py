@@ -61,7 +61,7 @@ def test_a_name_that_was_added_is_used_from_then_on(tmp_path: Path, room: Sequen
         service.client.poller("map/delta", MapDelta) as deltas,
     ):
         service.wait_for_actors()
-        with pytest.raises(ConfigError, match="no objects yet, which takes a keyframe"):
+        with pytest.raises(ConfigError, match=r"no objects yet\. They need a keyframe"):
             service.client.objects(timeout_s=1)
         assert "fire hydrant" in service.client.add_label("fire hydrant")
         told: set[str] = set()
