@@ -1,1 +1,1 @@
-"""The verbs of `ldo`, one file each. A verb parses, calls the library, prints."""
+"""Commands of `ldo`, one module each, which parse options, call the library and print."""

@@ -1,4 +1,4 @@
-"""ldo bench"""
+"""Command `ldo bench`."""
 
 import json
 from dataclasses import asdict
@@ -17,25 +17,35 @@ def bench(
     what: Annotated[
         Literal["render"],
         tyro.conf.Positional,
-        tyro.conf.arg(help="an iteration of the optimiser: rendering, loss, gradients, Adam"),
+        tyro.conf.arg(
+            help="one iteration of the Gaussian optimizer: rendering, loss, gradients, Adam"
+        ),
     ],
-    gaussians: Annotated[int, tyro.conf.arg(help="in view")] = 100_000,
-    gaussians_out_of_view: Annotated[int, tyro.conf.arg(help="Gaussians more, out of view")] = 0,
-    size: Annotated[str, tyro.conf.arg(metavar="WxH", help="of the image, pixels")] = "640x480",
-    threads: Annotated[int, tyro.conf.arg(help="of the kernels")] = 1,
-    repeats: Annotated[int, tyro.conf.arg(help="that the medians are taken of")] = 20,
+    gaussians: Annotated[int, tyro.conf.arg(help="Gaussians in view")] = 100_000,
+    gaussians_out_of_view: Annotated[
+        int, tyro.conf.arg(help="additional Gaussians out of view")
+    ] = 0,
+    size: Annotated[
+        str, tyro.conf.arg(metavar="WxH", help="size of the image, pixels")
+    ] = "640x480",
+    threads: Annotated[int, tyro.conf.arg(help="threads of the kernels")] = 1,
+    repeats: Annotated[int, tyro.conf.arg(help="iterations that each median is taken over")] = 20,
     json_: Annotated[bool, tyro.conf.arg(name="json", help="print one JSON object")] = False,
 ) -> None:
-    """Measure how long an iteration takes on this machine.
+    """Measure how long one iteration of the Gaussian optimizer takes on this machine.
 
-    Medians over repeats on a made-up scene, in milliseconds of wall time. Adam is a part of the
-    backward pass: adam_ms is what it adds, the pass with it less the pass without, and iteration_ms
-    is forward, loss and the pass with it. LDO_ISA=avx512, avx2 or baseline picks the instructions.
+    The times are medians over all repeats on a synthetic scene, in milliseconds of wall time. The
+    backward pass includes Adam. adam_ms is the difference between the backward pass with Adam and
+    without it. iteration_ms is the sum of the forward pass, the loss and the backward pass with
+    Adam.
+
+    LDO_ISA=avx512, avx2 or baseline chooses the instruction set.
     """
     width, height = _pixels(size)
     if not min(gaussians, threads, repeats) >= 1 or gaussians_out_of_view < 0:
         raise ConfigError(
-            "gaussians, threads and repeats must be 1 or more, gaussians-out-of-view 0 or more."
+            "--gaussians, --threads and --repeats must be at least 1, --gaussians-out-of-view at "
+            "least 0."
         )
     camera = bench_camera(width, height)
     iteration = Iteration(gaussians, camera, threads=threads, elsewhere=gaussians_out_of_view)
@@ -59,7 +69,7 @@ def bench(
 def _pixels(size: str) -> tuple[int, int]:
     width, _, height = size.partition("x")
     if not (width.isdecimal() and height.isdecimal() and 1 <= int(width) <= 8192 >= int(height)):
-        raise ConfigError(f"--size {size}: must be WIDTHxHEIGHT in pixels, as 640x480.")
+        raise ConfigError(f"--size {size}: must be WIDTHxHEIGHT in pixels, such as 640x480.")
     if int(height) < 1:
         raise ConfigError(f"--size {size}: must be at least one pixel high.")
     return int(width), int(height)

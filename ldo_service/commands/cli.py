@@ -1,8 +1,8 @@
-"""The command `ldo`: its verbs, and what becomes of an error.
+"""Command `ldo`: its verbs, and the handling of errors.
 
-Exit codes: 0 done, 1 other errors, 2 bad arguments or configuration, 3 bad input data, 4 a stage
-gave up, 5 a replay diverged, 130 interrupted. An error is one paragraph; --debug adds the
-traceback.
+Exit codes: 0 success, 1 other errors, 2 bad arguments or configuration, 3 bad input data, 4 an
+actor failed, 5 a replay diverged, 130 interrupted. An error is printed as one paragraph;
+--debug adds the traceback.
 """
 
 import logging
@@ -16,28 +16,30 @@ from rich.console import Console
 
 from ldo_service.errors import LdoError
 
-KEEPING = ("demo", "run", "suite")  # verbs that leave what they have done
+# Verbs that keep their partial results when they are interrupted.
+KEEPING = ("demo", "run", "suite")
 HELP = """\
 usage: ldo VERB ...
 
 RGB-D SLAM as a service: poses and a photo-realistic map, live, on a CPU.
 
 first steps:
-  ldo demo                      the main job on a built-in synthetic room
+  ldo demo                      track, map and label a built-in synthetic room
   ldo run SOURCE --out DIR      track and map a data set
-  ldo eval DIR SOURCE           judge its trajectory and its map
-  ldo serve                     the live service; `ldo publish SOURCE` feeds it
+  ldo eval DIR SOURCE           evaluate its trajectory and its map
+  ldo serve                     run the live service; `ldo publish SOURCE` sends frames to it
 
 verbs:
 {verbs}
 
 `ldo VERB --help` explains a verb. `--debug` shows the traceback of an error."""
 
-# Options under their names of version 0.1, accepted for one more version.
+# Names of options in version 0.1, which one more version accepts.
 OLD_OPTIONS = {"--localise": "--localize"}
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
+    """Run `ldo` with these arguments, or with those of the process, and exit."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
     words = [OLD_OPTIONS.get(word, word) for word in words if word != "--debug"]
@@ -63,10 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         Console(stderr=True, highlight=False, markup=False).print(f"ldo: {error}", soft_wrap=True)
         sys.exit(error.exit_code)
     except KeyboardInterrupt:
-        kept = "; what is done is kept" if words[0] in KEEPING else ""
+        kept = "; partial results are kept" if words[0] in KEEPING else ""
         Console(stderr=True).print(f"ldo: interrupted{kept}.")
         sys.exit(130)
-    except BrokenPipeError:  # `ldo topics | head`
+    except BrokenPipeError:  # The reader of a pipe closed it, as in `ldo topics | head`.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
@@ -81,13 +83,13 @@ def _handle_interrupts() -> None:
 
 
 def first_lines() -> Iterator[str]:
-    """Each verb with the first line of its help."""
+    """Yield each verb with the first line of its help."""
     for name, verb in verbs().items():
         yield f"  {name:<10}{(verb.__doc__ or '').strip().splitlines()[0]}"
 
 
 def verbs() -> dict[str, Callable[..., None]]:
-    """Each verb's function; its docstring is its help."""
+    """Return the function of each verb; its docstring is the help text."""
     from ldo_service.commands import (
         bench,
         control,

@@ -1,4 +1,4 @@
-"""ldo control"""
+"""Command `ldo control`."""
 
 from typing import Annotated, Literal
 
@@ -16,16 +16,19 @@ Verb = Annotated[
     tyro.conf.Positional,
     tyro.conf.arg(
         metavar="VERB",
-        help="pause: leave frames out; resume: take them again; save: write every actor's state "
-        "now; reset: begin anew with an empty map; refine: fit the map further; add-label: "
-        "choose from NAME too when regions are named",
+        help="pause: drop all frames; resume: process frames again; save: write every actor's "
+        "state now; reset: start again with an empty map; refine: optimize the map further; "
+        "add-label: let the labeller choose from NAME too",
     ),
 ]
 Name = Annotated[
-    str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help="of add-label, such as samovar")
+    str,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="NAME", help="label that add-label adds, such as samovar"),
 ]
 Iterations = Annotated[
-    int, tyro.conf.arg(metavar="N", help=f"of refine, at most {MAX_ITERATIONS} at a time")
+    int,
+    tyro.conf.arg(metavar="N", help=f"iterations of refine, at most {MAX_ITERATIONS} at a time"),
 ]
 
 
@@ -37,38 +40,49 @@ def control(
     keys: KeysFolder = None,
     iterations: Iterations = 200,
 ) -> None:
-    """Pause, resume, save or reset a running service; done when all its actors have done it.
+    """Pause, resume, save, reset or refine a running service, or add a label to it.
 
-    Exit code 4 when an actor did not; the answer names it. `refine` asks the mapper alone and does
-    not wait: it fits the map to its keyframes before it takes the next one.
+    The command returns when every actor has executed the request. If an actor did not, the message
+    names it and the exit code is 4.
+
+    `refine` goes to the mapper alone, and the command does not wait for it. The mapper runs these
+    iterations before it takes its next keyframe.
 
       ldo control reset
       ldo control refine --iterations 500
       ldo control add-label "fire extinguisher"
     """
     if bool(name) != (verb == "add-label"):
-        raise ConfigError("`ldo control add-label NAME` takes a name, and no other verb does.")
+        raise ConfigError("`ldo control add-label NAME` needs a name; the other verbs take none.")
     with connect(robot, endpoint, keys) as service:
         if verb == "refine":
             ask_to_refine(service, iterations)
         elif verb == "add-label":
             names = service.add_label(name)
-            print(f"{name} is added: regions are named from {len(names)} names.")
+            print(f"{name} is added: the labeller chooses from {len(names)} names.")
         else:
             run_control_verb(service, verb)
 
 
 def ask_to_refine(service: Client, iterations: int) -> None:
-    """Raises ConfigError for a number that is refused."""
+    """Request refinement iterations from the mapper.
+
+    Raises:
+        ConfigError: The number of iterations is out of bounds.
+    """
     try:
         service.refine(iterations)
     except ValueError as error:
         raise ConfigError(f"--iterations {iterations}: {error}.") from error
-    print(f"the mapper was asked for {iterations} iterations.")
+    print(f"{iterations} iterations are requested from the mapper.")
 
 
 def run_control_verb(service: Client, verb: str) -> None:
-    """Raises StageError when an actor does not."""
+    """Run a control command in all actors and print the result.
+
+    Raises:
+        StageError: An actor did not execute the command.
+    """
     answer = service.control(verb)
     if not answer.ok:
         raise StageError(answer.message)

@@ -1,4 +1,4 @@
-"""ldo demo"""
+"""Command `ldo demo`."""
 
 import os
 from collections.abc import Iterator
@@ -25,10 +25,10 @@ from ldo_service.synthetic.flat.sequence import prerender
 from .options import Overwrite, progress
 from .run import with_options
 
-FRAMES = 70  # of the flat: what stands in its first room
-HOLD_OUT = 5  # every 5th frame is tracked and never mapped
-PROCESSES = 4  # to ray cast: each takes seconds to begin, and a second for a frame
-NETWORKS = "demo"  # those that come with the package
+FRAMES = 70  # Frames of the synthetic flat that show its first room.
+HOLD_OUT = 5  # Every 5th frame is tracked but not mapped.
+PROCESSES = 4  # Processes that ray cast; each takes seconds to start and 1 s per frame.
+NETWORKS = "demo"  # Name of the networks that come with the package.
 
 
 def demo(
@@ -37,14 +37,15 @@ def demo(
     ),
     overwrite: Overwrite = False,
 ) -> None:
-    """Track and map a built-in synthetic room, name what stands in it, and judge all of it by its
-    exact truth.
+    """Track, map and label a built-in synthetic room, and evaluate the result by ground truth.
 
-    Ends with a table and three pictures. The frames are ray cast, not splatted, with the blur and
-    the depth noise of a Kinect, and every fifth is kept from the map: the PSNR is that of views
-    that the map was not made from. Things are named by small networks that come with the package
-    and know such rooms alone. They were trained on others; the rules for what depth sets apart were
-    chosen with this one in view.
+    The command prints a table and writes three pictures. The frames are ray cast, not rendered from
+    Gaussians, with the blur and the depth noise of a Kinect. Every fifth frame is tracked but not
+    mapped, and the PSNR is measured on these held-out frames.
+
+    Small networks that come with the package label the objects. They know only rooms like this one
+    and were trained on others. The rules that separate objects by depth were chosen with this room
+    in view.
     """
     console = Console(stderr=True)
     sequence = FlatSequence.named("flat")
@@ -55,7 +56,7 @@ def demo(
     with progress("tracking and mapping", job.work, console) as advance:
         record = run_offline(job, advance)
     run, threads = read_run(out), actor_parameters(job.config).mapper.thread_count()
-    with progress("judging", work(run, sequence), console) as advance:
+    with progress("evaluating", work(run, sequence), console) as advance:
         results = evaluate_run(run, sequence, advance, threads=threads)
     printed = Table(title="LDO-SLAM demo", show_header=False)
     size = f"{sequence.camera.width}x{sequence.camera.height}"
@@ -76,7 +77,7 @@ def demo_config() -> Config:
 def rows(
     summary: dict[str, Any], size: str, results: Results, found: MapObjects
 ) -> Iterator[tuple[str, str]]:
-    """What is printed: names and values."""
+    """Yield the names and values of the printed table."""
     yield "frames", f"{summary['frames']} of {size}"
     yield "tracking", ", ".join(f"{count} {name}" for name, count in summary["status"].items())
     for name, errors in (results.trajectories or {}).items():
@@ -88,6 +89,6 @@ def rows(
     yield "objects", ", ".join(sorted(one.name for one in found.objects)) or "none"
     for errors in results.labels:
         right = errors.lists[0].figures(gate=0.0).pixel_accuracy
-        yield "labels", f"{right:.0%} of the pixels have the right one of COCO's, or none"
-    yield "speed", f"{summary['fps']:.1f} FPS ({summary['isa']}, ray casting apart)"
+        yield "labels", f"{right:.0%} of the pixels have the right COCO class, or rightly none"
+    yield "speed", f"{summary['fps']:.1f} FPS ({summary['isa']}, without ray casting)"
     yield "pictures", "\n".join(map(str, results.pictures))

@@ -1,4 +1,4 @@
-"""ldo doctor"""
+"""Command `ldo doctor`."""
 
 import importlib.util
 import os
@@ -24,7 +24,7 @@ from ldo_service.transport.zenoh_transport import DEFAULT_ENDPOINT
 
 from .options import EndpointAddress, KeysFolder, Robot
 
-LIBRARIES = {  # name on the package index: name to import
+LIBRARIES = {  # Name on the package index: name to import.
     "numpy": "numpy",
     "msgspec": "msgspec",
     "eclipse-zenoh": "zenoh",
@@ -45,7 +45,7 @@ EXTRAS = {
     "realsense": ("pyrealsense2",),
     "ros2": ("rosbags",),
 }
-LISTEN_S = 1.5  # three heartbeats
+LISTEN_S = 1.5  # Three heartbeats.
 MARKS = {
     "ok": "[green]ok[/]     ",
     "absent": "[dim]absent[/] ",
@@ -56,16 +56,19 @@ MARKS = {
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    mark: str  # "ok", "absent": fine without; "note": good to know; "bad": to be mended
+    """Result of one check, printed as one line."""
+
+    # "ok", "absent" (optional), "note" (information) or "bad" (needs action).
+    mark: str
     text: str
 
 
 def doctor(
     robot: Robot = "robot", endpoint: EndpointAddress = DEFAULT_ENDPOINT, keys: KeysFolder = None
 ) -> None:
-    """Say what this machine has, what is missing and how to get it, and how a running service is.
+    """Check this machine and a running service, and print how to fix each problem.
 
-    Exit code 1 when something is bad.
+    The exit code is 1 if a line is marked bad.
     """
     console = Console(highlight=False, soft_wrap=True)
     bad = 0
@@ -79,10 +82,13 @@ def doctor(
         console.print(MARKS[finding.mark] + finding.text)
         bad += finding.mark == "bad"
     if bad:
-        raise LdoError(f"{bad} of the above must be mended.")
+        raise LdoError(
+            f"problems found: {bad}. Each line marked bad above says what to do about one."
+        )
 
 
 def machine() -> Iterator[Finding]:
+    """Check version, processor and free disk space."""
     yield Finding("ok", f"ldo-slam {__version__}, Python {platform.python_version()}")
     memory_gb = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     yield Finding(
@@ -96,6 +102,7 @@ def machine() -> Iterator[Finding]:
 
 
 def libraries() -> Iterator[Finding]:
+    """Check that every required library can be imported."""
     for package, module in LIBRARIES.items():
         try:
             importlib.import_module(module)
@@ -105,21 +112,23 @@ def libraries() -> Iterator[Finding]:
 
 
 def extras() -> Iterator[Finding]:
+    """Check which optional extras are installed."""
     for extra, packages in EXTRAS.items():
         missing = [p for p in packages if importlib.util.find_spec(p) is None]
         if missing:
-            advice = f"`pip install 'ldo-slam\\[{extra}]'` brings it"  # escaped for rich
+            advice = f"`pip install 'ldo-slam\\[{extra}]'` installs it"  # Escaped for rich.
             yield Finding("absent", f"extra {extra} ({', '.join(missing)}): {advice}")
         else:
             yield Finding("ok", f"extra {extra}")
 
 
 def networks() -> Iterator[Finding]:
+    """Check the registered networks."""
     models = Models()
     if not models.names:
         yield Finding(
             "absent",
-            "networks of your own: `demo` knows the synthetic scenes alone; `ldo models add NAME "
+            "registered networks: `demo` knows only the synthetic scenes; `ldo models add NAME "
             "FILE` registers a YOLOv5, YOLOX or YOLOv8 in ONNX",
         )
     for name in models.names:
@@ -133,6 +142,7 @@ def networks() -> Iterator[Finding]:
 
 
 def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
+    """Check every actor of the running service, if there is one."""
     try:
         actors = seen(robot, endpoint, keys)
     except ConfigError as error:
@@ -144,8 +154,8 @@ def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
     if not any(actor.has_token or actor.health for actor in actors):
         yield Finding(
             "bad",
-            f"something answers on {endpoint}, and no actor of robot {robot!r} is heard: is that "
-            "its name, and do this client's keys let it read (viewer or operator)?",
+            f"a router answers on {endpoint}, but no actor of robot {robot!r} sends a heartbeat. "
+            "Check --robot, and that the role of these keys may read (viewer or operator).",
         )
         return
     for actor in actors:
@@ -153,7 +163,11 @@ def service(robot: str, endpoint: str, keys: Path | None) -> Iterator[Finding]:
 
 
 def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatus]:
-    """Every actor of the graph, listened to for a while. Raises ConfigError when nobody answers."""
+    """Return the status of every actor after listening for LISTEN_S.
+
+    Raises:
+        ConfigError: No router answers on the endpoint.
+    """
     heard: dict[str, tuple[float, Health]] = {}
     with (
         connect(robot, endpoint, keys) as client,
@@ -166,7 +180,7 @@ def seen(robot: str, endpoint: str, keys: Path | None = None) -> list[ActorStatu
             time.sleep(0.05)
         alive, now_s = client.live_actors(), time.monotonic()
     names = [box.name for box in GRAPH]
-    names += sorted((set(heard) | alive) - set(names))  # of a later version
+    names += sorted((set(heard) | alive) - set(names))  # Actors of a later version.
     return [_seen(name, name in alive, heard.get(name), now_s) for name in names]
 
 
@@ -180,7 +194,7 @@ def _seen(
 
 
 def of_actor(actor: ActorStatus) -> Iterator[Finding]:
-    """How it is, then what is wrong with it."""
+    """Yield the state of an actor, then its problems and remarks."""
     wrong = list(diagnose(actor))
     if actor.health is not None:
         yield Finding("bad" if wrong else "ok", _in_numbers(actor.health))

@@ -1,4 +1,4 @@
-"""ldo eval"""
+"""Command `ldo eval`."""
 
 import json
 import sys
@@ -33,14 +33,14 @@ FIGURES = {
     "pixels": "pixel_accuracy",
 }
 
-WIDTH = 120  # of the tables in a file
-NO_TRUTH = "The source has no ground truth, so trajectories are not judged."
-NO_MAP = "The run localised in {folder} and made no map, so renderings are not judged."
-NO_LPIPS = "LPIPS is left out; --lpips FILE.onnx adds it."
+WIDTH = 120  # Columns of the tables when the output is no terminal.
+NO_TRUTH = "The source has no ground truth, so trajectories are not evaluated."
+NO_MAP = "The run localized in {folder} and made no map, so renderings are not evaluated."
+NO_LPIPS = "LPIPS is not computed; --lpips FILE.onnx adds it."
 
 
 def label_table(rows: list[LabelErrors]) -> Table:
-    """A line for each list of names, and for each share of the pixels that a class must have."""
+    """Return a table with a row for each list of names and each minimum frequency of a class."""
     table = Table("map", "names", "classes", *FIGURES, "per image", "frames")
     for row in rows:
         for errors in row.lists:
@@ -55,7 +55,12 @@ def label_table(rows: list[LabelErrors]) -> Table:
 
 
 def open_table(rows: list[LabelErrors], calls_per_frame: float | None) -> Table:
-    """Agreement of views, names beyond COCO, and how often somebody was asked for one."""
+    """Return a table of view consistency, labels beyond COCO and labeller requests.
+
+    Args:
+        rows: Label errors of each map.
+        calls_per_frame: Requests to the labeller per frame; None where the run did not count them.
+    """
     columns = ("map", "consistency", "beyond COCO: recall", "precision", "VLM calls per frame")
     table = Table(*columns)
     for row in rows:
@@ -83,25 +88,28 @@ def _number(value: float) -> str:
 
 def evaluate(
     folder: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="what `ldo run` wrote")
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of a run")
     ],
     source: Source,
     lpips: Annotated[
         Path | None,
         tyro.conf.arg(
             metavar="FILE.onnx",
-            help="network of LPIPS: two inputs float32 [1, 3, H, W], RGB in -1..1, and one output "
-            "with a single number, as torch.onnx.export writes lpips.LPIPS(net='alex')",
+            help="network of LPIPS with two inputs, float32 [1, 3, H, W], RGB in -1..1, and one "
+            "output with a single number, as torch.onnx.export writes lpips.LPIPS(net='alex')",
         ),
     ] = None,
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Judge a run: trajectory and loops by the truth of its source, its map by the frames, what its
-    map calls things by the labels of the source.
+    """Evaluate a run: its trajectory, loop closures, rendered map and labels.
 
-    Prints the protocol above the figures, and draws trajectory.png, rendering.png and labels.png
-    into DIR. `ldo run --hold-out-every 5` keeps every fifth frame out of the map, to judge it by.
-    Without ground truth only the map is judged.
+    Trajectory and loop closures are compared with the ground truth of the source. Renderings of the
+    map are compared with its frames, and labels with its labels. Without ground truth only the map
+    is evaluated.
+
+    The command prints the protocol above the results, and writes trajectory.png, rendering.png and
+    labels.png into DIR. `ldo run --hold-out-every 5` keeps every fifth frame out of the map, so
+    that the map can be evaluated on these frames.
 
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --hold-out-every 5
       ldo eval runs/desk ~/data/rgbd_dataset_freiburg1_desk
@@ -122,18 +130,24 @@ def evaluate(
 
 
 def run_config(folder: Path) -> Config:
-    """The configuration that a run was made with."""
+    """Return the configuration that a run was made with."""
     return load_config(require_file(folder, "config.yaml"))
 
 
 def labelled_by(config: Config) -> dict[str, str]:
-    """Who named things in a run; empty for nobody."""
+    """Return the detector and the labeller of a run; empty names where it had none."""
     labeller = config.vlm_labeller.model or config.vlm_labeller.url
     return {"detector": config.detector.model, "labeller": labeller}
 
 
 def print_results(results: Results, lpips: Path | None, config: Config) -> None:
-    """`config` is that of the run."""
+    """Print all results of an evaluation as tables.
+
+    Args:
+        results: The results.
+        lpips: Network of LPIPS; None if LPIPS was not computed.
+        config: Configuration of the run.
+    """
     console = Console(highlight=False, width=None if sys.stdout.isatty() else WIDTH)
     if results.trajectories is None:
         console.print(NO_TRUTH)
@@ -160,7 +174,7 @@ def _print_renderings(console: Console, results: Results, lpips: Path | None) ->
 
 
 def _print_labels(console: Console, results: Results, who: dict[str, str]) -> None:
-    """Nothing where neither the map nor the source has labels."""
+    """Print label results; print nothing if the map or the source has no labels."""
     if results.unlabelled:
         console.print(results.unlabelled, style="dim")
     if not results.labels:
@@ -173,6 +187,7 @@ def _print_labels(console: Console, results: Results, who: dict[str, str]) -> No
 
 
 def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:
+    """Return a table with the errors of each trajectory."""
     table = Table("trajectory", "poses", "ATE RMSE", "mean", "median", "max", "RPE 1 s")
     for name, errors in rows.items():
         ate = errors.ate_m
@@ -188,6 +203,7 @@ def trajectory_table(rows: dict[str, TrajectoryErrors]) -> Table:
 
 
 def loops_table(errors: LoopErrors) -> Table:
+    """Return a table with the precision, recall, pose errors and times of loop closing."""
     table = Table("loops", "precision", "recall", "position", "rotation", "ms p50", "p95")
     table.add_row(
         f"{errors.closures} of {errors.candidates}",
@@ -205,13 +221,14 @@ def _share(value: float | None) -> str:
 
 
 def _spread(values: tuple[float, ...], factor: float, unit: str) -> str:
-    """Median and maximum."""
+    """Return the median and the maximum as text."""
     if not values:
         return "-"
     return f"{factor * np.median(values):.2f}, at most {factor * max(values):.2f} {unit}"
 
 
 def rendering_table(rows: list[RenderingErrors], *, has_lpips: bool) -> Table:
+    """Return a table with the image errors of each map and protocol."""
     columns = {"PSNR dB": ("psnr_db", 1, ".2f"), "SSIM": ("ssim", 1, ".3f")}
     if has_lpips:
         columns["LPIPS"] = ("lpips", 1, ".3f")

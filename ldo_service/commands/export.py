@@ -1,4 +1,4 @@
-"""ldo export"""
+"""Command `ldo export`."""
 
 import csv
 import os
@@ -34,7 +34,7 @@ TRAJECTORY_COLUMNS = ("stamp_s", "x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """What to write, from what, and how."""
+    """Job of a writer: its source, its file and its options."""
 
     source: MapFolder
     out: Path
@@ -46,7 +46,7 @@ class Job:
 
 def export(
     folder: Annotated[
-        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="what `ldo run` wrote")
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of a run")
     ],
     format: Annotated[
         Format,
@@ -56,38 +56,38 @@ def export(
     ],
     out: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="FILE", help="default: in DIR, named after what it holds"),
+        tyro.conf.arg(metavar="FILE", help="default: a file in DIR, named after the format"),
     ] = None,
     online: Annotated[
-        bool, tyro.conf.arg(help="the run's own map and poses, also where refined ones are")
+        bool, tyro.conf.arg(help="export the map and poses of the run itself, not the refined ones")
     ] = False,
     voxel: Annotated[
         float | None,
         tyro.conf.arg(metavar="M", help="side of a voxel; default: mesh 0.02, occupancy 0.1"),
     ] = None,
     up: Annotated[
-        Up, tyro.conf.arg(help="axis of the map that is up, for the floor plan of occupancy")
+        Up, tyro.conf.arg(help="axis of the map that points up, for the floor plan of occupancy")
     ] = "-y",
     heights: Annotated[
         tuple[float, float],
         tyro.conf.arg(
-            metavar="MIN MAX", help="metres above the first camera that the floor plan sums up"
+            metavar="MIN MAX", help="height range of the floor plan, meters above the first camera"
         ),
     ] = (-0.5, 0.5),
     overwrite: Annotated[bool, tyro.conf.arg(help="replace an earlier FILE")] = False,
 ) -> None:
     """Write the map or the trajectory of a run for other programs.
 
-    Takes the refined map where there is one. `mesh` is a PLY with triangles in colour. `occupancy`
-    is an .npz with a grid of free, occupied and unknown voxels, and beside it a floor plan (.pgm,
-    .yaml) for ROS' map_server. The map has the axes of the first camera: `--up -y` is right when
-    that was held level.
+    The refined map is exported if there is one. `mesh` is a PLY file with colored triangles.
+    `occupancy` is an .npz file with a grid of free, occupied and unknown voxels. With it comes a
+    floor plan (.pgm and .yaml) for map_server of ROS. The map has the axes of the first camera, so
+    `--up -y` is right if that camera was level.
 
       ldo export runs/desk --format splat
       ldo export runs/desk --format occupancy --voxel 0.05 --heights -0.8 0.3
     """
     if voxel is not None and format not in ("mesh", "occupancy"):
-        raise ConfigError(f"--voxel has no meaning for {format}: leave it out.")
+        raise ConfigError(f"--voxel applies to mesh and occupancy, not to {format}. Remove it.")
     source = MapFolder(folder) if online else newest_map(folder)
     out = out or folder / EXPORTED[format][0]
     written = [out.with_suffix(Path(name).suffix) for name in EXPORTED[format][1:]]
@@ -101,17 +101,23 @@ def export(
 
 
 def require_writable(runs: Iterable[Path], files: list[Path], overwrite: bool) -> None:
-    """Raises ConfigError for a file that is there already, or that `runs` left themselves."""
+    """Check that the files to write neither exist nor are outputs of the runs.
+
+    Raises:
+        ConfigError: A file exists already, or is an output of a run.
+    """
     exported = {name for names in EXPORTED.values() for name in names}
     kept = {(run / name).resolve() for run in runs for name in WRITTEN - exported}
     for file in files:
         if file.resolve() in kept:
-            raise ConfigError(f"{file} is what a run left, not an export. Choose another --out.")
+            raise ConfigError(
+                f"{file} is an output of the run, not an export. Choose another --out."
+            )
         if file.exists() and not overwrite:
             raise ConfigError(f"{file} exists. Choose another --out, or add --overwrite.")
 
 
-# --- writers: each says in a few words what it wrote ----------------------------------------------
+# --- writers: each returns a short description of what it wrote ---------------------------------
 def _gaussians(write: Callable) -> Callable[[Job], str]:
     def write_gaussians(job: Job) -> str:
         rows = job.source.gaussians()
@@ -134,7 +140,7 @@ def _csv(job: Job) -> str:
 
 
 def write_csv(path: Path, trajectory: Trajectory) -> None:
-    """A line per pose T_map_camera: seconds, metres, quaternion wxyz."""
+    """Write a row per pose T_map_camera: stamp in seconds, meters, quaternion wxyz."""
     with path.open("w", newline="") as file:
         table = csv.writer(file)
         table.writerow(TRAJECTORY_COLUMNS)
@@ -149,7 +155,9 @@ def _mesh(job: Job) -> str:
     with progress("mesh", len(viewpoints), job.console) as advance:
         mesh = fuse(rows, viewpoints, config, threads=os.cpu_count() or 1, advance=advance).mesh()
     if not len(mesh.triangles):
-        raise DataError("no surface is seen from the keyframes, so there is nothing to write.")
+        raise DataError(
+            "the keyframes see no surface, so the mesh would be empty. Check the map by `ldo view`."
+        )
     write_mesh(job.out, mesh)
     vertices, triangles = len(mesh.vertices_m), len(mesh.triangles)
     return f"{vertices:,} vertices, {triangles:,} triangles, {mesh.area_m2:.1f} m2"

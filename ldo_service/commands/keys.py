@@ -1,4 +1,4 @@
-"""ldo keys"""
+"""Command `ldo keys`."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -15,17 +15,22 @@ from ldo_service.transport.endpoint import CLOSED, MAX_MESSAGE_MB
 from ldo_service.transport.keys import ACCESS, router_settings
 
 Folder = Annotated[
-    Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR", help="folder of the authority")
+    Path,
+    tyro.conf.Positional,
+    tyro.conf.arg(metavar="DIR", help="folder of the certificate authority"),
 ]
 Name = Annotated[
-    str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help="of a program or a machine")
+    str, tyro.conf.Positional, tyro.conf.arg(metavar="NAME", help="name of a program or a machine")
 ]
-Days = Annotated[int, tyro.conf.arg(metavar="N", help="valid for so many days")]
+Days = Annotated[int, tyro.conf.arg(metavar="N", help="days that the keys are valid")]
 
 
 @dataclass(frozen=True)
 class New:
-    """Make an authority in a new folder; nothing of it leaves this machine but what `add` makes."""
+    """Create a certificate authority in a new folder.
+
+    The private key of the authority never leaves this machine; only the keys that `add` makes do.
+    """
 
     folder: Folder
     days: Days = 3650
@@ -35,27 +40,32 @@ class New:
 class AddKeys:
     """Make keys: a folder to copy to the machine of that name, for --keys.
 
-    ldo keys add DIR service mule --robot mule --host mule.local
-    ldo keys add DIR camera front --robot mule
+    This also updates the access control list in the folder of each service. Copy that file too, and
+    restart the service.
 
-    Each service's folder gets the new list of who may do what: copy that too, and start it anew.
+      ldo keys add DIR service mule --robot mule --host mule.local
+      ldo keys add DIR camera front --robot mule
     """
 
     folder: Folder
     role: Annotated[
         Role,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="service|camera|odometry|viewer|operator", help="what it may do"),
+        tyro.conf.arg(
+            metavar="service|camera|odometry|viewer|operator",
+            help="role that limits what it may do",
+        ),
     ]
     name: Name
     robot: Annotated[
-        str, tyro.conf.arg(metavar="NAME", help="whose topics; otherwise those of every robot")
+        str,
+        tyro.conf.arg(metavar="NAME", help="robot whose topics it may use; default: every robot"),
     ] = EVERY_ROBOT
     host: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(
             metavar="HOST",
-            help="name or address where others reach a service, beside localhost; may be repeated",
+            help="name or address of a service besides localhost; may be repeated",
         ),
     ] = ()
     days: Days = 365
@@ -63,16 +73,16 @@ class AddKeys:
 
 @dataclass(frozen=True)
 class ListKeys:
-    """Show who has keys, what they may do and until when."""
+    """List all keys with their roles, robots and expiry dates."""
 
     folder: Folder
 
 
 @dataclass(frozen=True)
 class RevokeKeys:
-    """Let keys do nothing any more, and delete their folder here.
+    """Revoke keys, and delete their folder here.
 
-    That holds at a router that has the new `access.yaml` and was started anew.
+    The revocation takes effect when a router has the new `access.yaml` and was restarted.
     """
 
     folder: Folder
@@ -81,13 +91,15 @@ class RevokeKeys:
 
 @dataclass(frozen=True)
 class Router:
-    """Print the configuration of a router of its own (`zenohd --config FILE`), for a fleet."""
+    """Print the configuration of a separate router (`zenohd --config FILE`), for a fleet."""
 
     folder: Folder
     keys: Annotated[
-        Path, tyro.conf.arg(metavar="DIR", help="where the router has its folder of keys")
+        Path, tyro.conf.arg(metavar="DIR", help="folder of keys on the machine of the router")
     ] = Path("/etc/ldo/keys")
-    port: Annotated[int, tyro.conf.arg(metavar="PORT", help="where it listens")] = 7447
+    port: Annotated[int, tyro.conf.arg(metavar="PORT", help="port on which the router listens")] = (
+        7447
+    )
 
 
 Verb = (
@@ -100,7 +112,7 @@ Verb = (
 
 
 def keys(verb: Verb) -> None:
-    """Make and revoke the keys by which programs on the network know each other.
+    """Make and revoke the keys that authenticate programs on the network.
 
     Without keys the service listens on this machine alone:
 
@@ -118,24 +130,33 @@ def keys(verb: Verb) -> None:
     match verb:
         case New():
             CertificateAuthority.new(verb.folder, verb.days)
-            print(f"{verb.folder} is an authority: `ldo keys add` makes keys. ca.key stays here.")
+            print(
+                f"{verb.folder} is a certificate authority: `ldo keys add` makes keys. Keep ca.key "
+                "on this machine."
+            )
         case AddKeys():
             authority = CertificateAuthority(verb.folder)
             made = authority.add(verb.name, verb.role, verb.robot, verb.days, verb.host)
-            print(f"{made} is what {verb.name} needs: copy it there, for --keys.")
+            print(f"{made} has the keys of {verb.name}: copy it to that machine, for --keys.")
         case ListKeys():
             table = _table(CertificateAuthority(verb.folder))
             Console(highlight=False, markup=False, soft_wrap=True).print(table)
         case RevokeKeys():
             CertificateAuthority(verb.folder).remove(verb.name)
             print(
-                f"{verb.name} may do nothing any more, where services have the new {ACCESS} and "
-                "were started anew."
+                f"{verb.name} is revoked. Copy the new {ACCESS} to every service and restart it: "
+                "until then the keys remain valid there."
             )
 
 
 def router_yaml(access: Access, folder: Path, port: int) -> str:
-    """What makes `zenohd` do as a service's own router does."""
+    """Return a configuration that makes `zenohd` act like the router of a service.
+
+    Args:
+        access: The access control list.
+        folder: Folder of keys on the machine of the router.
+        port: Port on which the router listens.
+    """
     settings = {
         "mode": "router",
         "listen/endpoints": [f"tls/0.0.0.0:{port}"],
@@ -154,7 +175,7 @@ def router_yaml(access: Access, folder: Path, port: int) -> str:
 
 
 def _table(authority: Any) -> Table:
-    table, today = Table("name", "may be", "of robot", "until"), datetime.now(UTC).date()
+    table, today = Table("name", "role", "robot", "valid until"), datetime.now(UTC).date()
     for entry in authority.entries:
         who = entry.grantee
         until = "" if who.until is None else f"{who.until:%Y-%m-%d}"

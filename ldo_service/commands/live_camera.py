@@ -1,4 +1,4 @@
-"""`ldo publish realsense` and `ldo publish ros2`: frames of a camera that is there, passed on."""
+"""Live cameras of `ldo publish`: RealSense over USB and topics of ROS 2."""
 
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -24,58 +24,70 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class RealSenseOptions:
-    """Of `ldo publish realsense`."""
+    """Options of `ldo publish realsense`."""
 
     serial: Annotated[
-        str, tyro.conf.arg(metavar="NUMBER", help="of the device, where there are several")
+        str,
+        tyro.conf.arg(metavar="NUMBER", help="serial number of the device, if there are several"),
     ] = ""
-    size: Annotated[str, tyro.conf.arg(metavar="WxH", help="of colour and depth")] = "640x480"
-    fps: Annotated[int, tyro.conf.arg(metavar="HZ", help="of both")] = 30
+    size: Annotated[str, tyro.conf.arg(metavar="WxH", help="image size of color and depth")] = (
+        "640x480"
+    )
+    fps: Annotated[int, tyro.conf.arg(metavar="HZ", help="frame rate of color and depth")] = 30
 
     def stream(self) -> RealSenseStream:
-        """Raises ConfigError for a size or a rate that is none."""
+        """Return the stream with these options.
+
+        Raises:
+            ConfigError: The size or the rate cannot be read.
+        """
         width, _, height = self.size.partition("x")
         if not (width.isdecimal() and height.isdecimal() and self.fps > 0):
-            raise ConfigError(
-                f"--size {self.size} --fps {self.fps}: write them like 640x480 and 30."
-            )
+            raise ConfigError(f"--size {self.size} --fps {self.fps}: must be like 640x480 and 30.")
         return RealSenseStream(self.serial, int(width), int(height), self.fps)
 
 
 @dataclass(frozen=True)
 class RosOptions:
-    """Of `ldo publish ros2`."""
+    """Options of `ldo publish ros2`."""
 
     color: Annotated[
         str,
-        tyro.conf.arg(metavar="TOPIC", help="Image; CompressedImage where it ends in /compressed"),
+        tyro.conf.arg(metavar="TOPIC", help="Image, or CompressedImage if it ends in /compressed"),
     ] = ""
     depth: Annotated[
         str,
-        tyro.conf.arg(metavar="TOPIC", help="registered to colour; or one in /compressedDepth"),
+        tyro.conf.arg(
+            metavar="TOPIC", help="depth registered to color; may end in /compressedDepth"
+        ),
     ] = ""
     info: Annotated[
         str,
-        tyro.conf.arg(metavar="TOPIC", help="CameraInfo of colour; default: camera_info beside it"),
+        tyro.conf.arg(metavar="TOPIC", help="CameraInfo of color; default: camera_info next to it"),
     ] = ""
     bridge: Annotated[
         str,
         tyro.conf.arg(
-            metavar="ADDRESS", help="of a bridge with a router of its own; default: --endpoint"
+            metavar="ADDRESS", help="address of a bridge with its own router; default: --endpoint"
         ),
     ] = ""
     max_skew_s: Annotated[
-        float, tyro.conf.arg(metavar="S", help="most between the stamps of colour and depth")
+        float,
+        tyro.conf.arg(metavar="S", help="maximum difference of the stamps of color and depth"),
     ] = 0.015
     rectified: Annotated[
-        bool, tyro.conf.arg(help="images are rectified: take P of the CameraInfo, not K and D")
+        bool, tyro.conf.arg(help="images are rectified: use P of the CameraInfo, not K and D")
     ] = False
     registered: Annotated[
-        bool, tyro.conf.arg(help="depth is registered, though its frame_id is not that of colour")
+        bool, tyro.conf.arg(help="depth is registered, although its frame_id is not that of color")
     ] = False
 
     def topics(self) -> RosTopics:
-        """Raises ConfigError for what is missing, or no topic."""
+        """Return the topics.
+
+        Raises:
+            ConfigError: A topic is missing or has an invalid name.
+        """
         if not (self.color and self.depth):
             raise ConfigError("`ldo publish ros2` needs --color TOPIC and --depth TOPIC.")
         names = self.color, self.depth, self.info
@@ -85,11 +97,20 @@ class RosOptions:
 def frames_of_ros(
     options: RosOptions, service: Endpoint, say: Say
 ) -> Generator[CameraRgbd, None, None]:
-    """Raises ConfigError where nobody could get them."""
+    """Return the frames that a Zenoh bridge forwards from ROS 2.
+
+    Args:
+        options: Topics and options.
+        service: Endpoint of the service; the bridge uses it too unless `options.bridge` is given.
+        say: Receives notes for the user.
+
+    Raises:
+        ConfigError: The router has keys and lets no topics of a bridge through.
+    """
     if service.keys is not None and not options.bridge:
         raise ConfigError(
-            "a router with keys lets through the service's topics alone: run the bridge with a "
-            "router of its own, and name its address with --bridge."
+            "the router of the service uses keys and forwards only the service's own topics. Run "
+            "the bridge with its own router, and give that router's address with --bridge."
         )
     camera = RosCamera(options.topics(), say)
     bridge = Endpoint(service.robot, options.bridge or service.endpoint)
@@ -107,20 +128,32 @@ def _report_at_end(
 
 
 def require_no_sequence(source: str, **options: object) -> None:
-    """Raises ConfigError for options that only recorded frames have a use for."""
+    """Check that no option is given that applies only to recorded frames.
+
+    Raises:
+        ConfigError: Such an option is given.
+    """
     for name, value in options.items():
         if value:
             raise ConfigError(
-                f"--{name} is for sequences: `ldo publish {source}` sends what comes."
+                f"--{name} applies to sequences, not to the live camera `{source}`. Remove it."
             )
 
 
 def relay(
     service: Client, frames: Iterable[CameraRgbd], chosen: Selection, restamp: bool, say: Say
 ) -> None:
-    """Send every n-th frame, until there are `chosen.max_frames`, or Ctrl-C."""
+    """Send every n-th frame until `chosen.max_frames` are sent or the user presses Ctrl-C.
+
+    Args:
+        service: Connection to the service.
+        frames: Frames of a live camera.
+        chosen: Stride and maximum number of frames.
+        restamp: Replace the stamp of each frame by the time of sending.
+        say: Receives notes for the user.
+    """
     if not service.wait_for_subscriber():
-        say("nobody listens to camera/rgbd yet: is the service of this robot running?")
+        say("camera/rgbd has no subscriber yet: is the service of this robot running?")
     sent = 0
     try:
         for frame in islice(frames, 0, None, chosen.stride):

@@ -1,4 +1,4 @@
-"""ldo models"""
+"""Command `ldo models`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from ldo_service.errors import ConfigError, LdoError, ModelError
 Name = Annotated[
     str,
     tyro.conf.Positional,
-    tyro.conf.arg(metavar="NAME", help="what `detector.model` or `vlm_labeller.model` calls it"),
+    tyro.conf.arg(metavar="NAME", help="name for `detector.model` or `vlm_labeller.model`"),
 ]
 
 
@@ -26,39 +26,42 @@ Name = Annotated[
 class AddModel:
     """Check a network in ONNX, copy and register it.
 
-    ldo models add nano yolox_nano.onnx --license Apache-2.0
+    With a text encoder or with embeddings, FILE is the image encoder of a pair in the layout of
+    CLIP. Such a pair labels regions.
 
-    With a text encoder or embeddings FILE is the image encoder of a pair in CLIP's layout, which
-    names regions:
-
-    ldo models add clip visual.onnx --text text.onnx --vocabulary bpe_simple_vocab_16e6.txt.gz
-    ldo models add clip visual.onnx --embeddings names.npz
+      ldo models add nano yolox_nano.onnx --license Apache-2.0
+      ldo models add clip visual.onnx --text text.onnx --vocabulary bpe_simple_vocab_16e6.txt.gz
+      ldo models add clip visual.onnx --embeddings names.npz
     """
 
     name: Name
-    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE", help="in ONNX")]
+    file: Annotated[
+        Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE", help="network in ONNX")
+    ]
     layout: Annotated[
         Literal["yolov5", "yolox", "yolov8"] | None,
-        tyro.conf.arg(help="of its output; otherwise recognised"),
+        tyro.conf.arg(help="layout of its output; default: recognized by its shape"),
     ] = None
     names: Annotated[
         str,
         tyro.conf.arg(
             metavar="FILE",
-            help="its classes, one a line; otherwise those it carries, or the 80 of COCO",
+            help="its classes, one per line; default: those in the network, or the 80 of COCO",
         ),
     ] = ""
     license: Annotated[
-        str, tyro.conf.arg(metavar="FILE|TEXT", help="what you may do with it, kept beside it")
+        str, tyro.conf.arg(metavar="FILE|TEXT", help="its license, which is stored with it")
     ] = ""
     text: Annotated[Path | None, tyro.conf.arg(metavar="FILE", help="text encoder in ONNX")] = None
     vocabulary: Annotated[
-        Path | None, tyro.conf.arg(metavar="FILE", help="its byte pairs, as CLIP's .txt.gz")
+        Path | None,
+        tyro.conf.arg(metavar="FILE", help="byte pairs of the text encoder, as CLIP's .txt.gz"),
     ] = None
     embeddings: Annotated[
         Path | None,
         tyro.conf.arg(
-            metavar="FILE", help="names, embeddings and perhaps logit_scale, .npz or .safetensors"
+            metavar="FILE",
+            help="names, embeddings and optionally logit_scale, in .npz or .safetensors",
         ),
     ] = None
 
@@ -67,7 +70,11 @@ class AddModel:
         return any((self.text, self.vocabulary, self.embeddings))
 
     def pair(self) -> EncoderFiles:
-        """Raises ConfigError for half a pair."""
+        """Return the files of the encoder pair.
+
+        Raises:
+            ConfigError: Files of the pair are missing.
+        """
         files = self.file, self.text, self.vocabulary, self.embeddings
         image, text, vocabulary, embeddings = (file and file.expanduser() for file in files)
         assert image is not None
@@ -81,7 +88,7 @@ class ListModels:
 
 @dataclass(frozen=True)
 class RemoveModel:
-    """Forget a registered network and delete its copy."""
+    """Unregister a network and delete its copy."""
 
     name: Name
 
@@ -94,10 +101,11 @@ Verb = (
 
 
 def models(verb: Verb) -> None:
-    """Register, list and remove the networks that find objects, and those that name regions.
+    """Register, list and remove detectors and encoder pairs.
 
-    `detector.model` in the configuration takes a registered name, and `vlm_labeller.model` that of
-    a pair. Only `demo` comes with the package, a detector and a pair for the synthetic scenes:
+    `detector.model` in the configuration takes the registered name of a detector, and
+    `vlm_labeller.model` that of an encoder pair, which labels regions. Only `demo` comes with the
+    package: a detector and a pair for the synthetic scenes.
 
       ldo models add nano yolox_nano.onnx
       ldo run SOURCE --out DIR --set detector.model=nano
@@ -113,7 +121,11 @@ def models(verb: Verb) -> None:
 
 
 def add(verb: AddModel) -> None:
-    """Raises ConfigError for what cannot be used."""
+    """Register a detector or an encoder pair and print its facts.
+
+    Raises:
+        ConfigError: A file cannot be used.
+    """
     model = _add_pair(verb) if verb.is_pair else _add_detector(verb)
     about = model.about
     print(
@@ -129,14 +141,20 @@ def _add_detector(verb: AddModel) -> Model:
 
 def _add_pair(verb: AddModel) -> Model:
     if verb.layout:
-        raise ConfigError(f"--layout {verb.layout} is of a detector, and a pair was named.")
+        raise ConfigError(
+            f"--layout {verb.layout} applies to a detector, not to an encoder pair. Remove it."
+        )
     names = read_names(Path(verb.names).expanduser()) if verb.names else ()
     license = _license(verb.license)
     return Models().add_pair(verb.name, verb.pair(), DualEncoderConfig(), names, license)
 
 
 def show(console: Console) -> None:
-    """Raises LdoError when one of them is damaged."""
+    """Print a table of the registered networks.
+
+    Raises:
+        LdoError: A network is damaged.
+    """
     registered, damaged = Models(), 0
     table = Table("name", "layout", "classes", "license", "sha256", "")
     for name in registered.names:
@@ -155,18 +173,22 @@ def show(console: Console) -> None:
     if registered.names:
         console.print(table)
     else:
-        console.print(f"none in {registered.folder}: `ldo models add NAME FILE` registers one.")
+        console.print(
+            f"no networks in {registered.folder}: `ldo models add NAME FILE` registers one."
+        )
     console.print(f"{demo_networks.NAME}, a detector and a pair, comes with the package.")
     if damaged:
-        raise LdoError(f"{damaged} of the above must be removed and added again.")
+        raise LdoError(
+            f"{damaged} of the networks above are damaged: remove them and add them again."
+        )
 
 
 def _license(text: str) -> str:
-    """The text of a file, or the text itself."""
+    """Return the text of the file with this name, or the argument itself."""
     path = Path(text)
     try:
         is_file = path.is_file()
-    except OSError:  # too long for the name of a file
+    except OSError:  # The text is too long for a file name.
         return text
     try:
         return path.read_text("utf-8") if is_file else text

@@ -1,4 +1,4 @@
-"""Options that several commands share, and the progress of long work."""
+"""Options that several commands share, and progress bars."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,12 +16,12 @@ from ldo_service.config import Config, actor_parameters
 from ldo_service.runs.job import Advance
 from ldo_service.tracking.keyframe_database import load_keyframe_database
 
-LINES = 10  # in a log file
+LINES = 10  # Lines of progress where the output is no terminal.
 
 
 ConfigFile = Annotated[
     Path | None,
-    tyro.conf.arg(name="config", metavar="FILE", help="YAML with the settings that differ"),
+    tyro.conf.arg(name="config", metavar="FILE", help="YAML file with the settings to change"),
 ]
 Settings = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
@@ -37,11 +37,11 @@ Source = Annotated[
     tyro.conf.arg(
         metavar="SOURCE",
         help="folder of a data set (TUM RGB-D, Replica/NICE-SLAM, ScanNet export or 7-Scenes, "
-        "recognised by its files), a recording, or synthetic:room, :tour or :flat",
+        "recognized by its files), a recording, or synthetic:room, :tour or :flat",
     ),
 ]
-MaxFrames = Annotated[int | None, tyro.conf.arg(metavar="N", help="stop after so many frames")]
-Stride = Annotated[int, tyro.conf.arg(metavar="N", help="take every n-th frame")]
+MaxFrames = Annotated[int | None, tyro.conf.arg(metavar="N", help="stop after N frames")]
+Stride = Annotated[int, tyro.conf.arg(metavar="N", help="take every N-th frame")]
 Recording = Annotated[
     Path,
     tyro.conf.Positional,
@@ -51,7 +51,7 @@ ActorNames = Annotated[
     tyro.conf.UseAppendAction[tuple[str, ...]],
     tyro.conf.arg(
         metavar="ACTOR",
-        help="run this actor alone, as a part of a service that runs already; may be repeated",
+        help="run only this actor, as part of a running service; may be repeated",
     ),
 ]
 StateFolder = Annotated[
@@ -60,29 +60,32 @@ StateFolder = Annotated[
         name="state",
         aliases=["--resume"],
         metavar="DIR",
-        help="where actors keep what a successor needs, and go on from what they find; default: a "
-        "temporary folder",
+        help="folder of the actors' checkpoints, from which they resume; default: a temporary "
+        "folder",
     ),
 ]
 Localize = Annotated[
     Path | None,
     tyro.conf.arg(
         metavar="DIR",
-        help="track in the map that `ldo run` left in this folder, and do not change it",
+        help="localize in the finished map of this run folder, without changing it",
     ),
 ]
 Robot = Annotated[
-    str, tyro.conf.arg(metavar="NAME", help="second part of every topic: ldo/NAME/...")
+    str,
+    tyro.conf.arg(
+        metavar="NAME", help="name of the robot, second part of every topic: ldo/NAME/..."
+    ),
 ]
 EndpointAddress = Annotated[
-    str, tyro.conf.arg(metavar="ADDRESS", help="where the service's router listens")
+    str, tyro.conf.arg(metavar="ADDRESS", help="address of the service's router")
 ]
 KeysFolder = Annotated[
     Path | None,
     tyro.conf.arg(
         name="keys",
         metavar="DIR",
-        help="keys for TLS, a folder that `ldo keys add` made; ADDRESS is then tls/HOST:PORT",
+        help="folder with TLS keys, made by `ldo keys add`; ADDRESS is then tls/HOST:PORT",
     ),
 ]
 Overwrite = Annotated[bool, tyro.conf.arg(help="replace an earlier run in the folder")]
@@ -90,7 +93,11 @@ Json = Annotated[bool, tyro.conf.arg(help="print one JSON document and nothing e
 
 
 def localizing(config: Config, folder: Path | None) -> Config:
-    """The configuration with --localize. Raises DataError for a folder without a map."""
+    """Return the configuration with the map of --localize.
+
+    Raises:
+        DataError: The folder has no map.
+    """
     if folder is None:
         return config
     folder = folder.expanduser().resolve()
@@ -100,8 +107,13 @@ def localizing(config: Config, folder: Path | None) -> Config:
 
 
 def with_usable_networks(config: Config) -> Config:
-    """The same. Raises ConfigError when a network that it names cannot be used, which a service
-    only warns about."""
+    """Return the same configuration after a check of its networks.
+
+    A service only warns about a network that it cannot use.
+
+    Raises:
+        ConfigError: A network in the configuration cannot be used.
+    """
     parameters = actor_parameters(config)
     require_detector(parameters.detector)
     require_labeller(parameters.vlm_labeller)
@@ -110,7 +122,11 @@ def with_usable_networks(config: Config) -> Config:
 
 @contextmanager
 def progress(title: str, total: int, console: Console) -> Iterator[Advance]:
-    """A function to call with the number of items done, and with that of all where it grew."""
+    """Show progress while the context is open.
+
+    Yields:
+        A function that takes the number of finished items and, if it grew, the number of all items.
+    """
     if not console.is_terminal:
         yield _plain(title, total, console)
         return

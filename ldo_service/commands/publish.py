@@ -1,4 +1,4 @@
-"""ldo publish"""
+"""Command `ldo publish`."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -40,14 +40,16 @@ from .options import (
 )
 
 FIRST_REALSENSE, NO_TOPICS = RealSenseOptions(), RosOptions()
-MAX_BAD = 0.1  # share of unreadable frames over which the data is called bad
+MAX_BAD = 0.1  # Maximum fraction of unreadable frames.
 
 
 def publish(
     source: Annotated[
         str,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="SOURCE", help="a data set, as of `ldo run`; `realsense`; or `ros2`"),
+        tyro.conf.arg(
+            metavar="SOURCE", help="a data set, as for `ldo run`; `realsense`; or `ros2`"
+        ),
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
@@ -59,19 +61,19 @@ def publish(
     max_frames: MaxFrames = None,
     restamp: Annotated[
         bool,
-        tyro.conf.arg(help="stamp frames with the time of sending instead of the recorded one"),
+        tyro.conf.arg(help="stamp frames with the time of sending, not of recording"),
     ] = False,
     config: ConfigFile = None,
     set: Settings = (),
     usb: RealSenseOptions = FIRST_REALSENSE,
     ros: RosOptions = NO_TOPICS,
 ) -> None:
-    """Be a camera: publish on camera/rgbd what a sequence or a camera has.
+    """Publish the frames of a sequence or a camera on camera/rgbd.
 
-    `realsense` is a camera on USB. `ros2` are topics of ROS that a Zenoh bridge forwards.
+    `realsense` is a camera on USB. `ros2` reads topics of ROS 2 that a Zenoh bridge forwards.
 
-    Stamps are those of the source unless --restamp is given: then a subscriber can subtract the
-    stamp of a pose from its clock and has the pose's age.
+    The stamps are those of the source unless --restamp is given. With --restamp the age of a pose
+    is the difference between a subscriber's clock and the stamp of the pose.
 
       ldo publish ~/data/rgbd_dataset_freiburg1_desk --rate 15
       ldo publish realsense --size 848x480
@@ -102,13 +104,18 @@ def publish(
         for done, index in enumerate(paced(sequence, indices, rate), 1):
             camera.send(index)
             advance(done)
-    console.print(f"{camera.sent} frames published, {camera.bad} bad, {camera.unheard} unheard")
+    console.print(
+        f"{camera.sent} frames published, {camera.bad} bad, {camera.unheard} without subscriber"
+    )
     if camera.bad > MAX_BAD * len(indices):
         raise DataError(f"{camera.bad} of {len(indices)} frames could not be read.")
 
 
 class SequencePublisher:
-    """Sends frames of a sequence; tells once of bad ones, and of each time that nobody listens."""
+    """Publisher of the frames of a sequence.
+
+    It reports the first bad frame, and each time that the topic loses its subscribers.
+    """
 
     def __init__(
         self, service: Client, sequence: Sequence, restamp: bool, say: Callable[[str], None]
@@ -118,12 +125,13 @@ class SequencePublisher:
         self.sent = self.bad = self.unheard = 0
 
     def send(self, index: int) -> None:
+        """Send one frame, or count it as bad if it cannot be read."""
         self._notice_listeners()
         try:
             message = raw_frame_to_message(self._sequence.read(index))
         except FrameError as error:
             if self.bad == 0:
-                self._say(f"{error} It is left out; further bad frames are only counted.")
+                self._say(f"{error} The frame is skipped; further bad frames are only counted.")
             self.bad += 1
             return
         if self._restamp:
@@ -135,12 +143,18 @@ class SequencePublisher:
     def _notice_listeners(self) -> None:
         is_heard = self._service.has_subscriber
         if self._was_heard and not is_heard:
-            self._say("nobody listens to camera/rgbd: is the service still running?")
+            self._say("camera/rgbd has no subscriber any more: is the service still running?")
         self._was_heard = is_heard
 
 
 def paced(sequence: Sequence, indices: range, rate: float | None) -> Iterator[int]:
-    """Each index when it is due: by its recorded stamp, or `rate` times a second."""
+    """Yield each index at the time when it must be sent.
+
+    Args:
+        sequence: The sequence.
+        indices: Frames to send.
+        rate: Frames per second; None keeps the intervals of the recorded stamps.
+    """
     started_s = time.monotonic()
     first_ns = int(sequence.stamps_ns[indices[0]]) if indices else 0
     for number, index in enumerate(indices):

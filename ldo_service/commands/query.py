@@ -1,4 +1,4 @@
-"""ldo query"""
+"""Command `ldo query`."""
 
 import json
 from collections.abc import Sequence
@@ -37,7 +37,9 @@ def query(
         tyro.conf.Positional,
         tyro.conf.arg(metavar="DIR|live", help="folder of a finished run, or the running service"),
     ],
-    text: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT", help="its name")],
+    text: Annotated[
+        str, tyro.conf.Positional, tyro.conf.arg(metavar="TEXT", help="name of the object")
+    ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
     keys: KeysFolder = None,
@@ -45,16 +47,16 @@ def query(
         str,
         tyro.conf.arg(
             metavar="NAME",
-            help="pair of encoders that compares words where none in the map says the same; of a "
-            "run, the labeller that it had",
+            help="encoder pair that compares TEXT with the labels if no label has the same "
+            "meaning; default for a run: its own labeller",
         ),
     ] = "",
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Tell where things are: boxes in the map, the likeliest first.
+    """Find objects by name: print their boxes in the map, best match first.
 
-    Other words for the same are understood, and kinds of it: "sofa" finds couches. What no table
-    of words knows is compared by the texts of an image-text model, where there is one.
+    Synonyms are understood, and so are kinds: "sofa" finds couches. Words that are in no table are
+    compared by the text encoder of an encoder pair, if there is one.
 
       ldo query DIR "potted plant"
       ldo query live chair --json
@@ -71,35 +73,46 @@ def query(
 
 
 def _of_run(folder: Path) -> tuple[MapObjects, np.ndarray | None]:
-    """The objects, and where the camera was at the end."""
+    """Return the objects of a run and the last position [3] of the camera, None without poses."""
     found, path = read_objects(folder), folder / "trajectory.txt"
     T_map_camera = Trajectory.load(path).T_world_camera if path.is_file() else np.zeros((0, 4, 4))
     return found, T_map_camera[-1, :3, 3] if len(T_map_camera) else None
 
 
 def _live(robot: str, endpoint: str, keys: Path | None) -> tuple[MapObjects, np.ndarray | None]:
-    """The objects, and where the camera is."""
+    """Return the objects of a service and the position [3] of the camera, None if unknown."""
     with connect(robot, endpoint, keys) as service:
         found, poses = service.objects(), service.latest(POSE_TRACKED)
     eye = None
     for pose in poses:
         assert isinstance(pose, TrackedPose)
         if pose.submap:
-            continue  # where that is in the map is not known
+            continue  # The pose of this submap in the map is unknown.
         eye = (pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera))[:3, 3]
     return found, eye
 
 
 def _texts_of(model: str, run: Path | None) -> Encode:
-    """Of a pair, or where none is named of the labeller that a run had. It is opened when it is
-    asked: a name that cannot be opened is a ConfigError then; a run's labeller may be gone."""
+    """Return a function that encodes texts with an encoder pair.
+
+    The function opens the pair only when it is called, because the labeller of a run may no longer
+    exist.
+
+    Args:
+        model: Name of the encoder pair; empty takes the labeller of the run.
+        run: Folder of the run; None for a live service.
+
+    Returns:
+        The function. It raises ConfigError if the named pair cannot be opened, and
+        TextComparisonError if no pair is named and the run has none that can be opened.
+    """
 
     def encode(texts: Sequence[str]) -> np.ndarray:
         if model:
             return open_labeller(model, DualEncoderConfig()).texts.encode(texts)
         had = None if run is None else _labeller_of(run)
         if had is None:
-            raise TextComparisonError("`--model NAME` names a pair of encoders that can.")
+            raise TextComparisonError("`--model NAME` names an encoder pair for the comparison.")
         try:
             return open_labeller(had.model, had.dual_encoder).texts.encode(texts)
         except ConfigError as error:
@@ -109,10 +122,11 @@ def _texts_of(model: str, run: Path | None) -> Encode:
 
 
 def _labeller_of(run: Path) -> VlmLabellerConfig | None:
-    """Return the settings of the run's labeller; None where it had no pair.
+    """Return the settings of the run's labeller; None if it was no encoder pair.
 
     Raises:
-        NotCompared: The configuration of the run cannot be read, or is of an earlier version.
+        TextComparisonError: The configuration of the run cannot be read, or is of an earlier
+            version.
     """
     try:
         config = actor_parameters(load_config(run / "config.yaml")).vlm_labeller
@@ -132,7 +146,7 @@ def _plain(one: ObjectMatch) -> dict[str, object]:
 
 
 def _table(answers: list[ObjectMatch]) -> Table:
-    table = Table("id", "name", "score", "centre m", "size m", "distance m")
+    table = Table("id", "name", "score", "center m", "size m", "distance m")
     for one in answers:
         away = "" if one.distance is None else f"{one.distance:.2f}"
         lengths = (" ".join(f"{v:.2f}" for v in vector) for vector in (one.center, one.size))

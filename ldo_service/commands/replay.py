@@ -1,4 +1,4 @@
-"""ldo replay"""
+"""Command `ldo replay`."""
 
 import itertools
 from collections import Counter
@@ -17,18 +17,16 @@ from .options import Recording, progress
 
 def replay(
     recording: Recording,
-    verify: Annotated[
-        bool, tyro.conf.arg(help="end with exit code 5 at the first difference")
-    ] = False,
+    verify: Annotated[bool, tyro.conf.arg(help="exit with code 5 at the first difference")] = False,
     actor: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="NAME", help="this actor alone; may be repeated; default: all"),
+        tyro.conf.arg(metavar="NAME", help="replay only this actor; may be repeated; default: all"),
     ] = (),
 ) -> None:
-    """Feed fresh actors what they took in a recording, and compare what they make of it.
+    """Replay a recording with new actors, and compare their outputs with the recorded ones.
 
-    Restarts, failures and the room that each step saw are part of it. Nothing is sent. Without
-    --verify a difference is printed and is no error.
+    The replay includes restarts, failures and the send credit at each step. Nothing is published.
+    Without --verify, a difference is printed but is no error.
 
       ldo replay recordings/desk --verify
     """
@@ -56,7 +54,7 @@ def _replay(
 
 
 def _table(rows: list[ReplayReport]) -> Table:
-    table = Table("actor", "steps", "took", "made", "same")
+    table = Table("actor", "steps", "inputs", "outputs", "same")
     for row in rows:
         same = "yes" if row.difference is None else f"until\n{row.difference.step}"
         took, made = _counts(row.taken), _counts(row.made)
@@ -65,7 +63,7 @@ def _table(rows: list[ReplayReport]) -> Table:
 
 
 def _life(row: ReplayReport) -> Iterator[str]:
-    """Its name, and what did not go smoothly."""
+    """Yield the name of the actor, then its restarts and failures."""
     yield row.actor
     if row.starts != 1:
         yield f"{row.starts} starts"
@@ -74,7 +72,7 @@ def _life(row: ReplayReport) -> Iterator[str]:
     if row.failures:
         yield f"{row.failures} failed"
     if row.dead_lettered:
-        yield f"{row.dead_lettered} set aside"
+        yield f"{row.dead_lettered} dead letters"
 
 
 def _counts(messages: Counter[str]) -> str:

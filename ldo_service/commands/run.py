@@ -1,4 +1,4 @@
-"""ldo run"""
+"""Command `ldo run`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -44,19 +44,19 @@ def run(
     stride: Stride = 1,
     hold_out_every: Annotated[
         int | None,
-        tyro.conf.arg(metavar="N", help="track every n-th frame and never map it; 0: map all"),
+        tyro.conf.arg(metavar="N", help="track every N-th frame but never map it; 0: map all"),
     ] = None,
     threads: Annotated[
         int | None,
         tyro.conf.arg(
             metavar="T",
-            help="of the renderer; 0: all cores, but one for the tracker where frames do not wait",
+            help="threads of the renderer; 0: all cores, less one for the tracker with --realtime",
         ),
     ] = None,
     refine_iterations: Annotated[
         int,
         tyro.conf.arg(
-            metavar="N", help="fit the map for N more iterations at the end, into DIR/refined"
+            metavar="N", help="optimize the map for N more iterations at the end, into DIR/refined"
         ),
     ] = 0,
     localize: Localize = None,
@@ -64,20 +64,22 @@ def run(
         Path | None,
         tyro.conf.arg(
             metavar="FILE",
-            help="where another odometry had the robot's base, in the TUM format: a guess for the "
-            "tracker. tracker.T_base_camera says where the camera sits on it",
+            help="poses of the robot's base from another odometry, in the TUM format: an initial "
+            "guess for the tracker. Set the camera pose on the base by tracker.T_base_camera",
         ),
     ] = None,
     keep_front_end: Annotated[
         bool,
-        tyro.conf.arg(help="keep what tracker and detector say in DIR/front_end.mcap, images too"),
+        tyro.conf.arg(
+            help="record the outputs of tracker and detector, with images, in DIR/front_end.mcap"
+        ),
     ] = False,
     reuse_front_end: Annotated[
         Path | None,
         tyro.conf.arg(
             metavar="RUN",
-            help="take what they said from this folder of a run over the same frames, and run the "
-            "others alone: what their settings are worth, poses being equal",
+            help="take the outputs of tracker and detector from this run over the same frames, and "
+            "run only the other actors, to compare their settings with equal poses",
         ),
     ] = None,
     realtime: Annotated[
@@ -85,10 +87,10 @@ def run(
     ] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Track and map a sequence; write trajectory, map and figures to a folder.
+    """Track and map a sequence; write trajectory, map and metrics to a folder.
 
-    The result depends on the frames and the configuration alone, not on the machine's load, and
-    needs no ground truth. `ldo eval DIR SOURCE` compares it with one.
+    The result depends only on the frames and the configuration, not on the load of the machine. No
+    ground truth is needed; `ldo eval DIR SOURCE` compares the result with it.
 
       ldo run synthetic:room --out runs/room
       ldo run ~/data/rgbd_dataset_freiburg1_desk --out runs/desk --max-frames 300
@@ -135,19 +137,29 @@ def run(
 def execute(
     job: RunOptions, go: Callable[[RunOptions, Advance], RunWriter], console: Console
 ) -> RunWriter:
+    """Run the job with a progress bar.
+
+    Raises:
+        ConfigError: The folder cannot be written.
+    """
     with progress("run", job.work, console) as advance:
         try:
             return go(job, advance)
         except OSError as error:
             raise ConfigError(
                 f"{job.folder} cannot be written: {error.strerror}. Free some space, or choose "
-                "another folder; what is there is incomplete."
+                "another folder; the files in this one are incomplete."
             ) from error
 
 
 def kept_front_end(
     run: Path | None, out: Path, settings: Config, sequence: Sequence, selection: Selection
 ) -> FrontEnd | None:
+    """Open the recorded outputs of tracker and detector; return None without --reuse-front-end.
+
+    Raises:
+        ConfigError: The run would replace the recording that it reads.
+    """
     if run is None:
         return None
     if run.expanduser().resolve() == out.expanduser().resolve():
@@ -156,23 +168,25 @@ def kept_front_end(
 
 
 def format_unmerged(gaussians: int) -> str:
+    """Return a note on the Gaussians of submaps that were never merged with the map."""
     return (
-        f"map.ply leaves out {gaussians:,} Gaussians: the camera was lost, went on, and nothing it "
-        "saw from then on was recognised, so where they belong is not known."
+        f"map.ply lacks {gaussians:,} Gaussians: tracking was lost, and the submaps after it were "
+        "never merged with the map, so the poses of these Gaussians in it are unknown."
     )
 
 
 def format_localization(statuses: dict[str, int], folder: Path) -> str:
+    """Return a note on the result of localization in a finished map."""
     if statuses["OK"] + statuses["WEAK"] == 0:
         return (
-            f"No frame was recognised: is {folder} a map of this place, seen from about the same "
-            "heights and by a camera as wide?"
+            f"No frame was localized. Check that {folder} is a map of this place, made from "
+            "similar heights and with a camera of a similar field of view."
         )
-    return f"The map is that of {folder}, as it was."
+    return f"The map is that of {folder}, unchanged."
 
 
 def with_options(config: Config, hold_out: int | None, threads: int | None) -> Config:
-    """The configuration with what has an option of its own."""
+    """Return the configuration with the settings that have their own options."""
     tracker, mapper = config.tracker, config.mapper
     if hold_out is not None:
         tracker = replace(tracker, hold_out=hold_out)
@@ -182,30 +196,51 @@ def with_options(config: Config, hold_out: int | None, threads: int | None) -> C
 
 
 def require_none_of(option: str, is_given: object, others: Mapping[str, object]) -> None:
-    """Options that leave an option nothing to do, or would themselves have nothing to do."""
+    """Check that no option is given that would have no effect with another one.
+
+    Args:
+        option: Name of the option.
+        is_given: Its value; a true value means that it is given.
+        others: Options that exclude it, by name.
+
+    Raises:
+        ConfigError: Both are given.
+    """
     wrong = [name for name, value in others.items() if value]
     if is_given and wrong:
-        raise ConfigError(f"{option} and {wrong[0]} do not go together: leave one of them out.")
+        raise ConfigError(f"{option} and {wrong[0]} exclude each other. Remove one of them.")
 
 
 def require_separate(localize: Path | None, out: Path, refine: int) -> None:
-    """A map that is localised in stays as it is."""
+    """Check that localization does not change the map that it uses.
+
+    Raises:
+        ConfigError: The run would refine or replace that map.
+    """
     if localize and refine:
-        raise ConfigError("--localize leaves the map as it is: leave out --refine-iterations.")
+        raise ConfigError("--localize does not change the map. Remove --refine-iterations.")
     if localize and localize.expanduser().resolve() == out.expanduser().resolve():
         raise ConfigError(f"--out {out} would replace the map to localize in: choose another.")
 
 
 def require_held_out(stride: int, hold_out: int) -> None:
-    """Held-out frames are counted in the sequence: with a common factor some would never come."""
+    """Check that the stride reaches the frames that are held out.
+
+    Held-out frames are counted in the whole sequence. With a common factor of both numbers, some of
+    them would never be read.
+
+    Raises:
+        ConfigError: The stride and the interval of held-out frames have a common factor.
+    """
     if hold_out and gcd(stride, hold_out) > 1:
         raise ConfigError(
-            f"--stride {stride} and --hold-out-every {hold_out} share a factor, so other frames "
-            "would be held out than asked for. Choose one without."
+            f"--stride {stride} and --hold-out-every {hold_out} have a common factor, so other "
+            "frames would be held out than requested. Choose numbers without one."
         )
 
 
 def summary_table(summary: dict[str, Any], out: Path) -> Table:
+    """Return a table with the summary of a finished run."""
     table = Table(title=f"{out}", show_header=False)
     status = summary["status"]
     rows = {

@@ -1,4 +1,4 @@
-"""ldo serve, ldo record"""
+"""Commands `ldo serve` and `ldo record`."""
 
 from contextlib import ExitStack
 from pathlib import Path
@@ -25,14 +25,16 @@ from .options import (
 )
 
 Insecure = Annotated[
-    bool, tyro.conf.arg(help="listen on a network where everybody may do everything")
+    bool, tyro.conf.arg(help="listen on the network without keys: anyone there may do anything")
 ]
-Client = Annotated[bool, tyro.conf.arg(help="be a client of the router at ADDRESS, and open none")]
+Client = Annotated[
+    bool, tyro.conf.arg(help="connect to the router at ADDRESS instead of opening one")
+]
 MetricsPort = Annotated[
     int | None,
     tyro.conf.arg(
         metavar="PORT",
-        help="export every actor's health for Prometheus on PORT of service.metrics_address",
+        help="serve Prometheus metrics of every actor on PORT of service.metrics_address",
     ),
 ]
 
@@ -47,7 +49,7 @@ def serve(
     localize: Localize = None,
     record: Annotated[
         Path | None,
-        tyro.conf.arg(metavar="DIR", help="record what every actor takes, as `ldo record` does"),
+        tyro.conf.arg(metavar="DIR", help="record the inputs of every actor, as `ldo record` does"),
     ] = None,
     keys: KeysFolder = None,
     insecure: Insecure = False,
@@ -56,7 +58,8 @@ def serve(
 ) -> None:
     """Run the service: camera frames in on camera/rgbd; poses, map and health out.
 
-    Stop it with Ctrl-C: each stage finishes what it has. A second Ctrl-C stops at once.
+    Ctrl-C stops the service after each actor has finished its pending work. A second Ctrl-C stops
+    it at once.
 
       ldo serve
       ldo publish synthetic:room --rate 15      (in another terminal)
@@ -85,7 +88,7 @@ def record(
     out: Annotated[
         Path,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="DIR", help="new folder: a file per actor, in the MCAP format"),
+        tyro.conf.arg(metavar="DIR", help="new folder for the recording: an MCAP file per actor"),
     ],
     robot: Robot = "robot",
     endpoint: EndpointAddress = DEFAULT_ENDPOINT,
@@ -99,13 +102,13 @@ def record(
     client: Client = False,
     metrics_port: MetricsPort = None,
 ) -> None:
-    """Run the service as `ldo serve` does, and record what every actor takes.
+    """Run the service as `ldo serve` does, and record the inputs of every actor.
 
-    A service that runs already cannot begin to: what its actors hold would be missing. Stop it and
-    record in its --state, and it goes on with its map.
+    A service that already runs cannot start a recording, because the present state of its actors
+    would be missing. Stop the service, then record with its --state: the map is kept.
 
-    640x480 at 30 Hz makes 100 MB a second; recording.max_gb bounds it. `ldo replay DIR --verify`
-    lives it again, and DIR is a data set for every verb that takes a SOURCE.
+    640x480 at 30 Hz takes 100 MB per second; recording.max_gb limits the size. `ldo replay DIR
+    --verify` replays the recording. Every verb that takes a SOURCE accepts DIR as a data set.
 
       ldo record recordings/desk
       ldo publish synthetic:room --rate 15      (in another terminal)

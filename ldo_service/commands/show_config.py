@@ -1,4 +1,4 @@
-"""ldo config"""
+"""Command `ldo config`."""
 
 from typing import Annotated
 
@@ -16,11 +16,12 @@ def show_config(
         bool, tyro.conf.arg(name="all", help="print advanced settings too; they may change")
     ] = False,
 ) -> None:
-    """Print the effective configuration as YAML, with the reason for each default.
+    """Print the effective configuration as YAML, with a comment on each setting.
 
-    Without --all it has the public settings, and the advanced ones that differ from their defaults.
+    Without --all the output has the public settings, and the advanced ones that differ from their
+    defaults.
 
-    ldo config > my.yaml            then delete what you do not change
-    ldo run SOURCE --out DIR --config my.yaml
+      ldo config > my.yaml            then delete what you do not change
+      ldo run SOURCE --out DIR --config my.yaml
     """
     print(explained_yaml(load_config(config, set), with_advanced=all_), end="")

@@ -1,4 +1,4 @@
-"""ldo simulate"""
+"""Command `ldo simulate`."""
 
 import json
 from dataclasses import asdict
@@ -32,14 +32,14 @@ def simulate(
     max_frames: MaxFrames = None,
     stride: Stride = 1,
     threads: Annotated[
-        int | None, tyro.conf.arg(metavar="T", help="of the renderer; 0: all cores but one")
+        int | None, tyro.conf.arg(metavar="T", help="threads of the renderer; 0: all cores but one")
     ] = None,
     json_: Annotated[Json, tyro.conf.arg(name="json")] = False,
 ) -> None:
-    """Run every actor on a logical clock and print a digest of all that each one made.
+    """Run every actor on a logical clock, and print a digest of the outputs of each one.
 
-    The digests depend on the frames, the configuration and the instruction set alone: not on the
-    number of threads, nor on the machine's load. Nothing is written.
+    The digests depend only on the frames, the configuration and the instruction set, not on the
+    number of threads or the load of the machine. Nothing is written.
 
       ldo simulate synthetic:room --max-frames 60 --json
     """

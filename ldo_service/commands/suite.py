@@ -1,4 +1,4 @@
-"""ldo suite"""
+"""Command `ldo suite`."""
 
 import sys
 from pathlib import Path
@@ -19,21 +19,22 @@ def suite(
     name: Annotated[
         str,
         tyro.conf.Positional,
-        tyro.conf.arg(metavar="SUITE", help="a file, or the name of one that comes with it"),
+        tyro.conf.arg(metavar="SUITE", help="YAML file, or the name of a built-in suite"),
     ],
     out: Annotated[Path, tyro.conf.arg(metavar="DIR", help="folder for the runs and the table")],
     data: Annotated[
-        Path, tyro.conf.arg(metavar="DIR", help="where the suite's folders of data lie")
+        Path, tyro.conf.arg(metavar="DIR", help="folder with the data sets of the suite")
     ] = Path(),
     set: Settings = (),
     overwrite: Overwrite = False,
 ) -> None:
-    """Run and judge a list of sequences and variants; one table with means and spread.
+    """Run and evaluate a list of sequences and variants; print one table with mean and spread.
 
-    Prints the table in Markdown and writes it to DIR/table.md. Runs that are finished are not made
-    again: an interrupted suite goes on where it stopped. Sequences whose data is not there are
-    left out, and the table says so. Those that come with it are the tables of the paper, its
-    sensitivity and its ablation. `--set` is for all runs; variants say what differs.
+    The command prints the table in Markdown and writes it to DIR/table.md. An interrupted suite
+    resumes where it stopped: finished runs are not repeated. A sequence without data is skipped,
+    and the table names it. The built-in suites are the tables of the paper, its sensitivity
+    analysis and its ablation. `--set` changes a setting in all runs; the suite defines the settings
+    of each variant.
 
       ldo suite table-1 --data ~/data --out suites/table-1
       ldo suite table-9 --data ~/data --out suites/ablation --set detector.model=nano
@@ -52,7 +53,7 @@ def suite(
     outcomes = list(work.outcomes(begun))
     if all(outcome.missing == "no data" for outcome in outcomes):
         raise DataError(
-            f"{work.data} has none of the sequences of {name}: --data says where they are."
+            f"{work.data} has none of the sequences of {name}. Give their folder with --data."
         )
     table = markdown(chosen, outcomes)
     try:
@@ -65,7 +66,11 @@ def suite(
 
 
 def _require_folder(folder: Path) -> None:
-    """Before hours of runs. Raises ConfigError."""
+    """Create the folder before hours of runs.
+
+    Raises:
+        ConfigError: The folder cannot be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""ldo topics"""
+"""Command `ldo topics`."""
 
 import json
 from typing import Annotated
@@ -13,7 +13,7 @@ from ldo_service.schemas.topics import TOPICS
 
 from .options import Robot
 
-WIDTH = 160  # into a pipe or a file: no key is cut short
+WIDTH = 160  # Columns of a pipe or a file, so that no key is truncated.
 
 
 def topics(
@@ -22,12 +22,12 @@ def topics(
         bool,
         tyro.conf.arg(name="json-schema", help="print the JSON Schema of every message"),
     ] = False,
-    markdown: Annotated[bool, tyro.conf.arg(help="print the table of README")] = False,
-    mermaid: Annotated[bool, tyro.conf.arg(help="print the drawing of README")] = False,
+    markdown: Annotated[bool, tyro.conf.arg(help="print the table of the README")] = False,
+    mermaid: Annotated[bool, tyro.conf.arg(help="print the diagram of the README")] = False,
 ) -> None:
     """List every topic: its key, message, producer, consumers and their policies.
 
-    Bodies are MessagePack maps, which any MessagePack library reads; topics marked * also answer a
+    Bodies are MessagePack maps, which any MessagePack library reads. Topics marked * also answer a
     query with their last value.
     """
     if json_schema_:
@@ -44,7 +44,7 @@ def topics(
 
 
 def _table(robot: str) -> Table:
-    table = Table("topic", "message", "made by", "taken by")
+    table = Table("topic", "message", "producer", "consumers")
     for topic in TOPICS:
         expression = topic.expression(robot) + ("/<actor>" if topic.is_per_actor else "")
         takers = "\n".join(f"{who} {policy}" for who, policy in consumers_of(topic))

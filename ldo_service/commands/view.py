@@ -1,4 +1,4 @@
-"""ldo view"""
+"""Command `ldo view`."""
 
 import importlib.util
 import time
@@ -35,10 +35,10 @@ def view(
     config: ConfigFile = None,
     set: Settings = (),
 ) -> None:
-    """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a box to ask in.
+    """Show a map in a browser: Gaussians, paths, keyframes, objects, loops, and a search box.
 
-    Of a run that is under way it shows what there is, and the rest when it comes. The window is for
-    this machine alone; it has no keys, see docs/viewer.md. Ctrl-C ends it.
+    For a run in progress the window shows the files so far, and further ones as they are written.
+    The window is served on this machine only and needs no keys, see docs/viewer.md. Ctrl-C ends it.
 
       ldo view runs/desk
       ldo view live --endpoint tls/mule.local:7447 --keys keys/desk
@@ -51,16 +51,27 @@ def view(
 
 
 def require_viser() -> None:
-    """Raises ConfigError where it is not installed."""
+    """Check that viser is installed.
+
+    Raises:
+        ConfigError: It is not installed.
+    """
     if importlib.util.find_spec("viser") is None:
-        raise ConfigError("the window needs viser: `pip install 'ldo-slam[viewer]'` brings it.")
+        raise ConfigError(
+            "the window needs viser: install it with `pip install 'ldo-slam[viewer]'`."
+        )
 
 
 @contextmanager
 def source_of(
     where: str, robot: str, endpoint: str, keys: Path | None, config: ViewerConfig
 ) -> Iterator[Source]:
-    """Raises DataError for a folder that no run wrote, ConfigError when no service answers."""
+    """Open the scene of a run folder or of a running service.
+
+    Raises:
+        DataError: No run wrote the folder.
+        ConfigError: No service answers.
+    """
     if where != LIVE:
         yield RunFolder(Path(where).expanduser(), config)
         return
@@ -69,8 +80,8 @@ def source_of(
 
 
 def serve_window(source: Source, config: ViewerConfig, title: str) -> None:
-    """For ever."""
-    from ldo_service.viewer.window import open_window  # viser is an extra
+    """Serve the window until the program is interrupted."""
+    from ldo_service.viewer.window import open_window  # Viser is an optional extra.
 
     with open_window(source, config, title) as window:
         Console(stderr=True, highlight=False).print(f"{title} on {window.url}")

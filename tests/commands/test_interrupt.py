@@ -86,7 +86,7 @@ def test_a_run_ends_with_130_and_keeps_what_is_done(tmp_path: Path, number: sign
     with started(tmp_path / "log", "run", "synthetic:room", "--out", out) as run:
         run.wait_until(out.exists)
         assert run.end_by(number) == 130
-        assert "ldo: interrupted; what is done is kept." in run.log
+        assert "ldo: interrupted; partial results are kept." in run.log
         assert "Traceback" not in run.log
 
 

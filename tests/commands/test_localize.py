@@ -36,7 +36,9 @@ def test_a_second_run_is_in_the_frame_of_the_first(
     np.testing.assert_allclose(T_map_camera[:, :3, 3], expected[:, :3, 3], atol=0.01)
 
 
-@pytest.mark.parametrize(("ok", "says"), [(0, "is maps a map of this place"), (1, "as it was")])
+@pytest.mark.parametrize(
+    ("ok", "says"), [(0, "that maps is a map of this place"), (1, "unchanged")]
+)
 def test_where_no_frame_is_recognized_the_map_is_asked_about(ok: int, says: str) -> None:
     assert says in format_localization({"OK": ok, "WEAK": 0, "LOST": 3}, Path("maps"))
 

@@ -53,7 +53,7 @@ def test_a_pair_is_added_by_its_files(capsys, tmp_path: Path) -> None:
     (finding,) = doctor.networks()
     assert finding.text == "network colours: clip, 2 classes"
     code, _, err = ldo(capsys, *add, "--vocabulary", merges, "--layout", "yolox")
-    assert (code, "of a detector" in err) == (2, True)
+    assert (code, "applies to a detector" in err) == (2, True)
 
 
 def test_a_license_may_be_a_text(capsys, file: Path) -> None:

@@ -35,14 +35,14 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("keys init full", 2, "full exists already"),
         ("keys list empty", 2, "empty holds no certificate authority (No such file or directory)"),
         ("keys router empty", 2, "access.yaml cannot be read"),
-        ("eval empty synthetic:room", 3, "is it what `ldo run` wrote"),
+        ("eval empty synthetic:room", 3, "Give the folder of a finished `ldo run`"),
         ("query nowhere chair", 3, "nowhere is not a folder"),
         ("query empty chair", 3, "empty has no objects.json"),
         ("query kept chair", 3, "kept holds the state of a service"),
         ("publish nowhere", 3, "nowhere does not exist"),
         ("publish junk", 3, "junk holds no camera/rgbd"),
         ("publish realsense --size 3", 2, "--size 3"),
-        ("publish realsense --rate 3", 2, "--rate is for sequences"),
+        ("publish realsense --rate 3", 2, "--rate applies to sequences"),
         ("publish ros2", 2, "needs --color TOPIC and --depth TOPIC"),
         ("publish ros2 --color /c/image_raw --depth /d/*", 2, "no topic of ROS"),
         ("publish ros2 --color /c --depth /d --stride 0", 2, "stride of 0"),
@@ -61,9 +61,9 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (
             "run synthetic:room --out s --reuse-front-end x --keep-front-end",
             2,
-            "do not go together",
+            "exclude each other",
         ),
-        ("run synthetic:room --out s --realtime --keep-front-end", 2, "do not go together"),
+        ("run synthetic:room --out s --realtime --keep-front-end", 2, "exclude each other"),
         ("simulate empty", 3, "in no known layout"),
         ("simulate junk", 3, "junk holds no camera/rgbd"),
         ("simulate synthetic:room --max-frames 0", 2, "at most 0 frames"),
@@ -92,4 +92,4 @@ def test_a_router_with_keys_needs_a_bridge_of_its_own(capsys) -> None:
     with_keys = "--keys", "keys/front", "--endpoint", "tls/127.0.0.1:1"
     code, _, err = ldo(capsys, *ROS, "--depth", "/d", *with_keys)
     assert code == 2
-    assert "name its address with --bridge" in err
+    assert "router's address with --bridge" in err
