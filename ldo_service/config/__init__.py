@@ -1,14 +1,14 @@
-"""Configuration: settings with defaults, units and reasons, and what the actors get of them.
+"""Configuration: settings with defaults, units and reasons, and the actors' parameters from them.
 
-A configuration file lists only what differs:
+A configuration file lists only the settings that differ from their defaults:
 
     tracker:
       hold_out: 5
     service:
       process_actors: [optimizer, mapper]
 
-An unknown setting is an error that names the nearest one. `ldo config` prints the public settings,
-`ldo config --all` prints all of them.
+An unknown setting is an error that names the most similar setting. `ldo config` prints the public
+settings, `ldo config --all` prints all settings.
 """
 
 from .loading import checked, config_of, load_config

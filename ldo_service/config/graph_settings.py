@@ -17,49 +17,51 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class RetrievalSettings:
-    """Search for places that look like the present one."""
+    """Search for places that look like the current one."""
 
-    # Places are compared by names and images (two_stage), by names alone (semantic), or by images
-    # alone (geometric). The latter two are for comparison.
+    # Comparison of places: by labels and images (two_stage), by labels alone (semantic), or by
+    # images alone (geometric). The latter two serve for evaluation.
     mode: Literal["two_stage", "semantic", "geometric"] = "two_stage"
-    # Places fewer camera frames apart are no loop (III.C).
+    # Minimum number of camera frames between two places of a loop (III.C).
     min_gap_frames: NonNegativeInt = 100
-    # The loop closer keeps so many subgraphs of up to 5 keyframes. Beyond, the path is thinned.
+    # Maximum number of subgraphs, of up to 5 keyframes each, in the place database. Beyond it, the
+    # path is thinned.
     max_subgraphs: Annotated[int, Meta(ge=3)] = 1000
-    # The closest so many subgraphs are verified. This is K (III.C).
+    # Maximum number of most similar subgraphs that are verified. This is K (III.C).
     max_candidates: PositiveInt = advanced(5)
-    # The names of two places must be so similar. This is theta_loop (III.C).
+    # Minimum similarity of the labels of two places. This is theta_loop (III.C).
     min_similarity: Ratio = advanced(0.75)
 
 
 @dataclass(frozen=True, slots=True)
 class VerificationSettings:
-    """Geometric check of a loop closure."""
+    """Geometric verification of a loop closure."""
 
-    # So many features must agree on the pose. Fewer find more loops, and more false ones.
+    # Minimum number of features that agree on the pose. A lower value finds more loop closures, and
+    # more false ones.
     min_inliers: Annotated[int, Meta(ge=6)] = 20
-    # The old keyframe must see this fraction of the new surface too.
+    # Minimum fraction of the new surface that the old keyframe sees too.
     min_overlap: Ratio = advanced(0.2)
-    # The surfaces must fit with this error along their normals.
+    # Maximum RMSE between the two surfaces along their normals, meters.
     max_rmse_m: PositiveFloat = advanced(0.03)
 
 
 @dataclass(frozen=True, slots=True)
 class DriftGateSettings:
-    """Largest odometry drift that a closure may correct."""
+    """Maximum odometry drift that a loop closure may correct."""
 
-    # A closure may correct so much drift on any path.
+    # Maximum drift that a loop closure may correct on a path of any length, meters.
     max_drift_m: NonNegativeFloat = advanced(0.5)
-    # A closure may correct this fraction of the path length too: ten times what depth cameras
-    # drift.
+    # Additional drift that a loop closure may correct, as a fraction of the path length. The
+    # default is ten times the drift of depth cameras.
     max_drift_ratio: NonNegativeFloat = advanced(0.1)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopCloserSettings:
-    """Recognition of places."""
+    """Loop closing."""
 
-    # False recognizes no place, to measure what loop closing contributes.
+    # True closes loops. False disables loop closing, to measure its contribution.
     enabled: bool = True
     retrieval: RetrievalSettings = field(default_factory=RetrievalSettings)
     verification: VerificationSettings = field(default_factory=VerificationSettings)
@@ -68,45 +70,49 @@ class LoopCloserSettings:
 
 @dataclass(frozen=True, slots=True)
 class NoiseSettings:
-    """Noise of measurements in the graph."""
+    """Noise of measurements in the pose graph."""
 
-    # Rotations of odometry drift as a random walk of this rate. Without it no chain bends to a
-    # loop.
+    # Random walk of odometry rotations, in radians per square root of a meter. Without it, a loop
+    # closure cannot bend the odometry chain.
     drift_rad_per_sqrt_m: NonNegativeFloat = advanced(0.02)
-    # Translations of odometry drift as a random walk of this rate, about 1 % after some meters.
+    # Random walk of odometry translations, in meters per square root of a meter: about 1 % after
+    # some meters.
     drift_m_per_sqrt_m: NonNegativeFloat = advanced(0.02)
-    # A loop closure has this rotation noise, because calibration and exposure are not modeled.
+    # Rotation noise of a loop closure, radians. It covers unmodeled calibration and exposure.
     loop_rotation_rad: PositiveFloat = advanced(0.01)
-    # A loop closure has this translation noise.
+    # Translation noise of a loop closure, meters.
     loop_translation_m: PositiveFloat = advanced(0.01)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopClosureSettings:
-    """Loop closures in the graph."""
+    """Loop closures in the pose graph."""
 
-    # A closure with a larger residual is rejected, as by RGBD/OptimizeMaxError of RTAB-Map.
+    # Maximum residual of an accepted loop closure, in standard deviations, as RGBD/OptimizeMaxError
+    # of RTAB-Map.
     max_residual_sigmas: PositiveFloat = advanced(3.0)
-    # The graph holds so many closures, 1 kB each. Beyond, the most redundant one is removed.
+    # Maximum number of loop closures in the pose graph, 1 kB each. Beyond it, the most redundant
+    # one is removed.
     max_closures: PositiveInt = advanced(500)
 
 
 @dataclass(frozen=True, slots=True)
 class LandmarkSettings:
-    """Objects as landmarks of the graph."""
+    """Objects as landmarks of the pose graph."""
 
-    # False leaves objects out of the graph, to measure what they contribute.
+    # True adds objects to the pose graph. False keeps them out, to measure their contribution.
     enabled: bool = True
-    # The graph holds so many landmarks. Beyond, those not seen for longest are removed.
+    # Maximum number of landmarks in the pose graph. Beyond it, those not observed for the longest
+    # time are removed.
     max_landmarks: PositiveInt = 1000
-    # The graph takes observations in when enough of them wait (adaptive), or at every keyframe
-    # (fixed).
+    # Schedule of object observations in the pose graph: after enough of them are pending
+    # (adaptive), or at every keyframe (fixed).
     schedule: Literal["adaptive", "fixed"] = advanced("adaptive")
 
 
 @dataclass(frozen=True, slots=True)
 class OptimizerSettings:
-    """Graph of keyframe poses and landmarks."""
+    """Pose graph of keyframes and landmarks."""
 
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     loop_closures: LoopClosureSettings = field(default_factory=LoopClosureSettings)

@@ -1,4 +1,4 @@
-"""Reading and checking of configurations: defaults, YAML files and single settings."""
+"""Loading and validation of configurations: defaults, YAML files and single settings."""
 
 import dataclasses
 import re
@@ -28,14 +28,14 @@ KINDS = {
 
 
 def load_config(path: Path | None = None, settings: Sequence[str] = ()) -> Config:
-    """Return the defaults, changed by a YAML file, then by single settings.
+    """Return the defaults, changed by a YAML file and then by single settings.
 
     Args:
-        path: The YAML file; None reads none.
+        path: The YAML file; None uses none.
         settings: Settings as `section.field=value`.
 
     Raises:
-        ConfigError: A setting cannot be read, is unknown, has moved, or has a bad value.
+        ConfigError: A setting cannot be read, is unknown, has moved, or has an invalid value.
     """
     tree = _read(path) if path else {}
     for setting in settings:
@@ -47,7 +47,7 @@ def config_of(tree: dict[str, Any]) -> Config:
     """Return the defaults, changed by a tree of plain values.
 
     Raises:
-        ConfigError: A setting is unknown, has moved, or has a bad value.
+        ConfigError: A setting is unknown, has moved, or has an invalid value.
     """
     refuse_moved(tree)
     _check_names(tree, Config, "")
@@ -59,12 +59,12 @@ def config_of(tree: dict[str, Any]) -> Config:
 
 
 def checked(config: Config) -> Config:
-    """Return the configuration after a check of all its values.
+    """Validate all values of a configuration and return it.
 
-    A value that `dataclasses.replace` has set is not checked until then.
+    `dataclasses.replace` does not validate the values that it sets.
 
     Raises:
-        ConfigError: A setting has a bad value.
+        ConfigError: A setting has an invalid value.
     """
     return config_of(msgspec.to_builtins(config))
 
@@ -76,11 +76,13 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}.") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is no text in UTF-8.") from error
+        raise ConfigError(f"{path} is not a text file in UTF-8.") from error
     except yaml.YAMLError as error:
         raise ConfigError(f"{path} is not valid YAML: {error}") from error
     if not isinstance(tree or {}, dict):
-        raise ConfigError(f"{path} must hold sections such as `tracker:`, `ldo config` shows them.")
+        raise ConfigError(
+            f"{path} must hold sections such as `tracker:`. `ldo config` prints all of them."
+        )
     return tree or {}
 
 
@@ -92,7 +94,7 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
     for section in sections:
         tree = tree.setdefault(section, {})
         if not isinstance(tree, dict):
-            raise ConfigError(f"--set {setting}: {section} is no section.")
+            raise ConfigError(f"--set {setting}: {section} is a setting, not a section.")
     try:
         tree[last] = load_yaml(value)
     except yaml.YAMLError as error:
@@ -102,7 +104,7 @@ def _apply(tree: dict[str, Any], setting: str) -> None:
 # --- checking -------------------------------------------------------------------------------------
 def _check_names(tree: Any, schema: type, prefix: str) -> None:
     if not isinstance(tree, dict):
-        return  # The conversion says what was expected here.
+        return  # The conversion below reports the expected type.
     types = typing.get_type_hints(schema)
     for name, value in tree.items():
         path = f"{prefix}{name}"
@@ -114,13 +116,17 @@ def _check_names(tree: Any, schema: type, prefix: str) -> None:
 
 def _hint(path: str, prefix: str, names: list[str]) -> str:
     if was_section(path):
-        return "Its settings have moved: docs/configuration.md lists those of today."
+        return "Its settings have moved: docs/configuration.md lists the current ones."
     known = f"Known: {', '.join(names)}."
     return did_you_mean(path.removeprefix(prefix), names, known, prefix)
 
 
 def _refuse_nan(tree: dict[str, Any], prefix: str) -> None:
-    """Refuse NaN, which passes comparisons."""
+    """Check that no number is NaN, which would pass every comparison.
+
+    Raises:
+        ConfigError: A number is NaN.
+    """
     for name, value in tree.items():
         path = f"{prefix}{name}"
         if isinstance(value, dict):

@@ -22,12 +22,12 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class DensifySettings:
-    """Insertion of new Gaussians."""
+    """Addition of new Gaussians."""
 
-    # Flat surface gets one Gaussian per cell of so many pixels a side. 2 gains 0.4 dB with twice
-    # as many.
+    # Side of the largest cell of a flat surface that gets one Gaussian, pixels. 2 gains 0.4 dB with
+    # twice as many Gaussians.
     max_cell_px: PositiveInt = 4
-    # Pixels through which more light passes get new Gaussians. 0.5 costs 0.5 dB and saves 4 %.
+    # Maximum transmittance of a pixel that gets no new Gaussian. 0.5 costs 0.5 dB and saves 4 %.
     max_transmittance: OpenRatio = advanced(0.3)
 
     def __post_init__(self) -> None:
@@ -39,22 +39,22 @@ class DensifySettings:
 
 @dataclass(frozen=True, slots=True)
 class LearningRateSettings:
-    """Step lengths of Adam per iteration, 5 to 10 times those of 3DGS."""
+    """Learning rates of Adam per iteration, 5 to 10 times those of 3DGS."""
 
-    # This is the step of a center in meters. A keyframe gets tens of iterations, not thousands.
+    # Learning rate of a center, meters. A keyframe gets tens of iterations, not thousands.
     mean_m: NonNegativeFloat = advanced(5e-4)
-    # This is the step of the logarithm of an axis.
+    # Learning rate of the logarithm of a scale.
     log_scale: NonNegativeFloat = advanced(0.06)
-    # This is the step of a rotation.
+    # Learning rate of a rotation quaternion.
     quaternion: NonNegativeFloat = advanced(0.01)
-    # This is the step of an opacity before the sigmoid.
+    # Learning rate of an opacity before the sigmoid.
     opacity_logit: NonNegativeFloat = advanced(0.1)
-    # This is the step of a color in 0..1.
+    # Learning rate of a color in 0..1.
     color: NonNegativeFloat = advanced(0.01)
-    # The renderer turns keyframe poses by this step. 0 leaves them. 2e-4 gains 0.3 dB and adds 1 mm
-    # of noise to exact poses.
+    # Learning rate of keyframe rotations, radians. 0 keeps them. 2e-4 gains 0.3 dB and adds 1 mm of
+    # noise to exact poses.
     pose_rotation_rad: NonNegativeFloat = advanced(0.0)
-    # The renderer moves keyframe poses by this step. 0 leaves them.
+    # Learning rate of keyframe positions, meters. 0 keeps them.
     pose_translation_m: NonNegativeFloat = advanced(0.0)
 
 
@@ -62,14 +62,14 @@ class LearningRateSettings:
 class LossSettings:
     """Loss between a rendering and a keyframe."""
 
-    # This is the weight of the color error, as in 3DGS (Kerbl et al. 2023, equation 7).
+    # Weight of the color error, as in 3DGS (Kerbl et al. 2023, equation 7).
     l1: NonNegativeFloat = advanced(0.8)
-    # This is the weight of D-SSIM, as in 3DGS.
+    # Weight of D-SSIM, as in 3DGS.
     d_ssim: NonNegativeFloat = advanced(0.2)
-    # This is the weight of the depth error per meter.
+    # Weight of the depth error per meter.
     depth: NonNegativeFloat = advanced(0.5)
-    # A Gaussian grows to this standard deviation at most, or one would cover a whole wall. 10 costs
-    # 0.6 dB.
+    # Maximum standard deviation of a Gaussian in the image, pixels. Without it one Gaussian would
+    # cover a whole wall. 10 costs 0.6 dB.
     max_sigma_px: PositiveFloat = advanced(20.0)
 
 
@@ -77,30 +77,33 @@ class LossSettings:
 class PruneSettings:
     """Removal of Gaussians."""
 
-    # Gaussians with a lower opacity are removed, as in 3DGS (Kerbl et al. 2023, section 5.2).
+    # Minimum opacity. Gaussians below it are removed, as in 3DGS (Kerbl et al. 2023, section 5.2).
     min_opacity: Annotated[float, Meta(ge=0, lt=1)] = advanced(0.005)
-    # The map is pruned every so many keyframes.
+    # Number of keyframes between prunings of the map.
     interval_keyframes: PositiveInt = advanced(5)
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeImageSettings:
-    """Images of keyframes that the map is fitted to."""
+    """Keyframe images that the Gaussian optimizer uses."""
 
-    # The memory holds images up to this size: 119 keyframes of 640x480 with 2.15 MB each.
+    # Maximum size of keyframe images in memory, MB. The default holds 119 keyframes of 640x480 at
+    # 2.15 MB each.
     memory_mb: NonNegativeFloat = 256.0
-    # The disk holds images up to this size: some 8,000 keyframes of 640x480. Then the most
-    # redundant go.
+    # Maximum size of keyframe images on disk, MB. The default holds some 8,000 keyframes of
+    # 640x480. Beyond it, the most redundant ones are deleted.
     disk_mb: PositiveFloat = 4096.0
-    # The disk holds so many keyframes, however small, because each takes 3 kB of memory.
+    # Maximum number of keyframes with images on disk, because each takes 3 kB of memory, however
+    # small its image.
     max_keyframes: PositiveInt = advanced(20_000)
 
 
 @dataclass(frozen=True, slots=True)
 class OffloadSettings:
-    """Gaussians on disk."""
+    """Offloading of Gaussians to disk."""
 
-    # The memory holds so many Gaussians, 300 MB with their moments. Those out of view move to disk.
+    # Maximum number of Gaussians in memory, 300 MB with the moments of Adam. Gaussians out of view
+    # are offloaded to disk.
     max_resident_gaussians: PositiveInt = 1_500_000
 
 
@@ -108,9 +111,10 @@ class OffloadSettings:
 class SemanticsSettings:
     """Labels of Gaussians."""
 
-    # A Gaussian takes the label of a region that covers so much of it. This is theta_IoU (III.A).
+    # Minimum fraction of a Gaussian that a region must cover to label it. This is theta_IoU
+    # (III.A).
     min_overlap: Ratio = advanced(0.3)
-    # The vocabulary holds so many names. A later name becomes `other`.
+    # Maximum number of names in the vocabulary. A further name becomes `other`.
     max_label_names: Annotated[int, Meta(ge=1, le=MAX_LABELS)] = advanced(MAX_LABELS)
 
 
@@ -118,53 +122,53 @@ class SemanticsSettings:
 class ObjectSettings:
     """Objects in the map."""
 
-    # A candidate becomes an object when so many keyframes have seen it (III.C).
+    # Number of keyframes that must observe a candidate before it becomes an object (III.C).
     min_observations: PositiveInt = 3
-    # The map holds so many objects, 6 MB, and takes some ms per keyframe with all in view.
+    # Maximum number of objects in the map, 6 MB. A keyframe takes some ms with all of them in view.
     max_objects: PositiveInt = 2000
-    # A detection belongs to an object when their boxes overlap so much (III.C).
+    # Minimum IoU of the boxes of a detection and an object that are associated (III.C).
     min_iou: PositiveRatio = advanced(0.4)
-    # An object is removed when so many keyframes in a row miss it although it is in view (III.C).
+    # Number of consecutive keyframes that may miss a visible object before it is removed (III.C).
     max_misses: PositiveInt = advanced(10)
 
 
 @dataclass(frozen=True, slots=True)
 class OpenVocabularySettings:
-    """Regions that the labeller is asked about."""
+    """Regions for which a label is requested from the labeller."""
 
-    # A region that the detector is less sure of goes to the labeller (III.B).
+    # Minimum score of a detection that needs no label from the labeller (III.B).
     confident_score: Ratio = advanced(0.6)
-    # The labeller gets so many requests per keyframe on average. The paper asks on 10 to 25 % of
-    # the frames.
+    # Average number of label requests per keyframe. The paper requests labels on 10 to 25 % of the
+    # frames.
     requests_per_keyframe: PositiveFloat = advanced(2.5)
-    # Boxes of the detector vote for the name of a region. False leaves it to the labeller alone.
+    # True counts detector boxes as votes for the label of a region. False leaves the label to the
+    # labeller alone.
     detector_votes: bool = advanced(True)
-    # A less certain answer is ignored. 0.5 costs 7 points of recall on the flat.
+    # Minimum confidence of a label result. 0.5 costs 7 points of recall on the flat.
     min_confidence: Ratio = advanced(0.3)
 
 
 @dataclass(frozen=True, slots=True)
 class PublishSettings:
-    """Messages of the map."""
+    """Messages that carry the map."""
 
-    # A snapshot of the map is sent after so many keyframes at the earliest, which bounds the
-    # bandwidth.
+    # Minimum number of keyframes between two snapshots of the map, which limits the bandwidth.
     snapshot_interval_keyframes: PositiveInt = advanced(10)
-    # One message carries so many Gaussians, 1.2 MB or 1.8 MB with labels, so that it blocks no
-    # other for long.
+    # Maximum number of Gaussians per message, so that it blocks no other for long. 16,384 take 1.2
+    # MB, or 1.8 MB with labels.
     max_gaussians_per_message: PositiveInt = advanced(16_384)
-    # Changes of old Gaussians are sent every so many keyframes, because each keyframe changes all
-    # in view.
+    # Number of keyframes between messages with changed old Gaussians, because each keyframe changes
+    # all Gaussians in view.
     update_interval_keyframes: PositiveInt = advanced(5)
 
 
 @dataclass(frozen=True, slots=True)
 class RefitSettings:
-    """Fit of the map to keyframes that a correction has moved."""
+    """Refit of the map to keyframes that a correction has moved."""
 
-    # A keyframe that moves over 1 cm against the first is fitted again with so many iterations.
+    # Refit iterations for each keyframe that moves over 1 cm against the first one.
     iterations: NonNegativeInt = advanced(12)
-    # Each new keyframe pays for so many of these iterations while no other waits.
+    # Pending refit iterations that run with each new keyframe if no other keyframe is queued.
     iterations_per_keyframe: NonNegativeInt = advanced(6)
 
 
@@ -172,16 +176,17 @@ class RefitSettings:
 class MapperSettings:
     """Map of Gaussians and of objects."""
 
-    # The map is fitted to each keyframe with so many iterations: 12 frames per second on two cores
-    # at 640x480.
+    # Optimizer iterations for each keyframe. The default gives 12 frames per second on two cores at
+    # 640x480.
     iterations: NonNegativeInt = 12
-    # The renderer uses so many threads. 0 takes all cores but one, which the tracker needs.
+    # Threads of the renderer. 0 uses all cores but one, which is left for the tracker.
     threads: NonNegativeInt = 0
-    # The map is saved every so many keyframes. After a crash so many are mapped again.
+    # Number of keyframes between checkpoints of the map. After a crash, up to so many keyframes are
+    # mapped again.
     checkpoint_interval_keyframes: PositiveInt = 5
-    # Images of keyframes are kept in this folder. Empty takes a temporary one, or the state's.
+    # Folder of the keyframe images. Empty uses the state folder, or a temporary one.
     image_folder: str = advanced("")
-    # This seed decides which keyframes the map is fitted to.
+    # Seed of the random choice of keyframes that are optimized.
     seed: NonNegativeInt = advanced(0)
     densify: DensifySettings = field(default_factory=DensifySettings)
     learning_rate: LearningRateSettings = field(default_factory=LearningRateSettings)

@@ -1,4 +1,4 @@
-"""Settings of earlier versions, and where each of them is now."""
+"""Settings of earlier versions, and their current names."""
 
 import functools
 from importlib.resources import files
@@ -6,17 +6,17 @@ from typing import Any
 
 from ldo_service.errors import ConfigError
 
-SHOWN = 5  # An old configuration file has hundreds of them.
+SHOWN = 5  # Maximum number of moved settings in one message; an old file has hundreds.
 
 
 def refuse_moved(tree: dict[str, Any]) -> None:
-    """Refuse settings that have another name now, or are constants.
+    """Check for settings that have been renamed or are now constants.
 
     Args:
-        tree: The plain values of a file or of the command line.
+        tree: Plain values of a file or of the command line.
 
     Raises:
-        ConfigError: A setting of an earlier version is among them; the message has its new name.
+        ConfigError: A setting of an earlier version is used; the message gives its new name.
     """
     refusals = [text for path in _leaves(tree, "") if (text := moved(path))]
     if not refusals:
@@ -31,7 +31,7 @@ def refuse_moved(tree: dict[str, Any]) -> None:
 
 
 def moved(path: str) -> str:
-    """Return a sentence that says where a setting is now; empty for one that has not moved."""
+    """Return a sentence with the new name of a setting; empty if it has not moved."""
     kind, new = _table().get(path, ("", ""))
     if kind == "setting":
         return f"{path} is now {new}."
@@ -41,13 +41,13 @@ def moved(path: str) -> str:
 
 
 def was_section(path: str) -> bool:
-    """Return whether earlier versions had a section of this name."""
+    """Return whether an earlier version had a section of this name."""
     return any(old.startswith(f"{path}.") for old in _table())
 
 
 @functools.cache
 def _table() -> dict[str, tuple[str, str]]:
-    """Return the kind and the new place of each old path."""
+    """Return the kind and the new name of each old path."""
     text = files("ldo_service.config").joinpath("moved_settings.tsv").read_text()
     rows = [line.split("\t") for line in text.splitlines()[1:]]
     return {old: (kind, new) for old, kind, new in rows}

@@ -1,4 +1,4 @@
-"""Parameters of the detector and the labeller, made from the configuration."""
+"""Parameters of the detector and the labeller, from the configuration."""
 
 from ldo_service.actors.detector import DetectorConfig
 from ldo_service.actors.vlm_labeller import VlmLabellerConfig
@@ -11,7 +11,7 @@ from .sections import Config
 
 
 def detector_parameters(config: Config) -> DetectorConfig:
-    """Return what the detector is made from."""
+    """Return the parameters of the detector."""
     detector = config.detector
     return DetectorConfig(
         model=detector.model,
@@ -29,7 +29,7 @@ def detector_parameters(config: Config) -> DetectorConfig:
 
 
 def labeller_parameters(config: Config) -> VlmLabellerConfig:
-    """Return what the labeller is made from."""
+    """Return the parameters of the labeller."""
     labeller = config.vlm_labeller
     encoder, http = labeller.encoder, labeller.http
     return VlmLabellerConfig(

@@ -1,4 +1,4 @@
-"""Settings of the detector, the labeller and the inference of both."""
+"""Settings of the detector, of the labeller and of their inference."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
@@ -21,22 +21,22 @@ from .values import (
 class DetectorSettings:
     """Network that finds objects of known classes in keyframes."""
 
-    # This is a name of `ldo models list` or an ONNX file. Empty disables detection.
+    # Detection network: a name from `ldo models list`, or an ONNX file. Empty disables detection.
     model: str = ""
-    # This file has one class name a line. Empty takes the names that the network carries, or the 80
-    # of COCO.
+    # File with one class name per line. Empty uses the names in the network, or the 80 of COCO.
     class_names: str = ""
-    # Boxes with a lower score are ignored. The default is that of YOLOv5 and YOLOX.
+    # Minimum score of a detection. The default is that of YOLOv5 and YOLOX.
     min_score: Ratio = 0.25
-    # Things of these COCO classes may move by themselves, so no pose and no loop relies on them.
+    # COCO classes of objects that may move by themselves. Poses and loop closures do not rely on
+    # their pixels.
     dynamic_classes: tuple[str, ...] = DynamicClassConfig().classes
-    # This is the layout of the output. Empty recognizes it by the shape of the output.
+    # Output layout of the network. Empty recognizes it by the shape of the output.
     layout: Literal["", "yolov5", "yolox", "yolov8"] = advanced("")
-    # A network with a free input size is given this width and height.
+    # Width and height of the input of a network that accepts any size, pixels.
     input_size_px: tuple[PositiveInt, PositiveInt] = advanced((640, 480))
-    # Boxes of one class that overlap more are one object, as in YOLOv5.
+    # IoU above which two boxes of one class are merged into one object, as in YOLOv5.
     nms_iou: Ratio = advanced(0.45)
-    # An image has at most so many boxes, the most certain, as the evaluation of COCO counts.
+    # Maximum number of detections per image, the best ones, as in the evaluation of COCO.
     max_detections: PositiveInt = advanced(100)
 
 
@@ -44,10 +44,9 @@ class DetectorSettings:
 class InferenceSettings:
     """Inference of the detector and of the encoder pair."""
 
-    # These are the execution providers of onnxruntime in order of preference, such as cuda or
-    # tensorrt.
+    # Execution providers of onnxruntime in order of preference, such as cuda or tensorrt.
     providers: tuple[str, ...] = ("cpu",)
-    # One inference uses so many threads. With 1 a replay gives the same bits.
+    # Threads of one inference. With 1, a replay gives identical bits.
     threads: PositiveInt = 1
 
 
@@ -55,18 +54,18 @@ class InferenceSettings:
 class EncoderSettings:
     """Pair of image and text encoders."""
 
-    # The embeddings of these prompts are averaged for each name, which replaces {}.
+    # Prompts whose embeddings are averaged for each name; the name replaces {}.
     prompts: Annotated[tuple[str, ...], Meta(min_length=1)] = advanced(
         ("a photo of a {}.", "a cropped photo of a {}.", "a {} in a room.")
     )
-    # RGB in 0..1 is normalized by this mean. Empty takes the mean of the encoder, or CLIP's.
+    # Mean that normalizes RGB in 0..1. Empty uses the mean of the encoder, or that of CLIP.
     image_mean: tuple[float, ...] = advanced(())
-    # RGB in 0..1 is normalized by this standard deviation. Empty takes that of the encoder, or
-    # CLIP's.
+    # Standard deviation that normalizes RGB in 0..1. Empty uses that of the encoder, or of CLIP.
     image_std: tuple[PositiveFloat, ...] = advanced(())
-    # This factor makes the softmax over names sharper. 0 takes that of the pair, or CLIP's 100.
+    # Factor on the similarities before the softmax over names; a larger one sharpens it. 0 uses
+    # that of the pair, or 100 as in CLIP.
     logit_scale: NonNegativeFloat = advanced(0.0)
-    # These names compete with the others and are never reported, such as wall and floor.
+    # Names such as wall and floor that compete with the others but are never reported.
     background_names: tuple[str, ...] = advanced(())
 
     def __post_init__(self) -> None:
@@ -89,22 +88,22 @@ class EncoderSettings:
 class HttpSettings:
     """Vision-language model behind an OpenAI-compatible server."""
 
-    # This is the name of the model on the server. Empty takes the only one.
+    # Name of the model on the server. Empty uses the only one.
     model: str = ""
-    # A name counts with this confidence where the server returns no log-probabilities.
+    # Confidence of a label if the server returns no log-probabilities.
     default_confidence: Ratio = 0.3
-    # One attempt to ask the server may take so long.
+    # Timeout of one attempt of a request to the server, seconds.
     timeout_s: PositiveFloat = 10.0
-    # One region with all its views, attempts and waits may take so long. It must stay below
+    # Timeout of one region with all its views, attempts and waits, seconds. It must stay below
     # supervision.step_timeout_s.
     deadline_s: PositiveFloat = 40.0
-    # This environment variable holds the API key. Empty sends no key.
+    # Environment variable with the API key. Empty sends no key.
     api_key_variable: str = ""
-    # The server is asked about so many views of a region, one question each.
+    # Maximum number of views of a region, with one request each.
     max_views: PositiveInt = advanced(2)
-    # A question that fails is repeated until so many attempts were made.
+    # Maximum number of attempts of a request.
     max_attempts: PositiveInt = advanced(3)
-    # Attempts are spaced evenly by this rate, which bounds the cost.
+    # Maximum number of attempts per minute, evenly spaced, which limits the cost.
     max_requests_per_minute: PositiveFloat = advanced(60.0)
 
     def __post_init__(self) -> None:
@@ -117,13 +116,13 @@ class HttpSettings:
 
 @dataclass(frozen=True, slots=True)
 class VlmLabellerSettings:
-    """Names of regions that the detector does not know."""
+    """Labels of regions that the detector does not know."""
 
-    # This encoder pair is a name of `ldo models list` or a folder with its files. Empty uses none.
+    # Encoder pair: a name from `ldo models list`, or a folder with its files. Empty uses none.
     model: str = ""
-    # This is an OpenAI-compatible server such as http://127.0.0.1:8000/v1. Empty uses none.
+    # URL of an OpenAI-compatible server, such as http://127.0.0.1:8000/v1. Empty uses none.
     url: str = ""
-    # This file has one name a line to choose from. Empty takes the names of the pair, or the 80 of
+    # File with one name per line to choose from. Empty uses the names of the pair, or the 80 of
     # COCO.
     class_names: str = ""
     encoder: EncoderSettings = field(default_factory=EncoderSettings)
@@ -132,6 +131,6 @@ class VlmLabellerSettings:
     def __post_init__(self) -> None:
         if self.model and self.url:
             raise ConfigError(
-                f"vlm_labeller.model={self.model} and vlm_labeller.url={self.url}: choose one of "
-                "them."
+                f"vlm_labeller.model={self.model} and vlm_labeller.url={self.url} exclude each "
+                "other: choose one of them."
             )

@@ -1,8 +1,7 @@
-"""Parameters of the actors and of the runtime, made from the configuration.
+"""Parameters of the actors and of the runtime, from the configuration.
 
-This is the one place that knows where a setting is used. A value that several actors share is set
-once and given to all of them here. What no setting changes keeps the default of its class, which
-stands beside the code with the reason.
+Only this module knows where a setting is used. It passes one value to several actors if they share
+it. A parameter without a setting keeps the default of its class, where a comment gives the reason.
 """
 
 from ldo_service.actors.frame_source import FrameSourceConfig
@@ -60,11 +59,11 @@ from ldo_service.tracking.window import WindowConfig
 from .network_parameters import detector_parameters, labeller_parameters
 from .sections import Config
 
-FOREGROUND = ForegroundConfig()  # The labels, the regions and the landmarks of loops use one test.
+FOREGROUND = ForegroundConfig()  # Labels, regions and landmarks of loops share one foreground test.
 
 
 def actor_parameters(config: Config) -> ActorParameters:
-    """Return what the actors are made from."""
+    """Return the parameters of all actors."""
     return ActorParameters(
         frame_source=FrameSourceConfig(max_skew_s=config.frame_source.max_skew_s),
         tracker=_tracker(config),
@@ -77,7 +76,7 @@ def actor_parameters(config: Config) -> ActorParameters:
 
 
 def stage_parameters(config: Config) -> SupervisionConfig:
-    """Return how the stages of actors are supervised."""
+    """Return the parameters for the supervision of stages."""
     supervision = config.supervision
     return SupervisionConfig(
         max_restarts=supervision.max_restarts,
@@ -96,7 +95,7 @@ def recording_parameters(config: Config) -> RecordConfig:
 
 
 def latency_frames(config: Config) -> dict[str, int]:
-    """Return the latency of each actor on the logical clock, in frames."""
+    """Return the latency of each actor on the logical clock, in frames, by its name."""
     latency = config.offline.latency_frames
     return {
         "detector": latency.detector,

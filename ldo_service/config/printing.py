@@ -1,4 +1,4 @@
-"""Printing of configurations, with the reason for each default beside it."""
+"""Printing of configurations, with a comment on each setting."""
 
 import dataclasses
 import inspect
@@ -18,7 +18,7 @@ from .values import ADVANCED
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One settable value: its path, its value as YAML, and the comment of its field."""
+    """Setting of the configuration: its path, its value, that value as YAML, and its comment."""
 
     path: str
     value: Any
@@ -28,19 +28,19 @@ class Setting:
 
 
 def config_yaml(config: Config) -> str:
-    """Return the whole configuration as YAML, which reads back as the same."""
+    """Return the whole configuration as YAML that can be loaded again."""
     return dump_yaml(msgspec.to_builtins(config))
 
 
 def explained_yaml(config: Config, *, with_advanced: bool = False) -> str:
     """Return the configuration as YAML with comments.
 
-    Without `with_advanced` it has the public settings, and those advanced ones that differ from
-    their defaults: so it reads back as the same configuration.
+    Without `with_advanced`, the text has the public settings and the advanced ones that differ from
+    their defaults, so that it loads as the same configuration.
 
     Args:
         config: The configuration.
-        with_advanced: Print advanced settings too, as `ldo config --all` does.
+        with_advanced: Print all advanced settings too, as `ldo config --all` does.
     """
     defaults = {setting.path: setting.value for setting in settings_of(Config())}
     lines: list[str] = []
@@ -60,7 +60,7 @@ def explained_yaml(config: Config, *, with_advanced: bool = False) -> str:
 
 
 def settings_of(config: Config) -> list[Setting]:
-    """Return every settable value, in the order of the sections."""
+    """Return all settings in the order of the sections."""
     return list(_settings(config, ""))
 
 
@@ -96,10 +96,10 @@ _COMMENT = re.compile(r"^ {4,}# (?P<comment>.+)$")
 
 
 def _comments(schema: type) -> dict[str, str]:
-    """Return the comment of each field in the source.
+    """Return the comment of each field in the source of a dataclass.
 
-    It stands beside the field, with the lines that continue it, or, if there is none beside it, in
-    the lines above it that begin a sentence.
+    A comment starts behind the field and continues on the lines below. A field without one takes
+    the lines above it, if they begin with a capital letter.
     """
     comments: dict[str, list[str]] = {}
     last, block = "", list[str]()

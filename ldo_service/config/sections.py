@@ -1,4 +1,4 @@
-"""All sections of the configuration that a user sees."""
+"""Root of the configuration with all its sections."""
 
 import dataclasses
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ from .tracker_settings import TrackerSettings
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """Every setting. `parameters` turns it into what the actors take."""
+    """Root of the configuration, which `parameters` converts to the parameters of the actors."""
 
     frame_source: FrameSourceSettings = field(default_factory=FrameSourceSettings)
     tracker: TrackerSettings = field(default_factory=TrackerSettings)
@@ -43,13 +43,13 @@ class Config:
     viewer: ViewerSettings = field(default_factory=ViewerSettings)
 
     def check_timeouts(self) -> None:
-        """Check that a service does not give up an actor that waits for a labeller's server.
+        """Check that the service waits long enough for the server of the labeller.
 
         Raises:
-            ConfigError: The server may take longer than a limit of the service.
+            ConfigError: A request may take longer than a timeout of the service.
         """
         http = self.vlm_labeller.http
-        longest_s = http.deadline_s + http.timeout_s  # The time to connect counts anew.
+        longest_s = http.deadline_s + http.timeout_s  # The time to connect counts separately.
         limits = {
             "supervision.step_timeout_s": self.supervision.step_timeout_s,
             "service.control_timeout_s": self.service.control_timeout_s,
@@ -59,13 +59,13 @@ class Config:
                 raise ConfigError(
                     f"vlm_labeller.http.deadline_s={http.deadline_s:g} and "
                     f"vlm_labeller.http.timeout_s={http.timeout_s:g} together must be below "
-                    f"{name}={limit_s:g}: raise that, or lower these."
+                    f"{name}={limit_s:g}. Raise {name} or lower the other two."
                 )
 
     def with_map_folder(self, folder: Path) -> "Config":
         """Return the configuration with a folder for images and offloaded Gaussians.
 
-        A folder that is set already stays. A successor of the mapper finds them there.
+        A folder that is already set is kept. A restored mapper finds its files there.
 
         Args:
             folder: The folder within the state or the run.

@@ -22,34 +22,35 @@ from .values import (
 
 @dataclass(frozen=True, slots=True)
 class FrameSourceSettings:
-    """Camera frames."""
+    """Input of camera frames."""
 
-    # Color and depth farther apart in time are no pair. Under half a period at 30 Hz the nearest
-    # depth is found.
+    # Maximum difference of the stamps of a color and a depth image, seconds. Less than half a
+    # period at 30 Hz finds the nearest depth.
     max_skew_s: Annotated[float, Meta(ge=0, lt=10)] = 0.015
 
 
 @dataclass(frozen=True, slots=True)
 class DatasetSettings:
-    """Data sets whose depth and color come from two cameras (ScanNet, 7-Scenes)."""
+    """Data sets with separate cameras for depth and color (ScanNet, 7-Scenes)."""
 
-    # Depth is brought to the color camera. False takes depth as it is in the files.
+    # True registers depth to the color camera. False uses the depth as it is in the files.
     register_depth: bool = False
-    # These 16 numbers are T_color_depth, row by row, in meters. Empty takes that of the data set.
+    # The 16 numbers of T_color_depth, row by row, translation in meters. Empty uses those of the
+    # data set.
     T_color_depth: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.T_color_depth) not in (0, 16):
             raise ConfigError(
-                f"dataset.T_color_depth={list(self.T_color_depth)} must be 16 numbers: write the "
-                "4x4 matrix row by row."
+                f"dataset.T_color_depth={list(self.T_color_depth)} must be 16 numbers, the 4x4 "
+                "matrix row by row."
             )
 
     def options(self) -> SequenceOptions:
-        """Return the options with which a data set is opened.
+        """Return the options for opening a data set.
 
         Raises:
-            ConfigError: T_color_depth is no rigid transform.
+            ConfigError: T_color_depth is not a rigid transform.
         """
         if not self.T_color_depth:
             return SequenceOptions(register_depth=self.register_depth)
@@ -63,62 +64,65 @@ class DatasetSettings:
 
 @dataclass(frozen=True, slots=True)
 class LatencySettings:
-    """Latency of each actor on the logical clock of `ldo run`; the others answer at once."""
+    """Latency of each actor on the logical clock of `ldo run`; other actors have none."""
 
-    # Boxes of a keyframe arrive so many frames later, on any machine.
+    # Frames between a keyframe and its detections, the same on any machine.
     detector: NonNegativeInt = advanced(3)
-    # A loop closure arrives so many frames later. Five places are examined at a time.
+    # Frames between a keyframe and its loop closure. Five places are verified at a time.
     loop_closer: NonNegativeInt = advanced(10)
-    # A keyframe is in the map so many frames later.
+    # Frames between a keyframe and its addition to the map.
     mapper: NonNegativeInt = advanced(3)
-    # A correction arrives so many frames later.
+    # Frames between a keyframe and a correction of the pose graph.
     optimizer: NonNegativeInt = advanced(3)
-    # A name arrives so many frames later, a second: the labeller is late by design.
+    # Frames between a label request and its result: a second, because the labeller is asynchronous.
     vlm_labeller: NonNegativeInt = advanced(30)
 
 
 @dataclass(frozen=True, slots=True)
 class OfflineSettings:
-    """Runs over a file (`ldo run`)."""
+    """Offline runs over a sequence (`ldo run`)."""
 
-    # A run fails when a larger fraction of the frames cannot be read.
+    # Maximum fraction of frames that cannot be read. Above it, the run fails.
     max_rejected_ratio: Ratio = 0.1
     latency_frames: LatencySettings = field(default_factory=LatencySettings)
 
 
 @dataclass(frozen=True, slots=True)
 class ServiceSettings:
-    """Service (`ldo serve`)."""
+    """Live service (`ldo serve`)."""
 
-    # These actors run in processes of their own. gtsam holds the GIL of its process.
+    # Actors that run in their own processes. The default isolates gtsam, which holds the GIL of its
+    # process.
     process_actors: tuple[str, ...] = ("optimizer",)
-    # A soft stop waits so long for each stage to finish its work.
+    # Maximum time for each stage to finish its work at a soft stop, seconds.
     shutdown_timeout_s: PositiveFloat = 10.0
-    # A process without a heartbeat for so long is killed and started again.
+    # Seconds without a heartbeat after which a process is killed and started again.
     heartbeat_timeout_s: PositiveFloat = 10.0
-    # Each step is on the disk before it is reported, at 12 ms a step. False may lose the state in a
-    # power cut.
+    # True writes each step to disk before its outputs are published, 12 ms per step. False may lose
+    # the state in a power cut.
     fsync: bool = False
-    # This folder holds the TLS keys that `ldo keys add` made. The option --keys names another.
+    # Folder with the TLS keys that `ldo keys add` made. The option --keys overrides it.
     keys: str = ""
-    # Larger messages are dropped by the network. A 4K frame has up to 58 MB.
+    # Maximum size of a message, MB. The network drops larger ones. A 4K frame has up to 58 MB.
     max_message_mb: Annotated[int, Meta(ge=1, le=1000)] = MAX_MESSAGE_MB
-    # Prometheus metrics are served on this address. 0.0.0.0 shows everyone when the robot works.
+    # Address on which Prometheus metrics are served. With 0.0.0.0 anyone on the network can see
+    # when the robot works.
     metrics_address: str = LOOPBACK
-    # All actors obey `ldo control` within so long. The slowest measured took 0.6 s; a labeller may
-    # wait for its server for 50 s.
+    # Maximum time for all actors to execute `ldo control`, seconds. The slowest measured took 0.6
+    # s; a labeller may wait 50 s for its server.
     control_timeout_s: PositiveFloat = advanced(55.0)
-    # Larger messages are not decoded. Raw color and depth of 8 megapixels have 58 MB.
+    # Maximum size of a message that is decoded, MB. Raw color and depth of 8 megapixels have 58 MB.
     max_decoded_message_mb: PositiveFloat = advanced(64.0)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingSettings:
-    """Recordings (`ldo record`); 640x480 at 30 Hz makes 100 MB a second."""
+    """Recordings (`ldo record`); 640x480 at 30 Hz takes 100 MB per second."""
 
-    # A recording ends when its folder has this size.
+    # Maximum size of the folder of a recording in GB, at which the recording ends.
     max_gb: PositiveFloat = 50.0
-    # A recording ends when the disk has less space left, which the states of actors need.
+    # Minimum free disk space in GB, which the states of actors need. The recording ends when less
+    # is left.
     min_free_gb: NonNegativeFloat = 1.0
 
 
@@ -126,16 +130,19 @@ class RecordingSettings:
 class SupervisionSettings:
     """Supervision of actors."""
 
-    # An actor is given up when it fails more often within a minute. A restart does not cure that.
+    # Maximum number of failures of an actor within a minute. More of them are not cured by a
+    # restart, and the actor is stopped.
     max_restarts: NonNegativeInt = 5
-    # An actor that stays in one step for so long is given up: 100 times the slowest step measured.
+    # Maximum duration of one step of an actor, seconds. The default is 100 times the slowest step
+    # measured.
     step_timeout_s: PositiveFloat = 60.0
-    # Threads whose work may be late get this niceness (Linux): a tenth of the weight of the
-    # tracker.
+    # Niceness of threads that may run late (Linux). The default gives them a tenth of the CPU
+    # weight of the tracker.
     background_nice: Annotated[int, Meta(ge=0, le=19)] = 10
-    # Each stage reports its health this often. A stopped process shows within two reports.
+    # Interval of heartbeats, seconds. A stopped process is noticed within two of them.
     heartbeat_s: PositiveFloat = advanced(0.5)
-    # A consumer that takes nothing for so long is disconnected, because it holds up the robot.
+    # Seconds without taking a message after which a consumer is evicted, because it blocks the
+    # robot.
     evict_after_s: PositiveFloat = advanced(30.0)
 
 
@@ -143,11 +150,12 @@ class SupervisionSettings:
 class ViewerSettings:
     """Browser view (`ldo view`)."""
 
-    # The window is served on this address. It needs no keys: whoever reaches it sees the map.
+    # Address on which the window is served. It needs no keys: anyone who reaches it can see the
+    # map.
     address: str = LOOPBACK
-    # The window is served on this port, or on the next free one. 0 takes any.
+    # Port on which the window is served, or the next free one. 0 uses any free port.
     port: Annotated[int, Meta(ge=0, le=65535)] = 8080
-    # The browser shows so many Gaussians, the weightiest, at 32 bytes each.
+    # Maximum number of Gaussians in the browser, those of the largest weight, at 32 bytes each.
     max_gaussians: PositiveInt = 300_000
-    # The window looks for news this often: poses move at 5 Hz.
+    # Interval of updates of the window, seconds: poses move at 5 Hz.
     update_interval_s: PositiveFloat = advanced(0.2)

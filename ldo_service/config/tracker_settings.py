@@ -28,9 +28,9 @@ class MountingSettings:
     (REP-103), a camera that looks ahead has the quaternion 0.5 -0.5 0.5 -0.5.
     """
 
-    # This is the center of the camera in the base frame of the robot, in meters.
+    # Position of the camera in the base frame of the robot, meters.
     translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # This is the rotation of the camera in the base frame. The default makes the camera the base.
+    # Rotation of the camera in the base frame. The default makes the camera frame the base frame.
     quaternion_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -47,16 +47,16 @@ class MountingSettings:
 
 @dataclass(frozen=True, slots=True)
 class ImageSettings:
-    """Image pyramid that the tracker and the loop closer align."""
+    """Image pyramid for the alignment in tracker and loop closer."""
 
-    # An image is halved until it is narrower than 1.5 times this width. Larger is more accurate
-    # and slower.
+    # Working width in pixels. An image is halved until it is narrower than 1.5 times this width. A
+    # larger width is more accurate and slower.
     width_px: PositiveInt = 320
     # More levels let the alignment converge over larger motions. Four levels of 320 pixels end at
     # 40 pixels.
     pyramid_levels: PositiveInt = advanced(4)
-    # Depth beyond this is ignored: no depth camera measures farther, and a stray 65 m must not
-    # count.
+    # Maximum depth that is used, meters. No depth camera measures farther, and a stray 65 m must
+    # not count.
     max_depth_m: PositiveFloat = 30.0
 
 
@@ -64,9 +64,9 @@ class ImageSettings:
 class DepthNoiseSettings:
     """Axial noise of the depth camera: sigma(z) = floor + growth (z - 0.4 m)^2."""
 
-    # This is the noise at 0.4 m. The default is the Kinect's (Nguyen, Izadi and Lovell 2012).
+    # Noise at 0.4 m, meters. The default is that of the Kinect (Nguyen, Izadi and Lovell 2012).
     floor_m: PositiveFloat = advanced(0.0012)
-    # The noise grows by this factor times the squared distance beyond 0.4 m.
+    # Growth of the noise with the squared distance beyond 0.4 m, per meter.
     growth_per_m: NonNegativeFloat = advanced(0.0019)
 
 
@@ -74,7 +74,7 @@ class DepthNoiseSettings:
 class AlignmentSettings:
     """Direct image alignment."""
 
-    # The alignment stops after so many iterations per pyramid level, the finest level first.
+    # Maximum number of iterations per pyramid level, the finest level first.
     max_iterations: Annotated[tuple[PositiveInt, ...], Meta(min_length=1)] = advanced(
         (8, 8, 10, 10)
     )
@@ -82,9 +82,9 @@ class AlignmentSettings:
 
 @dataclass(frozen=True, slots=True)
 class FeatureSettings:
-    """Image features for poses without a prediction."""
+    """Image features for poses without an initial guess."""
 
-    # ORB keeps so many features of an image, as ORB-SLAM3 does at 640x480.
+    # Maximum number of ORB features in an image, as in ORB-SLAM3 at 640x480.
     max_features: PositiveInt = advanced(1000)
 
 
@@ -92,22 +92,24 @@ class FeatureSettings:
 class KeyframeSettings:
     """Selection of keyframes."""
 
-    # A keyframe is made when less of the visible surface overlaps with the last keyframe.
+    # Minimum fraction of the visible surface that overlaps with the last keyframe. Below it, a
+    # keyframe is made.
     min_overlap: Ratio = 0.85
-    # A keyframe is made when the camera has turned farther than this (15 degrees).
+    # Maximum rotation from the last keyframe, radians. Above it, a keyframe is made. The default is
+    # 15 degrees.
     max_rotation_rad: PositiveFloat = radians(15.0)
-    # A keyframe is made when the camera has moved farther than this, as a fraction of the median
-    # depth.
+    # Maximum translation from the last keyframe, as a fraction of the median depth. Above it, a
+    # keyframe is made.
     max_translation_ratio: PositiveFloat = 0.08
-    # A keyframe is made at most every so many frames, which bounds the work of the mapper.
+    # Minimum number of frames between keyframes, which limits the load of the mapper.
     min_interval_frames: PositiveInt = advanced(2)
-    # A keyframe is made at least every so many frames, if the camera moved at all.
+    # Maximum number of frames between keyframes, if the camera moved at all.
     max_interval_frames: PositiveInt = advanced(30)
-    # A frame is mapped but not tracked against after this fraction of the two motion limits. Above
-    # 1 there are no such frames. On the kitchen they gain 0.4 dB.
+    # Fraction of the two motion limits after which a mapping keyframe is made. Above 1 there are
+    # none. On the kitchen they gain 0.4 dB.
     mapping_only_ratio: PositiveFloat = advanced(0.33)
-    # From so many keyframes on the tracker looks for a known keyframe before it makes one. 0 never
-    # looks. Until then new views improve the map.
+    # Number of keyframes from which the tracker searches for a known keyframe before it makes a new
+    # one. 0 never searches. Until then new views improve the map.
     reuse_after: NonNegativeInt = 1500
 
     def __post_init__(self) -> None:
@@ -120,47 +122,48 @@ class KeyframeSettings:
 
 @dataclass(frozen=True, slots=True)
 class WindowSettings:
-    """Measurements between a keyframe and earlier ones."""
+    """Measurements between a keyframe and earlier keyframes."""
 
-    # A keyframe is measured against so many earlier ones, at 4 ms each. More change little; 0 is
-    # none.
+    # Maximum number of earlier keyframes that a keyframe is measured against, at 4 ms each. More
+    # change little; 0 uses none.
     max_measurements: NonNegativeInt = advanced(3)
 
 
 @dataclass(frozen=True, slots=True)
 class RelocalizationSettings:
-    """Search for the camera after tracking was lost."""
+    """Relocalization after tracking was lost."""
 
-    # The tracker and the loop closer keep so many keyframes, 0.13 MB each at 640x480. Beyond, the
+    # Maximum number of keyframes in the keyframe database, 0.13 MB each at 640x480. Beyond it, the
     # path is thinned.
     max_keyframes: Annotated[int, Meta(ge=3)] = 1000
-    # A lost frame is compared with so many keyframes of similar appearance.
+    # Number of keyframes of similar appearance that a lost frame is compared with.
     appearance_candidates: NonNegativeInt = advanced(5)
-    # A lost frame is compared with so many more keyframes by SIFT, which tolerates changes of
-    # scale. 0 disables SIFT.
+    # Number of further keyframes that a lost frame is compared with by SIFT, which tolerates scale
+    # changes. 0 disables SIFT.
     sift_candidates: NonNegativeInt = advanced(8)
 
 
 @dataclass(frozen=True, slots=True)
 class SubmapSettings:
-    """Submaps, which the tracker starts where it is lost."""
+    """Submaps that the tracker starts after it was lost."""
 
-    # The tracker starts a new submap after so long without a pose, as ORB-SLAM3 does. 0 never
+    # Seconds without a pose after which the tracker starts a new submap, as ORB-SLAM3 does. 0 never
     # starts one.
     start_after_lost_s: NonNegativeFloat = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class QualitySettings:
-    """Limits between the states OK, WEAK and LOST."""
+    """Limits between the tracking statuses OK, WEAK and LOST."""
 
-    # A pose is WEAK when less of the visible reference surface is matched. Chosen on one apartment.
+    # Minimum fraction of the visible reference surface that is matched. Below it, a pose is WEAK.
+    # Chosen on one apartment.
     weak_overlap: Ratio = advanced(0.15)
-    # A pose is WEAK when its residual exceeds the running median by this factor.
+    # Maximum ratio of the residual to its running median. Above it, a pose is WEAK.
     weak_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(2.5)
-    # A pose is LOST when its residual exceeds the running median by this factor.
+    # Maximum ratio of the residual to its running median. Above it, a pose is LOST.
     lost_residual_ratio: Annotated[float, Meta(gt=1)] = advanced(5.0)
-    # A pose is LOST when less of the visible reference surface is matched.
+    # Minimum fraction of the visible reference surface that is matched. Below it, a pose is LOST.
     lost_overlap: Ratio = advanced(0.08)
 
     def __post_init__(self) -> None:
@@ -178,21 +181,20 @@ class QualitySettings:
 
 @dataclass(frozen=True, slots=True)
 class DynamicsSettings:
-    """Segmentation of moving surfaces."""
+    """Motion segmentation."""
 
-    # Surfaces that move are left out of tracking and of the map. False takes the world as static.
+    # True masks moving surfaces in tracking and in the map. False assumes a static world.
     enabled: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryPriorSettings:
-    """Use of an external odometry."""
+    """Use of an external odometry as prior."""
 
-    # Two poses farther apart in time are not interpolated, because the path between is no straight
-    # line.
+    # Maximum time between two poses that are interpolated, seconds, because the path between them
+    # is not straight.
     max_gap_s: PositiveFloat = advanced(0.25)
-    # The tracker follows the external odometry for so long while LOST: 2 % drift at 0.5 m/s is
-    # then 30 cm.
+    # Maximum duration of dead reckoning while LOST, seconds: 2 % drift at 0.5 m/s is then 30 cm.
     max_dead_reckoning_s: PositiveFloat = advanced(30.0)
 
 
@@ -212,9 +214,11 @@ class TrackerSettings:
     quality: QualitySettings = field(default_factory=QualitySettings)
     dynamics: DynamicsSettings = field(default_factory=DynamicsSettings)
     odometry_prior: OdometryPriorSettings = field(default_factory=OdometryPriorSettings)
-    # The tracker localizes in the map of this finished run and does not change it. Empty maps.
+    # Folder of a finished run for localization in its map, which is not changed. Empty makes a new
+    # map.
     localization_map: str = ""
-    # Every n-th frame is tracked but never mapped, to evaluate the map on it. 0 maps every frame.
+    # Interval of held-out frames, which are tracked but never mapped, to evaluate the map on them.
+    # 0 maps every frame.
     hold_out: NonNegativeInt = 0
 
     def __post_init__(self) -> None:

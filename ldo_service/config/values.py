@@ -1,4 +1,4 @@
-"""Types of settings with their limits, and the mark of an advanced setting."""
+"""Types of settings with their limits, and the marker of advanced settings."""
 
 from dataclasses import field
 from typing import Annotated, TypeVar
@@ -13,15 +13,15 @@ Ratio = Annotated[float, Meta(ge=0, le=1)]
 PositiveRatio = Annotated[float, Meta(gt=0, le=1)]
 OpenRatio = Annotated[float, Meta(gt=0, lt=1)]
 
-ADVANCED = "advanced"  # key in the metadata of a field
+ADVANCED = "advanced"  # Key in the metadata of a field.
 
 T = TypeVar("T")
 
 
 def advanced(default: T) -> T:
-    """Declare a setting that only `ldo config --all` prints, and that may change in any release.
+    """Declare a setting that only `ldo config --all` prints and that may change in any release.
 
     Args:
-        default: The default of the setting.
+        default: Default of the setting.
     """
     return field(default=default, metadata={ADVANCED: True})
