@@ -1,1 +1,1 @@
-"""A run over a file: from a sequence of frames to a folder of results."""
+"""Execution of runs over a sequence of frames, which write a folder of results."""

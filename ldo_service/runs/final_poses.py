@@ -1,4 +1,4 @@
-"""Where frames are in the map in the end, when keyframes have moved since."""
+"""Final camera poses in the map, after corrections have moved the keyframes."""
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,15 @@ from ldo_service.geometry.se3 import interpolate
 
 @dataclass(frozen=True, slots=True)
 class FramePose:
-    """What the final trajectory needs of a frame."""
+    """Pose of a frame as it was tracked.
+
+    Attributes:
+        stamp_ns: Stamp of the frame.
+        reference: Keyframe that the frame was tracked against; None if there was none.
+        T_reference_camera: Camera pose in the reference keyframe, [4, 4].
+        T_map_camera_online: Camera pose in the map as it was published, [4, 4].
+        submap: Submap of the frame.
+    """
 
     stamp_ns: int
     reference: int | None
@@ -23,7 +31,7 @@ class FramePose:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredKeyframe:
-    """A keyframe, itself a frame that was tracked against a reference: T_reference_keyframe."""
+    """Keyframe with its pose in the reference keyframe that it was tracked against."""
 
     stamp_ns: int
     keyframe: int
@@ -31,29 +39,43 @@ class MeasuredKeyframe:
 
 
 class FinalPoses:
-    """T_map_camera of frames, from T_map_keyframe of the keyframes around each.
+    """Final poses T_map_camera of frames, from T_map_keyframe of the keyframes around each frame.
 
-    A frame at time t was measured in keyframe r, and so were the keyframes a before it and b after
-    it. Each says where the frame is,
+    A frame at time t was tracked against keyframe r. So were the keyframes a before it and b after
+    it. Each of the two gives a pose of the camera:
 
-        T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera,
+        T_a = T_map_a T_r_a^-1 T_r_camera,    T_b = T_map_b T_r_b^-1 T_r_camera.
 
-    and as long as nothing was corrected they agree. What corrections changed between a and b is
-    spread evenly over the time between them. a may be r; where there is no b, a alone says it.
+    Without corrections both poses are equal. The change that corrections make between a and b is
+    distributed evenly over the time between them. a may be r. If there is no b, the pose is T_a.
     """
 
     def __init__(self) -> None:
-        self._measured: dict[int, list[MeasuredKeyframe]] = {}  # by reference, ascending
+        # Keyframes by their reference, in order of time.
+        self._measured: dict[int, list[MeasuredKeyframe]] = {}
 
     def add(self, measured: MeasuredKeyframe, reference: int | None) -> None:
-        """A keyframe, later than all before."""
+        """Add a keyframe, which must be later than all earlier ones.
+
+        Args:
+            measured: The keyframe.
+            reference: Keyframe that it was tracked against; None if there was none.
+        """
         itself = MeasuredKeyframe(measured.stamp_ns, measured.keyframe, np.eye(4))
         self._measured[measured.keyframe] = [itself]
         if reference in self._measured:
             self._measured[reference].append(measured)
 
     def of(self, frames: Sequence[FramePose], T_map: Mapping[int, np.ndarray]) -> np.ndarray:
-        """T_map_camera [N, 4, 4]; as published where a frame had no reference that is known."""
+        """Return the final poses of frames.
+
+        Args:
+            frames: The frames.
+            T_map: Final pose T_map_keyframe of each keyframe, [4, 4].
+
+        Returns:
+            T_map_camera, [N, 4, 4]. A frame without a known reference keeps its published pose.
+        """
         before, after, shares = [], [], []
         for frame in frames:
             a, b, share = self._around(frame)
@@ -66,7 +88,7 @@ class FinalPoses:
     def _around(
         self, frame: FramePose
     ) -> tuple[MeasuredKeyframe | None, MeasuredKeyframe | None, float]:
-        """The keyframes before and after, and how far from one to the other it is."""
+        """Return the keyframes around a frame, and its fraction of the time between them."""
         measured = self._measured.get(frame.reference, []) if frame.reference is not None else []
         if not measured:
             return None, None, 0.0

@@ -1,6 +1,6 @@
-"""What a run left in its folder, read back. The files: `runs.folder`.
+"""Reading of the folder of a finished run; `runs.folder` lists its files.
 
-Every function raises DataError for a file that is missing or is not what a run writes.
+Every function raises DataError for a file that is missing or has an invalid format.
 """
 
 import csv
@@ -25,7 +25,12 @@ from .records import read_loops
 
 
 def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
-    """All that is judged of a run; one that localised has no map of its own."""
+    """Return all data of a run that are evaluated.
+
+    Args:
+        folder: Folder of the run.
+        has_map: False for a run with --localize, which makes no map.
+    """
     frames = _frames(require_file(folder, "frames.csv"))
     estimates = {
         "online": Trajectory.load(require_file(folder, "trajectory_online.txt")),
@@ -43,7 +48,7 @@ def read_run(folder: Path, *, has_map: bool = True) -> FinishedRun:
 
 
 def vlm_calls(folder: Path) -> int | None:
-    """How often the labeller was asked; None where summary.json does not say."""
+    """Return the number of requests to the labeller; None if summary.json does not have it."""
     path = folder / "summary.json"
     try:
         found = json.loads(path.read_text())["labeller_requests"] if path.is_file() else None
@@ -53,27 +58,34 @@ def vlm_calls(folder: Path) -> int | None:
 
 
 def newest_map(folder: Path) -> "MapFolder":
-    """What was refined after the run; the run's own where nothing was."""
+    """Return the refined map of a run, or its own map if it was not refined."""
     return MapFolder(folder / REFINED if has_refined(folder) else folder)
 
 
 def has_refined(folder: Path) -> bool:
-    """The map is the last file that a refinement writes."""
+    """Return whether the run has a refined map.
+
+    The map is the last file that a refinement writes.
+    """
     return (folder / REFINED / "map.ply").is_file()
 
 
 def require_file(folder: Path, name: str) -> Path:
-    """A file that every run writes."""
+    """Return the path of a file that every run writes.
+
+    Raises:
+        DataError: The file does not exist.
+    """
     if not (folder / name).is_file():
-        raise DataError(f"{folder} has no {name}: is it what `ldo run` wrote?")
+        raise DataError(f"{folder} has no {name}. Give the folder of a finished `ldo run`.")
     return folder / name
 
 
 @dataclass(frozen=True, slots=True)
 class MapFolder:
-    """`folder` holds map.ply, trajectory.txt and keyframes.json: a run's own or its refined ones.
+    """Folder with map.ply, trajectory.txt and keyframes.json of a run or of its refinement.
 
-    Only the map must be there; each is read when it is asked for.
+    Only the map must exist. Each file is read when its content is requested.
     """
 
     folder: Path
@@ -81,16 +93,16 @@ class MapFolder:
     def __post_init__(self) -> None:
         if not (self.folder / "map.ply").is_file():
             raise DataError(
-                f"{self.folder} has no map.ply: name the folder of a finished `ldo run`; one with "
-                "--localize makes no map."
+                f"{self.folder} has no map.ply: name the folder of a finished `ldo run`. With "
+                "--localize a run makes no map."
             )
 
     def gaussians(self) -> np.ndarray:
-        """Rows [N, 16], see `gaussians.model`."""
+        """Return the rows of all Gaussians, [N, 16], see `gaussians.model`."""
         return read_ply(self.folder / "map.ply")
 
     def semantics(self) -> SavedSemantics | None:
-        """What the Gaussians are, row by row; None where no detector looked."""
+        """Return the labels of the Gaussians, row by row; None if the run had no detector."""
         return self._semantics(len(self.gaussians()))
 
     def _semantics(self, gaussians: int) -> SavedSemantics | None:
@@ -98,15 +110,15 @@ class MapFolder:
         return read_semantics(path, gaussians) if path.is_file() else None
 
     def trajectory(self) -> Trajectory:
-        """T_map_camera of every frame that has a pose, after the last correction."""
+        """Return T_map_camera of every frame with a pose, after the last correction."""
         return Trajectory.load(require_file(self.folder, "trajectory.txt"))
 
     def viewpoints(self) -> list[Viewpoint]:
-        """Where the keyframes were taken that are in the map's frame."""
+        """Return the viewpoints of all keyframes in the frame of the map."""
         return list(read_viewpoints(self.folder).values())
 
     def exposures(self) -> Exposures:
-        """Of keyframes that have one; older versions wrote none."""
+        """Return the exposures of the keyframes that have one; older versions wrote none."""
         with _keyframes(self.folder) as (_, keyframes):
             exposed = [keyframe for keyframe in keyframes if "exposure" in keyframe]
             stamps_ns = np.array([int(keyframe["stamp_ns"]) for keyframe in exposed], np.int64)
@@ -114,32 +126,39 @@ class MapFolder:
             return Exposures(stamps_ns, matrices.reshape(-1, 2, 3))
 
     def keyframes(self) -> dict[int, int]:
-        """Index of the frame of each, by id."""
+        """Return the frame index of each keyframe, by its id."""
         with _keyframes(self.folder) as (_, keyframes):
             return {int(k["keyframe"]): int(k["frame_index"]) for k in keyframes}
 
     def posed(self, name: str) -> PosedMap:
+        """Return the map with its trajectory, exposures and labels, under this name."""
         rows = self.gaussians()
         labels = self._semantics(len(rows))
         return PosedMap(name, rows, self.trajectory(), self.exposures(), labels)
 
 
 def read_viewpoints(folder: Path) -> dict[int, Viewpoint]:
-    """Where the keyframes were taken that are in the map's frame, by id; needs keyframes.json
-    alone."""
+    """Return the viewpoints of all keyframes in the frame of the map, by id.
+
+    The folder needs only keyframes.json.
+    """
     with _keyframes(folder) as (path, keyframes):
         mapped = [k for k in keyframes if _submap(k) == 0]
         return {int(k["keyframe"]): _viewpoint(path, k) for k in mapped}
 
 
 def _submap(keyframe: dict[str, Any]) -> int:
-    """Return the submap of a keyframe. Version 0.1 wrote `segment`, and earlier ones neither."""
+    """Return the submap of a keyframe; version 0.1 wrote `segment`, earlier ones neither."""
     return next((keyframe[name] for name in ("submap", "segment") if name in keyframe), 0)
 
 
 @contextmanager
 def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
-    """Where keyframes.json is and what it holds; what makes no sense is the file's fault."""
+    """Open a context with the path and the content of keyframes.json.
+
+    Raises:
+        DataError: The file cannot be read, or the code in the context fails on its content.
+    """
     path = require_file(folder, "keyframes.json")
     try:
         yield path, json.loads(path.read_text())
@@ -152,12 +171,14 @@ def _keyframes(folder: Path) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
 def _viewpoint(path: Path, keyframe: dict[str, Any]) -> Viewpoint:
     if "camera" not in keyframe:
         raise DataError(
-            f"{path} does not say with which camera its keyframes were taken: an older version "
-            "wrote it. `ldo run` the sequence again."
+            f"{path} has no camera for its keyframes, because an older version wrote it. Run "
+            "`ldo run` on the sequence again."
         )
     T_map_camera = np.array(keyframe["T_map_camera"], float)
     if T_map_camera.shape != (4, 4) or not np.all(np.isfinite(T_map_camera)):
-        raise ValueError(f"T_map_camera of keyframe {keyframe['keyframe']} is no finite 4x4 matrix")
+        raise ValueError(
+            f"T_map_camera of keyframe {keyframe['keyframe']} is not a finite 4x4 matrix"
+        )
     return Viewpoint(Camera(*(keyframe["camera"][name] for name in CAMERA)), T_map_camera)
 
 

@@ -1,23 +1,25 @@
-"""The folder that a run writes.
+"""Folder that a run writes.
 
-trajectory_online.txt   what was published at the time, a line per frame that is not LOST
-trajectory.txt          the same frames after the last correction
-                        (frames of submaps that are not joined to the first are in neither)
-frames.csv              every frame: status, residuals, milliseconds, submap
-keyframes.json          id, frame, stamp, camera and pose of every keyframe
-map.ply                 the Gaussians that hang on keyframes in the map's frame
-                        (those of submaps that are not joined to the first are nowhere: left out)
-semantics.npz           what those Gaussians are, if a detector looked: `semantics.semantics_file`
-objects.json            the objects among them, if a detector looked: see `runs.records`
-keyframe_database.msgpack  what `--localize` finds the camera by, at the newest poses
-loops.json              places that were compared, and why each pair was refused: `runs.records`
-front_end.mcap          what tracker and detector said, if it was to be kept: see `runs.front_end`
-config.yaml             the effective configuration
-summary.json            counts, speed, memory, versions
-refined/                trajectory, keyframes and map after more iterations, if they were asked for
+trajectory_online.txt      poses as published, one line per frame that is not LOST
+trajectory.txt             poses of the same frames after the last correction
+frames.csv                 status, residuals, milliseconds and submap of every frame
+keyframes.json             id, frame, stamp, camera and pose of every keyframe
+map.ply                    Gaussians anchored to keyframes in the frame of the map
+semantics.npz              labels of these Gaussians: `semantics.semantics_file`
+objects.json               objects in the map: `runs.records`
+keyframe_database.msgpack  database for `--localize`, with the final poses
+loops.json                 loop candidates with their rejection reasons: `runs.records`
+front_end.mcap             recorded outputs of tracker and detector: `runs.front_end`
+config.yaml                effective configuration
+summary.json               counts, speed, memory, versions
+refined/                   trajectory, keyframes and map after further iterations
 
-A run with `--localize` makes no map: keyframes.json, map.ply and keyframe_database.msgpack stay in
-the folder that config.yaml names in tracker.localization_map.
+Submaps that were never merged with the first one are not in the frame of the map. The trajectories
+lack their frames, and the map lacks their Gaussians and objects. semantics.npz and objects.json
+exist only if a detector ran, front_end.mcap and refined/ only if they were requested.
+
+A run with `--localize` makes no map. Its keyframes.json, map.ply and keyframe_database.msgpack are
+in the folder that config.yaml names in tracker.localization_map.
 """
 
 import csv
@@ -69,8 +71,8 @@ from .records import LOOPS, OBJECTS, LoopRecord, write_objects
 
 MAP_FILES = ("map.ply", "trajectory.txt", "keyframes.json")
 SEMANTICS = "semantics.npz"
-REFINED = "refined"  # folder in that of the run, with such files of its own
-EXPORTED = {  # by `ldo export`, per format
+REFINED = "refined"  # Subfolder of a run with its own files of these names.
+EXPORTED = {  # Files of `ldo export` for each format.
     "ply": ("gaussians.ply",),
     "splat": ("gaussians.splat",),
     "spz": ("gaussians.spz",),
@@ -92,13 +94,13 @@ WRITTEN = frozenset(
             f"{REFINED}/{SEMANTICS}",
             f"{REFINED}/{OBJECTS}",
         ),
-        *("trajectory.png", "rendering.png", "labels.png"),  # by `eval` and `demo`
-        "views.png",  # by `demo` up to 0.1
+        *("trajectory.png", "rendering.png", "labels.png"),  # Files of `ldo eval` and `ldo demo`.
+        "views.png",  # File of `ldo demo` up to version 0.1.
         *(f"{REFINED}/{name}" for name in MAP_FILES),
         *(name for names in EXPORTED.values() for name in names),
     }
 )
-CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # of a keyframe, in pixels, rectified
+CAMERA = ("width", "height", "fx", "fy", "cx", "cy")  # Rectified camera of a keyframe, pixels.
 COLUMNS = (
     *("frame", "stamp_ns", "status", "reference", "keyframe", "held_out"),
     *("inlier_fraction", "residual_color", "residual_depth", "overlap", "iterations", "track_ms"),
@@ -107,13 +109,17 @@ COLUMNS = (
 
 
 class DatabaseWriter:
-    """Places of the keyframes that it is shown: no more than `places.count`, 0.13 MB each."""
+    """Writer of the keyframe database with the keyframes that it receives.
+
+    It keeps at most `places.count` keyframes, 0.13 MB each.
+    """
 
     def __init__(self, config: OdometryConfig) -> None:
         self._config = config
         self._places = KeyframeDatabase()
 
     def add(self, message: Keyframe) -> None:
+        """Add the record of a keyframe."""
         config = self._config
         place = make_keyframe_record(
             keyframe_from_message(message, config.pyramid), config.features, config.places
@@ -121,7 +127,13 @@ class DatabaseWriter:
         self._places = self._places.with_record(place, config.places)
 
     def save(self, path: Path, poses: KeyframePoses, joined: dict[int, int]) -> None:
-        """Those that are in the map's frame, with T_map_keyframe for T_odom_keyframe."""
+        """Write the records of all keyframes in the frame of the map.
+
+        Args:
+            path: File to write.
+            poses: Final poses T_map_keyframe, which replace T_odom_keyframe.
+            joined: Older submap with which each merged submap was merged.
+        """
         places = [
             replace(place, submap=0, T_odom_keyframe=np.array(poses[place.id]))
             for place in self._places.all
@@ -131,21 +143,26 @@ class DatabaseWriter:
 
 
 def prepare(folder: Path, overwrite: bool) -> None:
-    """An empty folder to write to. Raises ConfigError when it is not empty or not writable.
+    """Create an empty folder for a run.
 
-    `overwrite` deletes the files of an earlier run, and refuses when anything else lies there.
+    Args:
+        folder: The folder.
+        overwrite: Delete the files of an earlier run, if there is nothing else in the folder.
+
+    Raises:
+        ConfigError: The folder is not empty or cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         found = sorted(path for path in folder.rglob("*") if not path.is_dir())
         if found and not overwrite:
-            raise ConfigError(f"{folder} is not empty. Choose another, or add --overwrite.")
+            raise ConfigError(f"{folder} is not empty. Choose another folder, or add --overwrite.")
         names = [path.relative_to(folder).as_posix() for path in found]
         foreign = [name for name in names if name not in WRITTEN]
         if foreign:
             raise ConfigError(
-                f"{folder} holds {foreign[0]}, which no run wrote, so --overwrite leaves all of it "
-                "alone. Choose another folder."
+                f"{folder} holds {foreign[0]}, which no run wrote, so --overwrite deletes nothing. "
+                "Choose another folder."
             )
         for path in found:
             path.unlink()
@@ -154,7 +171,11 @@ def prepare(folder: Path, overwrite: bool) -> None:
 
 
 class RunWriter:
-    """Observes what the actors make; `close` writes what is only known at the end."""
+    """Writer of the folder of a run from the outputs of its actors.
+
+    config.yaml and frames.csv are written from the start of the run, the map and the summary by
+    `close`.
+    """
 
     def __init__(self, folder: Path, config_text: str, tracker: TrackerConfig) -> None:
         self.folder, self._hold_out = folder, tracker.hold_out
@@ -166,23 +187,29 @@ class RunWriter:
         self._csv.writerow(COLUMNS)
         self._tracked: list[FramePose] = []
         self._poses, self._final_poses = KeyframePoses(), FinalPoses()
-        self._joined: dict[int, int] = {}  # submaps placed in an older one
+        self._joined: dict[int, int] = {}  # Older submap of each merged submap.
         self._keyframes: dict[int, dict[str, Any]] = {}
         self.follower = MapReplica()
         self._objects: MapObjects | None = None
         self.statuses = {"OK": 0, "WEAK": 0, "LOST": 0}
         self.loops = LoopRecord()
-        self.boxes = 0  # that a detector found
-        self.labeller_calls = 0  # regions that a labeller looked at
+        self.boxes = 0  # Number of detections.
+        self.labeller_calls = 0  # Number of label results.
         self.newest_stamp_ns = 0
         self.summary: dict[str, Any] = {}
 
     @property
     def keyframes(self) -> int:
+        """Number of keyframes so far."""
         return len(self._keyframes)
 
     def observe(self, message: Message, step_ms: float) -> None:
-        """Take note of one message; `step_ms` is how long its maker took."""
+        """Record one message.
+
+        Args:
+            message: Output of an actor.
+            step_ms: Duration of the step that produced it.
+        """
         match message:
             case TrackedPose():
                 self._observe_pose(message, step_ms)
@@ -251,6 +278,7 @@ class RunWriter:
 
     # --- at the end -------------------------------------------------------------------------------
     def close(self, summary: dict[str, Any]) -> None:
+        """Write all files that are complete only at the end of the run."""
         self._csv_file.close()
         self.summary = summary
         self.online().save(self.folder / "trajectory_online.txt")
@@ -259,20 +287,24 @@ class RunWriter:
         write_json(self.folder / "summary.json", summary)
 
     def in_map(self) -> np.ndarray:
-        """Which Gaussians [N] bool hang on keyframes in the map's frame."""
+        """Return which Gaussians, [N] bool, are anchored to keyframes in the frame of the map."""
         placed = [k for k, facts in self._keyframes.items() if self._root(facts["submap"]) == 0]
         return np.isin(self.follower.map.anchors, placed)
 
     def objects(self) -> tuple[MapObject, ...]:
-        """Those in the map; none where nobody looked."""
+        """Return the objects in the map; empty if no detector ran."""
         return self._placed_objects(self._objects).objects if self._objects else ()
 
     def labelled(self) -> int:
-        """Gaussians in the map that are likelier something than background."""
+        """Return the number of Gaussians in the map whose best label is not background."""
         return int(np.count_nonzero(top_labels(self.follower.map.labels[self.in_map()])))
 
     def write_refined(self, iterations: int) -> None:
-        """The map as it is now, and where its keyframes are."""
+        """Write the refined map with its keyframes and trajectory.
+
+        Args:
+            iterations: Number of iterations of the refinement.
+        """
         folder = self.folder / REFINED
         folder.mkdir(exist_ok=True)
         self._write_map(folder)
@@ -294,18 +326,18 @@ class RunWriter:
         self._places.save(self.folder / DATABASE_FILE, self._poses, self._joined)
 
     def online(self) -> Trajectory:
-        """T_map_camera as published at the time."""
+        """Return T_map_camera of each frame as it was published."""
         frames = [frame for frame in self._tracked if frame.submap == 0]
         return _trajectory(frames, [frame.T_map_camera_online for frame in frames])
 
     def final(self) -> Trajectory:
-        """T_map_camera from where the keyframes around each frame are now."""
+        """Return T_map_camera of each frame from the final poses of the keyframes around it."""
         frames = [frame for frame in self._tracked if self._root(frame.submap) == 0]
         T_map = {keyframe: self._poses[keyframe] for keyframe in self._poses}
         return _trajectory(frames, self._final_poses.of(frames, T_map))
 
     def _root(self, submap: int) -> int:
-        """The oldest that it is joined to, itself where there is none."""
+        """Return the oldest submap that a submap is merged with, or the submap itself."""
         return self._joined.get(submap, submap)
 
     def _placed_keyframes(self) -> list[dict[str, Any]]:
@@ -320,7 +352,7 @@ class RunWriter:
         ]
 
     def _placed_objects(self, found: MapObjects) -> MapObjects:
-        """Those first seen from a keyframe in the map's frame."""
+        """Return the objects first observed from a keyframe in the frame of the map."""
         keyframes = self._keyframes
         placed = tuple(
             one for one in found.objects if self._root(keyframes[one.first_keyframe]["submap"]) == 0

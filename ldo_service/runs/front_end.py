@@ -1,10 +1,12 @@
-"""What the front end of a run said, kept to run other back ends on the same poses and keyframes.
+"""Recorded front end of a run, for runs of other back ends on the same poses and keyframes.
 
-The front end is who looks at every frame: frame source, tracker and detector. Given its words
-again, each at the tick at which it was heard, the others make what they made in the run that was
-kept, to the bit; with other settings of theirs they make what those settings are worth, odometry
-being the same. What the tracker knew of the map, by corrections, is that of the kept run: so are
-the poses as they were published, and to which keyframes it returned.
+The front end consists of the actors that process every frame: frame source, tracker and detector. A
+run can replace them by their recorded outputs, each at its original tick. With the same settings,
+the other actors then reproduce the recorded run bit by bit. With different settings, the results
+show the effect of these settings with equal odometry.
+
+The tracker received its corrections in the recorded run. So the published poses and the reused
+keyframes are those of the recorded run too.
 """
 
 import json
@@ -39,7 +41,7 @@ from .source import Selection
 
 log = logging.getLogger(__name__)
 
-FRONT_END = "front_end.mcap"  # in the folder of a run
+FRONT_END = "front_end.mcap"  # File in the folder of a run.
 ACTORS = frozenset({FrameSource.name, Tracker.name, Detector.name})
 TOPICS = {topic.message: topic for topic in (POSE_TRACKED, KEYFRAME_NEW, DETECTION_BOXES)}
 MESSAGES = {topic.name: topic.message for topic in TOPICS.values()}
@@ -47,10 +49,10 @@ DETECTOR_LATENCY = "offline.latency_frames.detector"
 
 
 class FrontEndRecord:
-    """Record of the front end, kept in a context.
+    """Recording of the front end, as a context.
 
-    It is removed when the run fails, grows past `recording.max_gb` or fills the disk: it would be
-    no front end for other runs.
+    The recording is deleted if the run fails, if it exceeds `recording.max_gb` or if the disk is
+    full, because an incomplete one is useless.
     """
 
     def __init__(
@@ -66,13 +68,18 @@ class FrontEndRecord:
         self._file = RecordingFile(folder / FRONT_END, about, recording_parameters(config))
 
     def observe(self, message: Message, tick: int) -> None:
+        """Record a message of the front end; ignore other messages."""
         topic = TOPICS.get(type(message))
         if topic is None:
             return
         body = msgspec.msgpack.encode(message)
         self._file.add(topic.name, topic.message, body, tick, message.stamp_ns)
         if self._file.is_open and self._file.is_over_limit():
-            log.error("%s: no room by recording.max_gb and min_free_gb: not kept", self._file.path)
+            log.error(
+                "front end: %s exceeds recording.max_gb or leaves less than recording.min_free_gb; "
+                "the run continues without this recording.",
+                self._file.path,
+            )
             self._drop()
 
     def __enter__(self) -> "FrontEndRecord":
@@ -91,9 +98,10 @@ class FrontEndRecord:
 
 @dataclass(frozen=True, slots=True)
 class FrontEnd:
-    """That of a finished run, for a run over the same frames.
+    """Recorded front end of a finished run, for a run over the same frames.
 
-    rejected: of the frames, how many could not be used.
+    Attributes:
+        rejected: Number of frames that could not be used.
     """
 
     rejected: int
@@ -103,16 +111,26 @@ class FrontEnd:
     def open(
         cls, run: Path, config: Config, sequence: Sequence, selection: Selection
     ) -> "FrontEnd":
-        """Raises DataError where there is none or not of these frames, ConfigError where a setting
-        of it is asked to be another."""
+        """Open the recorded front end of a run.
+
+        Args:
+            run: Folder of the recorded run.
+            config: Configuration of the new run.
+            sequence: Sequence of the new run.
+            selection: Selected frames of the new run.
+
+        Raises:
+            DataError: There is no recording, it is incomplete, or it has other frames.
+            ConfigError: A setting of the front end differs from the recorded one.
+        """
         path = run.expanduser() / FRONT_END
         if not path.is_file():
             raise DataError(
-                f"{run} has no {FRONT_END}: `ldo run --keep-front-end` leaves one in its folder."
+                f"{run} has no {FRONT_END}: `ldo run --keep-front-end` records one in its folder."
             )
         index = McapIndex(path)
         if not index.is_whole:
-            raise DataError(f"{path} is not whole: its run was killed. Make that run again.")
+            raise DataError(f"{path} is not complete because its run was killed. Repeat that run.")
         require_version(index)
         about = index.metadata.get(ABOUT, {})
         _require_settings(path, about, config)
@@ -122,13 +140,14 @@ class FrontEnd:
         stamps_ns = np.array([p.stamp_ns for p in index.places if p.topic == POSE_TRACKED.name])
         if told != kept or not np.isin(stamps_ns, sequence.stamps_ns).all():
             raise DataError(
-                f"{path} is of {kept[2]} frames of {kept[0]}, every {kept[1]}th; asked for are "
-                f"{told[2]} of {told[0]}, every {told[1]}th, at their stamps."
+                f"{path} has {kept[2]} frames of {kept[0]} with stride {kept[1]}; this run has "
+                f"{told[2]} of {told[0]} with stride {told[1]}. Source, stamps, --stride and "
+                "--max-frames must be the same."
             )
         return cls(frames - len(stamps_ns), index)
 
     def __iter__(self) -> Iterator[tuple[Message, ...]]:
-        """What was heard at each tick, from the first to the last at which anything was."""
+        """Yield the messages of each tick, from the first tick to the last one with messages."""
         tick = 0
         for number, places in groupby(self._index.places, lambda place: place.number):
             while tick < number:
@@ -145,7 +164,7 @@ class FrontEnd:
 
 
 def front_end_settings(config: Config) -> dict[str, object]:
-    """Those that a front end depends on, by their dotted names."""
+    """Return the settings that affect the front end, by their dotted names."""
     tree = msgspec.to_builtins(config)
     sections = {name: tree[name] for name in (*sorted(ACTORS), "inference", "dataset")}
     return {**dict(_leaves("", sections)), DETECTOR_LATENCY: config.offline.latency_frames.detector}
@@ -163,17 +182,17 @@ def _require_settings(path: Path, about: Mapping[str, str], config: Config) -> N
     try:
         was = dict(json.loads(about.get("settings", "")))
     except (ValueError, TypeError) as error:
-        raise DataError(f"{path} does not say how it was made: {error}.") from error
+        raise DataError(f"{path} has no settings of its run: {error}. Repeat that run.") from error
     asked = json.loads(json.dumps(front_end_settings(config)))
     if was.keys() != asked.keys():
         made_by, ours = about.get("ldo", "an unknown version"), versions()["ldo-slam"]
         raise DataError(
-            f"{path} is of LDO-SLAM {made_by}, which had other settings than this, {ours}. Make "
-            "that run again."
+            f"{path} is of LDO-SLAM {made_by}, which had other settings than this, {ours}. "
+            "Repeat that run."
         )
     for name, value in asked.items():
         if was[name] != value:
             raise ConfigError(
-                f"{name} is {value} and was {was[name]} when {path} was made: the front end does "
-                "not run again. Leave it as it was, or leave out --reuse-front-end."
+                f"{name}={value} was {was[name]} when {path} was recorded, and the front end does "
+                "not run again. Restore that value, or remove --reuse-front-end."
             )

@@ -1,4 +1,4 @@
-"""What a run is asked to do."""
+"""Options of a run."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,22 +12,34 @@ from ldo_service.geometry.sequence import Sequence
 from .front_end import FrontEnd
 from .source import Selection, Warn, require_overlap
 
-REFINE_ITERATIONS = 25  # asked of the mapper at a time: about a second
+REFINE_ITERATIONS = 25  # Maximum iterations per request to the mapper, about a second.
 
 
 class Advance(Protocol):
-    """Told how many frames and refinements are done, and of how many, where corrections left more
-    to do than was asked for."""
+    """Callback for progress.
+
+    It takes the number of finished frames and refinement requests. It also takes their total, which
+    grows if corrections require a refit.
+    """
 
     def __call__(self, done: int, total: int | None = None, /) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class RunOptions:
-    """A sequence and which of its frames, the configuration, where the results go, who is warned,
-    how many iterations refine the map after the last frame, and where another odometry had the
-    robot's base; a front end that another run kept, in place of one over the frames, or whether to
-    keep this one's."""
+    """Options of a run.
+
+    Attributes:
+        sequence: Sequence of frames.
+        folder: Folder for the results.
+        config: Configuration.
+        selection: Selected frames of the sequence.
+        warn: Receives warnings for the user.
+        refine: Iterations of the refinement after the last frame.
+        prior: Poses T_odom_base of the robot's base from another odometry, in its own frame.
+        front_end: Recorded front end that replaces frame source, tracker and detector.
+        keep_front_end: Record the front end of this run.
+    """
 
     sequence: Sequence
     folder: Path
@@ -35,7 +47,7 @@ class RunOptions:
     selection: Selection
     warn: Warn
     refine: int = 0
-    prior: Trajectory | None = None  # T_odom_base, in a frame of its own
+    prior: Trajectory | None = None
     front_end: FrontEnd | None = None
     keep_front_end: bool = False
 
@@ -47,10 +59,10 @@ class RunOptions:
 
     @property
     def work(self) -> int:
-        """Frames and refinements."""
+        """Number of frames and refinement requests."""
         return len(self.selection.indices(self.sequence)) + requests(self.refine)
 
 
 def requests(iterations: int) -> int:
-    """In how many the mapper is asked for so many iterations."""
+    """Return the number of requests to the mapper for so many iterations."""
     return -(-iterations // REFINE_ITERATIONS)

@@ -1,4 +1,4 @@
-"""A run over a sequence, on the logical clock."""
+"""Offline run over a sequence, on the logical clock."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -19,16 +19,25 @@ from .job import REFINE_ITERATIONS, Advance, RunOptions, requests
 from .source import FrameReader, interleave_prior
 from .summary import Percentiles, Usage, percentiles, summarize
 
-LAST_RATE = 0.05  # of the steps when the map is refined: they shrink so far, to settle
+# Final fraction of the learning rates in a refinement, which decay to let the map settle.
+LAST_RATE = 0.05
 
 
 def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
-    """Run every actor over the chosen frames, fit the map again where corrections have torn it, and
-    write the folder; then refine the map, if asked.
+    """Run every actor over the selected frames, refit and refine the map, and write the folder.
 
-    Independent of the machine's load: see `runtime.logical_clock`. A run that is interrupted or
-    fails leaves what it has done, and its summary says so. Raises DataError when nothing or too
-    little can be read, and StageError when an actor fails.
+    The refit covers keyframes that corrections have moved. The refinement runs only if it is
+    requested. The result does not depend on the load of the machine, see `runtime.logical_clock`.
+    An interrupted or failed run leaves its partial results, and its summary marks them as
+    interrupted.
+
+    Args:
+        job: Options of the run.
+        advance: Receives the progress.
+
+    Raises:
+        DataError: Too few frames can be read.
+        StageError: An actor fails.
     """
     with OfflineRun(job, advance) as run:
         try:
@@ -43,7 +52,7 @@ def run_offline(job: RunOptions, advance: Advance) -> RunWriter:
 
 
 class OfflineRun:
-    """The parts of a run, for a context: `stream`, `repair`, `close`, `refine`."""
+    """Offline run as a context, with its phases `stream`, `repair`, `close` and `refine`."""
 
     def __init__(self, job: RunOptions, advance: Advance) -> None:
         self._job, self._advance, self._work = job, advance, job.work
@@ -72,7 +81,7 @@ class OfflineRun:
         self._clock.__exit__(*error)
 
     def stream(self) -> None:
-        """Take every frame."""
+        """Process every frame."""
         job = self._job
         frames = interleave_prior(self._reader, job.prior)
         with ExitStack() as kept:
@@ -84,14 +93,14 @@ class OfflineRun:
         self._stage_ms = self._step_percentiles()
 
     def repair(self) -> None:
-        """Fit the map again where corrections have torn it."""
+        """Run the pending refit iterations for keyframes that corrections have moved."""
         if due := int(self._actors["mapper"].metrics()["iterations_pending"]):
             self._work += requests(due)
             self._run(refinements(due, self.record.newest_stamp_ns))
         self._is_finished = True
 
     def close(self) -> None:
-        """Write what there is."""
+        """Write all results so far."""
         used = Usage.now().since(self._started)
         facts = self._actors["optimizer"].metrics() | self._actors["mapper"].metrics()
         stage_ms = self._stage_ms or self._step_percentiles()
@@ -100,7 +109,7 @@ class OfflineRun:
         self.record.close({**summary, "interrupted": not self._is_finished})
 
     def refine(self) -> None:
-        """As many iterations as were asked for, into a folder of their own."""
+        """Run the requested refinement and write its results to their own folder."""
         self._run(refinements(self._job.refine, self.record.newest_stamp_ns))
         self.record.write_refined(self._job.refine)
 
@@ -128,19 +137,27 @@ class OfflineRun:
         return self._reader.rejected + by_source
 
     def _step_percentiles(self) -> dict[str, Percentiles]:
-        """Of what the steps of each actor took so far."""
+        """Return percentiles of the step durations of each actor so far."""
         steps_of = self._clock.step_ms()
         return {name: percentiles(steps) for name, steps in steps_of.items() if steps}
 
 
 def with_all_cores(config: Config) -> Config:
-    """Nobody is kept waiting by a run over a file: the renderer may use every core."""
+    """Return the configuration with a renderer that may use every core.
+
+    No live frame waits for the tracker in an offline run.
+    """
     threads = config.mapper.threads or os.cpu_count() or 1
     return replace(config, mapper=replace(config.mapper, threads=threads))
 
 
 def refinements(iterations: int, stamp_ns: int) -> Iterator[RefineMap]:
-    """Requests of a bounded size, with steps that shrink from the first to the last."""
+    """Yield refinement requests of bounded size with decaying learning rates.
+
+    Args:
+        iterations: Number of iterations of all requests together.
+        stamp_ns: Stamp of the requests.
+    """
     starts = range(0, iterations, REFINE_ITERATIONS)
     ends = [min(start + REFINE_ITERATIONS, iterations) for start in starts]
     rates = LAST_RATE ** (np.array([0, *ends]) / iterations)
@@ -154,10 +171,18 @@ def refinements(iterations: int, stamp_ns: int) -> Iterator[RefineMap]:
 
 
 def require_usable(record: RunWriter, max_rejected: float) -> None:
-    """Raise DataError when more than this share of the frames could not be used."""
+    """Check that enough frames could be used.
+
+    Args:
+        record: The finished run.
+        max_rejected: Maximum fraction of rejected frames.
+
+    Raises:
+        DataError: More frames were rejected.
+    """
     frames, rejected = record.summary["frames"], record.summary["frames_rejected"]
     if rejected > max_rejected * frames:
         raise DataError(
-            f"{rejected} of {frames} frames could not be used. What could be done is in "
+            f"{rejected} of {frames} frames could not be used. The results of the others are in "
             f"{record.folder}. Check the data, or raise offline.max_rejected_ratio."
         )

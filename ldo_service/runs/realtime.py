@@ -1,4 +1,4 @@
-"""A run over a sequence as if it were live: paced by its stamps, late frames are dropped."""
+"""Real-time run over a sequence: frames are paced by their stamps, and late ones are dropped."""
 
 import asyncio
 import time
@@ -25,14 +25,22 @@ from .summary import Usage, summarize
 
 
 def run_realtime(job: RunOptions, advance: Advance) -> RunWriter:
-    """Like `run_offline`, with the stages and policies of the service, all in this process.
+    """Run like `run_offline`, but with the stages and policies of the service in this process.
 
-    A frame that comes before the tracker is done with the last one is dropped and counted, so the
-    result depends on the machine's speed and load. Raises what `run_offline` raises, and
-    ConfigError when the map is to be refined: live, `map/refine` asks for that.
+    A frame that arrives before the tracker has finished the previous one is dropped and counted. So
+    the result depends on the speed and the load of the machine.
+
+    Args:
+        job: Options of the run.
+        advance: Receives the progress.
+
+    Raises:
+        ConfigError: A refinement is requested; a live service refines on `map/refine`.
+        DataError: Too few frames can be read.
+        StageError: An actor fails.
     """
     if job.refine:
-        raise ConfigError("--refine-iterations needs a run over a file: leave out --realtime.")
+        raise ConfigError("--refine-iterations needs an offline run. Remove --realtime.")
     with TemporaryDirectory(prefix="ldo-map-") as folder:
         return asyncio.run(_RealTimeRun(job, Path(folder), advance).go())
 
@@ -86,7 +94,7 @@ class _RealTimeRun:
         )
 
     async def _feed(self, transport: MemoryTransport) -> None:
-        """Each frame at its time, and just before it what another odometry says of it."""
+        """Send each frame at its time, after the poses of the odometry prior up to it."""
         camera = transport.publisher(data_key(CAMERA_RGBD.name))
         odometry = transport.publisher(data_key(ODOMETRY_PRIOR.name))
         first_ns = int(self._sequence.stamps_ns[self._indices[0]])

@@ -1,25 +1,23 @@
 """Records of a run: its loops and objects as JSON.
 
-loops.json holds every pair of places that was compared, and the loops that were closed.
+loops.json has every pair of places that was compared, and the loop closures.
 
-candidates   as the message `loop/candidate`: keyframe, reference, keyframes, references,
-             similarity, appearance, evidence, inliers, divergence, entropy, overlap, rmse_m, and
-             refused, which is "" where it became a closure; ms is the time of its comparison, null
-             where it was not measured
-closures     as `loop/closure`: keyframe, reference, T_reference_keyframe [4, 4], information
-             [6, 6], overlap, rmse_m, entropy; and is_believed, whether the graph took it, and
-             still did at the end
+candidates   fields of the message `loop/candidate`; rejected_reason is "" if the candidate became a
+             closure, and ms is the time of its comparison, null if it was not measured
+closures     fields of `loop/closure`: keyframe, reference, T_reference_keyframe [4, 4], information
+             [6, 6], overlap, rmse_m, entropy; is_believed is true if the pose graph accepted the
+             closure and kept it until the end
 
-objects.json holds the objects of its map, in the map's frame.
+objects.json has the objects of the map, in its frame. It is the message `map/objects` as JSON,
+whose `objects` is a list of
 
-It is the message `map/objects` as it is on the network, in JSON: `objects` is a list of
-
-    id, name, confidence      stays what it is during a run; the likeliest class, 0..1
+    id, name, confidence      id is constant during a run; most probable class, its probability
     centroid, covariance      of the Gaussians, m, and m^2 (9 numbers, row by row)
-    T_map_object, size        of the box: its centre, its axes (quaternion wxyz), and extents, m
-    distribution, entropy     [name, probability] of the likeliest classes; nats
-    seen, missed              keyframes that saw it, and that ought to have
-    first_keyframe, last_keyframe   that saw it
+    T_map_object, size        box: center and axes (quaternion wxyz), and extents, m
+    distribution, entropy     [name, probability] of the most probable classes; nats
+    observation_count         keyframes that observed the object
+    miss_count                keyframes that should have observed it and did not
+    first_keyframe, last_keyframe   first and last keyframe that observed it
     views                     keyframes that show it best, with box_px
 """
 
@@ -42,19 +40,26 @@ OBJECTS = "objects.json"
 
 
 class LoopRecord:
-    """Takes note of what the loop closer says."""
+    """Record of loop candidates, loop closures and their acceptance."""
 
     def __init__(self) -> None:
-        self._candidates: list[tuple[LoopCandidate, float]] = []  # with ms of their whole step
+        # Each with the milliseconds of its whole step.
+        self._candidates: list[tuple[LoopCandidate, float]] = []
         self._closures: list[LoopClosure] = []
-        self._not_believed: set[tuple[int, int]] = set()  # reference and keyframe
+        self._not_believed: set[tuple[int, int]] = set()  # Pairs of reference and keyframe.
 
     def observe(
         self, message: LoopCandidate | LoopClosure | GraphCorrection, step_ms: float
     ) -> None:
+        """Record one message.
+
+        Args:
+            message: Output of the loop closer or the optimizer.
+            step_ms: Duration of the step that produced it.
+        """
         match message:
             case GraphCorrection():
-                # a correction names the newest of them, and all that came to be believed again
+                # A correction lists the newest rejected closures, and all accepted ones.
                 self._not_believed |= set(message.rejected_closures)
                 self._not_believed -= set(message.accepted_closures)
             case LoopClosure():
@@ -64,12 +69,12 @@ class LoopRecord:
 
     @property
     def accepted(self) -> int:
-        """By the graph."""
+        """Number of loop closures that the pose graph accepts."""
         return sum(map(self._is_believed, self._closures))
 
     @property
     def rejected(self) -> int:
-        """By the loop closer, or by the graph."""
+        """Number of candidates and closures rejected by the loop closer or the pose graph."""
         refused = sum(bool(candidate.rejected_reason) for candidate, _ in self._candidates)
         return refused + len(self._closures) - self.accepted
 
@@ -77,6 +82,7 @@ class LoopRecord:
         return (closure.pose.reference, closure.pose.keyframe) not in self._not_believed
 
     def save(self, folder: Path) -> None:
+        """Write the record to a folder."""
         at_once = Counter(candidate.keyframe for candidate, _ in self._candidates)
         value = {
             "candidates": [
@@ -113,7 +119,11 @@ def _closure(message: LoopClosure) -> dict[str, Any]:
 
 
 def read_loops(folder: Path) -> FoundLoops | None:
-    """None where the run wrote none; raises DataError where it is not what a run writes."""
+    """Return the loops of a run; None if the run wrote none.
+
+    Raises:
+        DataError: The file cannot be read or has an invalid format.
+    """
     path = folder / LOOPS
     if not path.is_file():
         return None
@@ -136,35 +146,45 @@ def _compared(row: dict[str, Any]) -> ComparedPair:
 def _closed(row: dict[str, Any]) -> LoopClosed:
     T = np.array(row["T_reference_keyframe"], float)
     if T.shape != (4, 4) or not np.all(np.isfinite(T)):
-        raise ValueError(f"T_reference_keyframe of {row['keyframe']} is no finite 4x4 matrix")
+        raise ValueError(f"T_reference_keyframe of {row['keyframe']} is not a finite 4x4 matrix")
     return LoopClosed(int(row["keyframe"]), int(row["reference"]), T)
 
 
 def write_objects(folder: Path, objects: MapObjects) -> None:
-    """The same objects give the same bytes."""
+    """Write objects to a folder, with equal bytes for equal objects."""
     text = msgspec.json.format(msgspec.json.encode(objects), indent=1)
     (folder / OBJECTS).write_bytes(text + b"\n")
 
 
 def refuse_state(folder: Path) -> None:
-    """Raises DataError for a folder where a service keeps its state."""
+    """Check that a folder is not the state folder of a service.
+
+    Raises:
+        DataError: It is a state folder.
+    """
     if (folder / "state").is_dir():
         raise DataError(
-            f"{folder} holds the state of a service, and nothing that `ldo run` writes: "
-            f"`ldo serve --resume {folder}` goes on with it, and `live` names that service here."
+            f"{folder} holds the state of a service, not a run. Resume the service by "
+            f"`ldo serve --resume {folder}`, and give `live` instead of the folder."
         )
 
 
 def read_objects(folder: Path) -> MapObjects:
-    """Raises DataError when there is no such file, or it is not what `write_objects` writes."""
+    """Return the objects of a run.
+
+    Raises:
+        DataError: There is no such file, or it has an invalid format.
+    """
     path = folder / OBJECTS
     if not folder.is_dir():
-        raise DataError(f"{folder} is not a folder: name that of a finished `ldo run`, or `live`.")
+        raise DataError(
+            f"{folder} is not a folder. Give the folder of a finished `ldo run`, or `live`."
+        )
     if not path.is_file():
         refuse_state(folder)
         raise DataError(
-            f"{folder} has no {OBJECTS}: the run kept no objects, which takes a detector. "
-            "`ldo run` the sequence again with detector.model set; `ldo models` tells how."
+            f"{folder} has no {OBJECTS}: the run kept no objects, because it had no detector. Set "
+            "detector.model, see `ldo models --help`, and run `ldo run` again."
         )
     try:
         return msgspec.json.decode(path.read_bytes(), type=MapObjects)

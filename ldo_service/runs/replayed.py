@@ -1,4 +1,4 @@
-"""A recording lived again, one fresh actor after the other."""
+"""Replay of a recording by new actors, one after the other."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from ldo_service.storage.yaml_io import load_yaml
 
 @dataclass(frozen=True, slots=True)
 class RecordedActor:
-    """The lives of one actor. Raises DataError when a file cannot be read."""
+    """Recorded journals of one actor, one per process."""
 
     name: str
     files: tuple[JournalFile, ...]
@@ -31,18 +31,30 @@ class RecordedActor:
         return sum(file.steps for file in self.files)
 
     def replay(self, advance: Callable[[], None] = lambda: None) -> ReplayReport:
-        """Feed it to a fresh actor; `advance` is called after each step."""
+        """Replay the recording with a new actor.
+
+        Args:
+            advance: Called after each step.
+
+        Raises:
+            DataError: A file cannot be read.
+        """
         with TemporaryDirectory(prefix="ldo-replay-") as folder:
             return replay(self.name, self.files, partial(self._make, Path(folder)), advance)
 
     def verify(self) -> ReplayReport:
-        """Replay. Raises ReplayDiverged, or DataError when something was not recorded."""
+        """Replay the recording and compare the outputs.
+
+        Raises:
+            ReplayDiverged: An output differs from the recorded one.
+            DataError: The recording is incomplete.
+        """
         replayed = self.replay()
         replayed.verify()
         return replayed
 
     def _make(self, folder: Path, about: Mapping[str, str]) -> Actor:
-        """One that keeps on disk what outlives it, as it did then, and not where it did."""
+        """Return an actor as it was recorded, but with its files in another folder."""
         make = actor_spec(self.name).make
         assert make is not None
         config = _config_of(about)
@@ -50,12 +62,16 @@ class RecordedActor:
         return make(actor_parameters(replace(config, mapper=mapper)))
 
     def caveats(self) -> list[str]:
-        """Why the bits may differ here although nothing is wrong."""
+        """Return the reasons for which the last bits may differ on this machine."""
         return [line for file in self.files[:1] for line in _caveats(file.about)]
 
 
 def _config_of(about: Mapping[str, str]) -> Config:
-    """What the actor was configured with. Raises DataError."""
+    """Return the configuration of the recorded actor.
+
+    Raises:
+        DataError: It cannot be read.
+    """
     try:
         return config_of(load_yaml(about.get("config", "")) or {})
     except yaml.YAMLError as error:
@@ -63,7 +79,11 @@ def _config_of(about: Mapping[str, str]) -> Config:
 
 
 def _versions_of(about: Mapping[str, str]) -> dict[str, str]:
-    """Of libraries, by name. Raises DataError."""
+    """Return the recorded versions of libraries, by name.
+
+    Raises:
+        DataError: They cannot be read.
+    """
     try:
         return msgspec.json.decode(about.get("versions", "{}"), type=dict[str, str])
     except msgspec.DecodeError as error:
@@ -75,24 +95,33 @@ def _caveats(about: Mapping[str, str]) -> list[str]:
     isa, ours = about.get("isa", kernels.isa()), kernels.isa()
     if isa != ours:
         lines.append(
-            f"recorded with the instruction set {isa}, this is {ours}: the last bits may differ. "
-            f"Force it with LDO_ISA={isa}, on a machine that has it."
+            f"recorded with the instruction set {isa}, replayed with {ours}: the last bits may "
+            f"differ. Force the former by LDO_ISA={isa} on a machine that has it."
         )
     now = versions()
     for name, version in _versions_of(about).items():
         if now.get(name) != version:
-            lines.append(f"recorded with {name} {version}, this is {now.get(name)}.")
+            lines.append(f"recorded with {name} {version}, replayed with {now.get(name)}.")
     return lines
 
 
 def open_recording(folder: Path, only: tuple[str, ...] = ()) -> list[RecordedActor]:
-    """The recorded actors, or some of them. Raises DataError or ConfigError."""
+    """Return the recorded actors.
+
+    Args:
+        folder: Folder of the recording.
+        only: Names of actors to return; empty returns all.
+
+    Raises:
+        DataError: The folder has no recording, no step, or a recording of another version.
+        ConfigError: An actor is not in the recording.
+    """
     found = recorded_actors(folder)
     if not found:
-        raise DataError(f"{folder} holds no recording: `ldo record {folder}` would make one.")
+        raise DataError(f"{folder} holds no recording. `ldo record {folder}` makes one.")
     unknown = [name for name in only if name not in found]
     if unknown:
-        raise ConfigError(f"{folder} has no actor {unknown[0]!r}: it has {', '.join(found)}.")
+        raise ConfigError(f"{folder} has no actor {unknown[0]!r}, only {', '.join(found)}.")
     actors = [
         RecordedActor(name, tuple(JournalFile(path) for path in paths))
         for name, paths in found.items()

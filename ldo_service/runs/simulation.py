@@ -1,4 +1,4 @@
-"""The whole graph on the logical clock, reduced to a digest of what each actor made."""
+"""Run of all actors on the logical clock, reduced to a digest of the outputs of each one."""
 
 import hashlib
 from dataclasses import dataclass
@@ -17,22 +17,26 @@ from .source import FrameReader, Selection, Warn
 
 @dataclass(frozen=True, slots=True)
 class ActorDigest:
+    """Number and digest of the outputs of an actor."""
+
     messages: int
-    digest: str  # BLAKE2b of 16 bytes over the digests of all messages, in hexadecimal
+    digest: str  # BLAKE2b of 16 bytes over the digests of all messages, hexadecimal.
 
 
 class Digests:
-    """Observes what the actors make."""
+    """Digests of the outputs of actors."""
 
     def __init__(self, actors: list[str]) -> None:
         self._counts = dict.fromkeys(actors, 0)
         self._states = {actor: hashlib.blake2b(digest_size=16) for actor in actors}
 
     def observe(self, actor: str, message: Message) -> None:
+        """Add one output of an actor."""
         self._counts[actor] += 1
         self._states[actor].update(digest(encode(message)).encode())
 
     def made(self) -> dict[str, ActorDigest]:
+        """Return the digest of each actor by its name."""
         return {
             actor: ActorDigest(count, self._states[actor].hexdigest())
             for actor, count in self._counts.items()
@@ -42,10 +46,14 @@ class Digests:
 def simulate_graph(
     sequence: Sequence, config: Config, selection: Selection, warn: Warn, advance: Advance
 ) -> dict[str, ActorDigest]:
-    """By actor: what it made of the chosen frames.
+    """Run all actors over the selected frames and return the digest of each one.
 
-    Independent of the machine's load and of the number of threads, see `runtime.logical_clock`.
-    Raises DataError when no frame can be read, StageError when an actor fails.
+    The digests do not depend on the load of the machine or on the number of threads, see
+    `runtime.logical_clock`.
+
+    Raises:
+        DataError: No frame can be read.
+        StageError: An actor fails.
     """
     reader = FrameReader(sequence, selection.indices(sequence), warn)
     actors = make_actors(actor_parameters(config))

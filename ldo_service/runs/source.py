@@ -1,4 +1,4 @@
-"""Frames of a run: chosen from a sequence or a recording, read ahead, with external odometry."""
+"""Frames of a run: selected from a sequence or a recording, read ahead, with an odometry prior."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +28,8 @@ from ldo_service.schemas import CameraColor, CameraDepth, CameraRgbd, Message, O
 from ldo_service.schemas.message import LAST_INTEGER
 from ldo_service.schemas.topics import CAMERA_COLOR, CAMERA_DEPTH, CAMERA_RGBD
 
-READ_AHEAD = 3  # frames decoded before they are needed: one decoding, one waiting, one to spare
+# Frames that are decoded in advance: one in decoding, one queued and one in reserve.
+READ_AHEAD = 3
 
 M = TypeVar("M", bound=Message)
 
@@ -38,28 +39,35 @@ Warn = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Which frames of a sequence."""
+    """Selection of frames of a sequence."""
 
     stride: int = 1
-    max_frames: int | None = None  # None: all
+    max_frames: int | None = None  # No limit if None.
 
     def __post_init__(self) -> None:
         if self.stride < 1 or (self.max_frames is not None and self.max_frames < 1):
             raise ConfigError(
-                f"a stride of {self.stride} and at most {self.max_frames} frames: both must be at "
-                "least 1."
+                f"--stride {self.stride} and --max-frames {self.max_frames}: both must be at least "
+                "1."
             )
 
     def indices(self, sequence: Sequence) -> range:
-        """Raises DataError when nothing is left."""
+        """Return the indices of the selected frames.
+
+        Raises:
+            DataError: No frame is selected.
+        """
         chosen = range(0, len(sequence), self.stride)[: self.max_frames]
         if not chosen:
-            raise DataError(f"{sequence.name}: the selection leaves no frame to run on.")
+            raise DataError(f"{sequence.name}: --stride and --max-frames select no frame.")
         return chosen
 
 
 class FrameReader:
-    """Frames as camera messages, read ahead in a thread; bad ones are counted and left out."""
+    """Reader of frames as camera messages, ahead of time in a thread.
+
+    It skips and counts frames that cannot be read.
+    """
 
     def __init__(self, sequence: Sequence, indices: range, warn: Warn) -> None:
         self._sequence, self._indices, self._warn = sequence, indices, warn
@@ -81,7 +89,7 @@ class FrameReader:
             return raw_frame_to_message(self._sequence.read(index), compress_depth=False)
         except FrameError as error:
             if self.rejected == 0:
-                self._warn(f"{error} It is left out; further bad frames are only counted.")
+                self._warn(f"{error} The frame is skipped; further bad frames are only counted.")
             self.rejected += 1
             return None
 
@@ -89,7 +97,14 @@ class FrameReader:
 def interleave_prior(
     frames: Iterable[CameraRgbd], prior: Trajectory | None
 ) -> Iterator[tuple[Message, ...]]:
-    """Each frame behind the poses up to the first that is not before it, as they come live."""
+    """Yield each frame after the poses of the prior that arrive before it in a live service.
+
+    These are all poses up to the first one that is not older than the frame.
+
+    Args:
+        frames: The frames.
+        prior: Poses T_odom_base of another odometry, if there is one.
+    """
     poses = iter(() if prior is None else map(_prior_message, prior.stamps_s, prior.T_world_camera))
     told_ns = -1
     for frame in frames:
@@ -105,24 +120,32 @@ def _prior_message(stamp_s: float, T_odom_base: np.ndarray) -> OdometryPrior:
 
 
 def require_overlap(prior: Trajectory, sequence: Sequence, indices: range) -> None:
-    """Raise DataError when no pose is from the time of the frames."""
+    """Check that the prior covers the time of the frames.
+
+    Raises:
+        DataError: No pose is from that time.
+    """
     first_s, last_s = (1e-9 * float(sequence.stamps_ns[indices[end]]) for end in (0, -1))
     if not np.any((prior.stamps_s >= first_s) & (prior.stamps_s <= last_s)):
         raise DataError(
             f"the prior has no pose between {first_s:.3f} s and {last_s:.3f} s, the stamps of "
-            f"{sequence.name}. Give it the stamps of the clock that the frames have."
+            f"{sequence.name}. Its stamps must be of the same clock as those of the frames."
         )
 
 
 def open_source(source: str, options: SequenceOptions | None = None) -> Sequence:
-    """The frames of a recording, or of what `open_sequence` knows. Raises what it raises."""
+    """Return the frames of a recording, or of a data set that `open_sequence` knows.
+
+    Raises:
+        DataError: The source cannot be read.
+    """
     folder = Path(source).expanduser()
     return RecordingSequence(folder) if recorded_actors(folder) else open_sequence(source, options)
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedMessage:
-    """A message on the disk."""
+    """Message in a recording."""
 
     file: JournalFile
     place: MessageLocation
@@ -132,6 +155,11 @@ class RecordedMessage:
         return self.place.stamp_ns
 
     def message(self, kind: type[M], index: int) -> M:
+        """Return the decoded message.
+
+        Raises:
+            FrameError: The message cannot be decoded.
+        """
         try:
             return decode(self.file.body(self.place), kind)
         except msgspec.DecodeError as error:
@@ -140,7 +168,7 @@ class RecordedMessage:
 
 @dataclass(frozen=True, slots=True)
 class RecordedFrame:
-    """depth: None where colour is a whole frame."""
+    """Frame in a recording; `depth` is None if `color` is a message with both images."""
 
     color: RecordedMessage
     depth: RecordedMessage | None = None
@@ -157,10 +185,11 @@ class RecordedFrame:
 
 
 class RecordingSequence(Sequence):
-    """Halves are paired as the service pairs them by default.
+    """Recording as a sequence of frames.
 
-    Frames whose stamp is not after the one before are left out: of a camera that started again,
-    the first session is the data set.
+    Color and depth images are paired as in the service with default settings. Frames whose stamp is
+    not later than that of the previous one are skipped. If the camera was restarted, the data set
+    is the part before the restart.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -176,13 +205,13 @@ class RecordingSequence(Sequence):
         if not self._frames:
             raise DataError(
                 f"{folder} holds no {CAMERA_RGBD.name}, nor pairs of {CAMERA_COLOR.name} and "
-                f"{CAMERA_DEPTH.name}: was frame_source recorded?"
+                f"{CAMERA_DEPTH.name}. Check that frame_source was recorded."
             )
         stamps_ns = np.array([frame.color.stamp_ns for frame in self._frames], np.int64)
         super().__init__(folder.resolve().name, self._camera(folder), stamps_ns)
 
     def _camera(self, folder: Path) -> Camera:
-        """That of the first frame that can be read."""
+        """Return the camera of the first frame that can be read."""
         for index, frame in enumerate(self._frames):
             with suppress(FrameError):
                 return camera_from_message(frame.message(index).camera)
@@ -192,7 +221,7 @@ class RecordingSequence(Sequence):
         return self._frames[index].read(index)
 
     def truth(self) -> Trajectory | None:
-        return None  # nobody told the robot
+        return None  # A recording has no ground truth.
 
 
 def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
@@ -210,5 +239,5 @@ def _frames(messages: Iterator[RecordedMessage]) -> Iterator[RecordedFrame]:
                     yield from (RecordedFrame(*pair) for pair in pairing.add_a(stored))
                 case CAMERA_DEPTH.name:
                     yield from (RecordedFrame(*pair) for pair in pairing.add_b(stored))
-        except FrameError:  # its stamp goes back: taken again after a crash
+        except FrameError:  # The stamp goes back: the frame was received again after a crash.
             continue

@@ -1,4 +1,4 @@
-"""What a run has used, and the figures it ends with."""
+"""Resource usage and summary of a run."""
 
 import os
 import resource
@@ -13,7 +13,7 @@ from ldo_service import kernels, versions
 
 from .folder import RunWriter
 
-Percentiles = dict[str, float]  # p50, p95
+Percentiles = dict[str, float]  # Values of p50 and p95.
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +40,19 @@ def summarize(
     drops: dict[str, int],
     facts: Mapping[str, float],
 ) -> dict[str, Any]:
-    """The summary of a finished run; `drops` by "actor topic", `facts` of optimizer and mapper.
+    """Return the summary of a finished run.
 
-    FPS counts everything from the first read to the last step, and what is due to the map at the
-    end; nothing is excluded as warm-up.
+    FPS counts all time from the first read to the last step, and the refit at the end. Nothing is
+    excluded as warm-up.
+
+    Args:
+        record: The finished run.
+        used: Time that the run took.
+        frames: Number of selected frames.
+        rejected: Number of frames that could not be used.
+        stage_ms: Percentiles of the step durations of each actor.
+        drops: Dropped messages by "actor topic".
+        facts: Metrics of optimizer and mapper.
     """
     in_map = record.in_map()
     return {
@@ -52,8 +61,8 @@ def summarize(
         "status": record.statuses,
         "keyframes": record.keyframes,
         "gaussians": int(in_map.sum()),
-        "gaussians_unmerged": int((~in_map).sum()),  # of submaps never joined: in no file
-        "gaussians_labelled": record.labelled(),  # as something else than background
+        "gaussians_unmerged": int((~in_map).sum()),  # Gaussians of unmerged submaps, in no file.
+        "gaussians_labelled": record.labelled(),  # Labels other than background.
         "boxes": record.boxes,
         "objects": len(record.objects()),
         "fps": round((frames - rejected) / used.wall_s, 3),
@@ -66,9 +75,11 @@ def summarize(
         "loops_rejected": record.loops.rejected,
         "labeller_requests": record.labeller_calls,
         "optimizations": int(facts.get("optimizations", 0)),
-        "optimizations_skipped": int(facts.get("optimizations_skipped", 0)),  # left for later
-        "iterations": int(facts.get("iterations", 0)),  # of the map's optimiser
-        "iterations_pending": int(facts.get("iterations_pending", 0)),  # still, after corrections
+        # Postponed optimizations.
+        "optimizations_skipped": int(facts.get("optimizations_skipped", 0)),
+        "iterations": int(facts.get("iterations", 0)),  # Iterations of the Gaussian optimizer.
+        # Refit iterations still pending.
+        "iterations_pending": int(facts.get("iterations_pending", 0)),
         "isa": kernels.isa(),
         "threads": os.cpu_count(),
         "versions": versions(),
@@ -76,6 +87,7 @@ def summarize(
 
 
 def percentiles(values: list[float]) -> dict[str, float]:
+    """Return the percentiles p50 and p95 of values."""
     return {
         "p50": round(float(np.percentile(values, 50)), 3),
         "p95": round(float(np.percentile(values, 95)), 3),

@@ -157,7 +157,7 @@ def test_keyframes_without_camera_are_said(run: Path, format: str) -> None:
         del keyframe["camera"]
     (run / "keyframes.json").write_text(json.dumps(keyframes))
     code, said = ldo_export(run, "--format", format)
-    assert (code, "`ldo run` the sequence again" in said) == (3, True)
+    assert (code, "`ldo run` on the sequence again" in said) == (3, True)
 
 
 @pytest.mark.parametrize(

@@ -132,8 +132,8 @@ def test_what_was_refined_goes_first(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"T_map_camera": np.eye(3).tolist()}, "no finite 4x4"),
-        ({"T_map_camera": np.full((4, 4), np.nan).tolist()}, "no finite 4x4"),
+        ({"T_map_camera": np.eye(3).tolist()}, "not a finite 4x4"),
+        ({"T_map_camera": np.full((4, 4), np.nan).tolist()}, "not a finite 4x4"),
         ({"camera": {"width": 320}}, "height"),
         ({"camera": [1, 2]}, "not what `ldo run` writes"),
     ],

@@ -87,5 +87,5 @@ def test_a_prior_of_another_clock_is_refused(
     hurried: Sequence, prior: Trajectory, tmp_path: Path
 ) -> None:
     later = Trajectory(prior.stamps_s + 1e6, prior.T_world_camera)
-    with pytest.raises(DataError, match="stamps of the clock"):
+    with pytest.raises(DataError, match="must be of the same clock"):
         job(hurried, tmp_path / "out", frames=FRAMES, prior=later)
