@@ -1,7 +1,8 @@
-"""Lists of runs that make a table: sources x variants x seeds, each run and judged by itself.
+"""Suites: lists of runs, sources x variants x seeds, each evaluated and compared in a table.
 
-The files beside this one are the tables of the paper that LDO-SLAM implements, its sensitivity and
-its ablation; `published` in them are the figures that the paper prints, of its own and of others.
+The YAML files of this package are the tables of the paper that LDO-SLAM implements, its sensitivity
+analysis and its ablation. `published` in them has the values that the paper prints for its own
+method and for others.
 """
 
 from .runner import Outcome, SuiteRunner

@@ -1,7 +1,7 @@
-"""The runs of a suite, one after the other, each in a process of its own.
+"""Execution of the runs of a suite, one after the other, each in its own process.
 
-What is finished stays: a suite that was interrupted goes on where it stopped. A run that fails is
-left out of the table, and does not stop the others.
+Finished runs are kept: an interrupted suite resumes where it stopped. A run that fails is missing
+in the table and does not stop the others.
 """
 
 import json
@@ -26,7 +26,13 @@ TOLD, RESULTS = "entry.json", "eval.json"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """judged: None where there are no figures, and `missing` says why."""
+    """Outcome of a run.
+
+    Attributes:
+        entry: The run.
+        judged: Its results; None if there are none.
+        missing: Reason for missing results, as printed in the table.
+    """
 
     entry: SuiteRun
     judged: Judged | None
@@ -35,8 +41,15 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class SuiteRunner:
-    """data: where the sources lie; out: where runs go; settings: of all runs, before those of a
-    variant."""
+    """Runner of a suite.
+
+    Attributes:
+        suite: The suite.
+        data: Folder with the sources.
+        out: Folder for the runs.
+        settings: Settings of all runs; those of a variant override them.
+        overwrite: Repeat finished runs too.
+    """
 
     suite: Suite
     data: Path
@@ -45,10 +58,15 @@ class SuiteRunner:
     overwrite: bool = False
 
     def entries(self) -> list[SuiteRun]:
+        """Return all runs of the suite."""
         return list(self.suite.entries(self.data))
 
     def outcomes(self, begun: Callable[[SuiteRun], None]) -> Iterator[Outcome]:
-        """Each entry when it is finished; `begun` is told before."""
+        """Run the suite and yield the outcome of each run.
+
+        Args:
+            begun: Called before each run.
+        """
         for entry in self.entries():
             begun(entry)
             yield self._outcome(entry)
@@ -60,16 +78,18 @@ class SuiteRunner:
         if self.overwrite or not self._is_finished(entry, folder):
             failed = self._run(entry, folder)
             if failed:
-                log.error("%s: %s", entry.folder, failed)
+                log.error(
+                    "suite: run %s failed: %s The table shows it as failed.", entry.folder, failed
+                )
                 return Outcome(entry, None, "failed")
         try:
             return Outcome(entry, judged_in(folder))
         except ConfigError as error:
-            log.error("%s", error)
+            log.error("suite: %s", error)
             return Outcome(entry, None, "failed")
 
     def _told(self, entry: SuiteRun) -> str:
-        """What its figures depend on."""
+        """Return all inputs of a run that its results depend on, as JSON."""
         told = {
             **asdict(entry),
             "settings": (*self.settings, *entry.settings),
@@ -88,7 +108,7 @@ class SuiteRunner:
         return is_kept and told.is_file() and told.read_text() == self._told(entry)
 
     def _run(self, entry: SuiteRun, folder: Path) -> str:
-        """Why it failed; empty when it did not."""
+        """Make and evaluate a run; return the reason of a failure, empty on success."""
         settings = [
             word for setting in (*self.settings, *entry.settings) for word in ("--set", setting)
         ]
@@ -97,7 +117,7 @@ class SuiteRunner:
             run += ("--reuse-front-end", str(self.out / entry.front_end_folder))
         elif self.suite.front_end:
             run += ("--keep-front-end",)
-        for name in (TOLD, RESULTS):  # `ldo run` replaces what it wrote, and nothing else
+        for name in (TOLD, RESULTS):  # `ldo run` replaces only its own files.
             (folder / name).unlink(missing_ok=True)
         done = _ldo(*run, *settings)
         if done.returncode:
@@ -106,17 +126,24 @@ class SuiteRunner:
         if judged.returncode:
             return _reason(judged)
         _write(folder / RESULTS, judged.stdout)
-        _write(folder / TOLD, self._told(entry))  # last: now it is finished
+        # This file marks the run as finished, so it is written last.
+        _write(folder / TOLD, self._told(entry))
         return ""
 
 
 def judged_in(folder: Path) -> Judged:
-    """Raises ConfigError when a file is no longer what was written."""
+    """Return the results of a finished run.
+
+    Raises:
+        ConfigError: A file cannot be read.
+    """
     try:
         texts = [(folder / name).read_text() for name in ("summary.json", RESULTS)]
         return Judged(*map(json.loads, texts))
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{folder}: {error}. Remove the folder to run it again.") from error
+        raise ConfigError(
+            f"{folder} has no valid results ({error}). Remove it to run it again."
+        ) from error
 
 
 def _ldo(*words: str) -> subprocess.CompletedProcess[str]:
@@ -124,9 +151,9 @@ def _ldo(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def _reason(done: subprocess.CompletedProcess[str]) -> str:
-    """The paragraph in which `ldo` says what was wrong."""
+    """Return the error message of `ldo`."""
     lines = [line for line in done.stderr.strip().splitlines() if line.strip()]
-    return lines[-1].removeprefix("ldo: ") if lines else f"it ended with code {done.returncode}"
+    return lines[-1].removeprefix("ldo: ") if lines else f"exit code {done.returncode}."
 
 
 def _write(path: Path, text: str) -> None:

@@ -1,4 +1,4 @@
-"""Suite files: the runs they list and the figures they compare."""
+"""Suite files: the runs that they list and the metrics that they compare."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -18,41 +18,65 @@ HELD_OUT, TRAINING = "A held out", "B training"
 HERE = Path(__file__).parent
 SYNTHETIC = "synthetic:"
 OF_FRONT_END = frozenset({"fps", "tracking_s", "ate_online_cm"})
-NAME = re.compile(r"[\w][\w .+-]{0,60}")  # becomes the name of a folder
+NAME = re.compile(r"[\w][\w .+-]{0,60}")  # Valid names of folders.
 
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """summary: summary.json of a run; results: what `ldo eval --json` printed of it."""
+    """Results of a run.
+
+    Attributes:
+        summary: Content of summary.json.
+        results: Output of `ldo eval --json`.
+    """
 
     summary: dict[str, Any]
     results: dict[str, Any]
 
     def trajectory(self, name: str) -> dict[str, Any]:
+        """Return the errors of a trajectory, such as "online" or "final"."""
         return self.results["trajectory"][name]
 
     def rendering(self, protocol: str, figure: str, newest: bool = True) -> float | None:
-        """Mean over frames; of the refined map where there is one, or of that of the stream."""
+        """Return the mean over all frames of a rendering metric.
+
+        Args:
+            protocol: Protocol of the evaluation, HELD_OUT or TRAINING.
+            figure: Name of the metric.
+            newest: Use the refined map if there is one, not the map at the end of the stream.
+        """
         rows = [row for row in self.results["rendering"] if row["protocol"] == protocol]
         return rows[-1 if newest else 0]["mean"][figure]
 
     def labels(self) -> dict[str, Any]:
-        """Of the newest map: classes of COCO that have 0.2 % of the pixels, and background."""
+        """Return the label metrics of the newest map.
+
+        They cover background and the COCO classes with at least 0.2 % of the pixels.
+        """
         return self.results["labels"][-1]["lists"]["COCO"]["from 0.2 %"]
 
     def consistency(self) -> float | None:
+        """Return the label consistency of the newest map."""
         return self.results["labels"][-1]["consistency"]
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """`read` may find nothing (None, KeyError, IndexError, TypeError): then it is not judged."""
+    """Metric of a table.
+
+    Attributes:
+        title: Title of the column.
+        form: Number format.
+        read: Returns the value from the results. Without a value it returns None or raises
+            KeyError, IndexError or TypeError.
+    """
 
     title: str
     form: str
     read: Callable[[Judged], float | None]
 
     def of(self, judged: Judged) -> float | None:
+        """Return the value of a run; None if the run has none."""
         try:
             return self.read(judged)
         except (KeyError, IndexError, TypeError):
@@ -99,30 +123,31 @@ FIGURES: dict[str, Score] = {
     "tracking_s": Score("tracking s/frame", ".3f", _seconds("tracker")),
     "mapping_s": Score("mapping s/keyframe", ".3f", _seconds("mapper")),
     "gaussians": Score("Gaussians", ",.0f", lambda run: run.summary["gaussians"]),
-    "optimizations": Score("optimisations", ".0f", lambda run: run.summary["optimizations"]),
+    "optimizations": Score("optimizations", ".0f", lambda run: run.summary["optimizations"]),
     "loops": Score("closures", ".1f", lambda run: run.summary["loops_accepted"]),
 }
 
 
 @dataclass(frozen=True, slots=True)
 class SuiteRun:
-    """One run: `sequence` and `variant` by their names, with what `ldo run` is told."""
+    """Run of a suite: names of its sequence and variant, and the options of `ldo run`."""
 
     sequence: str
     variant: str
     source: str
     settings: tuple[str, ...]
-    seed: int | None  # None: the source has none
-    front_end: str | None = None  # variant whose front end it takes; None: it has its own
+    seed: int | None  # Seed of a synthetic source, else None.
+    # Variant that provides the recorded front end; None if the run has its own.
+    front_end: str | None = None
 
     @property
     def folder(self) -> Path:
-        """Within that of the suite's results."""
+        """Path within the folder of the suite's results."""
         return self._folder_of(self.variant)
 
     @property
     def front_end_folder(self) -> Path | None:
-        """Of the run whose front end it takes."""
+        """Path of the run that provides the recorded front end; None without one."""
         return self._folder_of(self.front_end) if self.front_end else None
 
     def _folder_of(self, variant: str) -> Path:
@@ -131,46 +156,56 @@ class SuiteRun:
 
 
 class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A suite file. Raises ConfigError for names that cannot be folders and unknown figures."""
+    """Content of a suite file.
+
+    Raises:
+        ConfigError: A name cannot be that of a folder, or a metric is unknown.
+    """
 
     title: str
     about: str = ""
-    sequences: dict[str, str]  # name: source, a folder within that of the data, or synthetic:...
+    sequences: dict[str, str]  # Name: source, a folder within the data folder or synthetic:...
     variants: dict[str, tuple[str, ...]] = field(default_factory=lambda: {"LDO-SLAM": ()})
-    # name: settings, as of `ldo run --set`
+    # Name: settings, as for `ldo run --set`.
     figures: tuple[str, ...]
-    front_end: str | None = None  # variant that alone looks at frames: the others take what its
-    # tracker and detector said, so that poses are equal; the first
-    seeds: tuple[int, ...] = (0,)  # of synthetic sources: another run of a folder is the same run
+    # First variant, if only it runs the front end. The others reuse the recorded outputs of its
+    # tracker and detector, so that all poses are equal.
+    front_end: str | None = None
+    # Seeds of synthetic sources. A data set has none, because its runs are identical.
+    seeds: tuple[int, ...] = (0,)
     hold_out: int = 0
     refine: int = 0
     stride: int = 1
     max_frames: int | None = None
     published: dict[str, dict[str, dict[str, float]]] = field(default_factory=dict)
-    # method: sequence: figure
+    # Method: sequence: metric.
 
     def __post_init__(self) -> None:
         if not self.sequences or not self.variants or not self.figures or not self.seeds:
-            raise ConfigError("a suite needs sequences, variants, figures and seeds: one at least.")
+            raise ConfigError("a suite needs at least one sequence, variant, figure and seed.")
         for name in (*self.sequences, *self.variants):
             if not NAME.fullmatch(name):
                 raise ConfigError(
-                    f"{name!r} cannot be the name of a folder: letters, digits, spaces and ._+- do."
+                    f"{name!r} cannot be the name of a folder: use letters, digits, spaces, ._+-."
                 )
         if self.front_end not in (None, next(iter(self.variants))):
             raise ConfigError(f"front_end is {self.front_end!r}: it must be the first variant.")
         unknown = sorted(set(self.figures) - FIGURES.keys())
         if unknown:
-            raise ConfigError(f"no figure {', '.join(unknown)}. There is {', '.join(FIGURES)}.")
+            raise ConfigError(f"unknown figure {', '.join(unknown)}. Known: {', '.join(FIGURES)}.")
         of_front_end = sorted(OF_FRONT_END.intersection(self.figures))
         if self.front_end and of_front_end:
             raise ConfigError(
-                f"{of_front_end[0]} is of the front end too, which all variants have from "
-                f"{self.front_end!r}: leave out the figure, or front_end."
+                f"{of_front_end[0]} depends on the front end, which all variants share with "
+                f"{self.front_end!r}. Remove the figure or front_end."
             )
 
     def entries(self, data: Path) -> Iterator[SuiteRun]:
-        """All runs, sequence by sequence; sources lie in the folder `data`."""
+        """Yield all runs, sequence by sequence.
+
+        Args:
+            data: Folder with the sources.
+        """
         for sequence, source in self.sequences.items():
             for variant, settings in self.variants.items():
                 front_end = None if variant == self.front_end else self.front_end
@@ -183,11 +218,11 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
                     yield SuiteRun(sequence, variant, where, settings, seed, front_end)
 
     def front_end_settings(self) -> tuple[str, ...] | None:
-        """Of the variant that alone looks at frames; None: each does."""
+        """Return the settings of the variant that provides the front end; None without one."""
         return None if self.front_end is None else self.variants[self.front_end]
 
     def options(self) -> list[str]:
-        """Of `ldo run`, alike for all."""
+        """Return the options of `ldo run` that all runs share."""
         words = [
             "--hold-out-every",
             self.hold_out,
@@ -202,12 +237,16 @@ class Suite(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 def known_suites() -> list[str]:
-    """Names of those that come with the package."""
+    """Return the names of the built-in suites."""
     return sorted(path.stem for path in HERE.glob("*.yaml"))
 
 
 def load_suite(name: str) -> Suite:
-    """A suite that comes with the package, or a file. Raises ConfigError."""
+    """Return a built-in suite or the suite in a file.
+
+    Raises:
+        ConfigError: There is no such suite, or the file is invalid.
+    """
     path = HERE / f"{name}.yaml" if name in known_suites() else Path(name).expanduser()
     if not path.is_file():
         raise ConfigError(

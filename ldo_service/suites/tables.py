@@ -1,4 +1,4 @@
-"""The outcomes of a suite as tables in Markdown."""
+"""Outcomes of a suite as tables in Markdown."""
 
 from collections.abc import Sequence
 from statistics import mean, stdev
@@ -7,13 +7,15 @@ from .runner import Outcome
 from .suite import FIGURES, Score, Suite
 
 AVERAGE = "average"
-Cells = dict[str, str]  # by column
+Cells = dict[str, str]  # Texts by column.
 
 
 def markdown(suite: Suite, outcomes: Sequence[Outcome]) -> str:
-    """A table with all figures of a single sequence, or one of all sequences for each figure.
+    """Return the outcomes of a suite as Markdown.
 
-    Cells are means over seeds with their standard deviation; methods of other papers stand above.
+    With a single sequence, one table shows all metrics. With several, each metric has a table of
+    all sequences. Cells have the mean and the standard deviation over the seeds. Published values
+    of other methods stand above.
     """
     parts = [f"# {suite.title}", suite.about.strip()]
     if len(suite.sequences) == 1:
@@ -67,7 +69,10 @@ def _cell(figure: Score, outcomes: Sequence[Outcome]) -> str:
 
 
 def _average(suite: Suite, figure: Score, outcomes: Sequence[Outcome]) -> str:
-    """Over sequences; none where one is missing, since it would be the mean of other ones."""
+    """Return the mean over all sequences as text.
+
+    It is "-" if a sequence is missing, because the mean of the others is not comparable.
+    """
     means = [
         _values(figure, [o for o in outcomes if o.entry.sequence == sequence])
         for sequence in suite.sequences

@@ -134,14 +134,14 @@ def test_a_figure_that_was_not_judged_is_none_and_no_error(name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"figures": ["beauty"]}, "no figure beauty. There is ate_cm"),
-        ({"figures": []}, "one at least"),
+        ({"figures": ["beauty"]}, "unknown figure beauty. Known: ate_cm"),
+        ({"figures": []}, "at least one"),
         ({"variants": {"../up": []}}, "cannot be the name of a folder"),
         ({"sequences": {"": "x"}}, "cannot be the name of a folder"),
         ({"front_end": "default"}, "front_end is 'default': it must be the first variant"),
         (
             {"front_end": "whole", "variants": {"whole": []}, "figures": ["miou", "fps"]},
-            "fps is of the front end too",
+            "fps depends on the front end",
         ),
         ({"sequnces": {}}, "is not a suite: .*sequnces"),
         ({"seeds": ["x"]}, "is not a suite: .*seeds"),
