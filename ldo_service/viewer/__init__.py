@@ -1,11 +1,11 @@
-"""The window: a map and what is known of it, in a browser.
+"""Browser window with the map, camera, keyframes, objects and loop closures.
 
-    run_folder, live     sources: what a run left, what a service says
-    scene                what they know, as plain arrays
-    lines                how it is drawn
-    flight               where to look from
-    panel                what is told in words
-    window               the browser's side, with viser
+    run_folder, live     sources of a scene: a run folder, a running service
+    scene                content of the window as plain arrays
+    lines                line drawings of the scene
+    flight               views of objects and flights to them
+    panel                texts of the panel
+    window               window in the browser, made with viser
 
-All but `window` knows nothing of viser, which is in the extra `viewer`.
+Only `window` imports viser, which is in the extra `viewer`.
 """

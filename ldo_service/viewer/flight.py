@@ -1,4 +1,4 @@
-"""From where an object is best looked at, and how to get there."""
+"""Views of objects and flights of the camera to them."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -7,25 +7,35 @@ import numpy as np
 
 from ldo_service.schemas import MapObject
 
-FILLS = 0.4  # of the height of the picture, by the object
-NEAREST_M = 0.4  # to its centre
-TILT = 0.05  # what tilting a camera costs, rolling it costs 1
-HALF_VIEW_RAD = 0.65  # half the height of the browser's picture: viser has 75 degrees
+FILLS = 0.4  # Size of an object as a fraction of the height of the picture.
+NEAREST_M = 0.4  # Minimum distance to the center of an object.
+TILT = 0.05  # Cost of tilting a camera; rolling it costs 1.
+HALF_VIEW_RAD = 0.65  # Half the vertical field of view of the browser: viser has 75 degrees.
 
 
 @dataclass(frozen=True, slots=True)
 class CameraView:
-    """position, look_at  [3] metres, map frame"""
+    """View of a camera.
+
+    Attributes:
+        position: Position of the camera in the map frame, [3], meters.
+        look_at: Point in the center of the picture, [3], meters.
+    """
 
     position: np.ndarray
     look_at: np.ndarray
 
 
 def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray) -> CameraView:
-    """The object as it was seen from the keyframe that shows it best, so that nothing is between,
-    and as near as shows the whole of it; from the side of `eye` [3] where no keyframe is known.
+    """Return a close view of the whole object along an unobstructed line of sight.
 
-    keyframes  T_map_camera [4, 4] by id
+    The view is from the direction of the keyframe that shows the object best. Without a known
+    keyframe it is from the direction of `eye`.
+
+    Args:
+        one: The object.
+        keyframes: T_map_camera of each keyframe, [4, 4], by id.
+        eye: Present position of the viewer, [3], meters.
     """
     center = np.array(one.T_map_object.translation)
     known = [view.keyframe for view in one.views if view.keyframe in keyframes]
@@ -39,30 +49,41 @@ def view_of(one: MapObject, keyframes: Mapping[int, np.ndarray], eye: np.ndarray
 
 
 def overview(T_map_camera: np.ndarray, back_m: float = 0.6, ahead_m: float = 2.0) -> CameraView:
-    """From a little behind a camera [4, 4], in its direction."""
+    """Return a view from behind a camera in its direction.
+
+    Args:
+        T_map_camera: Pose of the camera, [4, 4].
+        back_m: Distance of the view behind the camera.
+        ahead_m: Distance of the point in the center of the picture.
+    """
     position, ahead = T_map_camera[:3, 3], T_map_camera[:3, 2]
     return CameraView(position - back_m * ahead, position + ahead_m * ahead)
 
 
 def estimate_up(keyframes: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Up [3] in the map, for a horizon that is level: a camera in a hand is tilted more than it is
-    rolled. With x and y the axes of the cameras, to the right and down, it is the unit vector u
-    with the least
+    """Return the up direction of the map for a level horizon, [3].
+
+    A handheld camera is tilted more than it is rolled. With the axes x (right) and y (down) of the
+    cameras, up is the unit vector u that minimizes
 
         mean (x . u)^2 + TILT (1 - mean (y . u)^2)
 
-    on the side of -y. Without keyframes it is what was up in the first one."""
+    on the side of -y. Without keyframes it is the up direction of the first camera.
+
+    Args:
+        keyframes: T_map_camera of each keyframe, [4, 4], by id.
+    """
     T = np.array([*keyframes.values()]).reshape(-1, 4, 4)
     if not len(T):
         return np.array([0.0, -1.0, 0.0])
     x, y = T[:, :3, 0], T[:, :3, 1]
     _, vectors = np.linalg.eigh((x.T @ x - TILT * y.T @ y) / len(T))
-    up = vectors[:, 0]  # of the least eigenvalue
+    up = vectors[:, 0]  # Eigenvector of the smallest eigenvalue.
     return up if y.mean(axis=0) @ up < 0 else -up
 
 
 def interpolate_views(start: CameraView, end: CameraView, steps: int) -> Iterator[CameraView]:
-    """Views from one to the other, slow at both ends; the last is `end`."""
+    """Yield views from start to end, slow at both ends; the last one is `end`."""
     for step in range(1, steps + 1):
         t = step / steps
         share = t * t * (3 - 2 * t)

@@ -1,4 +1,4 @@
-"""What is drawn of a scene beside its Gaussians: paths, keyframes, boxes, loops."""
+"""Line drawings of a scene: paths, keyframes, boxes, loop closures."""
 
 import colorsys
 import itertools
@@ -17,12 +17,13 @@ from .scene import ObjectBox
 
 Color = tuple[int, int, int]  # RGB, 0..255
 
-# Between two poses of a path: a camera that was lost, not one that moved.
-JUMP_M = 1.0  # at least
-JUMPS = 10.0  # times the median step
-FRUSTUM_M = 0.12  # from a keyframe to its drawn image
-MAX_SIGHTS = 8  # of a keyframe, the first: more are a tangle
-UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # how a keyframe looks until it is
+# A longer step between two poses of a path means that the camera was lost, not that it moved.
+JUMP_M = 1.0  # Minimum length of a jump.
+JUMPS = 10.0  # Length of a jump as a multiple of the median step.
+FRUSTUM_M = 0.12  # Distance from a keyframe to its drawn image.
+MAX_SIGHTS = 8  # Maximum detections drawn per keyframe; more hide each other.
+# Camera that shapes a keyframe until its own is known.
+UNKNOWN_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 
 ONLINE, FINAL = (220, 90, 0), (0, 150, 30)
 KEYFRAME, LOOP, FOUND = (20, 70, 220), (220, 0, 110), (255, 255, 255)
@@ -30,18 +31,25 @@ KEYFRAME, LOOP, FOUND = (20, 70, 220), (220, 0, 110), (255, 255, 255)
 
 @dataclass(frozen=True, slots=True)
 class Lines:
-    """points [S, 2, 3] float32: both ends, metres; colors [S, 2, 3] uint8 RGB."""
+    """Colored line segments.
+
+    Attributes:
+        points: Both ends of each segment in the map frame, [S, 2, 3] float32, meters.
+        colors: RGB of both ends, [S, 2, 3] uint8.
+    """
 
     points: np.ndarray
     colors: np.ndarray
 
     @classmethod
     def of(cls, points: np.ndarray, color: Color) -> "Lines":
+        """Return segments of one color."""
         points = np.asarray(points, np.float32).reshape(-1, 2, 3)
         return cls(points, np.broadcast_to(np.array(color, np.uint8), points.shape))
 
     @classmethod
     def together(cls, many: Iterable["Lines"]) -> "Lines":
+        """Return all segments of many lines."""
         lines = [cls.of(np.zeros((0, 2, 3)), FOUND), *many]
         return cls(
             np.concatenate([one.points for one in lines]),
@@ -50,8 +58,15 @@ class Lines:
 
 
 def path_lines(positions: np.ndarray, color: Color) -> Lines:
-    """From each position [K, 3] to the next, but across jumps: steps that are much longer than
-    most, for of a long path not every pose is here."""
+    """Return the path through positions, without its jumps.
+
+    A jump is a step that is much longer than most. The limit is relative, because a long path is
+    drawn with fewer poses.
+
+    Args:
+        positions: Positions of the camera, [K, 3], meters; NaN where unknown.
+        color: Color of the path.
+    """
     segments = np.stack([positions[:-1], positions[1:]], axis=1)
     steps_m = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     known_m = steps_m[np.isfinite(steps_m)]
@@ -63,7 +78,13 @@ def path_lines(positions: np.ndarray, color: Color) -> Lines:
 def keyframe_lines(
     keyframes: Iterable[np.ndarray], camera: Camera | None, color: Color = KEYFRAME
 ) -> Lines:
-    """Of each T_map_camera [4, 4] the rays to the corners of its image, and the outline of it."""
+    """Return the outline of the image of each camera, and the rays to its corners.
+
+    Args:
+        keyframes: T_map_camera of each camera, [4, 4].
+        camera: Intrinsics; None draws UNKNOWN_CAMERA.
+        color: Color of the lines.
+    """
     camera = camera or UNKNOWN_CAMERA
     whole = np.array([[-0.5, -0.5, camera.width - 0.5, camera.height - 0.5]])
     (outline,) = _outlines(camera, whole)
@@ -77,7 +98,13 @@ def sight_lines(
     camera: Camera | None,
     sights: Mapping[int, Iterable[ObjectBox]],
 ) -> Lines:
-    """What keyframes show, as boxes in their drawn images; nothing without their camera."""
+    """Return the boxes of detections in the drawn images of their keyframes.
+
+    Args:
+        keyframes: T_map_camera of each keyframe, [4, 4], by id.
+        camera: Intrinsics of the keyframes; None draws nothing.
+        sights: Detections of each keyframe.
+    """
     shown = [
         (T, sight)
         for keyframe, T in keyframes.items()
@@ -96,7 +123,7 @@ def sight_lines(
 
 
 def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines:
-    """The edges of each object's box; without a colour in that of its name."""
+    """Return the edges of the box of each object, by default in the color of its name."""
     return Lines.together(
         Lines.of(
             se3.transform(pose_from_message(one.T_map_object), EDGES * one.size),
@@ -107,7 +134,7 @@ def box_lines(objects: Iterable[MapObject], color: Color | None = None) -> Lines
 
 
 def loop_lines(loops: Iterable[tuple[int, int]], keyframes: Mapping[int, np.ndarray]) -> Lines:
-    """Between keyframes of which one closed a loop with the other, where both are known."""
+    """Return a line for each loop closure between known keyframes."""
     ends = [
         [keyframes[a][:3, 3], keyframes[b][:3, 3]]
         for a, b in loops
@@ -118,21 +145,32 @@ def loop_lines(loops: Iterable[tuple[int, int]], keyframes: Mapping[int, np.ndar
 
 @lru_cache(maxsize=1024)
 def color_of(name: str) -> Color:
-    """The same for the same name, and strong: browsers draw lines paler."""
+    """Return the color of a name.
+
+    The color is saturated, because browsers draw lines paler.
+    """
     hue = zlib.crc32(name.encode()) % 360 / 360
     red, green, blue = (round(255 * value) for value in colorsys.hls_to_rgb(hue, 0.45, 1.0))
     return red, green, blue
 
 
 def _outlines(camera: Camera, boxes_px: np.ndarray) -> np.ndarray:
-    """The sides [M, 4, 2, 3] of boxes [M, 4] in the image, FRUSTUM_M in front of the camera."""
+    """Return the sides of boxes in the image, FRUSTUM_M in front of the camera.
+
+    Args:
+        camera: Intrinsics.
+        boxes_px: Boxes in the image, [M, 4], pixels.
+
+    Returns:
+        Both ends of each side in the camera frame, [M, 4, 2, 3], meters.
+    """
     corners_px = boxes_px[:, [[0, 1], [2, 1], [2, 3], [0, 3]]]  # [M, 4, 2]
     points = camera.points_at(corners_px[..., 0], corners_px[..., 1], FRUSTUM_M)
     return np.stack([points, np.roll(points, -1, axis=1)], axis=2)
 
 
 def _edges() -> np.ndarray:
-    """The edges [12, 2, 3] of a box of side 1 about the origin."""
+    """Return the edges of a box of side 1 around the origin, [12, 2, 3]."""
     corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
     pairs = itertools.combinations(corners, 2)
     return np.array([pair for pair in pairs if np.abs(np.subtract(*pair)).sum() == 1])

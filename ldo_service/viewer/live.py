@@ -1,4 +1,4 @@
-"""A running service as a scene: bounded, whatever it publishes."""
+"""Scene of a running service, with limits on what it may publish."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -40,30 +40,35 @@ from .live_poses import LiveKeyframes, LivePath, T_map_camera_of
 from .scene import Layer, ObjectBox, Scene, sights_of
 from .view_config import ViewerConfig
 
-MAX_ACTORS = 64  # whose health is told; a name is what a message says
-MAX_LOOPS = 4096  # heard of, the newest: a correction names all that it agrees with
-FACTS_EVERY_S = 1.0  # words that change faster cannot be read
+# Maximum actors in the panel. The names come from messages, so their number must be limited.
+MAX_ACTORS = 64
+# Maximum loop closures received, the newest. A correction lists all that the pose graph accepts.
+MAX_LOOPS = 4096
+FACTS_EVERY_S = 1.0  # Interval of texts, so that they can be read.
 
-KEPT: dict[
-    Topic, int
-] = {  # messages between two updates; what is too much is dropped, oldest first
-    POSE_TRACKED: 256,  # 8 s of 30 Hz
-    GRAPH_CORRECTION: 1,  # the newest says it all
+KEPT: dict[Topic, int] = {  # Maximum messages kept between two updates; the oldest are dropped.
+    POSE_TRACKED: 256,  # 8 s at 30 Hz.
+    GRAPH_CORRECTION: 1,  # The newest correction is complete.
     MAP_OBJECTS: 1,
     DETECTION_BOXES: 64,
     LOOP_CLOSURE: 64,
-    MAP_DELTA: 64,  # of at most 1.8 MB
-    MAP_SNAPSHOT: 64,  # the same: a million Gaussians
+    MAP_DELTA: 64,  # Messages of at most 1.8 MB.
+    MAP_SNAPSHOT: 64,  # Messages of at most 1.8 MB: a million Gaussians.
     HEALTH: 64,
 }
-STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)  # what a late joiner asks for
+# Topics whose last value is requested at the start.
+STATES = (MAP_SNAPSHOT, GRAPH_CORRECTION, MAP_OBJECTS, POSE_TRACKED)
 
-ANEW = ("tracker", "mapper")  # both began anew: so did the map, or it is told again
-TOGETHER_S = 30.0  # from one to the other of a service that starts; apart, each went on by itself
+ANEW = ("tracker", "mapper")  # If both have restarted, the map is new or is published again.
+# Maximum time between their restarts in one start of a service. Otherwise each restarted alone.
+TOGETHER_S = 30.0
 
 
 class LiveScene:
-    """`take` every message, then `update`: `scene` is what they say together."""
+    """Scene that is built from messages.
+
+    `take` receives the messages. `update` brings `scene` up to date.
+    """
 
     def __init__(self, config: ViewerConfig, clock: Callable[[], float]) -> None:
         self._config, self._clock = config, clock
@@ -74,11 +79,11 @@ class LiveScene:
         self.reset()
 
     def reset(self) -> None:
-        """The map is empty, and what comes is of another one."""
+        """Start with an empty map, because the service has a new one."""
         self._gaussians = MapReplica(self._config.most_gaussians)
         self.scene = Scene(camera=self.scene.camera)
         self._keyframes, self._path = LiveKeyframes(), LivePath(self._config.most_poses)
-        self._loops: dict[tuple[int, int], None] = {}  # heard of, in order
+        self._loops: dict[tuple[int, int], None] = {}  # Received loop closures, in order.
         self._correction: GraphCorrection | None = None
         self._pose: panel.HeardPose | None = None
         self._changed: set[Layer] = set(get_args(Layer)) - {"facts"}
@@ -88,6 +93,7 @@ class LiveScene:
         return self.scene.camera is not None
 
     def take(self, message: Message) -> None:
+        """Receive one message."""
         match message:
             case TrackedPose():
                 self._take_pose(message)
@@ -123,13 +129,14 @@ class LiveScene:
         if self._correction and correction.graph_version <= self._correction.graph_version:
             return
         self._correction = correction
-        for loop in correction.rejected_closures:  # the newest of them: older ones are gone already
+        # The correction lists only the newest; older ones have been removed here before.
+        for loop in correction.rejected_closures:
             self._loops.pop(loop, None)
         self._keyframes.correct(correction)
         self._changed |= {"keyframes", "final", "loops"}
 
     def _take_objects(self, objects: MapObjects) -> None:
-        if self.scene.objects is None:  # what was seen before anybody listened
+        if self.scene.objects is None:  # Detections from before this viewer subscribed.
             sights = sights_of(objects)
             newest = sorted(sights)[-self._config.most_keyframes :]
             self.scene.sights = {k: sights[k] for k in newest} | self.scene.sights
@@ -153,7 +160,7 @@ class LiveScene:
 
     def _take_map(self, message: MapDelta | MapSnapshot) -> None:
         if isinstance(message, MapDelta) and message.base_version == 0 and self._gaussians.version:
-            self.reset()  # on request, see `ldo control reset`
+            self.reset()  # The user has reset the map by `ldo control reset`.
         if self._gaussians.apply(message):
             self._changed.add("gaussians")
 
@@ -167,7 +174,11 @@ class LiveScene:
 
     # --- together ---------------------------------------------------------------------------------
     def update(self) -> set[Layer]:
-        """Bring the scene up to date; what changed since the last call."""
+        """Bring the scene up to date.
+
+        Returns:
+            The layers that have changed since the last call.
+        """
         changed, self._changed = self._changed, set()
         scene = self.scene
         if "keyframes" in changed:
@@ -188,7 +199,7 @@ class LiveScene:
         return changed
 
     def _agreed_loops(self) -> tuple[tuple[int, int], ...]:
-        """Heard of or in the newest correction, but for those that it does not believe."""
+        """Return all loop closures that are not rejected by the newest correction."""
         if self._correction is None:
             return tuple(self._loops)
         named = dict.fromkeys((*self._loops, *self._correction.accepted_closures))
@@ -196,6 +207,7 @@ class LiveScene:
         return tuple(loop for loop in named if loop not in refused)
 
     def _facts(self) -> str:
+        """Return the text of the panel."""
         scene, behind = self.scene, ", behind until the next snapshot"
         counts = (
             f"{len(self._keyframes.T_map):,} keyframes, {len(scene.rows):,} Gaussians drawn, "
@@ -213,12 +225,12 @@ class LiveScene:
 
 
 class LiveSource:
-    """Made by `live`."""
+    """Source of the scene of a running service; `live` makes it."""
 
     def __init__(self, service: Client, config: ViewerConfig, stack: ExitStack) -> None:
         self._service = service
-        self._epochs: dict[str, int] = {}  # of those in ANEW
-        self._began_s: dict[str, float] = {}  # when another one was first heard of
+        self._epochs: dict[str, int] = {}  # Epochs of the actors in ANEW.
+        self._began_s: dict[str, float] = {}  # Time at which a new epoch was first received.
         self._live = LiveScene(config, time.monotonic)
         self._inboxes = [
             stack.enter_context(service.poller(topic.subscription_key, topic.message, keep))
@@ -230,7 +242,7 @@ class LiveSource:
         self._ask()
 
     def _ask(self) -> None:
-        """For what was said before."""
+        """Request the last values of all states."""
         for topic in STATES:
             for message in self._service.latest(topic):
                 self._live.take(message)
@@ -240,6 +252,14 @@ class LiveSource:
         return self._live.scene
 
     def update(self, *, is_watched: bool = True) -> set[Layer]:
+        """Receive all waiting messages and bring the scene up to date.
+
+        Args:
+            is_watched: False if no browser is connected; the scene is then updated later.
+
+        Returns:
+            The layers that have changed since the last update.
+        """
         for inbox in self._inboxes:
             for message in inbox():
                 self._live.take(message)
@@ -250,8 +270,11 @@ class LiveSource:
         return self._live.update() if is_watched else set()
 
     def _note_epoch(self, health: Health) -> None:
-        """A service that was started again, or was told to reset, may count from the beginning:
-        its versions say nothing beside those of before."""
+        """Reset the scene if the service was restarted or reset.
+
+        The versions of its messages may then start again from the beginning and cannot be compared
+        with earlier ones.
+        """
         if health.actor not in ANEW:
             return
         if self._epochs.setdefault(health.actor, health.epoch) != health.epoch:
@@ -264,7 +287,10 @@ class LiveSource:
             self._ask()
 
     def _learn_camera(self) -> None:
-        """From one keyframe: these are large, and all of one camera."""
+        """Take the camera from one keyframe and unsubscribe.
+
+        Keyframe messages are large, and all have the same camera.
+        """
         for keyframe in self._keyframes():
             self._live.take(keyframe)
             self._until_camera.close()
@@ -272,6 +298,6 @@ class LiveSource:
 
 @contextmanager
 def live(service: Client, config: ViewerConfig) -> Iterator[LiveSource]:
-    """Subscribe to all that is shown, and ask for what was said before."""
+    """Open a context with the scene of a service, subscribed to all topics that are shown."""
     with ExitStack() as stack:
         yield LiveSource(service, config, stack)

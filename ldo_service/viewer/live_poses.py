@@ -1,4 +1,4 @@
-"""Where the camera and its keyframes were, as far as a service has said."""
+"""Poses of the camera and of the keyframes of a running service."""
 
 import numpy as np
 
@@ -10,20 +10,25 @@ NOWHERE = np.full(3, np.nan)
 
 
 class LiveKeyframes:
-    """T_map_keyframe [4, 4] by id. A correction names every keyframe, and says it all; those that
-    are newer stay where the tracker saw them from their references."""
+    """Poses T_map_keyframe of the keyframes, [4, 4], by id.
+
+    A correction has the poses of all keyframes at its time. Newer keyframes keep their poses
+    relative to their reference keyframes.
+    """
 
     def __init__(self) -> None:
         self.T_map: dict[int, np.ndarray] = {}
-        self._newer: dict[int, tuple[int | None, np.ndarray]] = {}  # than the last correction
+        # Keyframes newer than the last correction.
+        self._newer: dict[int, tuple[int | None, np.ndarray]] = {}
 
     def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
-        """The frame became a keyframe."""
+        """Add a frame that became a keyframe."""
         assert pose.keyframe is not None
         self.T_map = {**self.T_map, pose.keyframe: T_map_camera}
         self._newer[pose.keyframe] = pose.reference, pose_from_message(pose.T_reference_camera)
 
     def correct(self, correction: GraphCorrection) -> None:
+        """Apply a correction."""
         T_map = keyframe_poses_from_correction(correction)
         newest = max(T_map, default=-1)
         self._newer = {k: link for k, link in self._newer.items() if k > newest}
@@ -36,23 +41,32 @@ class LiveKeyframes:
 
 
 class LivePath:
-    """The positions of the camera: as they were published, and from where the keyframes that it
-    was tracked against are now. Of more than `most` every second is forgotten, then every second of
-    those that come."""
+    """Positions of the camera, as published and after corrections.
+
+    The corrected positions follow the keyframes that the frames were tracked against. When there
+    are more than `most` positions, every second one is dropped, and from then on every second new
+    one.
+    """
 
     def __init__(self, most: int) -> None:
         self._most = most
         self._every = 1
         self._heard = 0
         self._online: list[np.ndarray] = []
-        self._references: list[int] = []  # -1: none
-        self._p_reference: list[np.ndarray] = []  # the camera in its reference
+        self._references: list[int] = []  # -1 without a reference.
+        # Position of the camera in its reference keyframe.
+        self._p_reference: list[np.ndarray] = []
 
     def __len__(self) -> int:
         return len(self._online)
 
     def add(self, pose: TrackedPose, T_map_camera: np.ndarray) -> None:
-        """Not a LOST one. The online position is that of the map's own submap alone."""
+        """Add the position of a frame that is not LOST.
+
+        Args:
+            pose: Tracked pose of the frame.
+            T_map_camera: Pose of the camera, [4, 4]. Its online position is known only in submap 0.
+        """
         self._heard += 1
         if self._heard % self._every:
             return
@@ -65,11 +79,17 @@ class LivePath:
             self._every *= 2
 
     def online(self) -> np.ndarray:
-        """[K, 3], NaN where nobody could tell."""
+        """Return the published positions, [K, 3]; NaN where they are unknown."""
         return np.array(self._online).reshape(-1, 3)
 
     def final(self, T_map_keyframe: dict[int, np.ndarray]) -> np.ndarray:
-        """[K, 3]: T_map_reference p_reference of those whose reference is known, in order."""
+        """Return the corrected positions of all frames with a known reference, [K, 3].
+
+        Each is T_map_reference p_reference, in order of time.
+
+        Args:
+            T_map_keyframe: Pose of each keyframe, [4, 4], by id.
+        """
         ids = np.array(sorted(T_map_keyframe), np.int64)
         references = np.array(self._references, np.int64)
         known = np.isin(references, ids)
@@ -80,7 +100,7 @@ class LivePath:
 
 
 def T_map_camera_of(pose: TrackedPose) -> np.ndarray:
-    """[4, 4], as the tracker published it."""
+    """Return the pose of the camera as published by the tracker, [4, 4]."""
     return se3.orthonormalize(
         pose_from_message(pose.T_map_odom) @ pose_from_message(pose.T_odom_camera)
     )

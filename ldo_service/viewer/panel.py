@@ -1,4 +1,4 @@
-"""What the window tells in words, as Markdown."""
+"""Texts of the panel in Markdown."""
 
 import re
 from collections import deque
@@ -8,19 +8,22 @@ from typing import Any
 
 from ldo_service.schemas import Health, TrackedPose
 
-RATE_OVER_S = 5.0  # ten heartbeats
-SILENT_AFTER_S = 1.5  # three heartbeats
-MAX_NAME = 40  # characters; a panel is narrow
+RATE_OVER_S = 5.0  # Ten heartbeats.
+SILENT_AFTER_S = 1.5  # Three heartbeats.
+MAX_NAME = 40  # Maximum characters of a name, because the panel is narrow.
 
 
 def escaped(text: str) -> str:
-    """Plain text in Markdown: names are what a message says, and must not become markup."""
+    """Return plain text as Markdown without markup.
+
+    Names come from messages and must not become markup.
+    """
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", " ".join(text.split()))
 
 
 # --- of a run -------------------------------------------------------------------------------------
 def of_summary(summary: Mapping[str, Any]) -> str:
-    """summary.json of a run, whatever of it is there."""
+    """Return the available values of summary.json as text."""
     counts = [
         f"{summary[name]:,} {says}"
         for name, says in (
@@ -28,7 +31,7 @@ def of_summary(summary: Mapping[str, Any]) -> str:
             ("keyframes", "keyframes"),
             ("gaussians", "Gaussians"),
             ("objects", "objects"),
-            ("loops_accepted", "loops closed"),
+            ("loops_accepted", "loop closures"),
         )
         if isinstance(summary.get(name), int)
     ]
@@ -46,38 +49,40 @@ def of_summary(summary: Mapping[str, Any]) -> str:
 
 
 def under_way(frames: int) -> str:
-    return f"**under way**: {frames:,} frames so far. A run writes its map when it ends."
+    """Return the text for a run in progress."""
+    return f"**in progress**: {frames:,} frames so far. The map is written at the end of the run."
 
 
 def share_shown(shown: int, there: int) -> str:
-    """Nothing where all are."""
+    """Return how many Gaussians are drawn; empty if all of them are."""
     return f"{shown:,} of {there:,} Gaussians are drawn" if shown < there else ""
 
 
 # --- of a service ---------------------------------------------------------------------------------
 @dataclass(slots=True)
 class Rate:
-    """Of something that is counted, over the last seconds."""
+    """Rate of a counter over the last RATE_OVER_S."""
 
-    _counts: deque[tuple[float, int]] = field(default_factory=deque)  # at what time, how many
+    _counts: deque[tuple[float, int]] = field(default_factory=deque)  # Times and counts.
 
     def add(self, now_s: float, count: int) -> None:
+        """Add the present count."""
         if self._counts and count < self._counts[-1][1]:
-            self._counts.clear()  # it began anew
+            self._counts.clear()  # The counter was reset.
         self._counts.append((now_s, count))
         while now_s - self._counts[0][0] > RATE_OVER_S:
             self._counts.popleft()
 
     @property
     def hz(self) -> float:
-        """0 until there are two counts."""
+        """Rate per second; 0 until there are two counts."""
         (first_s, first), (last_s, last) = self._counts[0], self._counts[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
 
 
 @dataclass(slots=True)
 class HeartbeatRecord:
-    """The last heartbeat of an actor."""
+    """Last heartbeat of an actor, and the time when it was received."""
 
     health: Health
     at_s: float
@@ -86,17 +91,18 @@ class HeartbeatRecord:
 
 @dataclass(slots=True)
 class HeardPose:
-    """The last one."""
+    """Last pose, and the time when it was received."""
 
     pose: TrackedPose
     at_s: float
 
 
 def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
+    """Return the tracking status and the rate of poses as text."""
     if heard is None:
         return "no pose yet"
     pose, silent_s = heard.pose, now_s - heard.at_s
-    where = f", submap {pose.submap} not joined" if pose.submap else ""
+    where = f", submap {pose.submap} not merged" if pose.submap else ""
     if silent_s > SILENT_AFTER_S:
         silent = f"**no pose for {silent_s:.0f} s**"
         return f"{silent}; the last was {pose.status} at frame {pose.frame:,}{where}"
@@ -104,9 +110,10 @@ def of_pose(heard: HeardPose | None, poses: Rate, now_s: float) -> str:
 
 
 def of_health(heard: Iterable[HeartbeatRecord], now_s: float) -> str:
+    """Return a table of all actors."""
     rows = [_row(one, now_s) for one in sorted(heard, key=lambda one: one.health.actor)]
     if not rows:
-        return "No actor reports: is this the name of the robot? `ldo doctor` tells."
+        return "No actor reports. Check the robot name, and run `ldo doctor`."
     return "\n".join(
         ("| actor | | /s | ms | p95 | drops | MB |\n|---|---|---|---|---|---|---|", *rows)
     )

@@ -1,4 +1,4 @@
-"""What a run left in its folder, or has left so far: files are read as they come and change."""
+"""Scene of a run folder, whose files are read when they appear or change."""
 
 import json
 from collections.abc import Callable
@@ -19,41 +19,57 @@ from . import panel
 from .scene import Layer, Scene, sights_of, thinned
 from .view_config import ViewerConfig
 
-Signature = tuple[int, int]  # time of the last change, ns, and size, bytes
+Signature = tuple[int, int]  # Time of the last change, ns, and size, bytes.
 
 
 class RunFolder:
-    """Looks at the folder on every `update`; what cannot be read is told in words, once more when
-    it changes."""
+    """Source of the scene of a run folder, which is checked at every `update`.
+
+    A file that cannot be read is reported in the panel, and read again when it changes.
+    """
 
     def __init__(self, folder: Path, config: ViewerConfig) -> None:
-        """Raises DataError for a folder that is none, or that no run wrote to."""
+        """Open the folder.
+
+        Raises:
+            DataError: The folder does not exist, or no run wrote it.
+        """
         if not folder.is_dir():
-            raise DataError(f"{folder} is not a folder: name that of an `ldo run`, or `live`.")
+            raise DataError(
+                f"{folder} is not a folder. Give the folder of an `ldo run`, or `live`."
+            )
         self._folder, self._config = folder, config
         self._begin()
         if not any(_signature(folder / name) for name in PARTS):
             refuse_state(folder)
         if not any(_signature(folder / name) for name in ("config.yaml", *PARTS)):
             raise DataError(
-                f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt: "
-                "name the folder that was its --out."
+                f"{folder} holds nothing that `ldo run` writes, such as map.ply or trajectory.txt. "
+                "Give the folder that was its --out."
             )
 
     def _begin(self) -> None:
-        """Nothing is read yet."""
+        """Start with an empty scene."""
         self.scene = Scene()
         self._seen: dict[str, tuple[Path, Signature]] = {}
-        self._problems: dict[str, str] = {}  # by file
+        self._problems: dict[str, str] = {}  # Error messages by file.
         self._summary: dict[str, Any] | None = None
         self._frames = self._gaussians = 0
 
     def update(self, *, is_watched: bool = True) -> set[Layer]:
+        """Read all new and changed files.
+
+        Args:
+            is_watched: False if no browser is connected; nothing is read then.
+
+        Returns:
+            The layers that have changed.
+        """
         if not is_watched:
             return set()
         changed: set[Layer] = set()
         if any(_signature(self._path(name)) is None for name in self._seen):
-            self._begin()  # another run writes here now
+            self._begin()  # Another run writes to this folder now.
             changed |= set(get_args(Layer))
         for name, (layers, read) in PARTS.items():
             if self._is_news(name):
@@ -72,7 +88,7 @@ class RunFolder:
         return True
 
     def _path(self, name: str) -> Path:
-        """The refined one where there is one."""
+        """Return the path of a file, of the refined one if it exists."""
         refined = self._folder / REFINED / name
         return refined if has_refined(self._folder) and refined.is_file() else self._folder / name
 
@@ -101,7 +117,7 @@ class RunFolder:
         self._summary = value
 
     def read_frames(self, path: Path) -> None:
-        """How many: there is a line for each, and the names of the columns."""
+        """Count the frames: frames.csv has a line for each, and one with the column names."""
         try:
             self._frames = max(0, path.read_bytes().count(b"\n") - 1)
         except OSError as error:
@@ -130,7 +146,7 @@ class RunFolder:
         self.scene.rows = rows[weightiest(rows, self._config.most_gaussians)]
 
     def read_objects(self, path: Path) -> None:
-        """Their views are the detections that a run keeps."""
+        """Read the objects with their views, which are the detections that a run keeps."""
         self.scene.objects = read_objects(path.parent)
         self.scene.sights = sights_of(self.scene.objects)
 
@@ -153,7 +169,7 @@ PARTS: dict[str, tuple[tuple[Layer, ...], Callable[[RunFolder, Path], None]]] = 
 
 
 def _signature(path: Path) -> Signature | None:
-    """None where there is no such file."""
+    """Return the signature of a file; None if the file does not exist."""
     try:
         stat = path.stat()
     except OSError:

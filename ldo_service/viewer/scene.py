@@ -1,6 +1,6 @@
-"""The map and the camera as a scene, and its Gaussians as a browser draws them.
+"""Scene of map and camera, and its Gaussians in the format of a browser.
 
-Conventions: `ldo_service.geometry`.
+The conventions are those of `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ Layer = Literal["gaussians", "camera", "online", "final", "keyframes", "objects"
 
 @dataclass(frozen=True, slots=True)
 class ObjectBox:
-    """What a keyframe shows: a name, and its box in the image in pixels."""
+    """Detection in a keyframe: a name and a box in the image, pixels."""
 
     name: str
     box_px: Box
@@ -30,35 +30,47 @@ class ObjectBox:
 
 @dataclass(slots=True)
 class Scene:
-    """All in the map frame, metres. What other threads read, `keyframes` and `objects`, is replaced
-    and never written to."""
+    """Content of the window, in the map frame and in meters.
 
-    # [N, 16], see `gaussians.model`; valid until the next update
+    Other threads read `keyframes` and `objects`. So these are replaced and never modified.
+    """
+
+    # Gaussians, [N, 16], see `gaussians.model`; valid until the next update.
     rows: np.ndarray = field(default_factory=lambda: np.zeros((0, ROW), np.float32))
-    online: np.ndarray = field(default_factory=NOTHING.copy)  # [K, 3] camera, as it was published
-    final: np.ndarray = field(default_factory=NOTHING.copy)  # [K, 3] after the last correction
-    keyframes: dict[int, np.ndarray] = field(default_factory=dict)  # T_map_camera [4, 4] by id
-    camera: Camera | None = None  # of the keyframes, rectified; None where it is not known yet
-    sights: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)  # by keyframe
+    # Camera positions as published, [K, 3].
+    online: np.ndarray = field(default_factory=NOTHING.copy)
+    # Camera positions after the last correction, [K, 3].
+    final: np.ndarray = field(default_factory=NOTHING.copy)
+    keyframes: dict[int, np.ndarray] = field(default_factory=dict)  # T_map_camera, [4, 4], by id.
+    camera: Camera | None = None  # Rectified camera of the keyframes; None until it is known.
+    # Detections by keyframe.
+    sights: dict[int, tuple[ObjectBox, ...]] = field(default_factory=dict)
     objects: MapObjects | None = None
-    loops: tuple[tuple[int, int], ...] = ()  # pairs of keyframes
-    T_map_camera: np.ndarray | None = None  # [4, 4] where the camera is, or was at the end
-    facts: str = ""  # Markdown
+    loops: tuple[tuple[int, int], ...] = ()  # Pairs of keyframes.
+    T_map_camera: np.ndarray | None = None  # Current or final pose of the camera, [4, 4].
+    facts: str = ""  # Text of the panel, Markdown.
 
 
 class Source(Protocol):
-    """Where a scene comes from."""
+    """Source of a scene."""
 
     @property
     def scene(self) -> Scene: ...
 
     def update(self, *, is_watched: bool = True) -> set[Layer]:
-        """Take what is new; says what changed. Where nobody watches that waits."""
+        """Bring the scene up to date.
+
+        Args:
+            is_watched: False if no browser is connected; work may then be postponed.
+
+        Returns:
+            The layers that have changed.
+        """
         ...
 
 
 def sights_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
-    """Those that it names as the views of its objects, by keyframe."""
+    """Return the views of all objects as detections, by keyframe."""
     sights: dict[int, tuple[ObjectBox, ...]] = {}
     for one in objects.objects:
         for view in one.views:
@@ -68,16 +80,24 @@ def sights_of(objects: MapObjects) -> dict[int, tuple[ObjectBox, ...]]:
 
 
 def thinned(values: np.ndarray, most: int) -> np.ndarray:
-    """At most so many of `values` [K, ...], evenly chosen, the first among them."""
+    """Return at most `most` of the values, evenly spaced, including the first.
+
+    Args:
+        values: Values, [K, ...].
+        most: Maximum number of values.
+    """
     return values[:: max(1, -(-len(values) // most))]
 
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """centers      [N, 3] float32, metres, map frame
-    covariances  [N, 3, 3] float32, m^2
-    colors       [N, 3] float32 RGB, 0..1
-    opacities    [N, 1] float32, 0..1
+    """Gaussians in the format of a browser.
+
+    Attributes:
+        centers: Centers in the map frame, [N, 3] float32, meters.
+        covariances: Covariances, [N, 3, 3] float32, m^2.
+        colors: RGB, [N, 3] float32, 0..1.
+        opacities: Opacities, [N, 1] float32, 0..1.
     """
 
     centers: np.ndarray
@@ -87,10 +107,15 @@ class Splats:
 
 
 def splats_of(rows: np.ndarray) -> Splats:
-    """Of Gaussian rows [N, 16] (see `gaussians.model`): the covariance is R S S R^T, with the
-    rotation R of the quaternion and the scales S."""
+    """Return Gaussians in the format of a browser.
+
+    The covariance is R S S R^T, with the rotation R of the quaternion and the scales S.
+
+    Args:
+        rows: Gaussians, [N, 16], see `gaussians.model`.
+    """
     R, scales = se3.rotation(rows[:, 6:10]), np.exp(rows[:, 3:6])
-    half = R * scales[:, None, :]  # R S
+    half = R * scales[:, None, :]  # Factor R S of the covariance.
     return Splats(
         rows[:, 0:3],
         half @ half.transpose(0, 2, 1),

@@ -1,4 +1,4 @@
-"""The browser's side of a scene. The one file that knows viser."""
+"""Window in the browser; the only module that imports viser."""
 
 import io
 import logging
@@ -35,8 +35,8 @@ from .view_config import ViewerConfig
 
 FLIGHT_STEPS, FLIGHT_STEP_S = 30, 1 / 30
 THICK_PX, VERY_THICK_PX = 1.5, 4.0
-MAX_ANSWERS = 10  # that are told of
-LEGEND = {  # what can be hidden
+MAX_ANSWERS = 10  # Maximum matches that are listed.
+LEGEND = {  # Checkboxes of layers that can be hidden.
     "gaussians": "Gaussians",
     "online": "path, online",
     "final": "path, corrected",
@@ -49,14 +49,14 @@ LEGEND = {  # what can be hidden
 
 
 class Server(viser.ViserServer):
-    """The map stays on this machine: a browser may ask for a public address, and gets none."""
+    """Viser server that refuses public URLs, so that the map stays on this machine."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:  # noqa: ARG002
         return None
 
 
 class Window:
-    """Feed it with `show`; made by `open_window`."""
+    """Window in the browser, which `open_window` makes and `show` updates."""
 
     def __init__(
         self,
@@ -68,27 +68,29 @@ class Window:
     ) -> None:
         self._server, self._source, self._config = server, source, config
         self._clock = clock
-        self._due: set[Layer] = set()  # changed, and not shown yet
+        self._due: set[Layer] = set()  # Layers that have changed but are not drawn yet.
         self._drawn_s: dict[Layer, float] = {}
         self._begin()
-        self._nodes: dict[str, Any] = {}  # of viser, by name
-        self._names: dict[int, Any] = {}  # labels, by object
+        self._nodes: dict[str, Any] = {}  # Nodes of viser, by name.
+        self._names: dict[int, Any] = {}  # Labels, by object.
         server.scene.set_up_direction(estimate_up({}))
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._build_panel(title)
 
     def _begin(self) -> None:
-        """With another map."""
+        """Start with another map."""
         self._shown = self._scene
-        self._leveled_by = 0  # keyframes; 0: nobody has a view yet
-        self._found: int | None = None  # the object that was asked for
+        self._leveled_by = 0  # Keyframes that set the up direction; 0 until the first view is set.
+        self._found: int | None = None  # Object that was searched for.
 
     @property
     def url(self) -> str:
+        """Address of the window."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     @property
     def is_watched(self) -> bool:
+        """Presence of a connected browser."""
         return bool(self._server.get_clients())
 
     @property
@@ -101,7 +103,7 @@ class Window:
         gui.set_panel_label(title)
         self._facts = gui.add_markdown("")
         with gui.add_form("Where is ...") as form:
-            self._text = gui.add_text("name", "", hint="Enter flies to it")
+            self._text = gui.add_text("name", "", hint="Press Enter to fly to it")
             form.on_submit(self._fly_to_answer)
         self._answers = gui.add_markdown("")
         with gui.add_folder("Show"):
@@ -120,8 +122,13 @@ class Window:
 
     # --- what is new ------------------------------------------------------------------------------
     def show(self, changed: set[Layer]) -> None:
-        """Draw what changed, but no layer more often than it may be. While no browser is there
-        nothing is drawn, and all of it is due."""
+        """Draw the changed layers, each at most once per its interval.
+
+        Without a connected browser, all drawing is postponed.
+
+        Args:
+            changed: Layers that have changed.
+        """
         if self._scene is not self._shown:
             self._begin()
         self._due |= changed
@@ -137,7 +144,7 @@ class Window:
         self._server.flush()
 
     def _every_s(self, layer: Layer) -> float:
-        """The least time from one drawing to the next."""
+        """Return the minimum interval between two drawings of a layer, seconds."""
         match layer:
             case "camera":
                 return 0.0
@@ -247,12 +254,18 @@ class Window:
 
     # --- camera of the browser --------------------------------------------------------------------
     def _level(self) -> None:
-        """By the keyframes so far: the first one alone may be tilted."""
+        """Set the up direction from the keyframes so far.
+
+        It is repeated later, because the first keyframe alone may be tilted.
+        """
         self._leveled_by = max(1, len(self._scene.keyframes))
         self._server.scene.set_up_direction(estimate_up(self._scene.keyframes))
 
     def _look_along(self, T_map_camera: np.ndarray) -> None:
-        """For all browsers that are there and will be; from then on the view is theirs."""
+        """Set the view of all present and future browsers once.
+
+        From then on each user controls the view.
+        """
         view = overview(T_map_camera)
         initial = self._server.initial_camera
         initial.position, initial.look_at = view.position, view.look_at
@@ -260,18 +273,21 @@ class Window:
             _set_view(client, view)
 
     def eyes(self) -> list[CameraView]:
-        """From where each browser looks."""
+        """Return the view of each browser."""
         cameras = (client.camera for client in self._server.get_clients().values())
         return [CameraView(camera.position, camera.look_at) for camera in cameras]
 
     def _fly_to_answer(self, event: viser.GuiEvent[Any]) -> None:
-        """In a thread of viser's."""
+        """Search an object and move the view of the browser to it.
+
+        Viser calls this method in its own thread.
+        """
         client, text = event.client, self._text.value.strip()
         found, keyframes = self._scene.objects, self._scene.keyframes
         if client is None or not text:
             return
         if found is None:
-            self._answers.content = "The map has no objects: a detector has to find them."
+            self._answers.content = "The map has no objects. Set detector.model to detect them."
             return
         start = CameraView(client.camera.position, client.camera.look_at)
         try:
@@ -287,7 +303,7 @@ class Window:
             start, view_of(best, keyframes, start.position), FLIGHT_STEPS
         ):
             if client.client_id not in self._server.get_clients():
-                return  # it was closed
+                return  # The browser was closed.
             _set_view(client, view)
             time.sleep(FLIGHT_STEP_S)
 
@@ -304,25 +320,35 @@ def _line(one: ObjectMatch) -> str:
 
 
 def _require_own(address: str) -> None:
-    """viser would try port after port for ever."""
+    """Check that this machine has the address; viser would try ports without end otherwise.
+
+    Raises:
+        ConfigError: The machine does not have it.
+    """
     try:
         ((family, *_, where), *_) = socket.getaddrinfo(address, 0, type=socket.SOCK_STREAM)
         with socket.socket(family, socket.SOCK_STREAM) as listener:
             listener.bind(where)
     except OSError as error:
         raise ConfigError(
-            f"viewer.address={address}: {error.strerror}. It must be this machine's own, such as "
-            f"{LOOPBACK}, or 0.0.0.0 for all of them."
+            f"viewer.address={address} must be an address of this machine, such as {LOOPBACK}, or "
+            f"0.0.0.0 for all of them: {error.strerror}."
         ) from error
 
 
 @contextmanager
 def open_window(source: Source, config: ViewerConfig, title: str) -> Iterator[Window]:
-    """Serve a window on `config.address`, on the first free port from `config.port` on. Raises
-    ConfigError for an address that this machine does not have."""
+    """Open a context with a window on `config.address`.
+
+    The port is the first free one from `config.port` on.
+
+    Raises:
+        ConfigError: The machine does not have the address.
+    """
     _require_own(config.address)
-    logging.getLogger("websockets.server").setLevel(logging.WARNING)  # else a line per browser
-    with redirect_stdout(io.StringIO()):  # viser introduces itself
+    # Otherwise it logs a line per browser.
+    logging.getLogger("websockets.server").setLevel(logging.WARNING)
+    with redirect_stdout(io.StringIO()):  # Viser prints a banner.
         server = Server(host=config.address, port=config.port, label=title, verbose=False)
     try:
         yield Window(server, source, config, title)

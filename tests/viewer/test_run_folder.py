@@ -89,7 +89,7 @@ def test_a_run_under_way_is_shown_as_it_comes(run: Path, tmp_path: Path) -> None
         shutil.copy(run / name, young)
     folder = RunFolder(young, CONFIG)
     assert folder.update() == {"facts"}
-    assert "under way**: 16 frames" in folder.scene.facts
+    assert "in progress**: 16 frames" in folder.scene.facts
     for name in ("trajectory.txt", "map.ply"):
         shutil.copy(run / name, young)
     assert folder.update() == {"facts", "camera", "final", "gaussians"}
@@ -119,7 +119,7 @@ def test_a_run_that_is_written_anew_leaves_nothing_of_the_old_one(run: Path) -> 
     scene = folder.scene
     assert scene.objects is None
     assert len(scene.rows) == len(scene.online) == len(scene.final) == len(scene.keyframes) == 0
-    assert "under way" in scene.facts
+    assert "in progress" in scene.facts
 
 
 def test_a_folder_is_not_read_while_nobody_watches(run: Path) -> None:
