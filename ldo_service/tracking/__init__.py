@@ -1,4 +1,4 @@
-"""Camera poses from RGB-D frames: direct alignment to keyframes, relocalisation by features."""
+"""RGB-D odometry: direct alignment to keyframes and relocalization by features."""
 
 from .alignment import AlignConfig, Alignment, align
 from .odometry import Odometry, OdometryConfig

@@ -1,13 +1,15 @@
-"""Coarse-to-fine direct alignment of an RGB-D frame to a reference. `ldo_service.geometry`.
+"""Coarse-to-fine direct alignment of an RGB-D frame to a reference keyframe.
 
-For every reference point p with grey level s and normal n, seen at p_c = T_camera_reference p:
+A reference point p with gray level s and normal n lies at p_c = T_camera_reference p in the camera.
+Each point has two residuals:
 
     photometric   r = I(project(p_c)) - gain s - bias
     geometric     r = (R n) . (p_c - q),  q the camera's surface at the nearest pixel
 
-weighted by a t-distribution with 5 degrees of freedom, w = 6 / (5 + (r / sigma)^2) / sigma^2
-(Kerl, Sturm and Cremers, "Robust odometry estimation for RGB-D cameras", 2013, III). Unknowns are
-rotation and translation of T_reference_camera * exp(xi), then gain and bias.
+The weights follow a t-distribution with 5 degrees of freedom, w = 6 / (5 + (r / sigma)^2) / sigma^2
+(Kerl, Sturm and Cremers, "Robust odometry estimation for RGB-D cameras", 2013, III). The unknowns
+are rotation and translation of T_reference_camera * exp(xi), then gain and bias.
+Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass, field, replace
@@ -20,54 +22,64 @@ from ldo_service.kernels import _align
 
 from .pyramid import DepthNoise, Level, Pyramid, ReferencePoints
 
-DEGREES_OF_FREEDOM = 5.0  # Kerl et al. 2013, III.B; the kernel has the same
+DEGREES_OF_FREEDOM = 5.0  # Kerl et al. 2013, III.B; the kernel uses the same value.
 INLIER_SIGMA = 3.0
 
 POSE, BRIGHTNESS = slice(0, 6), slice(6, 8)
-BRIGHTNESS_PRIOR = np.array([1e3, 0.1])  # inverse variances: gain within 3 %, bias within 3 levels
+# Inverse variances of gain and bias: gain within 3 %, bias within 3 gray levels.
+BRIGHTNESS_PRIOR = np.array([1e3, 0.1])
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualConfig:
+    """Settings of the photometric and geometric residuals."""
+
     noise: DepthNoise = field(default_factory=DepthNoise)
-    gate: float = 0.1  # relative depth difference beyond which points are no pair
-    occlusion: float = 0.08  # relative; a point this far behind the surface is hidden
+    gate: float = 0.1  # Largest depth difference of a geometric pair, relative to depth.
+    # A point this far behind the camera's surface is hidden; relative to depth.
+    occlusion: float = 0.08
 
     def __post_init__(self) -> None:
         if not (self.gate > 0 and self.occlusion > 0):
-            raise ConfigError(f"gate={self.gate:g}, occlusion={self.occlusion:g}: must be > 0.")
+            raise ConfigError(
+                f"gate={self.gate:g} and occlusion={self.occlusion:g} must be positive."
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class BrightnessModel:
-    """Brightness change and noise, estimated beside the pose."""
+    """Brightness change and noise of a frame, estimated together with the pose.
+
+    The defaults are the start values of the estimation.
+    """
 
     gain: float = 1.0
-    bias: float = 0.0  # grey levels
-    intensity_sigma: float = 8.0  # grey levels; where estimation starts
-    depth_noise_scale: float = 2.0  # times DepthNoise; where estimation starts
+    bias: float = 0.0  # Gray levels.
+    intensity_sigma: float = 8.0  # Photometric noise, gray levels.
+    depth_noise_scale: float = 2.0  # Geometric noise, times DepthNoise.
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualStatistics:
-    """One kind of residual: how many, how many within 3 sigma, and sum of w (r / sigma)^2."""
+    """Statistics of the photometric or of the geometric residuals."""
 
-    count: float
-    inliers: float
-    square: float
+    count: float  # Number of residuals.
+    inliers: float  # Number of residuals within 3 sigma.
+    square: float  # Sum of w (r / sigma)^2.
 
     @property
     def inlier_fraction(self) -> float:
+        """Fraction of the residuals within 3 sigma; 0 if there are none."""
         return self.inliers / self.count if self.count else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """hessian [8, 8] and gradient [8] of half the weighted squares; `visible` points."""
+    """Gauss-Newton approximation of half the weighted squared residuals."""
 
-    hessian: np.ndarray
-    gradient: np.ndarray
-    visible: float
+    hessian: np.ndarray  # [8, 8]
+    gradient: np.ndarray  # [8]
+    visible: float  # Number of points inside the image and not hidden.
     photometric: ResidualStatistics
     geometric: ResidualStatistics
 
@@ -79,10 +91,19 @@ def normal_equations(
     appearance: BrightnessModel,
     config: ResidualConfig,
 ) -> NormalEquations:
-    """Linearise all residuals of points [7, N] (see `ReferencePoints`) in a target level.
+    """Linearize the residuals of reference points in one pyramid level of a frame.
 
-    Raises ValueError for arrays of another shape or a transform that is not rigid. Bitwise
-    reproducible on one instruction set.
+    The result is bitwise reproducible on one instruction set.
+
+    Args:
+        points: Reference points, [7, N]; see `ReferencePoints`.
+        target: Pyramid level of the frame.
+        T_camera_reference: Pose at which the residuals are linearized, [4, 4].
+        appearance: Brightness change and noise.
+        config: Settings of the residuals.
+
+    Raises:
+        ValueError: An array has another shape, or the transform is not rigid.
     """
     hessian, gradient, counts = _align.normal_equations(
         points,
@@ -108,51 +129,67 @@ def normal_equations(
 
 @dataclass(frozen=True, slots=True)
 class AlignConfig:
+    """Settings of direct alignment."""
+
     residuals: ResidualConfig = field(default_factory=ResidualConfig)
     start: BrightnessModel = field(default_factory=BrightnessModel)
-    iterations: tuple[int, ...] = (8, 8, 10, 10)  # at most, per level, the finest first
-    stop_px: float = 0.02  # image motion of the last step, at the level's resolution
-    largest_step: float = 0.15  # rad, and fraction of the median depth: one step's limit
-    damping: float = 1e-6  # of the diagonal: directions that nothing observes stay put
-    least_intensity_sigma: float = 1.0  # grey levels: rounding and interpolation
-    least_depth_noise_scale: float = 0.2  # 0.24 mm at the noise floor: rounding to millimetres
-    # Neighbouring residuals share their errors, so N of them inform less than N: errors fit a
-    # fraction of 0.1 on exact renders, and of 1e-4 (next frame) to 3e-5 (half a second) on a
-    # Kinect against KinectFusion, whose own error is in that. The value lies between, unproven.
+    iterations: tuple[int, ...] = (8, 8, 10, 10)  # Maximum per level, the finest first.
+    # A level has converged when the last step moves the image by less; pixels of the level.
+    stop_px: float = 0.02
+    # Limit of one step: rotation in rad, and translation as a fraction of the median depth.
+    largest_step: float = 0.15
+    # Damping of the normal equations, fraction of their diagonal: unobserved directions stay fixed.
+    damping: float = 1e-6
+    # Lower bound of the photometric noise, gray levels: rounding and interpolation.
+    least_intensity_sigma: float = 1.0
+    # Lower bound of the geometric noise, 0.24 mm at the noise floor: rounding to millimeters.
+    least_depth_noise_scale: float = 0.2
+    # Fraction of the residuals that count as independent: the errors of neighboring residuals are
+    # correlated. The measured errors fit a fraction of 0.1 on exact renders. On a Kinect against
+    # KinectFusion they fit 1e-4 (next frame) to 3e-5 (half a second), which includes the error of
+    # KinectFusion. The default lies between these values and is not validated.
     independent_fraction: float = 2e-3
 
     def __post_init__(self) -> None:
         if not self.iterations or min(self.iterations) < 1:
-            raise ConfigError(f"iterations={self.iterations}: at least 1 for each level.")
+            raise ConfigError(
+                f"iterations={self.iterations} must have at least 1 iteration for each level."
+            )
         if min(self.stop_px, self.largest_step, self.independent_fraction) <= 0:
-            raise ConfigError("stop_px, largest_step and independent_fraction must be positive.")
+            raise ConfigError(
+                f"stop_px={self.stop_px:g}, largest_step={self.largest_step:g} and "
+                f"independent_fraction={self.independent_fraction:g} must be positive."
+            )
         if min(self.least_intensity_sigma, self.least_depth_noise_scale) <= 0:
-            raise ConfigError("the least noise of intensity and depth must be positive.")
+            raise ConfigError(
+                f"least_intensity_sigma={self.least_intensity_sigma:g} and "
+                f"least_depth_noise_scale={self.least_depth_noise_scale:g} must be positive."
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """Pose of a camera in its reference, and how far to trust it.
-
-    information is [6, 6] of T_reference_camera * exp(xi), rotation rad then translation m.
-    """
+    """Pose of a camera in its reference keyframe, with quality measures."""
 
     T_reference_camera: np.ndarray  # [4, 4]
+    # [6, 6] for T_reference_camera * exp(xi), xi = (rotation rad, translation m).
     information: np.ndarray
-    photometric_inliers: float  # fraction of the visible points within 3 sigma
-    geometric_inliers: float  # fraction of the paired points within 3 sigma
-    intensity_sigma: float  # grey levels
-    depth_noise_scale: float  # times the sensor model
-    overlap: float  # visible fraction of the reference points
-    paired: float  # fraction of the reference points that have a depth to compare with
+    photometric_inliers: float  # Fraction of the visible points within 3 sigma.
+    geometric_inliers: float  # Fraction of the paired points within 3 sigma.
+    intensity_sigma: float  # Photometric noise, gray levels.
+    depth_noise_scale: float  # Geometric noise, times the sensor model.
+    overlap: float  # Visible fraction of the reference points.
+    paired: float  # Fraction of the reference points that are paired with a measured depth.
     gain: float
-    bias: float  # grey levels
-    iterations: int  # over all levels
-    converged: bool  # the last step on the finest level was below stop_px
-    condition: float  # of the information, translation in median depths; inf if singular
+    bias: float  # Gray levels.
+    iterations: int  # Sum over all levels.
+    converged: bool  # The last step on the finest level was below stop_px.
+    # Condition number of the information, with translation in median depths; inf if singular.
+    condition: float
 
     @property
     def appearance(self) -> BrightnessModel:
+        """Brightness change and noise that were estimated with the pose."""
         return BrightnessModel(self.gain, self.bias, self.intensity_sigma, self.depth_noise_scale)
 
 
@@ -162,10 +199,16 @@ def align(
     T_camera_reference: np.ndarray,
     config: AlignConfig,
 ) -> Alignment:
-    """Minimise the residuals of `equations` by Gauss-Newton, from a guess [4, 4].
+    """Align a frame to reference points by Gauss-Newton, from an initial guess.
 
-    Noise of intensity and depth is estimated along the way (Kerl et al. 2013, equation 13), and
-    weighs colour against geometry. Deterministic: bitwise equal for equal input.
+    Each iteration also estimates the noise of intensity and depth (Kerl et al. 2013, equation 13),
+    which weighs color against geometry. Equal input gives a bitwise equal result.
+
+    Args:
+        reference: Surface points of the reference keyframe.
+        frame: Pyramid of the frame.
+        T_camera_reference: Initial guess, [4, 4].
+        config: Settings.
     """
     T, appearance = se3.orthonormalize(T_camera_reference), config.start
     count, converged = 0, False
@@ -193,7 +236,17 @@ def evaluate(
     iterations: int = 0,
     converged: bool = True,
 ) -> Alignment:
-    """The alignment that a pose [4, 4] and an appearance make, measured on the finest level."""
+    """Return the alignment of a given pose, measured on the finest level without optimization.
+
+    Args:
+        reference: Surface points of the reference keyframe.
+        frame: Pyramid of the frame.
+        T_camera_reference: The pose, [4, 4].
+        appearance: Brightness change and noise of the frame.
+        config: Settings.
+        iterations: Number of iterations to record in the result.
+        converged: Convergence to record in the result.
+    """
     T = se3.orthonormalize(T_camera_reference)
     points = reference.points[0]
     e = normal_equations(points, frame.levels[0], T, appearance, config.residuals)
@@ -251,7 +304,7 @@ def _image_motion_px(step: np.ndarray, target: Level, reference: ReferencePoints
 
 
 def _pose_information(equations: NormalEquations) -> np.ndarray:
-    """The pose's part, gain and bias marginalised (Schur complement)."""
+    """Return the information [6, 6] of the pose; gain and bias are marginalized out (Schur)."""
     hessian = equations.hessian
     brightness = hessian[BRIGHTNESS, BRIGHTNESS] + np.diag(BRIGHTNESS_PRIOR)
     cross = hessian[POSE, BRIGHTNESS]

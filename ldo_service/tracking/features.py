@@ -1,11 +1,12 @@
-"""Pose from sparse features and PnP RANSAC, for large motions and relocalisation.
+"""Poses from sparse features with PnP RANSAC, and from point clouds with GICP.
 
-ORB is fast and enough from frame to frame. SIFT costs ten times as much and knows again what is
-seen from twice as near or far.
+Both methods need no accurate initial guess; they serve large motions and relocalization. ORB is
+fast and sufficient from frame to frame. SIFT costs ten times as much and also matches surfaces at
+half or twice the distance.
 
-Where nothing has a texture, the pose comes from shape alone: `small_gicp` pairs each point of a
-cloud with its nearest neighbors, so it reaches farther than `alignment`, which pairs along the ray,
-and is less accurate. Conventions: `ldo_service.geometry`.
+Without texture, the pose comes from shape alone: `small_gicp` pairs each point of a cloud with its
+nearest neighbors. It converges from farther away than `alignment`, which pairs along the ray, and
+is less accurate. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Sequence
@@ -22,50 +23,64 @@ from .pyramid import Level, Pyramid, ReferencePoints
 
 SIFT_SIZE = 128
 
-NEIGHBORS = 10  # that the covariance of a point is taken from, small_gicp's default
+NEIGHBORS = 10  # Neighbors that the covariance of a point is estimated from; small_gicp's default.
 
 
 @dataclass(frozen=True, slots=True)
 class FeatureConfig:
-    count: int = 1000  # as ORB-SLAM3 at 640x480
-    fast_threshold: int = 7  # grey levels; ORB-SLAM3's lower one: blurred images have no more
-    ratio: float = 0.8  # of the best to the second distance (Lowe 2004, 7.1, at 0.8)
-    max_distance: int = 64  # bits of 256 (ORB-SLAM3's loose threshold is 100, its tight one 50)
-    count_across_scales: int = 1000  # SIFT's of a frame, the strongest; half as many of a place
-    contrast: float = 0.01  # SIFT's least, of the grey range; OpenCV's 0.04 finds little indoors
-    reprojection_px: float = 3.0  # at 640 pixels wide; scaled with the image
+    """Settings of feature detection, matching and PnP RANSAC."""
+
+    count: int = 1000  # Maximum number of ORB features, as in ORB-SLAM3 at 640x480.
+    # FAST threshold, gray levels: ORB-SLAM3's lower one, for corners in blurred images.
+    fast_threshold: int = 7
+    ratio: float = 0.8  # Maximum ratio of best to second distance (Lowe 2004, 7.1, uses 0.8).
+    # Maximum Hamming distance of ORB matches, bits of 256 (ORB-SLAM3: 100 loose, 50 tight).
+    max_distance: int = 64
+    # Maximum number of SIFT features of a frame, the strongest; half as many of a database entry.
+    count_across_scales: int = 1000
+    # SIFT contrast threshold, fraction of the gray range; OpenCV's 0.04 finds little indoors.
+    contrast: float = 0.01
+    reprojection_px: float = 3.0  # Inlier threshold at an image width of 640; scaled with it.
     ransac_iterations: int = 200
-    min_inliers: int = 15  # ORB-SLAM3 relocalises from 15 RANSAC inliers
+    min_inliers: int = 15  # ORB-SLAM3 relocalizes from 15 RANSAC inliers.
 
     def __post_init__(self) -> None:
         if min(self.count, self.count_across_scales, self.fast_threshold) < 1:
-            raise ConfigError("count, count_across_scales and fast_threshold must be positive.")
+            raise ConfigError(
+                named(self, "count", "count_across_scales", "fast_threshold")
+                + " must be at least 1."
+            )
         if self.ransac_iterations < 1 or self.min_inliers < 6:
-            raise ConfigError("ransac_iterations must be positive, min_inliers at least 6.")
+            raise ConfigError(
+                named(self, "ransac_iterations", "min_inliers")
+                + ": ransac_iterations must be at least 1, min_inliers at least 6."
+            )
         if not (0 < self.ratio <= 1 and min(self.reprojection_px, self.contrast) > 0):
-            raise ConfigError("ratio must be within 0..1, reprojection_px and contrast positive.")
+            raise ConfigError(
+                named(self, "ratio", "reprojection_px", "contrast")
+                + ": ratio must be within 0..1, reprojection_px and contrast positive."
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class Features:
-    """pixels [N, 2]; points_camera [N, 3] m, z = 0 where unmeasured.
+    """Image features with their measured 3D points."""
 
-    descriptors [N, 32] uint8 are bits of ORB, [N, 128] uint8 are gradients of SIFT.
-    """
-
-    pixels: np.ndarray
-    points_camera: np.ndarray
-    descriptors: np.ndarray
+    pixels: np.ndarray  # [N, 2]
+    points_camera: np.ndarray  # [N, 3] meters in the camera; z = 0 where unmeasured.
+    descriptors: np.ndarray  # [N, 32] uint8 bits of ORB, or [N, 128] uint8 gradients of SIFT.
 
 
 @dataclass(frozen=True, slots=True)
 class FeaturePose:
-    T_camera_reference: np.ndarray
+    """Pose from feature matches, with the number of RANSAC inliers."""
+
+    T_camera_reference: np.ndarray  # [4, 4]
     inliers: int
 
 
 def detect(view: Pyramid, config: FeatureConfig) -> Features:
-    """ORB features of the full-resolution image, with the depth under each."""
+    """Detect ORB features in the full-resolution image, with the measured depth of each."""
     orb = cv2.ORB.create(nfeatures=config.count, fastThreshold=config.fast_threshold)
     keypoints, descriptors = orb.detectAndCompute(view.gray, None)
     if descriptors is None:
@@ -76,12 +91,21 @@ def detect(view: Pyramid, config: FeatureConfig) -> Features:
 def detect_sift(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, count: int, config: FeatureConfig
 ) -> Features:
-    """The strongest SIFT features (Lowe 2004) of a grey image [H, W] uint8, as `detect` has ORB."""
+    """Detect the strongest SIFT features (Lowe 2004), with the measured depth of each.
+
+    Args:
+        gray: Image, [H, W] uint8.
+        depth_m: Depth of the image, [H, W], meters; 0 where unknown.
+        camera: Intrinsics of the image.
+        count: Maximum number of features.
+        config: Settings.
+    """
     sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=config.contrast)
     keypoints, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is None:
         keypoints, descriptors = (), np.zeros((0, SIFT_SIZE))
-    return _measured(keypoints, descriptors.astype(np.uint8), depth_m, camera)  # whole numbers
+    # SIFT descriptors are integers of 0..255 stored as float32.
+    return _measured(keypoints, descriptors.astype(np.uint8), depth_m, camera)
 
 
 def _measured(
@@ -95,7 +119,10 @@ def _measured(
 
 
 def match(reference: Features, frame: Features, config: FeatureConfig) -> np.ndarray:
-    """Index pairs [M, 2] (reference, frame) that pass the ratio test, each feature used once."""
+    """Return index pairs [M, 2] (reference, frame) that pass the ratio test.
+
+    Each feature occurs in at most one pair.
+    """
     if min(len(reference.pixels), len(frame.pixels)) < 2:
         return np.zeros((0, 2), int)
     is_sift = frame.descriptors.shape[1] == SIFT_SIZE
@@ -104,14 +131,20 @@ def match(reference: Features, frame: Features, config: FeatureConfig) -> np.nda
     farthest = np.inf if is_sift else config.max_distance
     here = np.flatnonzero(distance < np.minimum(config.ratio * second, farthest))
     order = here[np.lexsort((here, distance[here], there[here]))]
-    _, first = np.unique(there[order], return_index=True)  # the nearest of each frame feature
+    # Keep the pair with the smallest distance for each frame feature.
+    _, first = np.unique(there[order], return_index=True)
     return np.column_stack([order[first], there[order[first]]])
 
 
 def _nearest_bits(
     reference: np.ndarray, frame: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each reference descriptor: the nearest in the frame, its distance, and the second's."""
+    """Find the nearest frame descriptor of each reference descriptor, by Hamming distance.
+
+    Returns:
+        Index of the nearest frame descriptor, its distance, and the distance of the second
+        nearest one; [N] each.
+    """
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(reference, frame, k=2)
     distances = np.array([(best.distance, second.distance) for best, second in pairs])
     return np.array([best.trainIdx for best, _ in pairs]), *distances.T
@@ -120,7 +153,11 @@ def _nearest_bits(
 def _nearest_gradients(
     reference: np.ndarray, frame: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Likewise; squares of whole numbers below 2^24 are exact in float32, in any order."""
+    """Find the nearest frame descriptor of each reference descriptor, by Euclidean distance.
+
+    Returns the same as `_nearest_bits`. The sums are integers below 2^24, which float32 holds
+    exactly in any order of summation.
+    """
     a, b = reference.astype(np.float32), frame.astype(np.float32)
     squares = np.sum(a * a, axis=1)[:, None] + np.sum(b * b, axis=1) - 2.0 * (a @ b.T)
     rows, nearest = np.arange(len(a)), squares.argmin(axis=1)
@@ -132,9 +169,12 @@ def _nearest_gradients(
 def estimate_pose(
     reference: Features, frame: Features, camera: Camera, config: FeatureConfig
 ) -> FeaturePose | None:
-    """Pose of the frame's camera from the reference's 3D points; None without enough inliers.
+    """Estimate the pose of a frame from the 3D points of the reference features.
 
-    Deterministic: RANSAC's random numbers are seeded here.
+    RANSAC is seeded here, so that equal input gives an equal result.
+
+    Returns:
+        The pose, or None with fewer inliers than `config.min_inliers`.
     """
     pairs = match(reference, frame, config)
     pairs = pairs[reference.points_camera[pairs[:, 0], 2] > 0]
@@ -159,11 +199,14 @@ def estimate_pose(
 
 @dataclass(frozen=True, slots=True)
 class GicpConfig:
-    level: int = 2  # of the pyramid: 80 pixels wide
-    spacing: float = 0.03  # of the points, in median depths
-    reach: float = 0.25  # between partners, in median depths: a large step of a robot
-    iterations: int = 30  # at most
-    min_partners: float = 0.6  # share of the frame's points that find one
+    """Settings of GICP registration."""
+
+    level: int = 2  # Pyramid level of the points: 80 pixels wide.
+    spacing: float = 0.03  # Voxel size of the downsampled points, in median depths.
+    # Maximum distance between corresponding points, in median depths: a large step of a robot.
+    reach: float = 0.25
+    iterations: int = 30  # Maximum number.
+    min_partners: float = 0.6  # Minimum fraction of the frame's points with a correspondence.
 
     def __post_init__(self) -> None:
         if self.level < 0 or self.iterations < 1:
@@ -174,16 +217,25 @@ class GicpConfig:
         if not (0 < self.spacing < self.reach and 0 < self.min_partners <= 1):
             raise ConfigError(
                 named(self, "spacing", "reach", "min_partners")
-                + ": 0 < spacing < reach and 0 < min_partners <= 1 are needed."
+                + ": spacing must be positive and below reach, min_partners within 0..1."
             )
 
 
 def register_gicp(
     reference: ReferencePoints, view: Pyramid, T_reference_camera: np.ndarray, config: GicpConfig
 ) -> np.ndarray | None:
-    """T_reference_camera [4, 4] by GICP (Koide 2024), from a guess; None where that finds nothing.
+    """Register the points of a frame to those of a reference by GICP (Koide 2024).
 
-    Deterministic: one thread.
+    GICP runs on one thread, so that equal input gives an equal result.
+
+    Args:
+        reference: Surface points of the reference keyframe.
+        view: Pyramid of the frame.
+        T_reference_camera: Initial guess, [4, 4].
+        config: Settings.
+
+    Returns:
+        T_reference_camera [4, 4], or None if GICP does not converge or too few points correspond.
     """
     scale_m = reference.median_depth_m
     level = min(config.level, len(view.levels) - 1, len(reference.points) - 1)
@@ -209,6 +261,6 @@ def _cloud(points: np.ndarray, spacing_m: float) -> tuple[small_gicp.PointCloud,
 
 
 def _points(level: Level) -> np.ndarray:
-    """[N, 3] of the pixels with depth."""
+    """Return the points [N, 3] of the pixels with depth, meters in the camera."""
     points = level.camera.rays() * level.depth_m[..., None]
     return points[level.depth_m > 0]

@@ -1,9 +1,10 @@
-"""Where a frame was taken: its pose against the reference keyframe.
+"""Frame-to-keyframe tracking: the pose of a frame against its reference keyframe.
 
-A frame is aligned from the pose that constant motion predicts. Where the outcome is unsure, it is
-aligned from all other initial guesses too, and the tracking status says how far the best one is
-trusted. A LOST camera is searched for in the keyframe database. What becomes of the frame is
-decided in `odometry`. Conventions: `ldo_service.geometry`.
+The tracker aligns a frame from the pose that constant velocity predicts. If the result is not OK,
+it aligns the frame from all other initial guesses too and chooses the best result. The tracking
+status follows from the quality of that result. The keyframe database serves to relocalize a LOST
+camera. `odometry` decides whether the frame becomes a keyframe.
+Conventions: `ldo_service.geometry`.
 """
 
 import logging
@@ -41,6 +42,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class OdometryConfig:
+    """Settings of odometry and of its parts."""
+
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
     features: FeatureConfig = field(default_factory=FeatureConfig)
@@ -56,7 +59,9 @@ class OdometryConfig:
     moving: MotionSegmentationConfig = field(default_factory=MotionSegmentationConfig)
     movable: DynamicClassConfig = field(default_factory=DynamicClassConfig)
     prior: PriorConfig = field(default_factory=PriorConfig)
-    large_motion: float = 0.05  # image widths per frame: 2 pixels of the coarsest level
+    # Image motion from which all initial guesses are tried, image widths per frame: 2 pixels of the
+    # coarsest level.
+    large_motion: float = 0.05
 
     def __post_init__(self) -> None:
         if not self.large_motion > 0:
@@ -66,7 +71,8 @@ class OdometryConfig:
 class FrameTracker:
     """Pose tracking of one camera, frame by frame.
 
-    `state` holds all that the next frame depends on. Equal frames give bitwise equal results.
+    `state` holds everything that the next frame depends on. Equal frames give bitwise equal
+    results.
     """
 
     def __init__(self, config: OdometryConfig) -> None:
@@ -87,11 +93,11 @@ class FrameTracker:
             config.large_motion,
         )
         self._view: tuple[RgbdFrame, Pyramid] | None = None  # The last frame and its pyramid.
-        self._prior: PriorPose | None = None  # Of the last frame.
+        self._prior: PriorPose | None = None  # Prior of the last frame.
 
     @property
     def can_reuse_keyframes(self) -> bool:
-        """True once so many keyframes were made that known ones are reused."""
+        """True once the map has enough keyframes (`returning.after`) for keyframe reuse."""
         return 0 < self.config.returning.after <= self.state.next_id
 
     def track(self, frame: RgbdFrame, prior: PriorPose | None = None) -> TrackedFrame:
@@ -99,14 +105,15 @@ class FrameTracker:
 
         Args:
             frame: The frame.
-            prior: Camera pose by another odometry. It is one more initial guess, and dead
-                reckoning while tracking is LOST. It makes no tracking status better.
+            prior: Camera pose from another odometry. It is one more initial guess, and supplies
+                dead reckoning while tracking is LOST. A frame is OK only if its images confirm
+                the pose.
         """
         view, keyframe = self.view(frame), self.state.keyframe
         self._prior = prior
         if keyframe is None:
             return self._first_result(view)
-        # Alignment, and how far it is trusted.
+        # Alignment and tracking status.
         candidate = self._track_against(keyframe, view, frame.stamp_ns)
         status = self._classify(candidate)
         if status is TrackingStatus.WEAK and not self._relocalizer.resembles_last_trusted(
@@ -119,23 +126,23 @@ class FrameTracker:
             if found is None:
                 return self._lost_result(frame, keyframe, candidate.alignment)
             (keyframe, candidate), status = found, TrackingStatus.OK
-            # Noise differs between scenes, and pixels that moved belong to one keyframe.
+            # Reset both: noise differs between scenes, and motion evidence belongs to one keyframe.
             origin = KeyframeOrigin.KNOWN if self.can_reuse_keyframes else KeyframeOrigin.NEW
             self.state = replace(
                 self.state, history=ResidualHistory(), motion_evidence=None, origin=origin
             )
-        # Motion, dynamic pixels, the need of a keyframe, and views of other submaps.
+        # Motion, dynamic mask, need of a keyframe, and search of other submaps.
         tracked = self._accepted_result(frame, keyframe, candidate, status)
         return self._search_other_submaps(tracked, keyframe, view)
 
     def start_submap(self, frame: RgbdFrame) -> TrackedFrame:
-        """Return the frame just tracked, LOST, as the first of a new submap.
+        """Return the LOST frame just tracked as the first frame of a new submap.
 
-        Odometry goes on where tracking was lost, so its frame never jumps, and the motion missed
-        meanwhile is its error. A prior supplies that motion.
+        Odometry continues from the last pose before the loss, so that the odometry frame does not
+        jump. The motion since then is missing unless a prior supplies it.
         """
         submap = len(self.state.submaps.roots)
-        log.info("tracker: starts submap %d with frame %d.", submap, frame.index)
+        log.info("tracker: starting submap %d at frame %d.", submap, frame.index)
         T_odom_camera = self._dead_reckoned_pose()
         if T_odom_camera is None:
             T_odom_camera = self.state.motion.T_odom_camera
@@ -148,7 +155,12 @@ class FrameTracker:
         )
 
     def restart_at(self, frame: RgbdFrame, T_odom_camera: np.ndarray) -> None:
-        """Begin a submap with the frame just tracked, at a pose [4, 4] in odometry."""
+        """Start a submap with the frame just tracked.
+
+        Args:
+            frame: The frame.
+            T_odom_camera: Pose of the frame in odometry, [4, 4].
+        """
         self.state = replace(
             self.state,
             motion=ConstantVelocity(T_odom_camera, stamp_ns=frame.stamp_ns),
@@ -164,12 +176,17 @@ class FrameTracker:
     def relocalize_in(
         self, frame: RgbdFrame, places: KeyframeDatabase
     ) -> tuple[ReferenceKeyframe, Alignment] | None:
-        """Return the keyframe of `places` that the frame just tracked shows, and the alignment."""
+        """Relocalize the frame just tracked in a keyframe database.
+
+        Returns:
+            The keyframe that the frame shows, and its alignment to that keyframe; None if none is
+            verified.
+        """
         found = self._relocalize(self.view(frame), places, is_lost=False)
         return None if found is None else (found[0], found[1].alignment)
 
     def view(self, frame: RgbdFrame) -> Pyramid:
-        """Return the pyramid of a frame; it is built once for the frame just tracked."""
+        """Return the pyramid of a frame; that of the last frame is cached."""
         if self._view is None or self._view[0] is not frame:
             self._view = (frame, pyramid_of(frame, self.config.pyramid))
         return self._view[1]
@@ -187,14 +204,14 @@ class FrameTracker:
         )
 
     def _is_usable(self, view: Pyramid) -> bool:
-        """Return whether frames could be aligned to a view: enough of its depth is measured."""
+        """Return whether a view has enough measured depth to align frames to it."""
         measured = float(np.mean(view.levels[0].depth_m > 0))
         return measured >= self.config.judgement.min_paired
 
     def _track_against(
         self, keyframe: ReferenceKeyframe, view: Pyramid, stamp_ns: int
     ) -> PoseHypothesis:
-        """Align from the predicted pose, and from all other guesses when that is not sure."""
+        """Align from the predicted pose; if the result is not OK, from all other guesses too."""
         motion = self.state.motion
         T_keyframe_odom = se3.inverse(keyframe.T_odom_keyframe)
         resting = T_keyframe_odom @ motion.T_odom_camera
@@ -209,7 +226,10 @@ class FrameTracker:
         return self._guesses.align_from_all_guesses(predicted, keyframe, view, resting, carried)
 
     def _dead_reckoned_pose(self) -> np.ndarray | None:
-        """Return T_odom_camera [4, 4] by the prior's motion since the last OK frame, if known."""
+        """Return T_odom_camera [4, 4] by the prior's motion since the last OK frame.
+
+        Return None if the prior does not cover that motion.
+        """
         start, now = self.state.dead_reckoning_start, self._prior
         if start is None or now is None:
             return None
@@ -223,7 +243,7 @@ class FrameTracker:
     def _places_when_lost(self) -> KeyframeDatabase:
         """Add the last mapping keyframe to the database, and return the database.
 
-        It shows more of the camera's last position than the reference keyframe does.
+        The mapping keyframe is closer to the last camera pose than the reference keyframe.
         """
         before = self.state
         if before.mapping_keyframe is not None:
@@ -243,7 +263,7 @@ class FrameTracker:
         )
 
     def _places_of_other_submaps(self, submap: int) -> KeyframeDatabase:
-        """Return the places of all submaps that are not merged with one."""
+        """Return the keyframe records of all submaps that are not merged with a submap."""
         state = self.state
         are_merged = state.submaps.are_merged
         return KeyframeDatabase(
@@ -308,11 +328,12 @@ class FrameTracker:
         self._remember(
             frame, keyframe, motion if is_steady else motion.without_velocity(), history, status
         )
-        dynamic_mask = None  # Surfaces contradict each other where a pose is unsure.
+        # Static surfaces contradict each other too if the pose is uncertain.
+        dynamic_mask = None
         if status is TrackingStatus.OK:
             dynamic_mask = self._segment_motion(keyframe, self.view(frame), alignment)
         if self.state.origin is KeyframeOrigin.KNOWN:
-            # What was put there since the keyframe was made does not move.
+            # A known keyframe may be old: a static object placed since then is not dynamic.
             dynamic_mask = None
             self.state = replace(self.state, dynamic_mask=None)
         needed = (
@@ -332,10 +353,10 @@ class FrameTracker:
     def _needed_keyframe(
         self, T_odom_camera: np.ndarray, candidate: PoseHypothesis
     ) -> KeyframeKind | None:
-        """Return the keyframe that an OK frame should become, by its distance to the last one."""
+        """Return the kind of keyframe that an OK frame should become, or None."""
         config, frames = self.config.keyframes, self.state.frames_since_keyframe
         is_known = self.state.origin is KeyframeOrigin.KNOWN
-        if is_known:  # A known keyframe serves for any time.
+        if is_known:  # The number of frames does not limit the use of a known keyframe.
             frames = min(frames, config.max_frames - 1)
         alignment, depth_m = candidate.alignment, candidate.median_depth_m
         if needs_keyframe(alignment.T_reference_camera, alignment.overlap, depth_m, frames, config):
@@ -348,9 +369,9 @@ class FrameTracker:
     def _segment_motion(
         self, keyframe: ReferenceKeyframe, view: Pyramid, alignment: Alignment
     ) -> np.ndarray | None:
-        """Return the moving pixels of a frame [H, W] bool.
+        """Return the dynamic mask of a frame, [H, W] bool.
 
-        Pixels of the keyframe that have moved since are masked in it.
+        Pixels of the keyframe that have moved since then are added to its ignore mask.
         """
         config = self.config.moving
         if not config.is_on:
@@ -384,7 +405,12 @@ class FrameTracker:
     ) -> None:
         before = self.state
         if status is not before.status:
-            log.info("tracking %s, was %s; keyframe %d", status, before.status, keyframe.id)
+            log.info(
+                "tracker: tracking status changed from %s to %s at keyframe %d.",
+                before.status,
+                status,
+                keyframe.id,
+            )
         self.state = replace(
             before,
             keyframe=keyframe,

@@ -1,7 +1,8 @@
-"""Every keyframe, small enough to keep: where a lost camera may be. `ldo_service.geometry`.
+"""Database of compressed keyframes for relocalization and keyframe reuse.
 
-A place is a keyframe's thumbnail, its strongest ORB features with their points, and its grey image
-and depth at the working resolution, compressed: from these it can be tracked against again.
+A record holds a thumbnail of the keyframe and its strongest ORB features with their 3D points. It
+also holds the compressed gray image and depth at working resolution, from which the keyframe is
+rebuilt when frames are aligned to it again. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Sequence, Set
@@ -26,60 +27,75 @@ from .motion_segmentation import resized
 from .pyramid import Pyramid, PyramidConfig, build_pyramid
 from .tracking_quality import ResidualHistory
 
-THUMBNAIL = 20, 15  # columns, rows: so blurred that a hand's width of motion matters little
-CONTRAST = 32.0  # steps per standard deviation; products of 300 int8 sum exactly in float32
-DEPTH_STEPS_PER_M = 2000.0  # 16 bits reach 32 m in half millimetres, below any sensor's noise
+# Columns and rows; coarse enough that a motion of 10 cm changes little.
+THUMBNAIL = 20, 15
+# Steps per standard deviation. Sums of products of 300 int8 are exact in float32.
+CONTRAST = 32.0
+# 16 bits reach 32 m in steps of half a millimeter, which is below the noise of any sensor.
+DEPTH_STEPS_PER_M = 2000.0
 NO_PAST = ResidualHistory()
 
-DATABASE_FILE = "keyframe_database.msgpack"  # In the folder of a run.
-OLD_DATABASE_FILE = "places.msgpack"  # Its name up to version 0.1, read for one more version.
+DATABASE_FILE = "keyframe_database.msgpack"  # File name in the folder of a run.
+OLD_DATABASE_FILE = "places.msgpack"  # File name up to version 0.1; read for one more version.
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeDatabaseConfig:
-    count: int = 1000  # places kept, 0.13 MB each at 640x480 (kitchen); then the path is thinned
-    features: int = 500  # of each: half of a frame's, which halves the time to match
-    same: float = 0.1  # rad, as `motion.extent`: a place so near is replaced by the newer one,
-    # which shows it as it is now. Half a step between keyframes: on a round memory stops growing
-    recent: int = 16  # last places, which are not replaced: new keyframes are measured against them
+    """Settings of the keyframe database."""
+
+    # Maximum number of records, 0.13 MB each at 640x480 (kitchen); beyond it the path is thinned.
+    count: int = 1000
+    # ORB features of a record: half of those of a frame, which halves the time to match.
+    features: int = 500
+    # A new record replaces one within this distance, rad (`motion.image_motion_rad`): the newer one
+    # shows the current state. Half a step between keyframes, so that the database stops growing
+    # while a robot repeats its route.
+    same: float = 0.1
+    # The newest records are not replaced: new keyframes are measured against them.
+    recent: int = 16
 
     def __post_init__(self) -> None:
         if self.count < 3 or self.features < 1:
-            raise ConfigError("places.count must be at least 3 and places.features at least 1.")
+            raise ConfigError(
+                f"places.count={self.count} must be at least 3 and "
+                f"places.features={self.features} at least 1."
+            )
         if self.same < 0 or self.recent < 0:
-            raise ConfigError("places.same and places.recent must not be negative.")
+            raise ConfigError(
+                f"places.same={self.same:g} and places.recent={self.recent} must not be negative."
+            )
 
 
 @dataclass(frozen=True, eq=False)
 class KeyframeRecord:
-    """A keyframe in some 130 kB.
-
-    thumbnail      [300] int8, of mean 0 and one contrast
-    points_camera  [N, 3] float32 m, of the features; all were measured
-    descriptors    [N, 32] uint8
-    gray, depth    PNG and zstd, of `camera`'s size
-    """
+    """Compressed keyframe of about 130 kB."""
 
     id: int
     submap: int
     T_odom_keyframe: np.ndarray  # [4, 4]
     median_depth_m: float
-    intensity_sigma: float  # of frames tracked before it, grey levels; 0: not known
-    depth_noise_scale: float  # likewise, times the sensor model
-    thumbnail: np.ndarray
-    points_camera: np.ndarray
-    descriptors: np.ndarray
-    camera: Camera
-    gray: bytes
-    depth: bytes
+    # Median photometric noise of the frames tracked before it, gray levels; 0 if unknown.
+    intensity_sigma: float
+    # Median geometric noise of the same frames, times the sensor model; 0 if unknown.
+    depth_noise_scale: float
+    thumbnail: np.ndarray  # [300] int8 with mean 0 and normalized contrast.
+    points_camera: np.ndarray  # Points of the features, [N, 3] float32 meters; all are measured.
+    descriptors: np.ndarray  # [N, 32] uint8 ORB descriptors.
+    camera: Camera  # Intrinsics of `gray` and `depth`.
+    gray: bytes  # PNG image of the size of `camera`.
+    depth: bytes  # Depth of the size of `camera`, 16 bits compressed by zstd.
 
     @cached_property
     def features(self) -> Features:
+        """ORB features with their pixels in `camera`."""
         points = self.points_camera.astype(np.float64)
         return Features(self.camera.project(points), points, self.descriptors)
 
     def sift_features(self, config: FeatureConfig) -> Features:
-        """SIFT of the small image, detected when first asked for; half as many as of a frame."""
+        """Return SIFT features of the gray image, half as many as of a frame.
+
+        They are detected on the first call and cached.
+        """
         if "_across_scales" not in self.__dict__:
             image = self._gray, self.depth_m, self.camera
             seen = detect_sift(*image, config.count_across_scales // 2, config)
@@ -87,7 +103,13 @@ class KeyframeRecord:
         return self.__dict__["_across_scales"]
 
     def history(self, otherwise: ResidualHistory) -> ResidualHistory:
-        """What a frame that shows this place is judged by: scenes differ in noise."""
+        """Return the residual history that frames aligned to this keyframe are compared with.
+
+        Noise differs between scenes, so the record's own noise is used if it is known.
+
+        Args:
+            otherwise: The history to return if the noise of this record is unknown.
+        """
         if not self.intensity_sigma:
             return otherwise
         return ResidualHistory((self.intensity_sigma,), (self.depth_noise_scale,))
@@ -103,7 +125,7 @@ class KeyframeRecord:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "KeyframeRecord":
-        """The inverse of `pack`. A record of version 0.1 says `segment` for `submap`."""
+        """Return the record from its packed form; version 0.1 wrote `segment` for `submap`."""
         values = {**kept, "camera": Camera.of(kept["camera"])}
         if "segment" in values:
             values["submap"] = values.pop("segment")
@@ -111,18 +133,23 @@ class KeyframeRecord:
 
     @property
     def nbytes(self) -> int:
+        """Size of the arrays and compressed images in bytes."""
         arrays = (self.thumbnail, self.points_camera, self.descriptors, self.T_odom_keyframe)
         return sum(array.nbytes for array in arrays) + len(self.gray) + len(self.depth)
 
     def keyframe(self, config: PyramidConfig) -> ReferenceKeyframe:
-        """The keyframe as frames can be aligned to it; bitwise equal each time."""
+        """Rebuild the keyframe for alignment; the result is bitwise equal each time."""
         view = build_pyramid(self._gray, self.depth_m, self.camera, config)
         return ReferenceKeyframe(
             view, self.T_odom_keyframe, self.id, self.submap, stored_features=self.features
         )
 
     def without(self, left_out: np.ndarray) -> "KeyframeRecord":
-        """The same with nothing known of pixels [H, W] bool, at the size of its camera."""
+        """Return the record without the features, intensity and depth of masked pixels.
+
+        Args:
+            left_out: Mask, [H, W] bool, of the size of `camera`.
+        """
         if not left_out.any():
             return self
         kept = _are_still(self.points_camera.astype(float), self.camera, left_out)
@@ -141,6 +168,7 @@ class KeyframeRecord:
 
     @property
     def depth_m(self) -> np.ndarray:
+        """Depth [H, W] float32 in meters; 0 where unknown."""
         width, height = self.camera.width, self.camera.height
         steps = codecs.decode_depth("z16+zstd", width, height, memoryview(self.depth))
         return steps.astype(np.float32) / np.float32(DEPTH_STEPS_PER_M)
@@ -152,7 +180,14 @@ def make_keyframe_record(
     config: KeyframeDatabaseConfig,
     history: ResidualHistory = NO_PAST,
 ) -> KeyframeRecord:
-    """What is kept of a keyframe without what moves in it, and of the noise of frames before it."""
+    """Compress a keyframe to a record, without the pixels of its ignore mask.
+
+    Args:
+        keyframe: The keyframe.
+        features: Settings of ORB.
+        config: Settings of the database.
+        history: Noise of the frames tracked before the keyframe; the record keeps its medians.
+    """
     view, level = keyframe.view, keyframe.view.levels[0]
     left_out = resized(keyframe.ignore_mask, level.depth_m.shape)
     seen = detect(view, replace(features, count=config.features))
@@ -185,7 +220,16 @@ def _depth_bytes(depth_m: np.ndarray, left_out: np.ndarray) -> bytes:
 
 
 def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.ndarray:
-    """Which of points [N, 3] bool were measured, on what does not move."""
+    """Return which points are measured and outside the mask.
+
+    Args:
+        points: Points in the camera, [N, 3] meters; z = 0 where unmeasured.
+        camera: Intrinsics of the mask.
+        left_out: Mask, [H, W] bool.
+
+    Returns:
+        [N] bool.
+    """
     kept = points[:, 2] > 0
     pixels = np.rint(camera.project(points[kept])).astype(int)
     column, row = np.clip(pixels, 0, [camera.width - 1, camera.height - 1]).T
@@ -194,7 +238,7 @@ def _are_still(points: np.ndarray, camera: Camera, left_out: np.ndarray) -> np.n
 
 
 def make_thumbnail(view: Pyramid) -> np.ndarray:
-    """[300] int8: the image in 20x15, free of brightness and contrast."""
+    """Return the image at 20x15 with brightness and contrast normalized, [300] int8."""
     small = cv2.resize(view.gray, THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64)
     small -= small.mean()
     steps = CONTRAST * small / max(float(small.std()), 1.0)
@@ -203,7 +247,7 @@ def make_thumbnail(view: Pyramid) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class KeyframeDatabase:
-    """Places along the path, the oldest first. Immutable: `with_record` makes another."""
+    """Immutable sequence of keyframe records, the oldest first."""
 
     all: tuple[KeyframeRecord, ...] = ()
 
@@ -213,8 +257,15 @@ class KeyframeDatabase:
     def with_record(
         self, place: KeyframeRecord, config: KeyframeDatabaseConfig
     ) -> "KeyframeDatabase":
-        """With one more, and without the one that it shows anew; where there are too many, one that
-        leaves the smallest gap is gone."""
+        """Return the database with a new record.
+
+        The new record replaces an older one at the same place. If there are too many records, the
+        one whose neighbors are closest to each other is removed.
+
+        Args:
+            place: The new record.
+            config: Settings.
+        """
         kept = (*self._others(place, config), place)
         if len(kept) > config.count:
             spare = int(np.argmin(neighbor_distances(kept))) + 1
@@ -222,22 +273,30 @@ class KeyframeDatabase:
         return KeyframeDatabase(kept)
 
     def with_reused(self, place: KeyframeRecord) -> "KeyframeDatabase":
-        """With a known one as the newest, where odometry has it now."""
+        """Return the database with a known record moved to the end, at its new odometry pose."""
         return KeyframeDatabase((*(other for other in self.all if other.id != place.id), place))
 
     def without(self, left_out: np.ndarray, keyframe: int) -> "KeyframeDatabase":
-        """With nothing known of pixels [H, W] bool of one of them: see `KeyframeRecord.without`."""
+        """Return the database with pixels of one record masked; see `KeyframeRecord.without`.
+
+        Args:
+            left_out: Mask, [H, W] bool.
+            keyframe: Id of the record.
+        """
         places = (p.without(left_out) if p.id == keyframe else p for p in self.all)
         return KeyframeDatabase(tuple(places))
 
     def in_submap(self, submap: int, without: Set[int] = frozenset()) -> tuple[KeyframeRecord, ...]:
-        """Those of a submap but for some, by id."""
+        """Return the records of a submap, except for the ids in `without`."""
         return tuple(p for p in self.all if p.submap == submap and p.id not in without)
 
     def _others(
         self, place: KeyframeRecord, config: KeyframeDatabaseConfig
     ) -> tuple[KeyframeRecord, ...]:
-        """All but the nearest of those that are the same place, the last ones aside."""
+        """Return all records except the one that a new record replaces.
+
+        That is the nearest one within `config.same`; the newest `config.recent` are never replaced.
+        """
         older = self.all[: max(0, len(self.all) - config.recent)]
         if not older:
             return self.all
@@ -248,22 +307,23 @@ class KeyframeDatabase:
         return (*self.all[:nearest], *self.all[nearest + 1 :])
 
     def rank_by_similarity(self, view: Pyramid) -> list[int]:
-        """Indices of all places, the one whose thumbnail correlates best first."""
+        """Return the indices of all records by descending correlation of their thumbnails."""
         correlations = self._thumbnails @ make_thumbnail(view).astype(np.float32)
         return np.argsort(-correlations, kind="stable").tolist()
 
     @cached_property
     def _thumbnails(self) -> np.ndarray:
-        """[N, 300] float32 of whole numbers: their products sum exactly in any order."""
+        """Thumbnails [N, 300] float32; integers, so that sums of products are exact."""
         return np.array([place.thumbnail for place in self.all], np.float32).reshape(
             -1, THUMBNAIL[0] * THUMBNAIL[1]
         )
 
 
 def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
-    """[N-2] rad: how far the neighbours of each inner place are apart, as `motion.extent`.
+    """Return the distance between the two neighbors of each inner record of a path.
 
-    Infinite where they are of two submaps.
+    Returns:
+        [N-2] rad as of `motion.image_motion_rad`; infinite if the neighbors belong to two submaps.
     """
     median_depth_m = np.array([place.median_depth_m for place in path[1:-1]])
     apart = image_motions_rad(se3.inverse(_poses(path[:-2])) @ _poses(path[2:]), median_depth_m)
@@ -272,7 +332,11 @@ def neighbor_distances(path: Sequence[KeyframeRecord]) -> np.ndarray:
 
 
 def _apart(places: tuple[KeyframeRecord, ...], other: KeyframeRecord) -> np.ndarray:
-    """[N] rad: how far each is from another one, as `motion.extent`; infinite in other submaps."""
+    """Return the distance of each record to another one.
+
+    Returns:
+        [N] rad as of `motion.image_motion_rad`; infinite for records of another submap.
+    """
     moved = se3.inverse(_poses(places)) @ other.T_odom_keyframe
     submap = np.array([place.submap for place in places])
     return np.where(submap == other.submap, image_motions_rad(moved, other.median_depth_m), np.inf)
@@ -283,13 +347,17 @@ def _poses(places: Sequence[KeyframeRecord]) -> np.ndarray:
 
 
 def load_keyframe_database(folder: Path) -> KeyframeDatabase:
-    """Of the map that a finished run left in its folder. Raises DataError when it left none."""
+    """Load the keyframe database of a finished run from its folder.
+
+    Raises:
+        DataError: The folder has no database, or it is unreadable or empty.
+    """
     files = [folder / name for name in (DATABASE_FILE, OLD_DATABASE_FILE)]
     path = next((file for file in files if file.is_file()), None)
     if path is None:
         raise DataError(
-            f"{folder} has no {DATABASE_FILE}, so nothing can be localized in it. Name the folder "
-            "that `ldo run SOURCE --out DIR` wrote; one of an older version has to be run again."
+            f"{folder} has no {DATABASE_FILE}, so localization in it is impossible. Give the "
+            "folder that `ldo run SOURCE --out DIR` wrote; repeat a run of an older version."
         )
     try:
         kept = decode_state(path.read_bytes())
@@ -297,7 +365,11 @@ def load_keyframe_database(folder: Path) -> KeyframeDatabase:
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}.") from error
     except (msgspec.DecodeError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} is not what `ldo run` writes: {error!r}. Run it again.") from error
+        raise DataError(
+            f"{path} is not a keyframe database of `ldo run`: {error!r}. Repeat the run."
+        ) from error
     if not len(places):
-        raise DataError(f"{path} holds no place: the run made no keyframe. Run it again.")
+        raise DataError(
+            f"{path} holds no keyframe record: the run made no keyframe. Repeat the run."
+        )
     return places

@@ -1,4 +1,4 @@
-"""When a frame becomes a keyframe, and what is kept of it. Conventions: `ldo_service.geometry`."""
+"""Reference keyframes and the decision to make one. Conventions: `ldo_service.geometry`."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -18,21 +18,31 @@ from .pyramid import Pyramid, PyramidConfig, ReferencePoints, build_pyramid, bui
 
 @dataclass(frozen=True, slots=True)
 class KeyframeConfig:
-    min_overlap: float = 0.85  # of the visible surface: below, new surface is worth mapping
+    """Settings of the decision to make a keyframe."""
+
+    # Minimum overlap with the reference keyframe; below it, the frame shows new surface to map.
+    min_overlap: float = 0.85
     max_rotation_rad: float = radians(15.0)
-    max_translation: float = 0.08  # of the median depth
-    min_frames: int = 2  # at most every 2nd frame
-    max_frames: int = 30  # at least every 30th, if the camera moved at all
-    still_overlap: float = 0.97  # of the visible surface: above, and
-    still_motion: float = 0.01  # rad, and fraction of the median depth: below, it stands still
-    # Share of max_rotation_rad and max_translation after which a frame is mapped although tracking
-    # goes on against the same keyframe: the map gains by more views, tracking by fewer references.
-    # Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1: none.
+    max_translation: float = 0.08  # Fraction of the median depth.
+    min_frames: int = 2  # Frames per keyframe at least: at most every 2nd frame becomes one.
+    # Frames per keyframe at most: at least every 30th frame becomes one while the camera moves.
+    max_frames: int = 30
+    # The camera stands still if the overlap is above still_overlap, and rotation (rad) and
+    # translation (fraction of the median depth) are below still_motion.
+    still_overlap: float = 0.97
+    still_motion: float = 0.01
+    # A frame becomes a mapping keyframe beyond this fraction of max_rotation_rad and
+    # max_translation; the reference keyframe stays. The map gains by more views, tracking by fewer
+    # references. Kitchen, held-out views at equal iterations: +0.4 dB, the worst +2 dB. Above 1:
+    # no mapping keyframes.
     supporting: float = 0.33
 
     def __post_init__(self) -> None:
         if not (0 <= self.still_overlap <= 1 and self.still_motion >= 0):
-            raise ConfigError("still_overlap must be within 0..1, still_motion at least 0.")
+            raise ConfigError(
+                f"still_overlap={self.still_overlap:g} must be within 0..1, "
+                f"still_motion={self.still_motion:g} at least 0."
+            )
         if not min(self.max_rotation_rad, self.max_translation, self.supporting) > 0:
             raise ConfigError(
                 f"max_rotation_rad={self.max_rotation_rad:g}, max_translation="
@@ -49,27 +59,31 @@ class KeyframeConfig:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceKeyframe:
-    """A frame that others are aligned to."""
+    """Keyframe that frames are aligned to."""
 
     view: Pyramid
     T_odom_keyframe: np.ndarray  # [4, 4]
-    id: int  # ascending, given by the odometry: a camera's frame numbers may start again
-    submap: int = 0  # whose odometry frame T_odom_keyframe leads to
-    moved_mask: np.ndarray | None = None  # [H, W] bool at working resolution, as `watch` found it
-    ignore_mask: np.ndarray | None = None  # [H, W] bool: what of it was seen to move
-    dynamic_class_mask: np.ndarray | None = (
-        None  # [H, W] bool: what of it a detector knows to move by itself
-    )
-    stored_features: Features | None = None  # of a place; its image is smaller than what they saw
+    # Ascending number from odometry, independent of the camera's frame numbers, which may restart.
+    id: int
+    submap: int = 0  # Submap whose odometry frame T_odom_keyframe leads to.
+    # Pixels that have moved, [H, W] bool at working resolution; found by `segment_motion`.
+    moved_mask: np.ndarray | None = None
+    ignore_mask: np.ndarray | None = None  # `moved_mask` grown by `grow_mask`, [H, W] bool.
+    dynamic_class_mask: np.ndarray | None = None  # Objects of dynamic classes, [H, W] bool.
+    # ORB features of a keyframe record; they come from a larger image than `view`.
+    stored_features: Features | None = None
 
     @cached_property
     def reference(self) -> ReferencePoints:
-        """Without what moves."""
+        """Surface points that frames are aligned to, without the masked pixels."""
         masks = [mask for mask in (self.ignore_mask, self.dynamic_class_mask) if mask is not None]
         return build_reference(self.view, np.logical_or.reduce(masks) if masks else None)
 
     def features(self, config: FeatureConfig) -> Features:
-        """Detected when first asked for: most keyframes never are."""
+        """Return the ORB features.
+
+        They are detected on the first call and cached; most keyframes are never used for this.
+        """
         if self.stored_features is not None:
             return self.stored_features
         if "_features" not in self.__dict__:
@@ -98,7 +112,7 @@ class ReferenceKeyframe:
 
     @staticmethod
     def unpack(kept: dict[str, Any], config: PyramidConfig) -> "ReferenceKeyframe":
-        """The inverse of `pack`, under the same configuration."""
+        """Return the keyframe from its packed form, under the same configuration."""
         features = None if kept["features"] is None else Features(**kept["features"])
         view = build_pyramid(kept["gray"], kept["depth_m"], Camera.of(kept["camera"]), config)
         return ReferenceKeyframe(
@@ -120,13 +134,21 @@ def needs_keyframe(
     frames: int,
     config: KeyframeConfig,
 ) -> bool:
-    """Whether a view has left its keyframe far enough, `frames` frames after it."""
+    """Return whether a frame should become a keyframe.
+
+    Args:
+        T_keyframe_camera: Pose of the frame in the reference keyframe, [4, 4].
+        overlap: Visible fraction of the keyframe's surface.
+        median_depth_m: Median depth of the keyframe.
+        frames: Number of frames since the keyframe.
+        config: Settings.
+    """
     if frames < config.min_frames:
         return False
     translation = se3.distances(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angle(T_keyframe_camera)
     if max(translation, rotation_rad) < config.still_motion and overlap > config.still_overlap:
-        return False  # a robot that waits must not fill its map
+        return False  # A robot that stands still must not add keyframes.
     return frames >= config.max_frames or left_keyframe_view(
         T_keyframe_camera, overlap, median_depth_m, config
     )
@@ -135,7 +157,7 @@ def needs_keyframe(
 def left_keyframe_view(
     T_keyframe_camera: np.ndarray, overlap: float, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
-    """Whether a view is elsewhere than its keyframe, or shows too little of it."""
+    """Return whether a view is too far from its keyframe or shows too little of it."""
     is_elsewhere = bool(limit_ratios(T_keyframe_camera, median_depth_m, config) > 1)
     return is_elsewhere or overlap < config.min_overlap
 
@@ -143,7 +165,7 @@ def left_keyframe_view(
 def needs_mapping_keyframe(
     T_mapped_camera: np.ndarray, median_depth_m: float, config: KeyframeConfig
 ) -> bool:
-    """Whether a view has left the last one that was mapped far enough to support it."""
+    """Return whether a frame is far enough from the last mapped frame for a mapping keyframe."""
     left = float(limit_ratios(T_mapped_camera, median_depth_m, config))
     return left > config.supporting and config.supporting <= 1
 
@@ -151,8 +173,16 @@ def needs_mapping_keyframe(
 def limit_ratios(
     T_keyframe_camera: np.ndarray, median_depth_m: np.ndarray | float, config: KeyframeConfig
 ) -> np.ndarray:
-    """[...] of how far a camera may go before a keyframe is due, the larger share of translation
-    and rotation. T_keyframe_camera [..., 4, 4], median_depth_m [...]."""
+    """Return the motion from a keyframe relative to the limits of `KeyframeConfig`.
+
+    Args:
+        T_keyframe_camera: Poses of the camera in its keyframe, [..., 4, 4].
+        median_depth_m: Median depth of the keyframe, [...].
+        config: Settings.
+
+    Returns:
+        [...], the larger ratio of translation and rotation; above 1 a keyframe is needed.
+    """
     translation = se3.distances(T_keyframe_camera) / median_depth_m
     rotation_rad = se3.rotation_angles(T_keyframe_camera)
     return np.maximum(translation / config.max_translation, rotation_rad / config.max_rotation_rad)
@@ -161,8 +191,16 @@ def limit_ratios(
 def keyframe_dynamic_class_mask(
     view: Pyramid, boxes: Sequence[Box], config: DynamicClassConfig
 ) -> np.ndarray:
-    """`dynamic_class_mask` [H, W] bool at working resolution, of boxes in pixels of the whole
-    image."""
+    """Return the dynamic mask of detected boxes at working resolution.
+
+    Args:
+        view: Pyramid of the keyframe.
+        boxes: Detections, in pixels of the full-resolution image.
+        config: Settings.
+
+    Returns:
+        [H, W] bool; see `dynamic_class_mask`.
+    """
     finest = view.levels[0]
     times = view.camera.width / finest.camera.width
     smaller = [box.in_smaller(times) for box in boxes]

@@ -1,8 +1,8 @@
-"""Localization in a finished map, which stays as it is. Conventions: `ldo_service.geometry`.
+"""Localization in a finished map, which does not change. Conventions: `ldo_service.geometry`.
 
-Odometry follows the camera with keyframes of its own. At intervals the view is searched for in the
-keyframe database of the map, which places the odometry frame in it: T_map_odom. Odometry is
-continuous and T_map_odom takes the jumps (REP-105).
+Odometry tracks the camera with its own keyframes. At intervals, the localizer relocalizes the frame
+in the keyframe database of the map, which yields T_map_odom. Odometry is continuous; T_map_odom
+jumps (REP-105).
 """
 
 from collections.abc import Mapping
@@ -22,12 +22,12 @@ from .submaps import SubmapConfig, SubmapMatch
 from .tracking_quality import TrackingStatus
 from .tracking_result import KeyframeKind, TrackedFrame, TrackingResult, make_tracking_result
 
-MAP = -1  # Stands for the map in place of the number of a submap.
+MAP = -1  # The map, in place of the number of a submap.
 
 
 @dataclass(frozen=True, slots=True)
 class MapFix:
-    """Odometry frame in the map, and the last match that speaks for it."""
+    """Pose of the odometry frame in the map, and the last match that supports it."""
 
     submap: int = 0  # Submap of odometry.
     T_map_odom: np.ndarray | None = None  # [4, 4]; None before the camera is found.
@@ -35,27 +35,27 @@ class MapFix:
     frames_since_search: int = 0  # Frames since the last search.
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Return whether to search in this frame: in every one until the camera is found."""
+        """Return whether to search with this frame: with every one until the camera is found."""
         return self.T_map_odom is None or self.frames_since_search >= config.look_every
 
     def after(self, tracked: TrackedFrame) -> "MapFix":
-        """Return the fix one frame later; a new submap of odometry may be anywhere."""
+        """Return the fix after one more frame; a new submap of odometry has no fix yet."""
         if tracked.submap != self.submap:
             return MapFix(tracked.submap)
         return replace(self, frames_since_search=self.frames_since_search + 1)
 
     def with_search_result(self, look: SubmapMatch, config: SubmapConfig) -> "MapFix":
-        """Return the fix after a match, which is accepted when the last one agrees with it."""
+        """Return the fix after a match; the match is accepted if the previous one agrees."""
         is_confirmed = self.pending_match is not None and self.pending_match.is_consistent_with(
             look, config
         )
         T_map_odom = look.T_there_here if is_confirmed else self.T_map_odom
-        # A match that contradicts the last one is followed by another search soon.
+        # Search again soon after a match that is not confirmed.
         since = 0 if is_confirmed else config.look_every - config.confirm_after
         return replace(self, T_map_odom=T_map_odom, pending_match=look, frames_since_search=since)
 
     def pack(self) -> dict[str, Any]:
-        """The fix in arrays and plain values."""
+        """Return the fix as arrays and plain values."""
         return asdict(self)
 
     @staticmethod
@@ -66,7 +66,7 @@ class MapFix:
 
 
 class Localizer(Odometry):
-    """Odometry whose map is a finished one: its keyframes are tracked against and never mapped."""
+    """Odometry in a finished map; its own keyframes serve tracking and are not mapped."""
 
     def __init__(
         self,
@@ -92,25 +92,25 @@ class Localizer(Odometry):
         *,
         may_map: bool = True,  # noqa: ARG002
     ) -> TrackingResult:
-        """Track a frame, and find it in the map.
+        """Track a frame and localize it in the map.
 
         Args:
             frame: The frame.
             prior: The last poses of another odometry.
-            may_map: Not used: nothing is mapped.
+            may_map: Unused, since nothing is mapped.
 
         Returns:
             The pose of the frame in odometry and in the map; LOST until the camera is found in
-            the map. It has no reference, for the keyframes of the odometry are not in the map.
+            the map. It has no reference because the keyframes of odometry are not in the map.
         """
-        # Odometry with its own keyframes.
+        # Track in odometry with its own keyframes.
         reading = self._read(prior, frame)
         tracked = self._frames.track(frame, reading)
         if tracked.should_start_submap:
             tracked = self._frames.start_submap(frame)
         if tracked.needed_keyframe in (KeyframeKind.FIRST, KeyframeKind.REFERENCE):
             self._add_reference(frame, tracked)
-        # Odometry in the map.
+        # Localize odometry in the map.
         self._fix = self._fix.after(tracked)
         if tracked.status is TrackingStatus.OK and self._fix.is_search_due(self.config.submaps):
             self._search(frame, tracked)
@@ -127,7 +127,7 @@ class Localizer(Odometry):
         )
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the next frames depend on; see `Odometry.snapshot`."""
+        """Return the state that the next frames depend on; see `Odometry.snapshot`."""
         return {**super().snapshot(), "fix": self._fix.pack()}
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None = None) -> None:
@@ -136,7 +136,7 @@ class Localizer(Odometry):
         self._fix = MapFix.unpack(state["fix"])
 
     def _search(self, frame: RgbdFrame, tracked: TrackedFrame) -> None:
-        """Search the frame just tracked in the map, and update the fix."""
+        """Relocalize the frame just tracked in the map, and update the fix."""
         found = self._frames.relocalize_in(frame, self._places)
         if found is None:
             self._fix = replace(self._fix, frames_since_search=0)

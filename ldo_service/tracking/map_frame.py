@@ -1,8 +1,8 @@
-"""Odometry in the map: the map's frame at each keyframe. Conventions: `ldo_service.geometry`.
+"""Pose of the odometry frame in the map, by keyframe. Conventions: `ldo_service.geometry`.
 
-Odometry is continuous, and the optimizer moves keyframes in the map: T_map_odom takes the jumps
-(REP-105). It is read at the keyframe that a frame was aligned to, so that what was tracked against
-a keyframe moves with it.
+Odometry is continuous. The pose-graph optimizer moves keyframes in the map, and T_map_odom jumps
+accordingly (REP-105). T_map_odom of a frame is that of its reference keyframe, so that the frame
+moves with the keyframe.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -16,48 +16,50 @@ from ldo_service.geometry.keyframe_poses import KeyframePoses
 
 from .tracking_result import TrackedFrame
 
-RECENT_KEYFRAMES = 32  # Four windows of keyframe/new: the optimizer cannot be further behind.
+# Four credit windows of keyframe/new; the pose-graph optimizer cannot lag further behind.
+RECENT_KEYFRAMES = 32
 
 
 @dataclass(frozen=True, slots=True)
 class MapCorrection:
-    """Keyframe poses of one version of the pose graph, decoded when they are asked for."""
+    """Keyframe poses of one version of the pose graph, decoded on demand."""
 
     version: int
-    roots: Mapping[int, int]  # The oldest submap by each one that was merged with it.
-    # T_map_keyframe [4, 4] by id: of all keyframes, or of the given ones and the newest.
+    roots: Mapping[int, int]  # Oldest merged submap, by submap.
+    # Returns T_map_keyframe [4, 4] by id, for all keyframes or for the given ones and the newest.
     read_poses: Callable[[Iterable[int] | None], Mapping[int, np.ndarray]]
 
 
 class MapFrame:
-    """Odometry frame in the map, by keyframe.
+    """Pose of the odometry frame in the map, by keyframe.
 
-    It keeps the poses of the last keyframes and of the reference keyframe. Older keyframes are
-    looked up in the last correction.
+    It holds the poses of the last keyframes and of the reference keyframe. Poses of older keyframes
+    come from the last correction.
     """
 
     def __init__(self) -> None:
         self._poses = KeyframePoses()
         self._correction: MapCorrection | None = None
-        self._T_map: Mapping[int, np.ndarray] | None = None  # Of the correction, once decoded.
+        # Poses of all keyframes in the correction, once they are decoded.
+        self._T_map: Mapping[int, np.ndarray] | None = None
 
     def __contains__(self, keyframe: int | None) -> bool:
         return keyframe is not None and keyframe in self._poses
 
     @property
     def version(self) -> int:
-        """Version of the pose graph that the poses follow; 0 before the first correction."""
+        """Version of the pose graph that the poses come from; 0 before the first correction."""
         return self._poses.version
 
     @property
     def T_map_keyframe(self) -> Mapping[int, np.ndarray]:
-        """Poses [4, 4] by id, of all keyframes in the last correction."""
+        """Poses [4, 4] of all keyframes in the last correction, by id."""
         if self._T_map is None:
             self._T_map = {} if self._correction is None else self._correction.read_poses(None)
         return self._T_map
 
     def correct(self, correction: MapCorrection) -> bool:
-        """Follow a correction, and return whether it is newer than the last one."""
+        """Apply a correction if it is newer than the last one, and return whether it is."""
         is_newer = correction.version > self._poses.version
         if is_newer:
             self._remember(correction)
@@ -65,28 +67,28 @@ class MapFrame:
         return is_newer
 
     def T_map_odom(self, reference: int | None) -> np.ndarray:
-        """Return the odometry frame in the map [4, 4], as seen at a keyframe that is kept."""
+        """Return the odometry frame in the map [4, 4] at a keyframe that is held."""
         return np.eye(4) if reference is None else self._poses.T_map_odom(reference)
 
     def T_map_camera(self, tracked: TrackedFrame) -> np.ndarray | None:
-        """Return the camera in the map [4, 4], or None when its reference is not kept."""
+        """Return the camera pose in the map [4, 4], or None if its reference is not held."""
         if tracked.reference is None or tracked.reference not in self._poses:
             return None
         return self._poses[tracked.reference] @ tracked.T_reference_camera
 
     def root_of(self, submap: int) -> int:
-        """Return the oldest submap that the pose graph has merged with a submap."""
+        """Return the oldest submap that the pose graph has merged with `submap`."""
         return submap if self._correction is None else self._correction.roots.get(submap, submap)
 
     def add_keyframe(
         self, keyframe: int, tracked: TrackedFrame, next_reference: int | None
     ) -> None:
-        """Place the keyframe that was made of a frame.
+        """Add the keyframe that was made from a frame.
 
         Args:
             keyframe: Id of the new keyframe.
             tracked: The frame.
-            next_reference: The keyframe that the next frame is aligned to; it is kept too.
+            next_reference: The keyframe that the next frame is aligned to; its pose is kept too.
         """
         self._poses.add(
             keyframe,
@@ -98,9 +100,9 @@ class MapFrame:
         self._keep(keyframe, tracked.reference, next_reference)
 
     def place_reference(self, tracked: TrackedFrame) -> None:
-        """Place the known keyframe that a frame was aligned to, and that is the next reference.
+        """Add the known keyframe that a frame was aligned to and that is the next reference.
 
-        The pose is that of the last correction, or that of odometry when the correction lacks it.
+        Its pose comes from the last correction, or from odometry if the correction lacks it.
         """
         keyframe = tracked.reference
         if keyframe is None:
@@ -114,11 +116,11 @@ class MapFrame:
         self._keep(newest, keyframe)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the poses that are kept, without the correction."""
+        """Return the poses that are held, without the correction."""
         return self._poses.snapshot()
 
     def restore(self, state: Mapping[str, Any], correction: MapCorrection | None) -> None:
-        """Continue from a snapshot and from the last correction before it."""
+        """Continue from a snapshot and the last correction before it."""
         self._poses.restore(state)
         self._remember(correction)
 
@@ -126,7 +128,7 @@ class MapFrame:
         self._correction, self._T_map = correction, None
 
     def _keep(self, newest: int, *references: int | None) -> None:
-        """Forget all keyframes but references and those that the optimizer may not know yet."""
+        """Drop all keyframes except references and recent ones that no correction may hold yet."""
         self._poses.keep_only(self._needed(newest, references))
 
     def _needed(self, newest: int, references: tuple[int | None, ...]) -> Iterator[int]:

@@ -6,22 +6,23 @@ import numpy as np
 
 from ldo_service.geometry import se3
 
-MAX_STEPS = 4.0  # extrapolate over at most this many of the last interval
+MAX_STEPS = 4.0  # Maximum extrapolation, in multiples of the last frame interval.
 
 
 @dataclass(frozen=True, slots=True)
 class ConstantVelocity:
-    """The last trusted pose, and the twist that led to it over `interval_ns`."""
+    """Constant-velocity motion model: the last accepted pose and the motion before it."""
 
-    T_odom_camera: np.ndarray = field(default_factory=lambda: np.eye(4))
+    T_odom_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
+    # Motion to the last pose over `interval_ns`, [6]: rotation rad, then translation m.
     twist: np.ndarray = field(default_factory=lambda: np.zeros(6))
     interval_ns: int = 0
     stamp_ns: int = 0
 
     def predicted(self, stamp_ns: int) -> np.ndarray:
-        """T_odom_camera [4, 4] at a stamp: T * exp(twist * elapsed / interval).
+        """Return T_odom_camera [4, 4] at a stamp: T * exp(twist * elapsed / interval).
 
-        Frames without usable stamps count as one interval apart.
+        Without usable stamps, the elapsed time is one interval.
         """
         elapsed_ns = stamp_ns - self.stamp_ns
         timed = elapsed_ns > 0 and self.interval_ns > 0
@@ -29,19 +30,28 @@ class ConstantVelocity:
         return se3.orthonormalize(self.T_odom_camera @ se3.exp(self.twist * steps))
 
     def moved_to(self, T_odom_camera: np.ndarray, stamp_ns: int) -> "ConstantVelocity":
+        """Return the model at a new pose [4, 4], with the velocity from the last pose to it."""
         twist = se3.log(se3.inverse(self.T_odom_camera) @ T_odom_camera)
         return ConstantVelocity(T_odom_camera, twist, stamp_ns - self.stamp_ns, stamp_ns)
 
     def without_velocity(self) -> "ConstantVelocity":
-        """The same place without velocity: after a loss, nothing is known of it."""
+        """Return the model at the same pose without velocity, which is unknown after a loss."""
         return ConstantVelocity(self.T_odom_camera, np.zeros(6), 0, self.stamp_ns)
 
 
 def image_motion_rad(T: np.ndarray, median_depth_m: float) -> float:
-    """How far T [4, 4] shifts the image of a scene at the median depth, in rad."""
+    """Return the image motion of a transform: rotation plus translation over depth.
+
+    Args:
+        T: Relative camera pose, [4, 4].
+        median_depth_m: Median depth of the scene.
+
+    Returns:
+        Angle in rad by which T shifts the image at the median depth.
+    """
     return float(image_motions_rad(T, median_depth_m))
 
 
 def image_motions_rad(T: np.ndarray, median_depth_m: np.ndarray | float) -> np.ndarray:
-    """Shifts [...] in rad of T [..., 4, 4] at median_depth_m [...]."""
+    """Return the image motions [...] in rad of transforms T [..., 4, 4] at depths [...]."""
     return se3.rotation_angles(T) + se3.distances(T) / median_depth_m

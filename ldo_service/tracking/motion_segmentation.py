@@ -1,9 +1,10 @@
-"""What moves, told from what stays: pixels through which a keyframe saw farther.
+"""Motion segmentation by depth differences between a keyframe and an aligned frame.
 
-A keyframe and a frame see each other's surfaces. Where the frame shows something in front of what
-the keyframe measured along the same ray, it came since; where it shows something behind what the
-keyframe measured, that has gone since. Either contradicts a static world, whereas something farther
-than the keyframe's surface was merely hidden. Conventions: `ldo_service.geometry`.
+Both directions are compared. A point of the frame in front of the surface that the keyframe
+measured along the same ray has appeared since. A point of the keyframe in front of the surface that
+the frame measures there has disappeared since: the frame sees through it. Both contradict a static
+scene. A point of the frame behind the keyframe's surface does not: the surface hid it before.
+Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -17,23 +18,36 @@ from ldo_service.geometry import Camera, se3
 
 from .pyramid import DepthNoise, Level, Pyramid
 
-NOTHING_M = 1e4  # the depth of a pixel without one, for minima
+NOTHING_M = 1e4  # Depth of an unmeasured pixel in the computation of minima, meters.
 
 
 @dataclass(frozen=True, slots=True)
 class MotionSegmentationConfig:
-    is_on: bool = True  # False: the world is taken as static
-    level: int = 1  # of the pyramid that is looked at: 160 pixels wide
-    least_m: float = 0.06  # by which a surface must contradict: pose errors of a keyframe's length
-    sigmas: float = 4.0  # of the depth noise as the alignment estimated it, added to it
-    edge_px: int = 2  # a surface so near in the image may be the one that is met: outlines
-    least_share: float = 0.0015  # of the image in one piece: what is smaller is noise
-    streak_px: int = 5  # a piece must touch what contradicted in the frame before, so far around
-    spread_px: int = 8  # how far around what contradicts the same thing may reach: parts of it that
-    spread_m: float = 0.12  # are as far away, but were there already, or stand on the floor
-    rim_px: int = 1  # around all of it: mixed pixels
-    gone_frames: int = 2  # that must see through a keyframe's point before it is believed gone
-    renewed_share: float = 0.005  # of the image that has gone from a keyframe, to prepare it anew
+    """Settings of motion segmentation."""
+
+    is_on: bool = True  # False: the scene is assumed to be static.
+    level: int = 1  # Pyramid level of the comparison: 160 pixels wide.
+    # Minimum depth difference that contradicts a static scene. It covers pose errors within the
+    # range of a keyframe.
+    least_m: float = 0.06
+    # Multiple of the depth noise, as estimated by alignment, that is added to the minimum.
+    sigmas: float = 4.0
+    # Radius within which the nearest surface counts as the measured one; tolerates outlines that
+    # are slightly off.
+    edge_px: int = 2
+    # Minimum size of a connected region, fraction of the image; smaller regions are noise.
+    least_share: float = 0.0015
+    # A region must be within this distance of a contradicting pixel of the previous frame.
+    streak_px: int = 5
+    # The dynamic mask grows to pixels within this distance and this difference of depth. They
+    # belong to parts of the same object that were there already or stand on the floor.
+    spread_px: int = 8
+    spread_m: float = 0.12
+    rim_px: int = 1  # Margin around the grown mask, for mixed pixels.
+    # Frames that must see through a keyframe's point before it counts as moved.
+    gone_frames: int = 2
+    # Fraction of the keyframe that must have moved in addition before its mask is updated.
+    renewed_share: float = 0.005
 
     def __post_init__(self) -> None:
         lengths = (self.least_m, self.sigmas, self.spread_m, self.least_share, self.renewed_share)
@@ -54,48 +68,50 @@ class MotionSegmentationConfig:
                     "gone_frames",
                     "renewed_share",
                 )
-                + ": nothing negative, gone_frames within 1..255."
+                + ": none may be negative, and gone_frames must be within 1..255."
             )
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MotionEvidence:
-    """What is kept from frame to frame, at the level that is looked at.
+    """State of motion segmentation from frame to frame, at the compared pyramid level."""
 
-    contradicts  [h, w] bool, pixels of the last frame that contradict
-    gone         [h, w] uint8, in how many frames each point of the keyframe was seen through;
-                 None: in none yet
-    """
-
-    contradicts: np.ndarray
+    contradicts: np.ndarray  # Pixels of the last frame that contradict a static scene, [h, w] bool.
+    # Number of frames that saw through each point of the keyframe, [h, w] uint8; None if zero.
     gone: np.ndarray | None
 
     def fits(self, now: Level, then: Level) -> bool:
+        """Return whether the masks have the sizes of a frame and a keyframe."""
         is_of_keyframe = self.gone is None or self.gone.shape == then.depth_m.shape
         return is_of_keyframe and self.contradicts.shape == now.depth_m.shape
 
     def of_new_keyframe(self) -> "MotionEvidence":
+        """Return the evidence against a new keyframe, which no frame has seen through yet."""
         return MotionEvidence(self.contradicts, None)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class MotionMasks:
-    """dynamic_mask [H, W] bool of the frame and moved_mask [H, W] bool of the keyframe, both at
-    working resolution."""
+    """Result of motion segmentation, at working resolution."""
 
-    dynamic_mask: np.ndarray
-    moved_mask: np.ndarray
-    suspicion: MotionEvidence
+    dynamic_mask: np.ndarray  # Dynamic pixels of the frame, [H, W] bool.
+    moved_mask: np.ndarray  # Pixels of the keyframe that have moved, [H, W] bool.
+    suspicion: MotionEvidence  # State for the next frame.
 
     def has_large_change(self, known: np.ndarray | None, config: MotionSegmentationConfig) -> bool:
-        """Whether much has moved beside what is known, [H, W] bool; None: nothing is."""
+        """Return whether a large part of the keyframe has moved in addition to a known mask.
+
+        Args:
+            known: Known moved pixels, [H, W] bool; None for none.
+            config: Settings.
+        """
         news = self.moved_mask if known is None else self.moved_mask & ~known
         return bool(np.mean(news) > config.renewed_share)
 
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """An aligned frame and its keyframe, at the level that is looked at."""
+    """Aligned frame and its keyframe, at the compared pyramid level."""
 
     now: Level
     then: Level
@@ -105,19 +121,22 @@ class _Pair:
     config: MotionSegmentationConfig
 
     def limit_m(self, level: Level) -> np.ndarray:
-        """By how much [h, w] a surface may differ from a static one by errors alone."""
+        """Return the depth difference [h, w] in meters that errors of a static scene explain."""
         sigma_m = self.noise_scale * self.noise.sigma_m(level.depth_m)
         return self.config.least_m + self.config.sigmas * sigma_m
 
     def came(self, moved_mask: np.ndarray) -> np.ndarray:
-        """Pixels [h, w] bool of the frame in front of what the keyframe saw, or on what moved."""
+        """Return the pixels [h, w] bool of the frame that have appeared since the keyframe.
+
+        They lie in front of the keyframe's surface, or on its moved pixels and not behind them.
+        """
         ahead_m = depth_gap_m(self.now, self.then, self.T_then_now, self.config)
         limit_m = self.limit_m(self.now)
         on_moved = _lies_on(moved_mask, self.now, self.then, self.T_then_now)
         return (ahead_m > limit_m) | (on_moved & (ahead_m > -limit_m))
 
     def gone(self, before: MotionEvidence | None) -> np.ndarray:
-        """In how many frames [h, w] uint8 each point of the keyframe was seen through."""
+        """Return the number of frames [h, w] uint8 that saw through each point of the keyframe."""
         ahead_m = depth_gap_m(self.then, self.now, se3.inverse(self.T_then_now), self.config)
         through = _bytes(ahead_m > self.limit_m(self.then))
         count = cv2.morphologyEx(through, cv2.MORPH_OPEN, _square(1))
@@ -135,20 +154,26 @@ def segment_motion(
     config: MotionSegmentationConfig,
     noise: DepthNoise,
 ) -> MotionMasks:
-    """What moved between a keyframe and an aligned frame.
+    """Segment the pixels that moved between a keyframe and an aligned frame.
 
-    moved_mask          [H, W] bool of the keyframe as known so far, None: nothing
-    T_keyframe_camera  [4, 4]
-    noise_scale        of the depth noise, as the alignment estimated it
-    before             of the frame before, against this keyframe or, by `of_new_keyframe`, an
-                       older one; None: none
-    Deterministic. What has stood still since the keyframe was made is static here.
+    Objects that have not moved since the keyframe count as static. The result is deterministic.
+
+    Args:
+        view: Pyramid of the frame.
+        keyframe: Pyramid of the keyframe.
+        moved_mask: Known moved pixels of the keyframe, [H, W] bool; None for none.
+        T_keyframe_camera: Pose of the frame in the keyframe, [4, 4].
+        noise_scale: Factor on the depth noise, as estimated by alignment.
+        before: Evidence of the previous frame; after a change of the keyframe, that of
+            `MotionEvidence.of_new_keyframe`. None for none.
+        config: Settings.
+        noise: Depth noise of the camera.
     """
     now, then = _level(view, config), _level(keyframe, config)
     pair = _Pair(now, then, T_keyframe_camera, noise, noise_scale, config)
     known = resized(moved_mask, then.depth_m.shape)
     if before is not None and not before.fits(now, then):
-        before = None  # another camera
+        before = None  # The evidence is from another camera.
     came, gone = pair.came(known), pair.gone(before)
     dynamic_mask = _in_pieces(came, None if before is None else before.contradicts, config)
     known = known | _in_pieces(gone >= config.gone_frames, None, config)
@@ -162,10 +187,17 @@ def segment_motion(
 def grow_mask(
     dynamic_mask: np.ndarray, view: Pyramid, config: MotionSegmentationConfig
 ) -> np.ndarray:
-    """Pixels [H, W] bool to leave out: what moves, all that is as far away beside it, and a rim.
+    """Grow a dynamic mask to nearby pixels of similar depth, and by a margin.
 
-    dynamic_mask [H, W] bool at working resolution, from `segment_motion`. What this adds must
-    not be given to `segment_motion` again, or it would spread on from frame to frame.
+    The grown mask must not be an input of `segment_motion`, or it would grow from frame to frame.
+
+    Args:
+        dynamic_mask: Mask of `segment_motion`, [H, W] bool at working resolution.
+        view: Pyramid of the image of the mask.
+        config: Settings.
+
+    Returns:
+        Pixels to ignore, [H, W] bool.
     """
     if not dynamic_mask.any():
         return dynamic_mask
@@ -183,10 +215,19 @@ def grow_mask(
 def depth_gap_m(
     view: Level, other: Level, T_other_view: np.ndarray, config: MotionSegmentationConfig
 ) -> np.ndarray:
-    """By how much [h, w] each point of `view` lies in front of what `other` measured there.
+    """Return the distance by which each point of `view` lies in front of the surface of `other`.
 
-    The nearest surface within `edge_px` is taken for what was measured, so that outlines that are
-    a little off do not count. Negative: behind it; NaN: either measured nothing.
+    The nearest surface within `edge_px` counts as the surface of `other`, so that outlines that are
+    slightly off make no difference.
+
+    Args:
+        view: Level of the points.
+        other: Level of the surface.
+        T_other_view: Relative pose, [4, 4].
+        config: Settings.
+
+    Returns:
+        [h, w] meters; negative behind the surface, NaN if either has no measurement.
     """
     u, v, z = _seen_from(view, other, T_other_view)
     depth_m = np.where(other.depth_m > 0, other.depth_m, np.float32(NOTHING_M))
@@ -203,7 +244,7 @@ def depth_gap_m(
 def _lies_on(
     moved_mask: np.ndarray, view: Level, keyframe: Level, T_keyframe_view: np.ndarray
 ) -> np.ndarray:
-    """Pixels [h, w] bool of `view` whose ray meets what moved in the keyframe."""
+    """Return the pixels [h, w] bool of `view` that project onto moved pixels of the keyframe."""
     if not moved_mask.any():
         return np.zeros(view.depth_m.shape, bool)
     u, v, _ = _seen_from(view, keyframe, T_keyframe_view)
@@ -213,7 +254,11 @@ def _lies_on(
 def _seen_from(
     view: Level, other: Level, T_other_view: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where [h, w] the points of `view` lie in `other`: u, v in pixels and z in m."""
+    """Project the points of `view` into `other`.
+
+    Returns:
+        u, v in pixels and z in meters, [h, w] each.
+    """
     R, t = T_other_view[:3, :3], T_other_view[:3, 3].astype(np.float32)
     points = cv2.transform(_rays(view.camera), R.astype(np.float32)) * view.depth_m[..., None] + t
     z = points[..., 2]
@@ -232,12 +277,21 @@ def _rays(camera: Camera) -> np.ndarray:
 def _in_pieces(
     contradicts: np.ndarray, before: np.ndarray | None, config: MotionSegmentationConfig
 ) -> np.ndarray:
-    """Pieces [h, w] bool that are large enough and touch what contradicted before."""
+    """Return the connected regions that are large enough and touch those of the previous frame.
+
+    Args:
+        contradicts: Pixels that contradict a static scene, [h, w] bool.
+        before: The same of the previous frame; None to skip that test.
+        config: Settings.
+
+    Returns:
+        [h, w] bool.
+    """
     opened = cv2.morphologyEx(_bytes(contradicts), cv2.MORPH_OPEN, _square(1))
     closed = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _square(2))
     count, labels, figures, _ = cv2.connectedComponentsWithStats(closed)
     kept = figures[:, cv2.CC_STAT_AREA] >= max(config.least_share * labels.size, 1)
-    kept[0] = False  # what does not contradict
+    kept[0] = False  # Label 0 is the background.
     if before is not None:
         near = cv2.dilate(_bytes(before), _square(config.streak_px)) > 0
         kept &= np.bincount(labels[near], minlength=count) > 0
@@ -249,7 +303,7 @@ def _level(view: Pyramid, config: MotionSegmentationConfig) -> Level:
 
 
 def resized(mask: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-    """A mask [h, w] bool, None for nothing, in another size [H, W]."""
+    """Return a mask [h, w] bool resized to [H, W]; None counts as an empty mask."""
     if mask is None:
         return np.zeros(shape, bool)
     if mask.shape == shape:

@@ -1,4 +1,4 @@
-"""RGB-D odometry in one pass: the pose of each frame, and what becomes of the frame.
+"""RGB-D odometry in one pass: frame poses, keyframes and submaps.
 
     odometry = Odometry()
     for frame in frames:
@@ -6,17 +6,17 @@
         if result.keyframe is not None:
             ...  # Map the frame.
 
-A frame enters once. `Odometry.process` takes these steps, in this order:
+`Odometry.process` takes these steps for each frame, in this order:
 
-1. track: align the frame to the reference keyframe, or relocalize a lost camera (`FrameTracker`);
-2. start a submap when the camera has been lost for long;
-3. reuse a known keyframe as the reference when the map holds one that shows the same;
-4. make a keyframe, measure it from earlier ones, and merge two submaps when a view of another
-   one is confirmed;
-5. place odometry in the map, by the last correction of the pose graph (`MapFrame`).
+1. Align the frame to the reference keyframe, or relocalize a lost camera (`FrameTracker`).
+2. Start a submap if the camera has been lost for long.
+3. Reuse a known keyframe as the reference if the map has one that shows the same surface.
+4. Make a keyframe and measure its pose relative to earlier ones. Merge two submaps if a match with
+   another submap is confirmed.
+5. Compute the odometry frame in the map from the last correction of the pose graph (`MapFrame`).
 
-The caller decides whether a frame may be mapped: its consumers may have no credit. Without a new
-keyframe, tracking goes on against the same reference. Conventions: `ldo_service.geometry`.
+The caller decides whether a frame may be mapped, as its consumers may have no credit. Without a new
+keyframe, tracking continues against the same reference. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -49,7 +49,7 @@ from .window import RecentKeyframeCache, measure_against
 
 
 class Odometry:
-    """Odometry of one camera, and its place in the map.
+    """Odometry of one camera, with its pose in the map.
 
     Equal frames, priors and corrections give bitwise equal results.
     """
@@ -61,8 +61,8 @@ class Odometry:
 
         Args:
             config: Settings; the defaults when None.
-            T_base_camera: Camera on the robot, [4, 4]: a prior has the poses of its base. None
-                means that the base is the camera.
+            T_base_camera: Pose of the camera on the robot, [4, 4]; the poses of a prior are those
+                of the robot's base. None if the base is the camera.
         """
         self.config = config or OdometryConfig()
         self._T_base_camera = np.eye(4) if T_base_camera is None else T_base_camera
@@ -80,38 +80,40 @@ class Odometry:
     def process(
         self, frame: RgbdFrame, prior: OdometryPriorBuffer | None = None, *, may_map: bool = True
     ) -> TrackingResult:
-        """Track a frame, and decide what becomes of it. The frame may be blank.
+        """Track a frame, and make a keyframe of it if one is needed. The frame may be blank.
 
         Args:
             frame: The frame; it is not changed. A keyframe keeps its own copy of the depth.
-            prior: The last poses of another odometry. They are one more initial guess, and dead
-                reckoning while tracking is LOST. They make no tracking status better.
-            may_map: Allow a new keyframe or submap. What was needed in spite of False is in
+            prior: The last poses of another odometry. They are one more initial guess, and supply
+                dead reckoning while tracking is LOST. A frame is OK only if its images confirm
+                the pose.
+            may_map: Allow a new keyframe or submap. If False, a keyframe that was needed is in
                 `TrackingResult.denied_keyframe`.
 
         Returns:
             The pose of the frame, and the keyframe that was made of it, if any.
         """
-        # Pose against the reference keyframe; relocalization may have found another reference.
+        # Track against the reference keyframe; relocalization may find another reference.
         reading = self._read(prior, frame)
         tracked = self._frames.track(frame, reading)
         if tracked.pose_source == "relocalized" and tracked.reference not in self._map:
             self._map.place_reference(tracked)
-        # First keyframe of a new submap, after a long loss.
+        # Start a submap after a long loss.
         needed = KeyframeKind.FIRST if tracked.should_start_submap else tracked.needed_keyframe
         if tracked.should_start_submap and may_map:
             tracked = self._frames.start_submap(frame)
-        # Known keyframe, as the reference in place of a new one. The first one that is found gets
-        # a new keyframe measured from it, which connects it to the last references in the graph.
+        # Reuse a known keyframe as the reference instead of making a new one. After new keyframes,
+        # one more is made first and measured from the known one. It connects the known one to the
+        # last references in the pose graph.
         known, reused = self._find_reusable_keyframe(frame, tracked), None
         if known is not None and self._is_connected_to_map:
             tracked = self._switch_to_keyframe(known, tracked)
             needed, reused, known = None, known.place.id, None
-        # New keyframe, with what it is measured from; it may merge two submaps.
+        # Make a keyframe with its relative-pose measurements; it may merge two submaps.
         keyframe = None
         if needed is not None and may_map:
             keyframe = self._make_keyframe(frame, tracked, needed, known)
-        # Odometry in the map, as seen at the reference.
+        # Compute odometry in the map, at the reference.
         reference = tracked.reference
         if reference is None and keyframe is not None:
             reference = keyframe.id
@@ -130,18 +132,18 @@ class Odometry:
         )
 
     def correct(self, correction: MapCorrection) -> bool:
-        """Follow a correction of the pose graph: the map moves, and odometry does not.
+        """Apply a correction of the pose graph; poses in odometry do not change.
 
         Returns:
-            True when the correction is newer than the last one; an older one changes nothing.
+            True if the correction is newer than the last one; an older one changes nothing.
         """
         return self._map.correct(correction)
 
     def mask_dynamic_objects(self, keyframe: int, boxes: Sequence[Box]) -> None:
-        """Stop tracking against objects of dynamic classes in the reference keyframe.
+        """Mask objects of dynamic classes in the reference keyframe.
 
         Args:
-            keyframe: The keyframe of the boxes. Nothing changes when it is not the reference.
+            keyframe: The keyframe of the boxes. Nothing changes if it is not the reference.
             boxes: Detections, in pixels of the keyframe's image.
         """
         state = self._frames.state
@@ -157,12 +159,12 @@ class Odometry:
 
     @property
     def reference(self) -> int | None:
-        """Id of the keyframe that the next frame is aligned to; None before the first one."""
+        """Id of the reference keyframe of the next frame; None before the first keyframe."""
         keyframe = self._frames.state.keyframe
         return None if keyframe is None else keyframe.id
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all that the next frames depend on, except for the last correction.
+        """Return the state that the next frames depend on, except for the last correction.
 
         Returns:
             Arrays and plain values. `places`, `keyframe` and `mapping_keyframe` hold the same
@@ -182,7 +184,7 @@ class Odometry:
         self._earlier = RecentKeyframeCache(self.config.pyramid)
 
     def _read(self, prior: OdometryPriorBuffer | None, frame: RgbdFrame) -> PriorPose | None:
-        """Return the camera pose of the other odometry at the time of a frame, if it is known."""
+        """Return the camera pose of the prior at the time of a frame, or None if unknown."""
         if prior is None:
             return None
         return prior.at(frame.stamp_ns, self._T_base_camera, self.config.prior)
@@ -190,13 +192,13 @@ class Odometry:
     # --- keyframe reuse ---------------------------------------------------------------------------
     @property
     def _is_connected_to_map(self) -> bool:
-        """True when the reference is a known keyframe, or was measured from one."""
+        """True if the reference is a known keyframe or was measured from one."""
         return self._frames.state.origin is not KeyframeOrigin.NEW
 
     def _find_reusable_keyframe(
         self, frame: RgbdFrame, tracked: TrackedFrame
     ) -> ReusedKeyframe | None:
-        """Return a known keyframe that can replace the new one that a frame needs, if any."""
+        """Return a known keyframe that can replace the new one that a frame needs, or None."""
         is_needed = tracked.needed_keyframe is not None and tracked.submap_measurement is None
         if not is_needed or not self._frames.can_reuse_keyframes:
             return None
@@ -218,7 +220,8 @@ class Odometry:
     def _switch_to_keyframe(self, known: ReusedKeyframe, tracked: TrackedFrame) -> TrackedFrame:
         """Make a known keyframe the reference, and return the frame as tracked against it.
 
-        Odometry goes on where it is: the keyframe gets another pose in it, and its submap.
+        The pose of the frame in odometry does not change; the keyframe gets a new pose in odometry
+        and the current submap.
         """
         alignment = known.candidate.alignment
         T_odom_keyframe = se3.orthonormalize(
@@ -247,13 +250,14 @@ class Odometry:
         kind: KeyframeKind,
         known: ReusedKeyframe | None,
     ) -> NewKeyframe:
-        """Make a keyframe of a frame, measure it, and place it in the map.
+        """Make a keyframe of a frame, measure its relative poses, and add it to the map frame.
 
         Args:
             frame: The frame just tracked.
-            tracked: Its result.
-            kind: The keyframe that it needs. It becomes the reference when `known` is given.
-            known: A known keyframe to connect it to.
+            tracked: The tracking result of the frame.
+            kind: The kind of keyframe that the frame needs. A mapping keyframe becomes a reference
+                keyframe if `known` is given.
+            known: A known keyframe to connect the new keyframe to.
         """
         window: list[RelativePose] = []
         if kind is KeyframeKind.MAPPING and known is None:
@@ -273,12 +277,12 @@ class Odometry:
     def _add_reference(
         self, frame: RgbdFrame, tracked: TrackedFrame, *, is_connected: bool = False
     ) -> int:
-        """Track against the frame just tracked from now on, and return its id as a keyframe.
+        """Make the frame just tracked the reference keyframe, and return the id of the keyframe.
 
         Args:
             frame: The frame.
-            tracked: Its result, not LOST.
-            is_connected: The keyframe is measured from a known one, which may be reused then.
+            tracked: The tracking result of the frame, not LOST.
+            is_connected: The keyframe is measured from a known one, which allows keyframe reuse.
         """
         frames = self._frames
         if tracked.pose_source == "first":
@@ -295,9 +299,10 @@ class Odometry:
         return keyframe.id
 
     def _add_mapping_keyframe(self, frame: RgbdFrame, tracked: TrackedFrame) -> int:
-        """Keep the reference, and return the id of the frame as a keyframe that is only mapped.
+        """Make the frame a mapping keyframe, and return its id; the reference stays.
 
-        The last one is kept for relocalization: a lost camera may still see what it showed.
+        The last mapping keyframe is kept for relocalization, since a camera that is lost next is
+        near it.
         """
         keyframe = self._keyframe_of(frame, tracked)
         self._frames.state = replace(
@@ -309,7 +314,10 @@ class Odometry:
         return keyframe.id
 
     def _measure_window(self, tracked: TrackedFrame) -> list[RelativePose]:
-        """Measure the new reference keyframe from others than the frame's old reference."""
+        """Measure the new reference keyframe from earlier keyframes of its submap.
+
+        The previous reference is excluded: tracking has measured that relative pose already.
+        """
         keyframe = self._frames.state.keyframe
         if keyframe is None or tracked.reference is None:
             return []

@@ -1,8 +1,8 @@
-"""Where another odometry has the camera: that of wheels, an inertial unit or another camera.
+"""Odometry prior: poses from another odometry, such as wheels, an inertial unit or another camera.
 
-Its poses are in a frame of its own, so only the motion between two of them says anything, and only
-as a guess that the images then confirm or refute. A source that starts again or jumps begins a new
-stretch; between two stretches nothing is known. Conventions: `ldo_service.geometry`.
+The poses are in a frame of their own, so only the motion between two of them is used. It is an
+initial guess that the images then confirm or refute. A source that restarts or jumps begins a new
+session; the motion between two sessions is unknown. Conventions: `ldo_service.geometry`.
 """
 
 from bisect import bisect_left
@@ -16,22 +16,31 @@ import numpy as np
 from ldo_service.errors import ConfigError, named
 from ldo_service.geometry import se3
 
-KEPT = 64  # poses: a third of a second at 200 Hz, and frames are not tracked later than that
+# Number of poses kept: a third of a second at 200 Hz; frames are not tracked later than that.
+KEPT = 64
 
 
 @dataclass(frozen=True, slots=True)
 class PriorConfig:
-    max_gap_s: float = 0.25  # between two poses: over a longer time a path is no straight line
-    max_extrapolation_s: float = 0.05  # past the newest pose, at its velocity: 20 Hz, as wheels do
-    max_speed_m_per_s: float = 10.0  # between two poses; no camera is followed so fast: a jump
-    max_turn_rad_per_s: float = 20.0  # the same; a hand turns a camera at up to 10
-    restart_after_s: float = 1.0  # a stamp so much earlier is no jitter: the source began again
-    max_carried_s: float = 30.0  # since the last OK frame: 2 % of drift at 0.5 m/s are 30 cm then
+    """Settings of the odometry prior."""
+
+    # Maximum time between two poses for interpolation; a longer path is not straight.
+    max_gap_s: float = 0.25
+    # Maximum extrapolation past the newest pose at its velocity: one period of wheels at 20 Hz.
+    max_extrapolation_s: float = 0.05
+    # A faster motion between two poses is a jump: tracking follows no camera that fast.
+    max_speed_m_per_s: float = 10.0
+    # A faster turn between two poses is a jump; a hand turns a camera at up to 10 rad/s.
+    max_turn_rad_per_s: float = 20.0
+    # A stamp that is this much earlier is not jitter: the source has restarted.
+    restart_after_s: float = 1.0
+    # Maximum time of dead reckoning since the last OK frame: 2 % drift at 0.5 m/s are 30 cm then.
+    max_carried_s: float = 30.0
 
     def __post_init__(self) -> None:
         times_s = self.max_gap_s, self.restart_after_s, self.max_carried_s
         limits = *times_s, self.max_speed_m_per_s, self.max_turn_rad_per_s
-        if not all(limit > 0 for limit in limits):  # NaN fails too
+        if not all(limit > 0 for limit in limits):  # NaN fails too.
             raise ConfigError(
                 named(
                     self,
@@ -41,50 +50,55 @@ class PriorConfig:
                     "restart_after_s",
                     "max_carried_s",
                 )
-                + ": limits must be positive."
+                + " must be positive."
             )
         if not self.max_extrapolation_s >= 0:
             raise ConfigError(
-                f"max_extrapolation_s={self.max_extrapolation_s:g}: must be 0 or more."
+                f"max_extrapolation_s={self.max_extrapolation_s:g} must not be negative."
             )
 
 
 class PriorCheck(StrEnum):
-    """On a pose that was added."""
+    """Outcome of adding a pose to the buffer; the values complete a log line."""
 
     FOLLOWS = "follows the last one"
-    LATE = "has a stamp that is not after the last one's, and is left out"
-    BROKEN = "holds NaN or infinity, and is left out"
-    RESTARTED = "has a much earlier stamp: its source has started again"
+    LATE = "has a stamp that is not after the last one's, and is dropped"
+    BROKEN = "holds NaN or infinity, and is dropped"
+    RESTARTED = "has a much earlier stamp: its source has restarted"
     JUMPED = "is too far from the last one for the time between: its source has jumped"
 
 
 @dataclass(frozen=True, slots=True)
 class StampedPose:
+    """Pose of the robot's base in the frame of the prior at one time."""
+
     stamp_ns: int
     T_prior_base: np.ndarray  # [4, 4]
 
 
 @dataclass(frozen=True, slots=True)
 class PriorPose:
-    """Where the other odometry had the camera at one time. Compares within its stretch alone."""
+    """Camera pose of the prior at one time."""
 
     stamp_ns: int
     T_prior_camera: np.ndarray  # [4, 4]
-    session: int
+    session: int  # The relative motion of two poses is known within one session only.
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryPriorBuffer:
-    """The last poses of the current stretch, ascending."""
+    """Last poses of the current session."""
 
-    poses: tuple[StampedPose, ...] = ()
-    session: int = 0
+    poses: tuple[StampedPose, ...] = ()  # Ascending by stamp.
+    session: int = 0  # Number of the session; restarts and jumps increase it.
 
     def added(
         self, stamp_ns: int, T_prior_base: np.ndarray, config: PriorConfig
     ) -> tuple["OdometryPriorBuffer", PriorCheck]:
-        """With one pose [4, 4] more, if it can be used."""
+        """Return the buffer with a new pose [4, 4], and the outcome of the checks on the pose.
+
+        A late or invalid pose is dropped; a restart or a jump begins a new session.
+        """
         pose = StampedPose(stamp_ns, T_prior_base)
         verdict = self._judged(pose, config)
         if verdict in (PriorCheck.LATE, PriorCheck.BROKEN):
@@ -110,7 +124,13 @@ class OdometryPriorBuffer:
         return PriorCheck.FOLLOWS if is_possible else PriorCheck.JUMPED
 
     def at(self, stamp_ns: int, T_base_camera: np.ndarray, config: PriorConfig) -> PriorPose | None:
-        """The camera [4, 4] at a stamp; None where the poses do not reach it."""
+        """Return the camera pose at a stamp, or None if the poses do not reach it.
+
+        Args:
+            stamp_ns: Time of the frame.
+            T_base_camera: Pose of the camera on the robot, [4, 4].
+            config: Settings.
+        """
         following = bisect_left(self.poses, stamp_ns, key=attrgetter("stamp_ns"))
         if following < len(self.poses):
             T_prior_base = self._between(following, stamp_ns, config)
@@ -131,7 +151,11 @@ class OdometryPriorBuffer:
         return interpolated(before, after, stamp_ns) if is_near else None
 
     def _beyond(self, stamp_ns: int, config: PriorConfig) -> np.ndarray | None:
-        """Over a long base, where there is one: the noise of two near poses would be multiplied."""
+        """Return the pose [4, 4] extrapolated past the newest one, or None if it is too far.
+
+        The velocity comes from the earliest pose within `max_gap_s`: extrapolation from two poses
+        close in time would amplify their noise.
+        """
         if not self.poses:
             return None
         newest = self.poses[-1]
@@ -142,7 +166,7 @@ class OdometryPriorBuffer:
         return None if base is newest else interpolated(base, newest, stamp_ns)
 
     def pack(self) -> dict[str, Any]:
-        """Arrays and plain values."""
+        """Return arrays and plain values."""
         return {
             "stamps_ns": [pose.stamp_ns for pose in self.poses],
             "T_prior_base": [pose.T_prior_base for pose in self.poses],
@@ -151,12 +175,22 @@ class OdometryPriorBuffer:
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "OdometryPriorBuffer":
+        """Return the buffer from its packed form."""
         pairs = zip(kept["stamps_ns"], kept["T_prior_base"], strict=True)
         return OdometryPriorBuffer(tuple(StampedPose(*pair) for pair in pairs), kept["stretch"])
 
 
 def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
-    """T [4, 4] at a stamp: rotation on the shortest arc, translation on a line; also beyond b."""
+    """Interpolate between two poses: rotation on the shortest arc, translation on a line.
+
+    Args:
+        a: The earlier pose.
+        b: The later pose.
+        stamp_ns: Time of the result; after b, the motion is extrapolated.
+
+    Returns:
+        Pose [4, 4] of the base in the frame of the prior.
+    """
     share = (stamp_ns - a.stamp_ns) / (b.stamp_ns - a.stamp_ns)
     T = se3.interpolate(a.T_prior_base[None], b.T_prior_base[None], np.array([share]))
     return T[0]
@@ -164,15 +198,17 @@ def interpolated(a: StampedPose, b: StampedPose, stamp_ns: int) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class DeadReckoningStart:
-    """An OK frame: where it was taken, and where the other odometry had it."""
+    """Pose of the last OK frame in odometry and in the prior."""
 
     T_odom_camera: np.ndarray  # [4, 4]
-    reading: PriorPose
+    reading: PriorPose  # Pose of the same frame in the prior.
 
     def dead_reckon(self, now: PriorPose, config: PriorConfig) -> np.ndarray | None:
-        """T_odom_camera [4, 4] by the motion since; None over two stretches, or too long after.
+        """Return T_odom_camera [4, 4] by the motion of the prior since the OK frame.
 
         T_odom_now = T_odom_then * inverse(T_prior_then) * T_prior_now
+
+        Return None if the prior is in another session, or if the OK frame is too long ago.
         """
         then, elapsed_s = self.reading, (now.stamp_ns - self.reading.stamp_ns) * 1e-9
         if now.session != then.session or not 0 <= elapsed_s <= config.max_carried_s:
@@ -181,9 +217,10 @@ class DeadReckoningStart:
         return se3.orthonormalize(self.T_odom_camera @ moved)
 
     def pack(self) -> dict[str, Any]:
-        """Arrays and plain values."""
+        """Return arrays and plain values."""
         return asdict(self)
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "DeadReckoningStart":
+        """Return the start from its packed form."""
         return DeadReckoningStart(kept["T_odom_camera"], PriorPose(**kept["reading"]))

@@ -1,4 +1,4 @@
-"""Pose hypotheses of one frame: initial guesses, alignment from each, and the choice between them.
+"""Pose hypotheses of a frame: alignment from several initial guesses, and selection of one.
 
 Conventions: `ldo_service.geometry`.
 """
@@ -17,32 +17,43 @@ from .keyframes import ReferenceKeyframe
 from .motion import image_motion_rad
 from .pyramid import Pyramid
 
-# weight of points without a depth to compare with, against points with one
+# Weight of visible points relative to points that are also paired with a measured depth.
 PHOTOMETRIC_ONLY_WEIGHT = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class PoseHypothesisConfig:
-    agreement_rad: float = 0.06  # rotation plus parallax; 9 of 10 ORB-PnP poses erred 3 cm or less
-    rival_support: float = 0.5  # of the best: a pose with less is refuted by the images
+    """Settings of the selection between pose hypotheses."""
+
+    # Two poses agree within this rotation plus parallax; the error of 9 of 10 ORB-PnP poses was
+    # 3 cm or less.
+    agreement_rad: float = 0.06
+    # Fraction of the best support; the images refute a hypothesis with less.
+    rival_support: float = 0.5
 
     def __post_init__(self) -> None:
         if not (self.agreement_rad > 0 and 0 < self.rival_support <= 1):
-            raise ConfigError("agreement_rad must be positive, rival_support within 0..1.")
+            raise ConfigError(
+                f"agreement_rad={self.agreement_rad:g} must be positive, "
+                f"rival_support={self.rival_support:g} within 0..1."
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class PoseHypothesis:
-    """`is_confirmed` is None where there was no second opinion, or the images refute it."""
+    """Alignment of a frame from one initial guess, and the evidence for it."""
 
     alignment: Alignment
-    # "direct" from a motion guess, "prior" from another odometry, "features" from ORB, "gicp" from
-    # point clouds
+    # Initial guess: "direct" from constant velocity or rest, "prior" from another odometry,
+    # "features" from ORB, "gicp" from point clouds.
     pose_source: str
-    median_depth_m: float  # of the keyframe
+    median_depth_m: float  # Median depth of the keyframe.
+    # An independent estimate agrees (True) or contradicts (False); None without an independent
+    # estimate, or if the images refute it.
     is_confirmed: bool | None = None
-    hypothesis_spread_rad: float = 0.0  # from the farthest rival that the images support
-    agrees_with_prior: bool = False  # a prior has the camera there too
+    # Distance to the farthest other hypothesis that the images support.
+    hypothesis_spread_rad: float = 0.0
+    agrees_with_prior: bool = False  # The odometry prior predicts this pose.
 
 
 def align_hypothesis(
@@ -52,7 +63,15 @@ def align_hypothesis(
     pose_source: str,
     config: AlignConfig,
 ) -> PoseHypothesis:
-    """Direct alignment from a guessed pose."""
+    """Return the hypothesis of direct alignment from an initial guess.
+
+    Args:
+        keyframe: The keyframe.
+        view: Pyramid of the frame.
+        T_keyframe_camera: Initial guess, [4, 4].
+        pose_source: Name of the initial guess.
+        config: Settings.
+    """
     guess = se3.inverse(T_keyframe_camera)
     reference = keyframe.reference
     return PoseHypothesis(
@@ -67,10 +86,18 @@ def support(
     view: Pyramid,
     config: AlignConfig,
 ) -> float:
-    """How much of the reference a candidate explains at the least noise among the others, 0..1.
+    """Return the fraction of the reference that a hypothesis explains, 0..1.
 
-    Each estimated its own noise, and a wrong pose excuses itself with a large one: so all are
-    measured again with the smallest. Depth counts; colour alone counts little.
+    Each hypothesis has estimated its own noise, and a wrong pose inflates it. Therefore all are
+    evaluated again with the smallest noise among them. Points with a measured depth dominate;
+    color alone has a small weight.
+
+    Args:
+        candidate: The hypothesis.
+        others: All hypotheses of the frame, whose smallest noise is used.
+        keyframe: The keyframe.
+        view: Pyramid of the frame.
+        config: Settings.
     """
     own = candidate.alignment
     common = replace(
@@ -93,10 +120,16 @@ def select_hypothesis(
     config: PoseHypothesisConfig,
     align_config: AlignConfig,
 ) -> PoseHypothesis:
-    """The candidate with the most support, told whether a second opinion is with it.
+    """Select the hypothesis with the most support, and set whether it is confirmed.
 
-    T_keyframe_second [4, 4] is the camera's pose as features or shape have it, without a guess; the
-    candidate that started there is the last. None: neither found one.
+    Args:
+        candidates: The hypotheses. If T_keyframe_second is given, the last one started from it.
+        T_keyframe_second: Independent estimate of the pose by features or GICP, [4, 4]; None if
+            both failed.
+        keyframe: The keyframe.
+        view: Pyramid of the frame.
+        config: Settings.
+        align_config: Settings of alignment.
     """
     supports = [support(c, candidates, keyframe, view, align_config) for c in candidates]
     winner, least = int(np.argmax(supports)), config.rival_support * max(supports)
@@ -109,27 +142,28 @@ def select_hypothesis(
     if T_keyframe_second is None:
         return chosen
     *unled, led = apart
-    others = unled if winner == len(unled) else [led]  # two starts that met are two witnesses
+    # Two hypotheses that started apart and converged to one pose confirm each other.
+    others = unled if winner == len(unled) else [led]
     if min(*others, hypothesis_distance_rad(chosen, T_keyframe_second)) < config.agreement_rad:
         return replace(chosen, is_confirmed=True)
     return replace(chosen, is_confirmed=False if supports[-1] > least else None)
 
 
 def hypothesis_distance_rad(candidate: PoseHypothesis, T_keyframe_camera: np.ndarray) -> float:
-    """Rotation plus parallax, rad."""
+    """Return the distance of a hypothesis to a pose [4, 4]: rotation plus parallax, rad."""
     difference = se3.inverse(candidate.alignment.T_reference_camera) @ T_keyframe_camera
     return image_motion_rad(difference, candidate.median_depth_m)
 
 
 @dataclass(frozen=True, slots=True)
 class InitialGuessAligner:
-    """Alignments from each guess; knows nothing from frame to frame."""
+    """Alignment of a frame from its initial guesses; stateless."""
 
     align: AlignConfig
     features: FeatureConfig
     shape: GicpConfig
     candidates: PoseHypothesisConfig
-    large_motion: float  # image widths per frame
+    large_motion: float  # Image widths per frame.
 
     def align_from_guess(
         self,
@@ -138,6 +172,7 @@ class InitialGuessAligner:
         T_keyframe_camera: np.ndarray,
         pose_source: str = "direct",
     ) -> PoseHypothesis:
+        """Return the hypothesis of alignment from an initial guess T_keyframe_camera [4, 4]."""
         return align_hypothesis(keyframe, view, T_keyframe_camera, pose_source, self.align)
 
     def align_from_all_guesses(
@@ -148,10 +183,14 @@ class InitialGuessAligner:
         resting: np.ndarray,
         carried: np.ndarray | None,
     ) -> PoseHypothesis:
-        """The best of `predicted`, what rest leads to and what a second opinion leads to.
+        """Align from all other initial guesses, and return the best hypothesis.
 
-        resting  T_keyframe_camera [4, 4] of the frame before
-        carried  T_keyframe_camera [4, 4] by a prior; None: there is none
+        Args:
+            predicted: Hypothesis of the constant-velocity guess.
+            keyframe: The keyframe.
+            view: Pyramid of the frame.
+            resting: T_keyframe_camera [4, 4] of the previous frame, the guess of no motion.
+            carried: T_keyframe_camera [4, 4] by dead reckoning with the prior; None if unknown.
         """
         candidates = [predicted, self.align_from_guess(keyframe, view, resting)]
         if carried is not None:
@@ -166,7 +205,13 @@ class InitialGuessAligner:
         return replace(chosen, agrees_with_prior=is_expected)
 
     def is_large_step(self, candidate: PoseHypothesis, resting: np.ndarray, view: Pyramid) -> bool:
-        """Whether the image moved so far since the last frame that a minimum may be a wrong one."""
+        """Return whether the image moved so far that alignment may be in a wrong minimum.
+
+        Args:
+            candidate: Hypothesis of the frame.
+            resting: T_keyframe_camera [4, 4] of the previous frame.
+            view: Pyramid of the frame.
+        """
         moved = se3.inverse(resting) @ candidate.alignment.T_reference_camera
         shift_rad = image_motion_rad(moved, candidate.median_depth_m)
         return shift_rad * view.camera.fx > self.large_motion * view.camera.width
@@ -174,7 +219,11 @@ class InitialGuessAligner:
     def _independent_estimate(
         self, keyframe: ReferenceKeyframe, view: Pyramid, resting: np.ndarray
     ) -> tuple[np.ndarray | None, str]:
-        """T_keyframe_camera [4, 4] by features; by shape, where there is too little texture."""
+        """Return T_keyframe_camera [4, 4] by features, or by GICP with too few features.
+
+        Returns:
+            The pose, or None if both fail, and the name of the method.
+        """
         known, seen = keyframe.features(self.features), detect(view, self.features)
         pose = estimate_pose(known, seen, view.camera, self.features)
         if pose is not None:

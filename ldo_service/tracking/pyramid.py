@@ -1,9 +1,10 @@
-"""Frames made ready for alignment: image pyramids, reference points, and the noise of their depth.
+"""Image pyramids, reference points and depth noise for direct alignment.
 
-Pixel centers have one definition, `Camera.halved`: color and depth are halved by averaging 2x2
-blocks, so a pixel of the coarse image is centered on the corner that its four parents share.
-(`cv2.pyrDown` centers it on one of them; that half pixel doubles the trajectory's error.) What a
-frame is aligned to are the surface points of a keyframe. Conventions: `ldo_service.geometry`.
+Color and depth are halved by averaging 2x2 blocks, as `Camera.halved` expects. A pixel of the
+coarse image is centered on the corner that its four parents share. `cv2.pyrDown` centers it on one
+of the parents; that half pixel doubles the trajectory error. The reference points are the surface
+points of a keyframe to which frames are aligned.
+Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import dataclass
@@ -15,8 +16,9 @@ from ldo_service.errors import ConfigError
 from ldo_service.geometry import Camera, RgbdFrame
 from ldo_service.kernels import _align
 
-CLIPPED = 250  # grey levels: above, one of the colours is at its end and the others are near it
-ANY_DIFFERENCE = 1e3  # relative
+# Gray levels from here on are clipped: one color channel is saturated and the others nearly are.
+CLIPPED = 250
+ANY_DIFFERENCE = 1e3  # Relative tolerance that excludes no value.
 
 
 Intrinsics = tuple[float, float, float, float]
@@ -24,15 +26,23 @@ Intrinsics = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class PyramidConfig:
-    working_width_px: int = 320  # finest level: halved until below 1.5 times this
-    levels: int = 4  # 320, 160, 80, 40 pixels wide
-    smallest_side_px: int = 12  # coarser images hold too few pixels to align
-    depth_tolerance: float = 0.03  # relative; blocks across an edge keep the nearer surface
-    max_depth_m: float = 30.0  # no depth camera measures beyond; a stray 65 m must not count
+    """Settings of the image pyramid."""
+
+    # Width of the finest level: the image is halved until it is below 1.5 times this width.
+    working_width_px: int = 320
+    levels: int = 4  # Maximum number of levels: 320, 160, 80, 40 pixels wide.
+    smallest_side_px: int = 12  # Minimum side of a level; smaller images have too few pixels.
+    # Relative depth difference within a 2x2 block; blocks across an edge keep the nearer surface.
+    depth_tolerance: float = 0.03
+    # Larger depths are dropped: no depth camera measures beyond, and 65 m is a stray value.
+    max_depth_m: float = 30.0
 
     def __post_init__(self) -> None:
         if min(self.working_width_px, self.levels, self.smallest_side_px) < 1:
-            raise ConfigError("working_width_px, levels and smallest_side_px must be at least 1.")
+            raise ConfigError(
+                f"working_width_px={self.working_width_px}, levels={self.levels} and "
+                f"smallest_side_px={self.smallest_side_px} must be at least 1."
+            )
         if not self.max_depth_m > 0:
             raise ConfigError(f"max_depth_m={self.max_depth_m:g} must be positive.")
         if not 0 < self.depth_tolerance < 1:
@@ -41,63 +51,84 @@ class PyramidConfig:
 
 @dataclass(frozen=True, slots=True)
 class Level:
-    """texels [H, W, 4] float32: grey level, its gradients along u and v per pixel, depth in m."""
+    """One level of an image pyramid."""
 
+    # [H, W, 4] float32: gray level, its gradients along u and v per pixel, depth in meters.
     texels: np.ndarray
     camera: Camera
 
     @property
     def depth_m(self) -> np.ndarray:
+        """Depth [H, W] float32 in meters; 0 where unknown."""
         return self.texels[..., 3]
 
     @property
     def intrinsics(self) -> Intrinsics:
+        """Intrinsics (fx, fy, cx, cy) of the level in pixels."""
         return intrinsics(self.camera)
 
 
 @dataclass(frozen=True, slots=True)
 class Pyramid:
-    """A frame ready for alignment: its grey image and depth, and `levels`, the finest first.
+    """Image pyramid of a frame, with the full-resolution gray image and depth."""
 
-    gray [H, W] uint8; depth_m [H, W] float32.
-    """
-
-    gray: np.ndarray
-    depth_m: np.ndarray
-    camera: Camera
-    levels: tuple[Level, ...]
+    gray: np.ndarray  # [H, W] uint8.
+    depth_m: np.ndarray  # [H, W] float32 meters; 0 where unknown.
+    camera: Camera  # Intrinsics of the full-resolution image.
+    levels: tuple[Level, ...]  # The finest first.
 
 
 def intrinsics(camera: Camera) -> Intrinsics:
+    """Return (fx, fy, cx, cy) of a camera in pixels."""
     return camera.fx, camera.fy, camera.cx, camera.cy
 
 
 def mask_clipped(gray: np.ndarray) -> np.ndarray:
-    """Grey levels [H, W] float32 of an image uint8, 0 where it is clipped, black or white.
+    """Set overexposed pixels of a gray image to 0, the value of invalid pixels.
 
-    The brightness of a clipped pixel does not follow that of its surface: after a jump of the
-    exposure such pixels would speak against the right pose.
+    The brightness of a clipped pixel does not follow that of its surface. After a change of the
+    exposure, such pixels would increase the residual of the right pose.
+
+    Args:
+        gray: Image, [H, W] uint8.
+
+    Returns:
+        Gray levels, [H, W] float32; 0 where clipped, black or white.
     """
     return np.where(gray < CLIPPED, gray, 0).astype(np.float32)
 
 
 def halved_image(image: np.ndarray, least: int = 1) -> np.ndarray:
-    """Means [H//2, W//2] float32 of what 2x2 blocks of an image [H, W] float32 tell.
+    """Halve an image by averaging the valid pixels of 2x2 blocks.
 
-    A block in which fewer than `least` pixels tell says nothing.
+    Args:
+        image: Gray levels, [H, W] float32; 0 where invalid.
+        least: Minimum number of valid pixels in a block; blocks with fewer become 0.
+
+    Returns:
+        [H//2, W//2] float32.
     """
     return _align.halve(image, ANY_DIFFERENCE, least)
 
 
 def halved_depth(depth_m: np.ndarray, tolerance: float) -> np.ndarray:
-    """Means [H//2, W//2] of 2x2 blocks, over the pixels within `tolerance` of the nearest one."""
+    """Halve a depth image by averaging 2x2 blocks.
+
+    Args:
+        depth_m: Depth, [H, W] float32 meters; 0 where unknown.
+        tolerance: Relative depth difference to the nearest pixel of a block; farther pixels are
+            excluded from the mean.
+
+    Returns:
+        [H//2, W//2] float32 meters.
+    """
     return _align.halve(depth_m, tolerance)
 
 
 def build_pyramid(
     gray: np.ndarray, depth_m: np.ndarray, camera: Camera, config: PyramidConfig
 ) -> Pyramid:
-    """The pyramid of an image [H, W] uint8 and its depth [H, W] float32."""
+    """Build the pyramid of an image [H, W] uint8 and its depth [H, W] float32 in meters."""
     image, depth, scaled = mask_clipped(gray), np.ascontiguousarray(depth_m), camera
     levels: list[Level] = []
     while True:
@@ -106,17 +137,18 @@ def build_pyramid(
         smallest = min(scaled.width, scaled.height) // 2
         if len(levels) == config.levels or smallest < config.smallest_side_px:
             break
-        # At an edge of what is clipped, the rest of a block is darker than the whole: it has no
-        # part in the finest level. Coarser ones lead there, and would be left with too little.
+        # The valid pixels of a partly clipped block are darker than the whole block. Such blocks
+        # are excluded down to the finest level. Coarser levels, which only give the initial guess
+        # of finer ones, keep them: they would have too few pixels otherwise.
         image = halved_image(image, least=1 if levels else 4)
         depth, scaled = halved_depth(depth, config.depth_tolerance), scaled.halved()
-    if not levels:  # a strip: wide, and too low to be halved
+    if not levels:  # The image is wide and too low to be halved.
         levels.append(Level(_align.pack(image, depth, config.max_depth_m), scaled))
     return Pyramid(gray, depth_m, camera, tuple(levels))
 
 
 def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
-    """The pyramid of a frame's luminance and depth."""
+    """Build the pyramid of a frame from its luminance and depth."""
     return build_pyramid(
         cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), frame.depth_m, frame.camera, config
     )
@@ -126,8 +158,8 @@ def pyramid_of(frame: RgbdFrame, config: PyramidConfig) -> Pyramid:
 class DepthNoise:
     """Axial noise sigma(z) = floor + growth (z - nearest)^2 of a depth camera.
 
-    The defaults are the Kinect's (Nguyen, Izadi and Lovell 2012, equation 5). Only the shape of
-    the curve matters much: alignment estimates a factor on it from every frame's residuals.
+    The defaults are those of the Kinect (Nguyen, Izadi and Lovell 2012, equation 5). Mainly the
+    shape of the curve matters: alignment estimates a factor on it from the residuals of each frame.
     """
 
     floor_m: float = 0.0012
@@ -143,28 +175,31 @@ class DepthNoise:
 
     @property
     def coefficients(self) -> tuple[float, float, float]:
-        """(floor_m, growth_per_m, nearest_m)."""
+        """Coefficients (floor_m, growth_per_m, nearest_m) of the noise curve."""
         return self.floor_m, self.growth_per_m, self.nearest_m
 
     def sigma_m(self, depth_m: np.ndarray) -> np.ndarray:
-        """Standard deviation [...] of depth [...]."""
+        """Return the standard deviation [...] of depths [...], in meters."""
         return self.floor_m + self.growth_per_m * (depth_m - self.nearest_m) ** 2
 
 
 @dataclass(frozen=True, slots=True)
 class ReferencePoints:
-    """Points [7, N] float32 of each level, the finest first.
+    """Surface points of a keyframe that frames are aligned to."""
 
-    Rows: x y z in m in the reference camera, grey level, and a normal (0 0 0 where none).
-    `median_depth_m` is the scale of the scene, 1 where nothing was measured.
-    """
-
+    # Points of each level, the finest first, [7, N] float32. Rows: x y z in meters in the reference
+    # camera, gray level, and a normal (0 0 0 if unknown).
     points: tuple[np.ndarray, ...]
-    median_depth_m: float
+    median_depth_m: float  # Scale of the scene; 1 without any measured depth.
 
 
 def build_reference(pyramid: Pyramid, left_out: np.ndarray | None = None) -> ReferencePoints:
-    """Of the pixels with depth, but for those `left_out` [H, W] bool at working resolution."""
+    """Build reference points from the pixels with depth.
+
+    Args:
+        pyramid: Pyramid of the keyframe.
+        left_out: Pixels to ignore, [H, W] bool at working resolution.
+    """
     levels = (_without(level, left_out) for level in pyramid.levels)
     points = tuple(_level_points(level, i) for i, level in enumerate(levels))
     depth_m = points[0][2]
@@ -183,6 +218,6 @@ def _without(level: Level, left_out: np.ndarray | None) -> Level:
 
 def _level_points(level: Level, index: int) -> np.ndarray:
     smooth = np.asarray(cv2.medianBlur(np.ascontiguousarray(level.depth_m), 3), np.float32)
-    radius_px = max(1, 3 - index)  # about the same angle on every level
+    radius_px = max(1, 3 - index)  # The angle is about the same on each level.
     normals = _align.normals(smooth, level.intrinsics, radius_px)
     return _align.points(level.texels, normals, level.intrinsics)

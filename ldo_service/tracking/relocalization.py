@@ -1,20 +1,22 @@
-"""Relocalization of a lost camera and reuse of known keyframes. `ldo_service.geometry`.
+"""Relocalization of a lost camera, and keyframe reuse. Conventions: `ldo_service.geometry`.
 
-A lost frame is compared with the places whose thumbnails are most like it, and with a few more
-in turn, so that each frame costs the same however large the memory is, and every place has its
-chance. Where its fast features find nothing, SIFT looks at others in turn, and at the newest: it
-knows a room again from twice as far, for ten times the price. A place counts as found when features
-and images agree on it; no prediction speaks for it, so it is judged more strictly than tracking.
-Where two places a room apart both explain the view, neither does: the ends of a corridor may be
-furnished alike. Only places of one submap are compared so; where submaps are to each other is not
-known here.
+Relocalization. A lost frame is compared with the keyframe records of the most similar thumbnails,
+and with a few more in rotation. The cost per frame is thus independent of the size of the database,
+and every record is tried at some time. If ORB finds nothing, SIFT is tried on the newest records
+and on others in rotation. It matches at twice the distance and costs ten times as much.
 
-A camera that makes keyframes wherever it goes fills a map with time, not with rooms: a robot on
-its round would make the same ones every day. So once a map has many, a frame that is worth mapping
-looks first for a known keyframe that shows the same, and new ones are made where there is none. A
-known one counts only where the map already has the camera where the images put it: what has drifted
-must be mapped on, so that a loop can be closed and the map be mended. A camera that comes from what
-it has just mapped makes one keyframe more, measured from the known one: so the graph knows too.
+A record is accepted if features and direct alignment agree on the pose. The criteria are stricter
+than in tracking, since no predicted pose supports the result. A match is ambiguous and rejected if
+a place far away in the same submap explains the view almost as well. The two ends of a corridor,
+for example, may look alike. Places of different submaps are not compared, as their relative pose is
+unknown here.
+
+Keyframe reuse. A robot that repeats its route would make the same keyframes every day, so that the
+map grows with time instead of space. Once the map has many keyframes, a frame that needs a keyframe
+first searches for a known one that shows the same surface. A known keyframe is reused only if map
+and images agree on the pose of the camera. Otherwise odometry has drifted, and new keyframes are
+made so that a loop closure can correct the map. A camera that arrives from newly mapped surface
+makes one more keyframe, measured from the known one, which adds a factor to the pose graph.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,8 +50,8 @@ from .tracking_quality import (
     classify_tracking,
 )
 
-NEWEST = 2  # places that a lost camera is looked for at each time: it may not have gone far
-RANKED = 10  # times `alike`: places looked through for likely ones that are apart
+NEWEST = 2  # Number of newest records that each SIFT search includes: the camera may be near them.
+RANKED = 10  # Multiple of `alike`: number of ranked records to choose distinct candidates from.
 
 
 PosedPlace = tuple[KeyframeRecord, FeaturePose]
@@ -57,34 +59,53 @@ PosedPlace = tuple[KeyframeRecord, FeaturePose]
 
 @dataclass(frozen=True, slots=True)
 class RelocalizationConfig:
-    alike: int = 5  # places per lost frame, by thumbnail: the prototype's number
-    in_turn: int = 3  # further ones: 1000 places in 11 s at 30 Hz
-    across_scales: int = 8  # further ones in turn, by features that know near from far; 0: none
-    attempts: int = 3  # direct alignments per search, the best feature poses first
-    min_geometric_inliers: float = 0.85  # of the depths that meet a surface; the prototype's
-    agreement_rad: float = 0.06  # rotation plus parallax between feature pose and alignment
-    variety_rad: float = 0.25  # likely places nearer to each other than this are one
-    rival_inliers: float = 0.3  # of the best place's: a place with more that says
-    rival_rad: float = 1.0  # the camera is this far elsewhere (57 degrees, or a median depth)
-    familiar: float = 0.4  # correlation with the last trusted thumbnail; below, a WEAK frame shows
-    # another place. Kitchen, frame to frame: above 0.93; against another place: 97 % below
+    """Settings of relocalization."""
+
+    # Records per lost frame by similarity of the thumbnail, as in the prototype.
+    alike: int = 5
+    in_turn: int = 3  # Further records in rotation: 1000 records take 11 s at 30 Hz.
+    # Further records in rotation by SIFT, which matches across scales; 0: none.
+    across_scales: int = 8
+    attempts: int = 3  # Maximum direct alignments per search; the best feature poses first.
+    # Minimum fraction of inliers among the depths that meet a surface, as in the prototype.
+    min_geometric_inliers: float = 0.85
+    # Maximum rotation plus parallax between feature pose and alignment.
+    agreement_rad: float = 0.06
+    # Similar records within this distance of each other count as one candidate.
+    variety_rad: float = 0.25
+    # A match is ambiguous if another record far away has more than this fraction of its inliers.
+    rival_inliers: float = 0.3
+    # Minimum distance of the camera poses by both records: 57 degrees, or one median depth.
+    rival_rad: float = 1.0
+    # Minimum correlation with the thumbnail of the last OK frame; a WEAK frame below it shows
+    # another place. Kitchen, frame to frame: above 0.93; against another place: 97 % below.
+    familiar: float = 0.4
 
     def __post_init__(self) -> None:
         if self.alike < 0 or self.in_turn < 0 or self.alike + self.in_turn < 1:
-            raise ConfigError("alike and in_turn must not be negative, nor both 0.")
+            raise ConfigError(
+                named(self, "alike", "in_turn") + " must not be negative, and not both 0."
+            )
         if self.attempts < 1 or self.across_scales < 0:
-            raise ConfigError("attempts must be at least 1, across_scales at least 0.")
+            raise ConfigError(
+                named(self, "attempts", "across_scales")
+                + ": attempts must be at least 1, across_scales at least 0."
+            )
         if not min(self.agreement_rad, self.variety_rad, self.rival_rad) > 0:
-            raise ConfigError("agreement_rad, variety_rad and rival_rad must be positive.")
+            raise ConfigError(
+                named(self, "agreement_rad", "variety_rad", "rival_rad") + " must be positive."
+            )
         if not (0 <= self.min_geometric_inliers <= 1 and 0 <= self.rival_inliers <= 1):
-            raise ConfigError("min_geometric_inliers and rival_inliers must be within 0..1.")
+            raise ConfigError(
+                named(self, "min_geometric_inliers", "rival_inliers") + " must be within 0..1."
+            )
         if not 0 <= self.familiar <= 1:
-            raise ConfigError(f"familiar={self.familiar:g}: a correlation within 0..1.")
+            raise ConfigError(f"familiar={self.familiar:g} must be a correlation within 0..1.")
 
 
 @dataclass(frozen=True, slots=True)
 class Relocalizer:
-    """How a lost camera is found; knows nothing from frame to frame."""
+    """Relocalization of a frame in a keyframe database; stateless."""
 
     pyramid: PyramidConfig
     align: AlignConfig
@@ -101,10 +122,18 @@ class Relocalizer:
         *,
         is_lost: bool = True,
     ) -> tuple[ReferenceKeyframe, PoseHypothesis] | None:
-        """The keyframe that a view surely shows, and its alignment to it.
+        """Find a verified keyframe that a view shows.
 
-        `turn` counts the searches; it decides whose turn it is beside the likely places. A camera
-        that is not lost must not wait: it is looked for by what is fast alone.
+        Args:
+            view: Pyramid of the frame.
+            places: Keyframe database to search.
+            turn: Number of the search; it selects the records in rotation.
+            history: Residual history, for records without their own.
+            is_lost: Allow the slow search by SIFT, which would delay a camera that is not lost.
+
+        Returns:
+            The keyframe and the alignment of the view to it, or None if no keyframe is verified
+            or the match is ambiguous.
         """
         if not len(places):
             return None
@@ -122,13 +151,13 @@ class Relocalizer:
         return sure[1]
 
     def resembles_last_trusted(self, view: Pyramid, trusted: np.ndarray) -> bool:
-        """Whether a view looks like the thumbnail [300] of the last trusted one."""
+        """Return whether a view resembles the thumbnail [300] of the last OK frame."""
         seen, trusted = make_thumbnail(view).astype(float), trusted.astype(float)
         scale = np.linalg.norm(seen) * np.linalg.norm(trusted)
         return bool(seen @ trusted >= self.config.familiar * scale > 0)
 
     def _distinct_candidates(self, ranked: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
-        """The first of each neighbourhood."""
+        """Return the most similar records that are distinct places, at most `alike`."""
         likely: list[KeyframeRecord] = []
         for place in islice(ranked, RANKED * self.config.alike):
             if len(likely) == self.config.alike:
@@ -138,14 +167,17 @@ class Relocalizer:
         return likely
 
     def _poses(self, view: Pyramid, places: Iterable[KeyframeRecord]) -> list[PosedPlace]:
-        """Places with a feature pose, most inliers first."""
+        """Return the records with a pose by ORB features, most inliers first."""
         seen = detect(view, self.features)
         return self._posed(view, seen, ((place, place.features) for place in places))
 
     def _poses_across_scales(
         self, view: Pyramid, places: Iterable[KeyframeRecord]
     ) -> list[PosedPlace]:
-        """Likewise, of a camera that has come much nearer or gone farther."""
+        """Return the records with a pose by SIFT features, most inliers first.
+
+        SIFT also matches a camera that is much nearer or farther than the record.
+        """
         config = self.features
         image = view.gray, view.depth_m, view.camera
         seen = detect_sift(*image, config.count_across_scales, config)
@@ -162,7 +194,7 @@ class Relocalizer:
     def _first_verified(
         self, view: Pyramid, poses: Sequence[PosedPlace], history: ResidualHistory
     ) -> tuple[PosedPlace, tuple[ReferenceKeyframe, PoseHypothesis]] | None:
-        """The first that the images confirm."""
+        """Return the first record that direct alignment verifies, with the alignment."""
         for place, pose in poses[: self.config.attempts]:
             keyframe = place.keyframe(self.pyramid)
             guess = se3.inverse(pose.T_camera_reference)
@@ -183,7 +215,7 @@ class Relocalizer:
     def _is_ambiguous(
         self, place: KeyframeRecord, pose: FeaturePose, poses: Iterable[PosedPlace]
     ) -> bool:
-        """Whether another place explains the view nearly as well, from far elsewhere."""
+        """Return whether a record of another place explains the view almost as well."""
         T_odom_camera = _seen_from(place, pose)
         return any(
             other.submap == place.submap
@@ -197,7 +229,7 @@ class Relocalizer:
 
 
 def _due(places: KeyframeDatabase, turn: int, count: int) -> list[KeyframeRecord]:
-    """Those whose turn it is: `count` each time, and from the first again."""
+    """Return the records of one turn: `count` records in rotation through the database."""
     numbers = range(turn * count, (turn + 1) * count)
     return [places.all[number % len(places)] for number in numbers]
 
@@ -207,7 +239,7 @@ def _each_once(*groups: Iterable[KeyframeRecord]) -> list[KeyframeRecord]:
 
 
 def _seen_from(place: KeyframeRecord, pose: FeaturePose) -> np.ndarray:
-    """T_odom_camera [4, 4]."""
+    """Return T_odom_camera [4, 4] of a feature pose against a record."""
     return place.T_odom_keyframe @ se3.inverse(pose.T_camera_reference)
 
 
@@ -217,17 +249,22 @@ def _is_apart(place: KeyframeRecord, other: KeyframeRecord, limit_rad: float) ->
     return is_far or place.submap != other.submap
 
 
-Nearby = tuple[KeyframeRecord, np.ndarray]  # a place, and T_place_camera [4, 4] as the map has it
+Nearby = tuple[KeyframeRecord, np.ndarray]  # A record, and T_keyframe_camera [4, 4] by the map.
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReuseConfig:
-    after: int = 1500  # keyframes, supporting ones too: from then on known ones are looked for; 0:
-    # never. Until then the map gains more by new views than they take, a few kB each
-    tries: int = 2  # places per frame, the nearest first: 8 ms each at 640x480
-    agreement_rad: float = 0.03  # rotation plus parallax between map and images, 3 % of the median
-    # depth; above, keyframes are made until a loop is closed
-    min_geometric_inliers: float = 0.85  # of the depths that meet a surface, as when relocalised
+    """Settings of keyframe reuse."""
+
+    # Number of keyframes, mapping keyframes included, from which known ones are reused; 0: never.
+    # Below it, the map gains more by new views than they cost, a few kB each.
+    after: int = 1500
+    tries: int = 2  # Maximum records per frame, the nearest first; 8 ms each at 640x480.
+    # Maximum rotation plus parallax between map and images, 3 % of the median depth; above it, new
+    # keyframes are made until a loop closure.
+    agreement_rad: float = 0.03
+    # Minimum fraction of inliers among the depths that meet a surface, as in relocalization.
+    min_geometric_inliers: float = 0.85
 
     def __post_init__(self) -> None:
         if self.after < 0 or self.tries < 1:
@@ -243,21 +280,21 @@ class KeyframeReuseConfig:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ReusedKeyframe:
-    """A place, the keyframe that it was, and the alignment of a view to that."""
+    """Known keyframe that can be reused as the reference."""
 
-    place: KeyframeRecord
-    keyframe: ReferenceKeyframe
-    candidate: PoseHypothesis
+    place: KeyframeRecord  # Record of the keyframe.
+    keyframe: ReferenceKeyframe  # The keyframe, rebuilt from the record.
+    candidate: PoseHypothesis  # Alignment of the frame to the keyframe.
 
     def measures(self, keyframe: int) -> RelativePose:
-        """The pose of the keyframe that the view was made."""
+        """Return the relative-pose measurement of the keyframe that the frame became."""
         seen = self.candidate.alignment
         return RelativePose(self.place.id, keyframe, seen.T_reference_camera, seen.information)
 
 
 @dataclass(frozen=True, slots=True)
 class KeyframeReuse:
-    """How a known keyframe is found to go on against; knows nothing from frame to frame."""
+    """Search for a known keyframe to reuse as the reference; stateless."""
 
     pyramid: PyramidConfig
     align: AlignConfig
@@ -268,9 +305,15 @@ class KeyframeReuse:
     def find(
         self, view: Pyramid, near: Sequence[Nearby], history: ResidualHistory
     ) -> ReusedKeyframe | None:
-        """The first that a view surely shows, from where the map has the camera, and has not left.
+        """Find the first keyframe that a view verifiably shows at the pose that the map predicts.
 
-        history  noise of the frames before: the next ones are judged by it too
+        Args:
+            view: Pyramid of the frame.
+            near: Records with the poses predicted by the map, the nearest first.
+            history: Residual history of tracking, which the next frames are compared with too.
+
+        Returns:
+            The keyframe, or None if none is verified or the view is too far from all of them.
         """
         for place, T_place_camera in near[: self.config.tries]:
             keyframe = place.keyframe(self.pyramid)
@@ -306,9 +349,13 @@ def find_nearby_keyframes(
     T_map_camera: np.ndarray,
     config: KeyframeConfig,
 ) -> list[Nearby]:
-    """The places that a camera at T_map_camera [4, 4] has not left, the nearest first.
+    """Return the records within the keyframe limits of a camera pose, the nearest first.
 
-    T_map_keyframe  [4, 4] by id; places that the map does not have are left out
+    Args:
+        places: Records to choose from; those without a pose in the map are skipped.
+        T_map_keyframe: Poses [4, 4] of the keyframes in the map, by id.
+        T_map_camera: Pose of the camera in the map, [4, 4].
+        config: The limits.
     """
     known = [place for place in places if place.id in T_map_keyframe]
     if not known:

@@ -1,4 +1,4 @@
-"""What the odometry remembers from frame to frame, and its form on disk."""
+"""State of odometry between frames, and its packed form for checkpoints."""
 
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
@@ -17,37 +17,38 @@ from .tracking_quality import ResidualHistory, TrackingStatus
 
 
 class KeyframeOrigin(StrEnum):
-    """Of the keyframe tracked against, where a map holds many."""
+    """Origin of the reference keyframe, which matters for keyframe reuse."""
 
     NEW = "new"
-    TIED = "tied"  # new, and measured from a known one
-    KNOWN = "known"  # made long before, with all that it shows
+    TIED = "tied"  # New, and measured from a known keyframe.
+    KNOWN = "known"  # Made long before; its surface is mapped.
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryState:
-    places: KeyframeDatabase = field(default_factory=KeyframeDatabase)  # for relocalisation
-    keyframe: ReferenceKeyframe | None = None  # the one tracked against, usually the newest
-    mapping_keyframe: KeyframeRecord | None = (
-        None  # the last frame mapped, where it is none of these
-    )
+    """State that the next frame depends on."""
+
+    # Keyframe records for relocalization and keyframe reuse.
+    places: KeyframeDatabase = field(default_factory=KeyframeDatabase)
+    keyframe: ReferenceKeyframe | None = None  # The reference keyframe, usually the newest one.
+    # Record of the last mapping keyframe, if it is newer than the reference keyframe.
+    mapping_keyframe: KeyframeRecord | None = None
     motion: ConstantVelocity = field(default_factory=ConstantVelocity)
     history: ResidualHistory = field(default_factory=ResidualHistory)
     status: TrackingStatus = TrackingStatus.OK
     frames_since_keyframe: int = 0
-    next_id: int = 0  # of the next keyframe
+    next_id: int = 0  # Id of the next keyframe.
     origin: KeyframeOrigin = KeyframeOrigin.NEW
-    trusted_thumbnail: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))  # thumbnail
-    relocalization_count: int = 0  # frames that were looked for among the places
+    # Thumbnail of the last OK frame, [300] int8; empty before it.
+    trusted_thumbnail: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int8))
+    relocalization_count: int = 0  # Number of searches in the keyframe database.
     submaps: Submaps = field(default_factory=Submaps)
-    T_odom_last_mapped: np.ndarray = field(
-        default_factory=lambda: np.eye(4)
-    )  # the last frame mapped
-    dynamic_mask: np.ndarray | None = None  # [H, W] bool of the last frame, at working resolution
+    # Pose of the last mapped frame, [4, 4].
+    T_odom_last_mapped: np.ndarray = field(default_factory=lambda: np.eye(4))
+    dynamic_mask: np.ndarray | None = None  # Last frame, [H, W] bool at working resolution.
     motion_evidence: MotionEvidence | None = None
-    dead_reckoning_start: DeadReckoningStart | None = (
-        None  # the last OK frame, where a prior says where it was too
-    )
+    # The last OK frame, if the prior had a pose at its time.
+    dead_reckoning_start: DeadReckoningStart | None = None
 
     def with_new(
         self,
@@ -57,7 +58,14 @@ class OdometryState:
         *,
         is_tied: bool,
     ) -> "OdometryState":
-        """Tracking against the frame just tracked, which is a keyframe and a place from now on."""
+        """Return the state with the frame just tracked as the new reference keyframe.
+
+        Args:
+            keyframe: The frame as a keyframe.
+            place: Its record, which is added to the database.
+            config: Settings of the database.
+            is_tied: The keyframe is measured from a known one.
+        """
         return replace(
             self._against(keyframe, keyframe.T_odom_keyframe),
             places=self.places.with_record(place, config),
@@ -68,7 +76,13 @@ class OdometryState:
     def with_reused_keyframe(
         self, keyframe: ReferenceKeyframe, place: KeyframeRecord, T_odom_camera: np.ndarray
     ) -> "OdometryState":
-        """Tracking against a keyframe of old, seen from T_odom_camera [4, 4] by the last frame."""
+        """Return the state with a known keyframe as the reference.
+
+        Args:
+            keyframe: The known keyframe.
+            place: Its record, which becomes the newest of the database.
+            T_odom_camera: Pose of the frame just tracked, [4, 4].
+        """
         return replace(
             self._against(keyframe, T_odom_camera),
             places=self.places.with_reused(place),
@@ -88,7 +102,10 @@ class OdometryState:
 
 
 def pack(state: OdometryState) -> dict[str, Any]:
-    """Arrays and plain values. The keyframe is grey image, depth and pose: the rest follows."""
+    """Return arrays and plain values.
+
+    A keyframe is packed as gray image, depth, pose and masks; `unpack` computes the rest.
+    """
     return {
         "places": [place.pack() for place in state.places.all],
         "keyframe": None if state.keyframe is None else state.keyframe.pack(),
@@ -111,7 +128,7 @@ def pack(state: OdometryState) -> dict[str, Any]:
 
 
 def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
-    """The inverse of `pack`, under the same configuration."""
+    """Return the state from its packed form, under the same configuration."""
     keyframe, suspicion, dynamic_mask = (
         values["keyframe"],
         values["suspicion"],
@@ -143,7 +160,7 @@ def unpack(values: dict[str, Any], config: PyramidConfig) -> OdometryState:
 
 
 def _bits(mask: np.ndarray | None) -> dict[str, Any] | None:
-    """A mask [H, W] bool in an eighth of its size: it is written at each frame."""
+    """Pack a mask [H, W] bool to an eighth of its size, since it is written with each frame."""
     return None if mask is None else {"bits": np.packbits(mask), "shape": list(mask.shape)}
 
 

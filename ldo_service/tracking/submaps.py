@@ -1,9 +1,9 @@
-"""Stretches of tracking without a loss, and which of them are known to meet.
+"""Submaps: stretches of tracking without a loss, and their merging.
 
-A camera that stays lost begins a new submap, with a first keyframe of its own. Where that is
-among the older ones is found out when keyframes of another submap are recognised, twice and to
-the same effect, in views that share nothing: a corridor's ends may look alike, and a false join
-would fold two places into one. Conventions: `ldo_service.geometry`.
+A camera that stays lost starts a new submap with its own first keyframe. A submap is merged with
+another one after two consistent matches with keyframes of the other one, in views far apart. A
+single match may be a perceptual alias, such as the other end of a corridor. A false merge would put
+two places into one. Conventions: `ldo_service.geometry`.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -22,97 +22,112 @@ from .motion import image_motion_rad
 
 @dataclass(frozen=True, slots=True)
 class SubmapConfig:
-    begin_after_s: float = 3.0  # LOST without a break: ORB-SLAM3's patience; 0: never
-    # Frames between looks for the other submaps: twice a second at 30 Hz. A prime, so that it
-    # does not meet a frame held out from mapping each time.
+    """Settings of submaps."""
+
+    # Uninterrupted LOST time before a new submap starts, as in ORB-SLAM3; 0: never.
+    begin_after_s: float = 3.0
+    # Frames between searches of the other submaps: twice a second at 30 Hz. A prime number, so that
+    # the searches do not coincide with the frames that are held out from mapping.
     look_every: int = 17
-    confirm_after: int = 7  # frames between looks while a find is to be confirmed
-    confirm_rad: float = 0.06  # rotation plus parallax between what the two looks say
-    # How far the camera has turned from one to the other, plus a third of the parallax: as wide as
-    # a depth camera sees. Lower values join sooner and believe twins.
+    confirm_after: int = 7  # Frames between searches while a match is pending.
+    confirm_rad: float = 0.06  # Maximum rotation plus parallax between two consistent matches.
+    # Minimum rotation plus a third of the parallax between the views of two matches: the field of
+    # view of a depth camera. Lower values merge sooner and accept perceptual aliases.
     confirm_apart_rad: float = 1.0
-    misses: int = 3  # looks in a row that find nothing before a find is forgotten
+    misses: int = 3  # Maximum searches in a row without a match before a pending match is dropped.
 
     def __post_init__(self) -> None:
         if not self.begin_after_s >= 0 or min(self.look_every, self.confirm_after) < 1:
             raise ConfigError(
-                "begin_after_s must be at least 0, look_every and confirm_after at least 1."
+                f"begin_after_s={self.begin_after_s:g} must be at least 0, "
+                f"look_every={self.look_every} and confirm_after={self.confirm_after} at least 1."
             )
         if not (self.confirm_rad > 0 and self.confirm_apart_rad >= 0 and self.misses >= 0):
             raise ConfigError(
-                "confirm_rad must be positive, confirm_apart_rad and misses at least 0."
+                f"confirm_rad={self.confirm_rad:g} must be positive, "
+                f"confirm_apart_rad={self.confirm_apart_rad:g} and misses={self.misses} at least 0."
             )
 
 
 @dataclass(frozen=True, slots=True)
 class SubmapMeasurement:
-    """The camera as a keyframe of another submap sees it; `information` as in `TrackingResult`."""
+    """Pose of the camera relative to a keyframe of another submap."""
 
     keyframe: int
-    submap: int  # of the keyframe
+    submap: int  # Submap of the keyframe.
     T_keyframe_camera: np.ndarray  # [4, 4]
-    information: np.ndarray  # [6, 6]
+    information: np.ndarray  # [6, 6], as in `TrackingResult`.
 
     @staticmethod
     def of(keyframe: ReferenceKeyframe, alignment: Alignment) -> "SubmapMeasurement":
-        """By the alignment of the camera's frame to that keyframe."""
+        """Return the measurement of an alignment of the frame to a keyframe."""
         T_keyframe_camera = alignment.T_reference_camera
         return SubmapMeasurement(
             keyframe.id, keyframe.submap, T_keyframe_camera, alignment.information
         )
 
     def measures(self, keyframe: int) -> RelativePose:
-        """The pose of the keyframe that the camera's frame was made."""
+        """Return the relative-pose measurement of the keyframe that the frame became."""
         return RelativePose(self.keyframe, keyframe, self.T_keyframe_camera, self.information)
 
 
 @dataclass(frozen=True, slots=True)
 class SubmapMatch:
-    """One submap as seen from another: where their odometry frames are to each other."""
+    """Relative pose of the odometry frames of two submaps, from one relocalized frame."""
 
-    here: int
-    there: int
+    here: int  # Submap of the frame.
+    there: int  # Submap of the keyframe.
     T_there_here: np.ndarray  # [4, 4]
-    T_here_camera: np.ndarray  # [4, 4], of the view
-    median_depth_m: float  # of what was recognised
+    T_here_camera: np.ndarray  # Pose of the frame, [4, 4].
+    median_depth_m: float  # Median depth of the keyframe.
 
     @staticmethod
     def at(
         keyframe: ReferenceKeyframe, alignment: Alignment, here: int, T_here_camera: np.ndarray
     ) -> "SubmapMatch":
-        """By the alignment of a frame at T_here_camera [4, 4] to a keyframe of another submap."""
+        """Return the match of an alignment to a keyframe of another submap.
+
+        Args:
+            keyframe: The keyframe.
+            alignment: Alignment of the frame to the keyframe.
+            here: Submap of the frame.
+            T_here_camera: Pose of the frame in odometry, [4, 4].
+        """
         T_there_camera = keyframe.T_odom_keyframe @ alignment.T_reference_camera
         T_there_here = T_there_camera @ se3.inverse(T_here_camera)
         median_depth_m = keyframe.reference.median_depth_m
         return SubmapMatch(here, keyframe.submap, T_there_here, T_here_camera, median_depth_m)
 
     def is_consistent_with(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
+        """Return whether two matches agree on the relative pose of the same two submaps."""
         if (self.here, self.there) != (other.here, other.there):
             return False
         difference = se3.inverse(self.T_there_here) @ other.T_there_here
         return image_motion_rad(difference, self.median_depth_m) < config.confirm_rad
 
     def is_distinct_from(self, other: "SubmapMatch", config: SubmapConfig) -> bool:
-        """Whether the views are so different that a chance likeness of both is unlikely."""
+        """Return whether two views are so far apart that aliases in both are unlikely."""
         moved = se3.inverse(self.T_here_camera) @ other.T_here_camera
         return image_motion_rad(moved, 3.0 * self.median_depth_m) >= config.confirm_apart_rad
 
 
 @dataclass(frozen=True, slots=True)
 class Submaps:
-    """`roots[s]` is the oldest submap that s is joined to, itself where there is none."""
+    """Submaps with their merges, and the search for further ones."""
 
+    # Oldest submap that each submap is merged with, or itself.
     roots: tuple[int, ...] = ()
-    lost_since_ns: int | None = None  # stamp of the first frame of those LOST in a row
-    frames_since_search: int = 0  # frames
-    pending_match: SubmapMatch | None = None  # the find that is to be confirmed
-    missed: int = 0  # looks in a row since it that found nothing
+    lost_since_ns: int | None = None  # Stamp of the first LOST frame in a row.
+    frames_since_search: int = 0
+    pending_match: SubmapMatch | None = None  # Match that awaits confirmation.
+    missed: int = 0  # Searches in a row without a match.
 
     def started(self) -> "Submaps":
+        """Return the submaps with a new one."""
         return Submaps((*self.roots, len(self.roots)))
 
     def after(self, is_lost: bool, stamp_ns: int) -> "Submaps":
-        """One frame later; a camera that starts again may count time from an earlier point."""
+        """Return the state after a frame; a camera that restarts may have earlier stamps."""
         known = self.lost_since_ns
         since_ns = stamp_ns if known is None else min(known, stamp_ns)
         return replace(
@@ -122,21 +137,22 @@ class Submaps:
         )
 
     def should_start(self, stamp_ns: int, config: SubmapConfig) -> bool:
-        """Whether a frame of this stamp is LOST, and those before it were for long enough."""
+        """Return whether tracking has been LOST for long enough at a stamp to start a submap."""
         if self.lost_since_ns is None or config.begin_after_s == 0:
             return False
         return stamp_ns - self.lost_since_ns >= 1e9 * config.begin_after_s
 
     def is_search_due(self, config: SubmapConfig) -> bool:
-        """Whether any submaps are apart, and the last look was long enough ago."""
+        """Return whether unmerged submaps exist and the last search was long enough ago."""
         wait = config.look_every if self.pending_match is None else config.confirm_after
         return len(set(self.roots)) > 1 and self.frames_since_search >= wait
 
     def are_merged(self, submap: int, other: int) -> bool:
+        """Return whether two submaps are merged, directly or by others."""
         return self.roots[submap] == self.roots[other]
 
     def is_confirmed_by(self, look: SubmapMatch, config: SubmapConfig) -> bool:
-        """Whether both say the same of different views."""
+        """Return whether a match confirms the pending one: consistent, and from another view."""
         last = self.pending_match
         return (
             last is not None
@@ -145,7 +161,13 @@ class Submaps:
         )
 
     def with_search_result(self, found: SubmapMatch | None, config: SubmapConfig) -> "Submaps":
-        """The oldest find that nothing speaks against is kept."""
+        """Return the state after a search; the pending match stays until one contradicts it.
+
+        Args:
+            found: The match, or None if the search found none. More than `misses` of these in a
+                row drop the pending match.
+            config: Settings.
+        """
         if found is None:
             is_kept = self.missed < config.misses
             return replace(
@@ -165,16 +187,18 @@ class Submaps:
         )
 
     def with_merge(self, submap: int, other: int) -> "Submaps":
+        """Return the state with two submaps merged."""
         older, younger = sorted((self.roots[submap], self.roots[other]))
         roots = tuple(older if root == younger else root for root in self.roots)
         return replace(self, roots=roots, pending_match=None)
 
     def pack(self) -> dict[str, Any]:
-        """Arrays and plain values."""
+        """Return arrays and plain values."""
         return asdict(self)
 
     @staticmethod
     def unpack(kept: dict[str, Any]) -> "Submaps":
+        """Return the submaps from their packed form."""
         match = kept["pending_match"]
         return Submaps(
             **{

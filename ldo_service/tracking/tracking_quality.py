@@ -1,9 +1,8 @@
-"""Whether an alignment is right: independent signs, compared with the recent past.
+"""Tracking status from the quality of an alignment.
 
-Inlier fractions do not see a wrong local minimum, whose inflated noise estimate makes everything
-an inlier. So an alignment is judged by what it cannot fake: how much of the surface it shows
-again, its noise against the running median, the condition of its information, and whether
-features found the same pose.
+Inlier fractions do not detect a wrong local minimum: its inflated noise estimate makes every
+residual an inlier. The status therefore depends on other measures: overlap with the reference,
+noise relative to its running median, condition of the information, and confirmation by features.
 """
 
 from dataclasses import dataclass, replace
@@ -18,61 +17,83 @@ from .alignment import Alignment
 from .motion import image_motion_rad
 from .pose_candidates import PoseHypothesis
 
-MIN_GAIN = 0.05  # a frame this dark shows nothing
+MIN_GAIN = 0.05  # Lower bound of the gain; a darker frame shows nothing.
 
 
 class TrackingStatus(StrEnum):
+    """Tracking status of a frame."""
+
     OK = "OK"
-    WEAK = "WEAK"  # a pose, but nothing to build a map on
-    LOST = "LOST"  # no pose
+    WEAK = "WEAK"  # The pose is known, but not reliable enough for mapping.
+    LOST = "LOST"  # The pose is unknown.
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingQualityConfig:
-    min_overlap: float = 0.15  # visible reference points; chosen on apartment_floor1, not elsewhere
-    min_paired: float = 0.05  # of the reference points met by a depth: below, colour is alone
-    max_condition: float = 1e5  # of the information in median depths
-    max_gain: float = 3.0  # either way: a stop and a half, as cameras that step into the light do
-    weak_residual: float = 2.5  # times the running median
-    lost_residual: float = 5.0  # times the running median: never accepted
-    lost_overlap: float = 0.08
-    least_intensity_sigma: float = 2.0  # grey levels: what any camera has, for the comparison
+    """Limits of the tracking status."""
+
+    # Minimum visible fraction of the reference points; chosen on apartment_floor1, not elsewhere.
+    min_overlap: float = 0.15
+    # Minimum fraction of the reference points with a measured depth; below it, only color counts.
+    min_paired: float = 0.05
+    # Maximum condition number of the information, with translation in median depths.
+    max_condition: float = 1e5
+    # Maximum gain, and inverse of the minimum: 1.5 stops, as of a camera that steps into the light.
+    max_gain: float = 3.0
+    weak_residual: float = 2.5  # Maximum residual of an OK frame, times the running median.
+    lost_residual: float = 5.0  # A frame with a larger one is LOST, times the running median.
+    lost_overlap: float = 0.08  # A frame with a smaller overlap is LOST.
+    # Lower bounds of the running medians: the noise of any camera. Intensity in gray levels.
+    least_intensity_sigma: float = 2.0
     least_depth_noise_scale: float = 0.5
-    # A camera that is found without a prediction must show more, unless features found the same
-    # pose (43 of 43 such finds below 0.35 were right, kitchen and flat), and fit better: within
-    # this many times the running median seen from the same pose, plus so much per radian of motion
-    # and parallax from it (`motion.extent`), as the noise of true finds grows (kitchen, p50 1.4 at
-    # 0.15 rad, 2.0 at 0.55), and within weak_residual. 1.6 at any distance found a third fewer of
-    # the kitchen's frames, and one more false one in the flat's twin corridor.
+    # A relocalized camera must have more overlap, unless features confirm the pose: 43 of 43
+    # confirmed poses below 0.35 were right (kitchen and flat). It must also fit better. The limit
+    # is relocalised_residual times the running median at the same pose. It grows by
+    # relocalised_residual_per_rad per radian of image motion from the keyframe
+    # (`motion.image_motion_rad`), up to weak_residual. The noise of right poses grows likewise
+    # (kitchen, p50 1.4 at 0.15 rad, 2.0 at 0.55). A fixed limit of 1.6 found a third fewer frames
+    # of the kitchen, and one more false pose in the ambiguous corridor of the flat.
     relocalised_overlap: float = 0.35
     relocalised_residual: float = 1.3
     relocalised_residual_per_rad: float = 2.0
-    first_intensity_sigma: float = 8.0  # grey levels; expected while there is no past
+    # Expected noise while the history is empty. Intensity in gray levels.
+    first_intensity_sigma: float = 8.0
     first_depth_noise_scale: float = 2.0
-    recovery_margin: float = 0.8  # limits are this much stricter until a frame is OK again
-    history: int = 30  # frames of the running median: a second
+    recovery_margin: float = 0.8  # Limits are stricter by this factor until a frame is OK again.
+    history: int = 30  # Frames of the running median: one second.
 
     def __post_init__(self) -> None:
         if not 0 <= self.lost_overlap <= self.min_overlap <= 1:
-            raise ConfigError("overlaps must be ordered 0 <= lost_overlap <= min_overlap <= 1.")
+            raise ConfigError(
+                f"lost_overlap={self.lost_overlap:g} must be within 0..1 and at most "
+                f"min_overlap={self.min_overlap:g}, which must be at most 1."
+            )
         if not 1 < self.weak_residual <= self.lost_residual:
-            raise ConfigError("residual limits must be ordered 1 < weak <= lost.")
+            raise ConfigError(
+                f"weak_residual={self.weak_residual:g} must be above 1 and at most "
+                f"lost_residual={self.lost_residual:g}."
+            )
         if self.relocalised_residual < 1 or self.relocalised_residual_per_rad < 0:
             raise ConfigError(
-                "relocalised_residual must be at least 1, relocalised_residual_per_rad at least 0."
+                f"relocalised_residual={self.relocalised_residual:g} must be at least 1, "
+                f"relocalised_residual_per_rad={self.relocalised_residual_per_rad:g} at least 0."
             )
         if not 0 < self.recovery_margin <= 1 or self.history < 1:
-            raise ConfigError("recovery_margin must be within 0..1 and history at least 1.")
+            raise ConfigError(
+                f"recovery_margin={self.recovery_margin:g} must be within 0..1 and "
+                f"history={self.history} at least 1."
+            )
 
 
 @dataclass(frozen=True, slots=True)
 class ResidualHistory:
-    """Noise of the last trusted frames."""
+    """Noise of the last OK frames."""
 
-    intensity_sigmas: tuple[float, ...] = ()
-    depth_noise_scales: tuple[float, ...] = ()
+    intensity_sigmas: tuple[float, ...] = ()  # Gray levels of the reference.
+    depth_noise_scales: tuple[float, ...] = ()  # Times the sensor model.
 
     def extended(self, alignment: Alignment, config: TrackingQualityConfig) -> "ResidualHistory":
+        """Return the history with the noise of one more alignment."""
         keep = config.history - 1
         return ResidualHistory(
             (*self.intensity_sigmas[-keep:], exposure_corrected_sigma(alignment)),
@@ -80,7 +101,7 @@ class ResidualHistory:
         )
 
     def residual_ratio(self, alignment: Alignment, config: TrackingQualityConfig) -> float:
-        """The alignment's noise over its running median, the larger of colour and depth."""
+        """Return the noise of an alignment over its running median, the larger of both ratios."""
         usual_sigma = median(self.intensity_sigmas or (config.first_intensity_sigma,))
         usual_scale = median(self.depth_noise_scales or (config.first_depth_noise_scale,))
         intensity = max(usual_sigma, config.least_intensity_sigma)
@@ -91,7 +112,7 @@ class ResidualHistory:
 
 
 def exposure_corrected_sigma(alignment: Alignment) -> float:
-    """Photometric noise in grey levels of the reference: it grows with the exposure."""
+    """Return the photometric noise in gray levels of the reference, as it grows with exposure."""
     return alignment.intensity_sigma / max(alignment.gain, MIN_GAIN)
 
 
@@ -101,10 +122,17 @@ def classify_tracking(
     previous: TrackingStatus,
     config: TrackingQualityConfig,
 ) -> TrackingStatus:
-    """The status of a frame by its best alignment, after a frame of `previous` status.
+    """Return the tracking status of a frame by its best alignment.
 
-    Hysteresis: limits are stricter after a WEAK frame, unless features vouch for this one, and
-    strictest after a loss, from which only OK leads back: there a prior must expect it too.
+    The limits have hysteresis. After a WEAK frame they are stricter, unless features confirm the
+    pose. After a LOST frame they are strictest, unless features and a prior both confirm the pose.
+    A LOST frame is followed by an OK or a LOST frame, never by a WEAK one.
+
+    Args:
+        candidate: Best hypothesis of the frame.
+        history: Noise of the last OK frames.
+        previous: Status of the previous frame.
+        config: Limits.
     """
     alignment = candidate.alignment
     is_known = previous is TrackingStatus.WEAK or candidate.agrees_with_prior

@@ -19,38 +19,37 @@ class KeyframeKind(StrEnum):
 
     FIRST = "first"  # Starts a submap and is measured from no other keyframe.
     REFERENCE = "reference"  # The next frames are aligned to it.
-    MAPPING = (
-        "mapping"  # It is mapped; the next frames are aligned to the same reference as before.
-    )
+    MAPPING = "mapping"  # It is mapped; the reference keyframe stays.
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """Pose of a frame against its reference keyframe, and what the pose calls for.
+    """Pose of a frame against its reference keyframe, and the keyframe that it needs.
 
-    The pose is the last trusted one while the status is LOST. `information` is that of
-    T_reference_camera * exp(xi) with xi = (rotation rad, translation m), and zero while LOST.
+    While the status is LOST, the pose is the last accepted one and `information` is zero.
     """
 
     status: TrackingStatus
-    pose_source: (
-        str  # The initial guess that won: "first", "direct", "prior", "features", "gicp", ...
-    )
+    # Initial guess of the selected hypothesis: "first", "direct", "prior", "features", "gicp", ...
+    pose_source: str
     T_odom_camera: np.ndarray  # [4, 4]
     T_reference_camera: np.ndarray = field(default_factory=lambda: np.eye(4))  # [4, 4]
     reference: int | None = None  # Keyframe that the frame was aligned to; None before the first.
     submap: int = 0  # Submap whose odometry frame T_odom_camera leads to.
-    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))  # [6, 6]
+    # [6, 6] for T_reference_camera * exp(xi) with xi = (rotation rad, translation m).
+    information: np.ndarray = field(default_factory=lambda: np.zeros((6, 6)))
     overlap: float = 0.0  # Visible fraction of the reference's surface.
     inlier_fraction: float = 0.0  # The smaller of the photometric and the geometric fraction.
     intensity_sigma: float = 0.0  # Photometric residual, gray levels.
     depth_noise_scale: float = 0.0  # Geometric residual, times the noise of the sensor model.
     iterations: int = 0
-    hypothesis_spread_rad: float = 0.0  # Between the outcomes of all guesses; 0 for a single one.
-    dynamic_mask: np.ndarray | None = None  # [H, W] bool at working resolution: not to be mapped.
+    hypothesis_spread_rad: float = 0.0  # Spread of the supported hypotheses; 0 for a single one.
+    # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
+    dynamic_mask: np.ndarray | None = None
     needed_keyframe: KeyframeKind | None = None  # Set for OK frames only.
-    should_start_submap: bool = False  # LOST for so long that a new submap is better than none.
-    submap_measurement: SubmapMeasurement | None = None  # Counts once the frame is a keyframe.
+    should_start_submap: bool = False  # LOST for so long that a new submap should start.
+    # Measurement that merges two submaps once the frame is a keyframe.
+    submap_measurement: SubmapMeasurement | None = None
 
     @staticmethod
     def of(
@@ -73,7 +72,7 @@ class TrackedFrame:
             status: Tracking status of the frame.
             pose_source: The initial guess that the alignment started from.
             needed_keyframe: The keyframe that the frame should become.
-            hypothesis_spread_rad: Spread of the outcomes of all initial guesses.
+            hypothesis_spread_rad: Spread of the supported hypotheses.
             dynamic_mask: Moving pixels, [H, W] bool at working resolution.
         """
         return TrackedFrame(
@@ -101,24 +100,24 @@ class NewKeyframe:
 
     id: int
     kind: KeyframeKind
-    submap: int  # Its own submap, whatever that was merged with.
-    window: tuple[RelativePose, ...] = ()  # From earlier keyframes other than the reference.
-    submap_measurement: RelativePose | None = None  # From a keyframe of another submap: a merge.
+    submap: int  # The submap that it was made in, not the root of merged ones.
+    # Measurements from earlier keyframes other than the reference.
+    window: tuple[RelativePose, ...] = ()
+    # Measurement from a keyframe of another submap, which merges the submaps.
+    submap_measurement: RelativePose | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingResult:
-    """Pose of a frame in odometry and in the map, and what became of the frame.
+    """Pose of a frame in odometry and in the map, and the keyframe made of it.
 
-    The pose is the last trusted one while the status is LOST. `information` is that of
-    T_reference_camera * exp(xi) with xi = (rotation rad, translation m), and zero while LOST.
+    While the status is LOST, the pose is the last accepted one and `information` is zero.
     """
 
     # Pose.
     status: TrackingStatus
-    pose_source: (
-        str  # The initial guess that won: "first", "direct", "prior", "features", "gicp", ...
-    )
+    # Initial guess of the selected hypothesis: "first", "direct", "prior", "features", "gicp", ...
+    pose_source: str
     T_odom_camera: np.ndarray  # [4, 4]
     T_map_odom: np.ndarray  # [4, 4]
     graph_version: int  # Version of the pose graph that T_map_odom follows.
@@ -126,21 +125,23 @@ class TrackingResult:
     # Alignment.
     reference: int | None  # The first keyframe refers to itself; None before it.
     T_reference_camera: np.ndarray  # [4, 4]
-    information: np.ndarray  # [6, 6]
+    # [6, 6] for T_reference_camera * exp(xi) with xi = (rotation rad, translation m).
+    information: np.ndarray
     overlap: float  # Visible fraction of the reference's surface.
     # Quality.
     inlier_fraction: float  # The smaller of the photometric and the geometric fraction.
     intensity_sigma: float  # Photometric residual, gray levels.
     depth_noise_scale: float  # Geometric residual, times the noise of the sensor model.
     iterations: int
-    hypothesis_spread_rad: float  # Between the outcomes of all guesses; 0 for a single one.
-    dynamic_mask: np.ndarray | None  # [H, W] bool at working resolution: not to be mapped.
-    has_prior: bool  # An odometry prior reached the time of the frame.
-    # What became of the frame.
+    hypothesis_spread_rad: float  # Spread of the supported hypotheses; 0 for a single one.
+    # Dynamic pixels, which are not mapped, [H, W] bool at working resolution.
+    dynamic_mask: np.ndarray | None
+    has_prior: bool  # The odometry prior covers the time of the frame.
+    # Keyframes.
     keyframe: NewKeyframe | None = None
     reused_keyframe: int | None = None  # Known keyframe that is the reference from now on.
-    denied_keyframe: KeyframeKind | None = None  # Needed, and not allowed by `may_map`.
-    awaits_mapping: bool = False  # Odometry has not begun: its first frame may not be mapped yet.
+    denied_keyframe: KeyframeKind | None = None  # Needed, but not allowed by `may_map`.
+    awaits_mapping: bool = False  # Odometry has not started: its first frame may not be mapped.
 
 
 def make_tracking_result(
@@ -163,12 +164,12 @@ def make_tracking_result(
         T_map_odom: Odometry frame in the map, [4, 4]; its rotation is orthonormalized here.
         graph_version: See `TrackingResult`, as are the arguments below.
         submap: The root of the frame's submap.
-        reference: The keyframe that subscribers find the pose by.
-        has_prior: An odometry prior reached the time of the frame.
+        reference: The keyframe that the pose refers to.
+        has_prior: The odometry prior covers the time of the frame.
         keyframe: The keyframe made of the frame.
         reused_keyframe: The known keyframe that is the reference from now on.
-        denied_keyframe: The keyframe that was needed and not allowed.
-        awaits_mapping: Odometry has not begun.
+        denied_keyframe: The kind of keyframe that was needed, but not allowed.
+        awaits_mapping: Odometry has not started.
     """
     return TrackingResult(
         status=tracked.status,

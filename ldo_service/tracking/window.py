@@ -1,9 +1,9 @@
-"""A new keyframe measured against earlier ones. Conventions: `ldo_service.geometry`.
+"""Relative-pose measurements of a new keyframe from earlier ones.
 
-One chain of measurements, each keyframe from the one before, adds up its errors. The last
-keyframes show much of the same surface, so each new one is measured from several of them: a band
-of measurements that the optimizer solves together. On `synthetic:flat-exact` the error of the
-trajectory falls to under half.
+A single chain of measurements, each keyframe from the previous one, accumulates errors. The last
+keyframes show much of the same surface, so each new one is measured from several of them. The
+pose-graph optimizer solves these measurements together. On `synthetic:flat-exact` this reduces the
+trajectory error to less than half. Conventions: `ldo_service.geometry`.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,18 +21,22 @@ from .pyramid import PyramidConfig
 
 @dataclass(frozen=True, slots=True)
 class WindowConfig:
-    measurements: int = 3  # more per keyframe change little and cost 4 ms each; 0: none
-    reach: int = 6  # of the last keyframes, which are tried newest first
-    min_overlap: float = 0.35  # of the older keyframe's surface; less is mostly its edges
-    worst_noise: float = 1.5  # times that of tracking: a poorer fit is left out
-    levels: int = 2  # the finest: the guess is good
-    iterations: tuple[int, ...] = (10, 4)  # at most, per level, the finest first
+    """Settings of the measurements of a new keyframe from earlier ones."""
+
+    # Maximum measurements per keyframe; more change little and cost 4 ms each. 0: none.
+    measurements: int = 3
+    reach: int = 6  # Number of the last keyframes to try, newest first.
+    # Minimum overlap with the older keyframe; a smaller one is mostly its edges.
+    min_overlap: float = 0.35
+    worst_noise: float = 1.5  # Maximum noise of a measurement, in multiples of that of tracking.
+    levels: int = 2  # Number of finest pyramid levels to use: the initial guess is good.
+    iterations: tuple[int, ...] = (10, 4)  # Maximum per level, the finest first.
 
     def __post_init__(self) -> None:
         if self.measurements < 0 or min(self.reach, self.levels) < 1:
             raise ConfigError(
                 named(self, "measurements", "reach", "levels")
-                + ": measurements may be 0, reach and levels at least 1."
+                + ": measurements must be at least 0, reach and levels at least 1."
             )
         if not (0 < self.min_overlap <= 1 and self.worst_noise >= 1):
             raise ConfigError(
@@ -40,11 +44,13 @@ class WindowConfig:
                 + ": min_overlap must be within 0..1, worst_noise at least 1."
             )
         if not self.iterations or min(self.iterations) < 1:
-            raise ConfigError(f"iterations={self.iterations}: at least 1 for each level.")
+            raise ConfigError(
+                f"iterations={self.iterations} must have at least 1 iteration for each level."
+            )
 
 
 class RecentKeyframeCache:
-    """The last keyframes from their places, each rebuilt once and kept while it is among them."""
+    """Cache of the last keyframes, each rebuilt once from its record."""
 
     def __init__(self, config: PyramidConfig) -> None:
         self._config = config
@@ -53,7 +59,12 @@ class RecentKeyframeCache:
     def newest_first(
         self, places: Sequence[KeyframeRecord], reach: int
     ) -> Iterator[ReferenceKeyframe]:
-        """The last `reach` of places, which come oldest first."""
+        """Iterate over the last keyframes, newest first.
+
+        Args:
+            places: Keyframe records, oldest first.
+            reach: Maximum number of keyframes.
+        """
         last = places[-reach:]
         ids = {place.id for place in last}
         self._rebuilt = {number: k for number, k in self._rebuilt.items() if number in ids}
@@ -71,9 +82,18 @@ def measure_against(
     align_config: AlignConfig,
     config: WindowConfig,
 ) -> list[RelativePose]:
-    """The pose of `keyframe` in the first ones of `earlier` that show the same surface.
+    """Measure the pose of a new keyframe relative to earlier ones that show the same surface.
 
-    usual  how tracking sees just now: its noise starts each alignment, and judges it
+    Args:
+        earlier: Earlier keyframes in order of preference.
+        keyframe: The new keyframe.
+        usual: Brightness and noise of tracking; the start values of each alignment, and the scale
+            of its maximum noise.
+        align_config: Settings of alignment.
+        config: Settings.
+
+    Returns:
+        At most `config.measurements` relative poses.
     """
     measure = replace(align_config, start=usual, iterations=config.iterations)
     poses: list[RelativePose] = []

@@ -69,11 +69,11 @@ def test_a_folder_without_a_map_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("body", [b"", b"nonsense", encode_state({"places": [{"id": 1}]})])
 def test_a_file_that_no_run_wrote_is_refused(tmp_path: Path, body: bytes) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(body)
-    with pytest.raises(DataError, match="is not what `ldo run` writes"):
+    with pytest.raises(DataError, match="is not a keyframe database of `ldo run`"):
         load_keyframe_database(tmp_path)
 
 
 def test_a_run_that_made_no_keyframe_is_refused(tmp_path: Path) -> None:
     (tmp_path / DATABASE_FILE).write_bytes(encode_state({"places": []}))
-    with pytest.raises(DataError, match="no place"):
+    with pytest.raises(DataError, match="no keyframe record"):
         load_keyframe_database(tmp_path)
